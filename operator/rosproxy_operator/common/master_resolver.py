@@ -11,8 +11,6 @@ AGAIN = 15.0
 """Seconds after which a name is resolved anew."""
 AGAIN_UNRESOLVED = 3.0
 """The same for a name that could not be resolved."""
-THIS_HOST = "host.docker.internal"
-"""How containers call the host that they run on."""
 
 
 class MasterResolver:

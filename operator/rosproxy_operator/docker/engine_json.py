@@ -13,6 +13,7 @@ import msgspec
 
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.ros2_variables import OF_ROS2
+from rosproxy_operator.common.zenoh import OVERRIDE, runs_router
 from rosproxy_operator.docker.engine_client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
 from rosproxy_operator.docker.planner.own_containers import CreationFacts
@@ -20,7 +21,7 @@ from rosproxy_operator.docker.planner.specs import FORMER_TOKEN, MANAGED, SECRET
 
 # Go's zero time, 0001-01-01T00:00:00Z.
 _NEVER_STARTED = "0001-"
-_VARIABLES = OF_ROS2 | {"ROS_VERSION", "ROS_DISTRO", "ROS_IP", "ROS_HOSTNAME"}
+_VARIABLES = OF_ROS2 | {"ROS_VERSION", "ROS_DISTRO", "ROS_IP", "ROS_HOSTNAME", OVERRIDE}
 """Variables that tell the version of ROS in a container, and how its nodes find each other."""
 _KEPT_VARIABLES = _VARIABLES | {"ROS_MASTER_URI", FORMER_TOKEN}
 LONGEST_TEXT = 4096
@@ -208,6 +209,7 @@ def read_container(
         hostname=dig(inspected, "Config", "Hostname") or "",
         started_at="" if started.startswith(_NEVER_STARTED) else started,
         exit_code=dig(inspected, "State", "ExitCode") or 0,
+        is_zenoh_router=runs_router(read_making(inspected).command),
     )
 
 

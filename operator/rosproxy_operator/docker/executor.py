@@ -342,7 +342,7 @@ class DockerApplier:
         secret = snapshot.state.secret
         masters = snapshot.state.masters
         key = action.key
-        address = "" if key.is_ros2 else masters.get(master(key).host.lower(), "")
+        address = masters.get(master(key).host.lower(), "") if key.ros == "1" else ""
         return container_config(action, self._settings, secret, address)
 
     def _remove(self, action: Remove, snapshot: DockerSnapshot) -> None:

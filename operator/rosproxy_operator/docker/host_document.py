@@ -9,13 +9,21 @@ from dataclasses import asdict
 from datetime import datetime
 
 from rosproxy import __version__
-from rosproxy.admin.status_document import ParticipantStatus, ProxyStatus
+from rosproxy.admin.status_document import ParticipantStatus, ProxyStatus, ZenohNodeStatus
+from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json
 from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
 from rosproxy_operator.common.ros2_variables import why_unheard
 from rosproxy_operator.docker.planner.label_policy import network_owner
-from rosproxy_operator.docker.planner.model import Container, HostState, Key, Member, OwnContainer
+from rosproxy_operator.docker.planner.model import (
+    ZENOH,
+    Container,
+    HostState,
+    Key,
+    Member,
+    OwnContainer,
+)
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.redirect import redirect_record_name
 from rosproxy_operator.docker.planner.specs import lan_relay_name, proxy_name, sandbox_name
@@ -94,23 +102,25 @@ def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: Pla
             f"{lan_relay.container.state}"
         )
     domain = status.domains[0] if status and status.domains else None
+    zenoh = status.zenoh if status else None
     return {
         "name": proxy_name(key),
-        "ros": "2" if key.is_ros2 else "1",
+        "ros": key.ros,
         "domain": key.domain,
         "peers": list(domain.peers) if domain else [],
+        "links": {link.peer: link.up for link in zenoh.links} if zenoh else {},
         "lan_relay": lan_relay.container.state if lan_relay else None,
         "master_uri": key.master_uri,
         "master_address": (status.master.address if status else None) or "",
-        "master_up": status.master.up if status and not key.is_ros2 else None,
+        "master_up": status.master.up if status and key.ros == "1" else None,
         "advertise_host": key.advertise_host,
         "range": str(own.range) if own else "",
         "state": proxy.container.state if proxy else "absent",
         "reachable": status is not None,
         "networks": sorted(sandbox.container.networks - {settings.uplink}) if sandbox else [],
         "data_plane": status.data_plane.plane if status and status.data_plane else None,
-        "used": status.ports.used if status else None,
-        "free": status.ports.free if status else None,
+        "used": status.ports.used if status and key != ZENOH else None,
+        "free": status.ports.free if status and key != ZENOH else None,
         "reached": status.range_probe.reached if status and status.range_probe else None,
         "problems": problems,
     }
@@ -138,6 +148,16 @@ def _participant(participant: ParticipantStatus) -> Json:
     }
 
 
+def _zenoh_node(node: ZenohNodeStatus) -> Json:
+    return {
+        "name": node.name,
+        "domain": node.domain,
+        "publishes": list(node.publishes),
+        "subscribes": list(node.subscribes),
+        "services": list(node.services),
+    }
+
+
 def _redirects(
     members: Iterable[Member], observed: HostState
 ) -> dict[tuple[str, Key | None], Json]:
@@ -145,13 +165,13 @@ def _redirects(
     by_id = {container.id: container for container in observed.containers}
     return {
         (member.container.id, member.key): {
-            "master": str(member.redirected_master),
+            "master": listed(map(str, member.redirected)),
             "in_place": bool(
                 redirect_record_name(observed, member.key, network_owner(member.container, by_id))
             ),
         }
         for member in members
-        if member.redirected_master and member.container.alive
+        if member.redirected and member.container.alive
     }
 
 
@@ -224,11 +244,16 @@ def _container(
         "name": container.name,
         "state": container.state,
         "proxy": proxy,
-        "ros": ("2" if key.is_ros2 else "1") if key else None,
+        "ros": key.ros if key else None,
         "participants": [
             _participant(p)
             for address in dict.fromkeys(addresses.values())
             for p in participants.get(address, ())
+        ],
+        "zenoh_nodes": [
+            _zenoh_node(node)
+            for node in (status.zenoh.nodes if status and status.zenoh else ())
+            if node.address in addresses.values()
         ],
         "redirect": redirect,
         "networks": sorted(container.networks),

@@ -130,7 +130,8 @@ def _is_as_wanted(status: Json) -> bool:
 
 def _works(proxy: Json) -> bool:
     """Whether a proxy answers, and nothing shows that its master or outside is cut off from it."""
-    return proxy["reachable"] and False not in (proxy["master_up"], proxy["reached"])
+    links = proxy["links"].values()
+    return proxy["reachable"] and False not in (proxy["master_up"], proxy["reached"], *links)
 
 
 def _is_wrong(status: Json) -> bool:

@@ -22,7 +22,7 @@ from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, Pr
 from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 from rosproxy_operator.common.proxy_status import Leases, inside_addresses, leases
 from rosproxy_operator.docker.host_document import STARTING
-from rosproxy_operator.docker.planner.model import Member
+from rosproxy_operator.docker.planner.model import ZENOH, Member
 from rosproxy_operator.docker.planner.proxy_update import NetworkFacts, ProxyUpdate, network_facts
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
@@ -40,7 +40,7 @@ class ProxyUpdater:
     master, whether or not that has, asked for its nodes, and told what is new (`ProxyUpdate`).
     ``silent_since`` is when it ceased to answer (monotonic), or was started; None while it answers.
     ``leases`` are what its participants of ROS 2 have; it is told the ``former_leases`` until it
-    has some.
+    has some. ``has_callers``: it is told who may use it.
     """
 
     def __init__(
@@ -50,6 +50,7 @@ class ProxyUpdater:
         proxies: ProxyClient,
         answered: Callable[[], None],
         former_leases: Leases,
+        has_callers: bool = True,
     ) -> None:
         self.access = access
         self.leases: Leases = {}
@@ -57,6 +58,7 @@ class ProxyUpdater:
         self.error: ProxyError | None = None
         self.silent_since: float | None = time.monotonic()
         self._name = name
+        self._has_callers = has_callers
         self._answered = answered
         self._session = ProxySession(proxies, access.admin, access.token)
         self._update = ProxyUpdate()
@@ -73,7 +75,8 @@ class ProxyUpdater:
     async def run(self) -> None:
         """Tell what there is to be told, for good."""
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._keep_selected())
+            if self._has_callers:
+                tasks.create_task(self._keep_selected())
             tasks.create_task(self._keep_told())
 
     async def _keep_selected(self) -> None:
@@ -204,6 +207,7 @@ class DockerProxySync:
                     self._proxies,
                     self._answered,
                     self._former_leases(name, proxy.range),
+                    has_callers=proxy.key != ZENOH,  # routers of zenoh ask nobody
                 )
                 self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
             facts = network_facts(snapshot.state, proxy, members, self._settings.policy)

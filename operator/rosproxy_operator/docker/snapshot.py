@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common.master_resolver import THIS_HOST, MasterResolver
+from rosproxy_operator.common.master_resolver import MasterResolver
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker import engine_json, host
 from rosproxy_operator.docker.engine_client import DockerClient, Json
@@ -24,6 +24,7 @@ from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.planner.labels.members import LabelReading, master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import (
     STARTED,
+    THIS_HOST,
     Container,
     FlushContainer,
     HostState,

@@ -11,7 +11,7 @@ import msgspec
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.telemetry.text import clean
+from rosproxy.telemetry.text import clean, listed
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec
 
@@ -87,8 +87,9 @@ class Create(_CreateContainer, frozen=True):
     def _details(self) -> str:
         instead = f", instead of {self.replaces}" if self.replaces else ""
         rights = ", with NET_ADMIN" if self.spec.data_plane == "kernel" else ""
+        host = f" at {self.key.advertise_host}" if self.key.advertise_host else ""
         return (
-            f": proxy of the {self.key.graph} at {self.key.advertise_host}, "
+            f": proxy of the {self.key.graph}{host}, "
             f"ports {self.range} of {self.sandbox}{rights}{instead}"
         )
 
@@ -115,21 +116,22 @@ class CreateLanRelay(_CreateContainer, frozen=True):
 class CreateRedirect(_CreateContainer, frozen=True):
     """Create what sets rules in the network of a container, and ends.
 
-    ``target`` is that container's id, ``started`` when it was started. There ``master``, an address
-    and port, is to lead to ``proxy``; where both are None, what led there is taken away.
+    ``target`` is that container's id, ``started`` when it was started. There these ``addresses``
+    are to lead to ``proxy``; without both, what led there is taken away.
     """
 
     target: str
     started: str
-    master: HostPort | None = None
+    addresses: tuple[HostPort, ...] = ()
     proxy: HostPort | None = None
     fingerprint: str = ""
 
     def _details(self) -> str:
         location = f"in the network of container {self.target[:12]}"
-        if self.master is None:
+        if self.proxy is None:
             return f": removes the redirect of the {self.key.graph} {location}"
-        return f": redirects {self.master} to the proxy at {self.proxy} {location}"
+        addresses = listed(map(str, self.addresses))
+        return f": redirects {addresses} to the proxy at {self.proxy} {location}"
 
 
 class CreateFlush(_CreateContainer, frozen=True):

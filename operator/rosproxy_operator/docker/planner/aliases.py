@@ -142,7 +142,7 @@ def answers_to(container: Container, network: str, alias: str) -> bool:
 
 def _names(key: Key) -> tuple[str, ...]:
     """The names that a proxy is to have: its container's own, too, which has no endpoint itself."""
-    if key.is_ros2:  # found by multicast, or as a peer
+    if key.ros != "1":  # found by multicast, as a peer, or by a redirect
         return (proxy_name(key),)
     host = master(key).host
     return (ALIAS, proxy_name(key), *(() if is_address(host) else (host,)))

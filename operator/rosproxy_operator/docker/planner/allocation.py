@@ -20,6 +20,7 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.model import (
     SERVING,
     STARTED,
+    ZENOH,
     Container,
     Desired,
     HostState,
@@ -27,6 +28,7 @@ from rosproxy_operator.docker.planner.model import (
 )
 from rosproxy_operator.docker.planner.specs import proxy_name, reserved_ports
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.planner.zenoh_redirect import FIRST_PORT
 from rosproxy_operator.docker.settings import PlanSettings
 
 
@@ -80,7 +82,8 @@ class _Host:
         observed = self.observed
         claimed = self.published(observed.containers, key) | reserved_ports(key)
         blocked = claimed | self._matching(key, observed.listening, observed.listening_udp)
-        others = [s for s in observed.sandboxes if s.key != key]
+        # The ports of the proxy for rmw_zenoh are not the host's.
+        others = [s for s in observed.sandboxes if s.key not in (key, ZENOH)]
         ranges = [s.range for s in others]
         former: list[FormerRange] = []
         if served := self.memory.served.get(key):
@@ -127,6 +130,7 @@ def allocate(
     no range gets longer: nothing can be created.
     """
     live = {d.key: d for d in desired if d.live}
+    routers = live.pop(ZENOH, None)
     serving = frozenset(s.key for s in observed.sandboxes if s.container.state in SERVING)
     host = _Host(observed, memory, live, serving)
     # Keys with ports come first, then those that had some, then those that want some.
@@ -147,6 +151,8 @@ def allocate(
         for key, error in exhausted.items()
     ]
     problems += _too_short(wishes, ranges, observed.ephemeral)
+    if routers:
+        ranges[ZENOH] = _router_ports(routers.ports, memory)
     left = new_moves(memory.served, ranges, now)
     served = {key: ports for key, ports in memory.served.items() if key not in left}
     moved = left | dict(memory.moved)
@@ -154,7 +160,7 @@ def allocate(
         if key in moved and is_moved(moved[key].ports, ports):
             text = (
                 f"has left ports {moved[key].ports} for {ports}, since another program or "
-                f"container has taken the old ports. {after_move(not key.is_ros2, key.is_ros2)}"
+                f"container has taken the old ports. {after_move(key.ros == '1', key.is_ros2)}"
             )
             problems.append(_problem(key, text))
     return replace(memory, served=served, planned=ranges, moved=moved), problems
@@ -194,6 +200,12 @@ def _too_short(
             f"rosproxy.ports asks for {count}: {why}"
         )
         yield _problem(key, text)
+
+
+def _router_ports(count: int, memory: DockerMemory) -> PortRange:
+    """The ports of the proxy for rmw_zenoh, which are not the host's. They never get fewer."""
+    former = memory.served.get(ZENOH) or memory.planned.get(ZENOH)
+    return PortRange(FIRST_PORT, FIRST_PORT + max(count, len(former) if former else 0) - 1)
 
 
 def _problem(key: Key, text: str, fatal: bool = False) -> Problem:

@@ -37,6 +37,7 @@ from rosproxy_operator.docker.planner.label_policy import label_layers
 from rosproxy_operator.docker.planner.model import (
     SERVING,
     STARTED,
+    ZENOH,
     Attachment,
     Container,
     Desired,
@@ -151,7 +152,7 @@ def removal_steps(
     for own in ordered:
         state = own.container.state
         if again or state != "removing":
-            retire = isinstance(own, Proxy) and state in STARTED
+            retire = isinstance(own, Proxy) and state in STARTED and key != ZENOH
             yield Remove(own.container.name, reason, retire=retire)
 
 

@@ -2,13 +2,17 @@
 
 from collections.abc import Collection, Iterable, Iterator
 
+from rosproxy.settings import MOST_ZENOH_PORTS
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.ros2 import LEAST_PORTS
 from rosproxy_operator.docker.planner.labels.readers import BUILT_IN
-from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
+from rosproxy_operator.docker.planner.model import THIS_HOST, ZENOH, Desired, HostState, Key, Member
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
-from rosproxy_operator.proxy_spec.spec import WISHES, ProxySpec, merged
+from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, merged
+
+ROUTERS_STEP = 32
+"""The routers of a proxy for rmw_zenoh are a multiple of this, of half a megabyte each."""
 
 
 def desire(
@@ -39,17 +43,16 @@ def desire(
         exited = [member for member in recent if member.key == key]
         joined = {name for s in observed.sandboxes_of(key) for name in s.container.networks}
         networks = _networks(own) | (_networks(exited) & joined)
-        ports = max([settings.ports, *(member.ports for member in own)])
         considered = [*own, *exited]
         desired.append(
             Desired(
                 key,
                 bool(own),
-                max(ports, LEAST_PORTS) if key.is_ros2 else ports,
+                _ports(key, own, settings),
                 networks & usable,
                 own,
                 proxy_spec(key, considered, settings),
-                _peers(considered, settings) if key.is_ros2 else (),
+                _peers(key, considered, observed, settings),
             )
         )
     bad_networks = [_bad_network(name, settings.uplink) for name in sorted(bad & _networks(alive))]
@@ -58,15 +61,31 @@ def desire(
 
 def proxy_spec(key: Key, members: Iterable[Member], settings: PlanSettings) -> ProxySpec:
     """The options of a proxy with these containers."""
-    version = "2" if key.is_ros2 else "1"
-    names = (name for name, wish in WISHES.items() if wish.ros in ("", version))
+    if key == ZENOH:  # none is for its routers
+        return OWN_SPEC
+    names = (name for name, wish in WISHES.items() if wish.ros in ("", key.ros))
     defaults = ProxySpec(**{name: getattr(settings, name) for name in names})
     return merged([member.wishes for member in members], defaults)
 
 
-def _peers(members: Iterable[Member], settings: PlanSettings) -> tuple[str, ...]:
-    """The peers a proxy for ROS 2 tells of participants: the operator's and its containers'."""
-    return tuple(sorted({*settings.ros2_peer, *(peer for m in members for peer in m.peers)}))
+def _ports(key: Key, members: Collection[Member], settings: PlanSettings) -> int:
+    """The least number of ports of a proxy with these containers."""
+    if key == ZENOH:  # in steps: with each change of the number its nodes have to connect again
+        steps = max(-(-len(members) // ROUTERS_STEP), 1)
+        return min(steps * ROUTERS_STEP, MOST_ZENOH_PORTS)
+    ports = max([settings.ports, *(member.ports for member in members)])
+    return max(ports, LEAST_PORTS) if key.is_ros2 else ports
+
+
+def _peers(
+    key: Key, members: Iterable[Member], observed: HostState, settings: PlanSettings
+) -> tuple[str, ...]:
+    """The peers of a proxy for ROS 2: its containers', and for DDS the operator's."""
+    peers = {peer for member in members for peer in member.peers}
+    if key == ZENOH:
+        gateway = observed.gateway(settings.uplink) or THIS_HOST
+        return tuple(sorted(peer.replace(THIS_HOST, gateway) for peer in peers))
+    return tuple(sorted({*settings.ros2_peer, *peers})) if key.is_ros2 else ()
 
 
 def _networks(members: Iterable[Member]) -> frozenset[str]:

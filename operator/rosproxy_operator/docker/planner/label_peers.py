@@ -9,9 +9,10 @@ from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import replace
 
+from rosproxy.settings import MOST_ZENOH_PEERS
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels.readers import PEERS
-from rosproxy_operator.docker.planner.model import Key, Member
+from rosproxy_operator.docker.planner.model import ZENOH, Key, Member
 from rosproxy_operator.docker.settings import PlanSettings
 
 MOST_OF_PROXY = 256
@@ -27,21 +28,30 @@ def with_bounded_peers(
     # Containers that run come first: one that has exited only keeps its peers for a while.
     order = sorted(members, key=lambda m: (not m.container.alive, len(m.peers), m.container.name))
     for member in order:
-        peers = (named[member.key] | member.peers) - {*settings.ros2_peer}
-        if len(peers) > MOST_OF_PROXY:
+        peers = named[member.key] | member.peers
+        peers -= frozenset(settings.ros2_peer if member.key.is_ros2 else ())
+        if len(peers) > _most(member.key):
             ignored.append(member)
         else:
             named[member.key] = peers
-    text = (
-        f"label {PEERS} is ignored: a proxy takes at most {MOST_OF_PROXY} peers from all labels of "
-        "its containers, and ignores the labels with the most peers. Name fewer peers, or start "
-        "the operator with --ros2-peer for common peers"
-    )
     return (
         tuple(replace(m, peers=frozenset()) if m in ignored else m for m in members),
         tuple(
-            Problem(f"container {member.container.name}", text, fatal=False)
+            Problem(f"container {member.container.name}", _ignored(member.key), fatal=False)
             for member in ignored
             if member.container.alive
         ),
+    )
+
+
+def _most(key: Key) -> int:
+    return MOST_ZENOH_PEERS if key == ZENOH else MOST_OF_PROXY
+
+
+def _ignored(key: Key) -> str:
+    """Why the peers of a container are ignored, and what to do."""
+    common = "" if key == ZENOH else ", or start the operator with --ros2-peer for common peers"
+    return (
+        f"label {PEERS} is ignored: a proxy takes at most {_most(key)} peers from all labels of "
+        f"its containers, and ignores the labels with the most peers. Name fewer peers{common}"
     )

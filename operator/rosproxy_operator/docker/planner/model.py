@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network
+from typing import Literal
 
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
@@ -14,6 +15,8 @@ ALIVE = frozenset({"created", "running", "paused", "restarting"})
 STARTED = frozenset({"running", "paused"})
 SERVING = STARTED | {"restarting"}
 """States of a container that runs, or does again in a moment."""
+THIS_HOST = "host.docker.internal"
+"""How containers call the host that they run on."""
 STARTED_LABEL = "io.rosproxy.started"
 """On a redirect's container: when the one was started whose network it is in."""
 
@@ -43,9 +46,9 @@ class Container:
     ``master_uri`` ROS_MASTER_URI of its environment or empty, ``variables`` those that say what it
     is of ROS 2, and how its nodes call their host. ``host_ports`` are the TCP ports that it
     publishes on the host, or will once it is started, ``udp_ports`` the UDP ports. ``started_at``
-    is empty if it never was, or if nobody asked; ``exit_code`` is how it ended last. ``forged``
-    says of one that has the labels of this operator's own what shows that it is none; it is empty
-    for all others.
+    is empty if it never was, or if nobody asked; ``exit_code`` is how it ended last.
+    ``is_zenoh_router``: its command runs a router of zenoh. ``forged`` says of one that has the
+    labels of this operator's own what shows that it is none; it is empty for all others.
     """
 
     id: str
@@ -62,6 +65,7 @@ class Container:
     started_at: str = ""
     forged: str = ""
     exit_code: int = 0
+    is_zenoh_router: bool = False
 
     @property
     def alive(self) -> bool:
@@ -101,13 +105,22 @@ class Key:
     """What tells proxies of one host apart: master's URI or domain, and the advertised host.
 
     ROS 1 has a master. ROS 2 has a domain, and its ``master_uri`` is empty: a container with both
-    has two proxies, since the containers of a master are not those of a domain.
+    has two proxies, since the containers of a master are not those of a domain. All containers of
+    rmw_zenoh share one proxy (`ZENOH`), which publishes no port: zenoh keeps domains apart itself.
     """
 
-    # Ordering never compares a domain with None: keys of ROS 1 have a master_uri, of ROS 2 none.
+    # Ordering never compares a domain with None: keys of ROS 1 have a master_uri, those of ROS 2
+    # an advertised host, and the one of rmw_zenoh neither.
     master_uri: str
     advertise_host: str
     domain: int | None = None
+
+    @property
+    def ros(self) -> Literal["1", "2", "zenoh"]:
+        """What the proxy serves, in the words of its option ``--ros``."""
+        if self.is_ros2:
+            return "2"
+        return "1" if self.master_uri else "zenoh"
 
     @property
     def is_ros2(self) -> bool:
@@ -117,7 +130,12 @@ class Key:
     @property
     def graph(self) -> str:
         """What its nodes have in common, as users are told of it."""
-        return f"ROS 2 domain {self.domain}" if self.is_ros2 else f"master {self.master_uri}"
+        graphs = {"1": f"master {self.master_uri}", "2": f"ROS 2 domain {self.domain}"}
+        return graphs.get(self.ros, "zenoh network")
+
+
+ZENOH = Key("", "")
+"""The key of the proxy for rmw_zenoh."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,9 +274,10 @@ class Member:
     the names of those on which it wants to meet its proxy. ``wanted_alias`` is the host in its
     ROS_MASTER_URI: the name by which it looks for the proxy, ``rosproxy`` if it has no such
     variable, empty where no alias can help it. ``policy`` are rules for its own nodes alone.
-    ``peers`` are hosts outside, for a member of a ROS 2 domain. ``redirect`` is what its label
-    says, None without one; ``redirected_master`` the address and port of its master that
-    are to lead to its proxy, in its network, None if none are. A container that is not alive only
+    ``peers`` are hosts outside, for a member of a ROS 2 domain, and routers for rmw_zenoh.
+    ``redirect`` is what its label says, None without one; ``redirected`` are the addresses and
+    ports that are to lead to its proxy, in its network: its master's, or those of the routers that
+    its nodes of rmw_zenoh look for. A container that is not alive only
     keeps networks joined, and what else its labels made its proxy, for a while.
     """
 
@@ -271,7 +290,7 @@ class Member:
     policy: tuple[Rule, ...] = ()
     peers: frozenset[str] = frozenset()
     redirect: bool | None = None
-    redirected_master: HostPort | None = None
+    redirected: tuple[HostPort, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,7 +299,7 @@ class Desired:
 
     Without ``live`` no running container wants it any more: it is left as it is, but for the
     networks that it leaves, until its grace ends. ``ports`` is the least number of ports. ``peers``
-    are whom a proxy for ROS 2 tells of its participants.
+    are whom a proxy for ROS 2 tells of its participants, and routers that one for rmw_zenoh dials.
     """
 
     key: Key

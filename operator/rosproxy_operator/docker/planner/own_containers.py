@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rosproxy_operator.common.ros2 import LAN_RELAY_COMMAND
+from rosproxy_operator.docker.planner.model import ZENOH
 from rosproxy_operator.docker.planner.specs import (
     FORMER_LAN_RELAY,
     HELPER_USER,
@@ -44,6 +45,7 @@ from rosproxy_operator.docker.planner.specs import (
     redirect_name,
     sandbox_name,
 )
+from rosproxy_operator.docker.planner.zenoh_redirect import zenoh_sysctls
 
 _TEMPORARY = r"(-\d+)?(-old(-\d+)?)?"
 """What follows a name while another container takes over or has it (`duplicates.free_name`)."""
@@ -111,7 +113,7 @@ def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: s
         ROLE_SANDBOX: _odd_sandbox(own, making.host),
         ROLE_PROXY: _odd_proxy(making.host),
         ROLE_LAN_RELAY: _odd_lan_relay(making.host),
-        ROLE_REDIRECT: _odd_redirect(making.host),
+        ROLE_REDIRECT: _odd_redirect(own, making.host),
         ROLE_FLUSH: _odd_flush(making.host),
     }
     return next((f"HostConfig.{name} is not the operator's" for name in odd[own.role]), "")
@@ -173,9 +175,10 @@ def _odd_lan_relay(host: Mapping[str, Any]) -> Iterator[str]:
     yield from (name for name in ("PortBindings", "Sysctls") if host.get(name))
 
 
-def _odd_redirect(host: Mapping[str, Any]) -> Iterator[str]:
-    """It has NET_ADMIN in another container's network, and nothing else."""
-    yield from _odd_helper(host)
+def _odd_redirect(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
+    """It has NET_ADMIN in another container's network; for rmw_zenoh, it has a sysctl there."""
+    sysctls = frozenset(zenoh_sysctls(True)) if own.key == ZENOH else frozenset()
+    yield from _odd_helper(host, sysctls)
     if not str(host.get("NetworkMode")).startswith("container:"):
         yield "NetworkMode"
 
@@ -187,13 +190,16 @@ def _odd_flush(host: Mapping[str, Any]) -> Iterator[str]:
         yield "NetworkMode"
 
 
-def _odd_helper(host: Mapping[str, Any]) -> Iterator[str]:
+def _odd_helper(host: Mapping[str, Any], sysctls: frozenset[str] = frozenset()) -> Iterator[str]:
     yield from _odd(host)
     if [str(name).removeprefix("CAP_") for name in host.get("CapAdd") or ()] != ["NET_ADMIN"]:
         yield "CapAdd"
     if host.get("SecurityOpt") != ["no-new-privileges:true"]:
         yield "SecurityOpt"
-    yield from (name for name in ("PortBindings", "Sysctls") if host.get(name))
+    if host.get("PortBindings"):
+        yield "PortBindings"
+    if not (host.get("Sysctls") or {}).keys() <= sysctls:
+        yield "Sysctls"
 
 
 def _odd_proxy(host: Mapping[str, Any]) -> Iterator[str]:

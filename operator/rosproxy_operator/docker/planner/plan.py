@@ -24,6 +24,7 @@ from rosproxy_operator.docker.planner.flush import flush_steps
 from rosproxy_operator.docker.planner.label_peers import with_bounded_peers
 from rosproxy_operator.docker.planner.label_policy import with_bounded_rules
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
+from rosproxy_operator.docker.planner.labels.zenoh import with_bounded_containers
 from rosproxy_operator.docker.planner.lan_relay import missing_lan_relay, with_lan_relay
 from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
 from rosproxy_operator.docker.planner.redirect import redirect_steps
@@ -136,7 +137,8 @@ def _within_bounds(
     """The members as far as their proxies can hold what all of their labels ask for together."""
     members, crowded = with_bounded_rules(members, settings)
     members, peerless = with_bounded_peers(members, settings)
-    return members, [*crowded, *peerless]
+    members, left_out = with_bounded_containers(members)
+    return members, [*crowded, *peerless, *left_out]
 
 
 def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
@@ -219,7 +221,7 @@ def _waits(group: Group, observed: HostState, uplink: str) -> bool:
 
 
 def _lacks_address(key: Key, observed: HostState, uplink: str) -> bool:
-    if key.is_ros2:  # its LAN relay is at the uplink's gateway
+    if key.ros != "1":  # a LAN relay, and a router of this host, are at the uplink's gateway
         return uplink not in {network.name for network in observed.networks}
     return observed.masters.get(master(key).host) == ""
 

@@ -218,7 +218,7 @@ def network_facts(
 
     One for ROS 2 has no master, and hears by itself of containers that come.
     """
-    host = "" if proxy.key.is_ros2 else master(proxy.key).host.lower()
+    host = master(proxy.key).host.lower() if proxy.key.ros == "1" else ""
     sandbox = observed.sandbox_of(proxy)
     joined = {a.network for a in sandbox.container.attachments if a.address} if sandbox else set()
     by_id = {container.id: container for container in observed.containers}
@@ -241,7 +241,7 @@ def network_facts(
         arrivals=frozenset(
             arrival
             for member in own_members
-            if not proxy.key.is_ros2
+            if proxy.key.ros == "1"
             for arrival in _arrivals(member, observed, by_id, joined)
         ),
         running=frozenset(container.id for container in running),
@@ -270,7 +270,7 @@ def _arrivals(
     own = {container.name, container.hostname, container.id[:12], host.hostname}
     # Until the redirect is there, nodes reach the real master by its address, and register around
     # the proxy with the host that these variables name.
-    if member.redirected_master:
+    if member.redirected:
         own |= {container.variables.get(name, "") for name in ("ROS_IP", "ROS_HOSTNAME")}
         own = {name for name in own if not is_loopback(name)}
     return [

@@ -11,11 +11,13 @@ of its own, without rules. Where a record says something else than is wanted, th
 anew, in one transaction; where nothing is wanted any more, they are taken away and the record goes
 last. Connections that were there before stay as they are.
 
+The routers that nodes of rmw_zenoh look for lead to the proxy in the same way (`zenoh_redirect`).
+
 A redirect is only set towards a proxy that runs. Once set, it stays while the proxy is away for a
 moment: its nodes then reach nothing, as they would by a name.
 """
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from string import Template
 from typing import Any
@@ -29,6 +31,7 @@ from rosproxy_operator.docker.planner.label_policy import network_owner
 from rosproxy_operator.docker.planner.labels.readers import MASTER_URI
 from rosproxy_operator.docker.planner.model import (
     STARTED,
+    ZENOH,
     Container,
     Desired,
     HostState,
@@ -43,6 +46,13 @@ from rosproxy_operator.docker.planner.specs import (
     own_labels,
     proxy_name,
     redirect_name,
+)
+from rosproxy_operator.docker.planner.zenoh_redirect import (
+    as_client,
+    router_ports,
+    with_all_routers,
+    zenoh_rules,
+    zenoh_sysctls,
 )
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.fingerprint import digest
@@ -81,8 +91,11 @@ class RedirectSteps:
 
 def redirect_config(action: CreateRedirect, settings: PlanSettings) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for what sets a redirect's rules."""
+    helper = helper_config(settings, f"container:{action.target}")
+    if action.key == ZENOH:
+        helper["HostConfig"]["Sysctls"] = zenoh_sysctls(bool(action.addresses))
     return {
-        **helper_config(settings, f"container:{action.target}"),
+        **helper,
         "Entrypoint": [NFT],
         "Cmd": [_rules(action)],
         "Labels": own_labels(action),
@@ -94,12 +107,13 @@ def _rules(action: CreateRedirect) -> str:
     table = f"rosproxy-redirect-{proxy_name(action.key).rpartition('-')[2]}"
     # To delete a table that is not there is an error, and would undo the transaction: so add first.
     text = f"add table ip {table}\ndelete table ip {table}\n"
-    if action.master is None:
+    if action.proxy is None:
         return text
-    # A CreateRedirect has both or neither: the second operand only satisfies the type checker.
-    proxy = action.proxy or action.master
+    if action.key == ZENOH:
+        return text + zenoh_rules(table, action.addresses, action.proxy)
+    (master,) = action.addresses
     return text + _SET.substitute(
-        table=table, address=action.master.host, port=action.master.port, proxy=proxy.host
+        table=table, address=master.host, port=master.port, proxy=action.proxy.host
     )
 
 
@@ -129,6 +143,11 @@ def redirect_steps(
 
 def _by_name(key: Key) -> str:
     """How nodes use their proxy where no redirect can be set."""
+    if key == ZENOH:
+        return (
+            "Until the redirect is in place, the nodes do not find the proxy. The operator tries "
+            f"again; or set {as_client(proxy_name(key))}"
+        )
     return (
         "Until the redirect is in place, the nodes bypass the proxy. The operator tries again; or "
         f"set ROS_MASTER_URI=http://{proxy_name(key)}:{master(key).port} and the label "
@@ -160,40 +179,58 @@ def _wanted(
     """
     wanted: dict[RedirectSite, CreateRedirect | None] = {}
     owners: dict[tuple[str, HostPort], Key] = {}
-    by_id = {container.id: container for container in observed.containers}
+    ports: Mapping[str, int] = {}
     for proxy in desired:
-        for member in proxy.members if proxy.live else ():
-            owner = network_owner(member.container, by_id)
-            if (
-                member.redirected_master is None
-                or not {owner.state, member.container.state} <= STARTED
-            ):
-                continue
-            if owners.setdefault((owner.id, member.redirected_master), proxy.key) == proxy.key:
+        started = [*_started(proxy, observed)]
+        if proxy.key == ZENOH:
+            targets = frozenset(owner.id for _, owner in started)
+            ports = router_ports(observed.redirects, targets)
+            started = [*with_all_routers(started)]
+        for member, owner in started:
+            if owners.setdefault((owner.id, member.redirected[0]), proxy.key) == proxy.key:
                 site = proxy.key, owner.id
+                port = ports[owner.id] if proxy.key == ZENOH else master(proxy.key).port
                 # Containers that share a network share the redirect.
-                wanted[site] = wanted.get(site) or _redirect_to(member, owner, observed, settings)
+                wanted[site] = wanted.get(site) or _redirect_to(
+                    member, owner, port, observed, settings
+                )
     return wanted
 
 
+def _started(proxy: Desired, observed: HostState) -> Iterator[tuple[Member, Container]]:
+    """The containers of a proxy that are to be redirected now, and whose network each is in."""
+    by_id = {container.id: container for container in observed.containers}
+    for member in proxy.members if proxy.live else ():
+        owner = network_owner(member.container, by_id)
+        if member.redirected and {owner.state, member.container.state} <= STARTED:
+            yield member, owner
+
+
 def _redirect_to(
-    member: Member, owner: Container, observed: HostState, settings: PlanSettings
+    member: Member, owner: Container, port: int, observed: HostState, settings: PlanSettings
 ) -> CreateRedirect | None:
     """The redirect of a container; None while its proxy does not run, or is not met."""
-    key = member.key
     meeting = _meeting(member, owner, observed)
     if meeting is None:
         return None
     proxy, ports = meeting
+    if member.key == ZENOH:
+        if port not in ports:  # the proxy is about to get more ports
+            return None
+        ports = PortRange(port, port)
     action = CreateRedirect(
-        "", key, ports, owner.id, owner.started_at, member.redirected_master, proxy
+        "",
+        member.key,
+        ports,
+        owner.id,
+        owner.started_at,
+        member.redirected,
+        HostPort(proxy, port),
     )
     return _with_fingerprint(action, observed, settings)
 
 
-def _meeting(
-    member: Member, owner: Container, observed: HostState
-) -> tuple[HostPort, PortRange] | None:
+def _meeting(member: Member, owner: Container, observed: HostState) -> tuple[str, PortRange] | None:
     """Where a container meets its proxy, on the first network that both are on."""
     shared = {a.network for a in owner.attachments if a.address} & member.networks
     running = [p for p in observed.proxies_of(member.key) if p.container.state == "running"]
@@ -202,7 +239,7 @@ def _meeting(
         places = box.container.attachments if box and box.container.state == "running" else ()
         pairs = sorted((p.network, p.address) for p in places if p.network in shared and p.address)
         if box and pairs:
-            return HostPort(pairs[0][1], master(member.key).port), box.range
+            return pairs[0][1], box.range
     return None
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from rosproxy.telemetry.tables import besides_first, table
-from rosproxy.telemetry.text import clean, plural, shorten, wrap
+from rosproxy.telemetry.text import clean, listed, plural, shorten, wrap
 
 Status = Mapping[str, Any]
 """What ``rosproxy-operator docker status --json`` prints."""
@@ -73,13 +73,23 @@ def _proxy_row(proxy: Status) -> tuple[str, ...]:
         clean(proxy["name"]),
         clean(proxy["state"]) + (", no answer" if lost else ""),
         _graph(proxy),
-        clean(proxy["advertise_host"]),
+        _outside(proxy),
         clean(proxy["range"]) + (f" {proxy['used']} used" if proxy["used"] is not None else ""),
     )
 
 
+def _outside(proxy: Status) -> str:
+    """At which host outside reaches a proxy; which routers one for rmw_zenoh is linked with."""
+    if proxy["ros"] != "zenoh":
+        return clean(proxy["advertise_host"])
+    links = (clean(peer) + ("" if up else " DOWN") for peer, up in proxy["links"].items())
+    return listed(links) or "no peers"
+
+
 def _graph(proxy: Status) -> str:
     """What a proxy's nodes have in common."""
+    if proxy["ros"] == "zenoh":
+        return "rmw_zenoh"
     if proxy["ros"] == "2":
         return f"domain {proxy['domain']}" + (
             ", no LAN relay" if proxy["lan_relay"] is None else ""
@@ -109,7 +119,10 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
             names = [clean(name) for node in container["nodes"] for name in node["names"]]
             yield from wrap("  ".join(names), columns, INDENT, most=MOST_LINES)
             for participant in container["participants"]:
-                yield from wrap(_participant(participant), columns, INDENT, most=MOST_LINES)
+                text = _topics(participant["vendor"], participant)
+                yield from wrap(text, columns, INDENT, most=MOST_LINES)
+            for node in container["zenoh_nodes"]:
+                yield from wrap(_topics(node["name"], node), columns, INDENT, most=MOST_LINES)
         yield from _wrong(filter(None, (p["problem"] for p in container["participants"])), columns)
         # A container of both versions of ROS has two rows; what is wrong with it is told once.
         subject = f"container {container['name']}"
@@ -120,11 +133,11 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
         reported.add(subject)
 
 
-def _participant(row: Status) -> str:
-    """A participant's topics and services, in one line."""
+def _topics(name: str, row: Status) -> str:
+    """The topics and services of a participant or a node, in one line."""
     verbs = (("publishes", "publishes"), ("subscribes to", "subscribes"), ("serves", "services"))
     texts = [f"{verb} {'  '.join(map(clean, row[key]))}" for verb, key in verbs if row[key]]
-    return f"{clean(row['vendor'])}: {'; '.join(texts) or 'nothing announced yet'}"
+    return f"{clean(name)}: {'; '.join(texts) or 'nothing announced yet'}"
 
 
 def _container_row(container: Status, ranges: Mapping[str, str]) -> tuple[str, ...]:
@@ -133,7 +146,8 @@ def _container_row(container: Status, ranges: Mapping[str, str]) -> tuple[str, .
     proxy = container["proxy"]
     cells = map(clean, (name, state, proxy or "-", ranges.get(proxy, "-")))
     participants = plural(len(container["participants"]), "participant")
-    return (*cells, participants if container["ros"] == "2" else str(len(container["nodes"])))
+    nodes = str(len(container["nodes"]) + len(container["zenoh_nodes"]))
+    return (*cells, participants if container["ros"] == "2" else nodes)
 
 
 def _wrong(texts: Iterable[str], columns: int) -> Iterator[str]:

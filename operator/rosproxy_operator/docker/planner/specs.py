@@ -13,6 +13,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.setting_kinds import SettingError, hash_token, parse_range
+from rosproxy.settings import MOST_ZENOH_PORTS
 from rosproxy_operator.common.policy import AWAITED, as_variable
 from rosproxy_operator.common.ros2 import (
     LAN_RELAY_COMMAND,
@@ -28,7 +29,8 @@ from rosproxy_operator.docker.planner.actions import (
     CreateRedirect,
     CreateSandbox,
 )
-from rosproxy_operator.docker.planner.model import STARTED_LABEL, Key
+from rosproxy_operator.docker.planner.model import STARTED_LABEL, ZENOH, Key
+from rosproxy_operator.docker.planner.zenoh_redirect import FIRST_PORT
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.environment import environment
 from rosproxy_operator.proxy_spec.fingerprint import LIVE_VARIABLES, digest
@@ -45,6 +47,8 @@ ROLE_REDIRECT = "redirect"
 ROLE_FLUSH = "flush"
 MASTER_URI = "io.rosproxy.master-uri"
 DOMAIN = "io.rosproxy.domain"
+ROUTERS = "io.rosproxy.zenoh"
+"""``true`` on what is for the proxy for rmw_zenoh."""
 ADVERTISE_HOST = "io.rosproxy.advertise-host"
 RANGE = "io.rosproxy.range"
 FINGERPRINT = "io.rosproxy.fingerprint"
@@ -123,7 +127,8 @@ class OwnLabels:
 def proxy_name(key: Key) -> str:
     """The name of a key's proxy container: master's host or domain, six digits of a hash."""
     digest = hashlib.sha256(_identity(key).encode()).hexdigest()
-    label = f"domain-{key.domain}" if key.is_ros2 else master(key).host.lower()
+    labels = {"2": f"domain-{key.domain}", "zenoh": "zenoh"}
+    label = labels.get(key.ros) or master(key).host.lower()
     slug = re.sub(r"[^a-z0-9]+", "-", label)[:30].strip("-")
     return f"rosproxy-{slug or 'master'}-{digest[:6]}"
 
@@ -155,7 +160,7 @@ def is_proxy_name(name: str) -> bool:
 
 def _identity(key: Key) -> str:
     """What a key's proxy is known by."""
-    return f"{key.graph if key.is_ros2 else key.master_uri} {key.advertise_host}"
+    return f"{key.master_uri or key.graph} {key.advertise_host}"
 
 
 def unresolved_master(host: str) -> str:
@@ -181,7 +186,7 @@ def master(key: Key) -> HostPort:
 
 def admin_port(key: Key) -> int:
     """The port of a proxy's admin endpoint: 11312, or 11313 where nodes find their master there."""
-    taken = not key.is_ros2 and master(key).port == ADMIN_PORT
+    taken = key.ros == "1" and master(key).port == ADMIN_PORT
     return ADMIN_PORT + 1 if taken else ADMIN_PORT
 
 
@@ -198,7 +203,7 @@ def reserved_ports(key: Key) -> frozenset[int]:
     """The ports on which a key's proxy listens besides its range, so never to be in it."""
     if key.domain is not None:
         return frozenset({DEFAULT_MASTER_PORT, ADMIN_PORT, *well_known_ports(key.domain)})
-    return frozenset({master(key).port, admin_port(key)})
+    return frozenset({admin_port(key), *((master(key).port,) if key.ros == "1" else ())})
 
 
 def own_range(key: Key, ports: PortRange) -> PortRange:
@@ -209,9 +214,10 @@ def own_range(key: Key, ports: PortRange) -> PortRange:
 def published_ports(key: Key, ports: PortRange, udp: bool) -> list[tuple[str, int]]:
     """What a key's sandbox publishes, in the engine's words, each with the port of the host.
 
-    ``udp``: that of a proxy for ROS 1 publishes them for UDP as well, for UDPROS.
+    ``udp``: that of a proxy for ROS 1 publishes them for UDP as well, for UDPROS. The one for
+    rmw_zenoh publishes nothing, as it connects to outside by itself.
     """
-    protocols = ["udp"] if key.is_ros2 else ["tcp", *(["udp"] if udp else [])]
+    protocols = {"1": ["tcp", *(["udp"] if udp else [])], "2": ["udp"], "zenoh": []}[key.ros]
     own = own_range(key, ports).ports()
     return [(f"{port}/{protocol}", port) for protocol in protocols for port in own]
 
@@ -240,6 +246,8 @@ def _read_key(labels: Mapping[str, str]) -> Key | None:
     uri = labels.get(MASTER_URI, "")
     host = labels.get(ADVERTISE_HOST, "")
     domain = labels.get(DOMAIN, "")
+    if labels.get(ROUTERS) == "true":
+        return None if uri or host or domain else ZENOH
     if not host or bool(uri) == bool(domain):
         return None
     if uri:
@@ -261,11 +269,12 @@ def flush_command(key: Key, ports: PortRange) -> tuple[str, ...]:
 def own_labels(action: Creation) -> dict[str, str]:
     """The labels of a container, from which `read_own` reads it back."""
     key = action.key
+    graph = {"1": {MASTER_URI: key.master_uri}, "2": {DOMAIN: str(key.domain)}}
     return {
         MANAGED: "true",
         ROLE: _ROLES[type(action)],
-        **({DOMAIN: str(key.domain)} if key.is_ros2 else {MASTER_URI: key.master_uri}),
-        ADVERTISE_HOST: key.advertise_host,
+        **graph.get(key.ros, {ROUTERS: "true"}),
+        **({ADVERTISE_HOST: key.advertise_host} if key != ZENOH else {}),
         RANGE: str(action.range),
         FINGERPRINT: action.fingerprint,
         **({STARTED_LABEL: action.started} if isinstance(action, CreateRedirect) else {}),
@@ -295,9 +304,10 @@ def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, A
     """The body of the engine's ``POST /containers/create`` for a sandbox.
 
     It does nothing until it is stopped. Outgoing connections, which are the proxy's, start
-    below the ports that a proxy is to listen on.
+    below the ports that a proxy is to listen on, and above those of its routers for rmw_zenoh.
     """
-    sysctls = {"net.ipv4.ip_local_port_range": "1024 11000"}
+    first = FIRST_PORT + MOST_ZENOH_PORTS if action.key == ZENOH else 1024
+    sysctls = {"net.ipv4.ip_local_port_range": f"{first} 11000"}
     if action.spec.data_plane == "kernel":
         sysctls["net.ipv4.ip_forward"] = "1"
     bindings = {
@@ -378,6 +388,14 @@ def _told(
 ) -> dict[str, Any]:
     """The settings of a proxy, by their fields, in the order of `environment`."""
     key = action.key
+    if key == ZENOH:
+        return {
+            "admin": HostPort("0.0.0.0", admin_port(key)),
+            "admin_token_hash": hash_token(proxy_token(key, secret)),
+            "ros": (key.ros,),
+            "zenoh_ports": action.range,
+            "zenoh_peer": action.peers,
+        }
     return {
         "master_uri": key.master_uri,
         "advertise_host": key.advertise_host,
@@ -390,7 +408,7 @@ def _told(
         **({} if key.is_ros2 else asdict(settings.proxy_bounds)),
         "await_policy": AWAITED,
         "policy_layers": as_variable((*settings.policy, *action.policy)),
-        "ros": ("2",) if key.is_ros2 else ("1",),
+        "ros": (key.ros,),
         "ros2_domain": key.domain,
         "ros2_peer": action.peers,
         "ros2_lan_relay": action.lan_relay,

@@ -44,9 +44,7 @@ def _nodes(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
     if not any(session.port is not None for session in zenoh.sessions):
         port = zenoh.ports.partition("-")[0]
         text = f"no node has connected to a port of {zenoh.ports}"
-        override = f"""mode="client";connect/endpoints=["tcp/PROXY:{port}"]"""
-        fix = "set for the nodes in containers: RMW_IMPLEMENTATION=rmw_zenoh_cpp and "
-        yield note("nodes", ROUTERS, text, f"{fix}ZENOH_CONFIG_OVERRIDE='{override}'")
+        yield note("nodes", ROUTERS, text, how_to("zenoh nodes", port=port))
     inside = sum(1 for node in zenoh.nodes if node.address)
     text = f"{plural(inside, 'node')} connected here, {len(zenoh.nodes) - inside} outside"
     yield ok("nodes", ROUTERS, text)

@@ -37,6 +37,7 @@ VERSIONS = ("1", "2", "1,2", "1", "nonsense")
 DOMAINS = ("0", "16")
 PEERS = ("robot", "arm:11400", "")
 ADDRESSED = "http://192.0.2.9:11402"
+ZENOH_ROUTER = "192.0.2.7"
 ENVS = ("", "http://rosproxy:11311", "http://robot:11311", "http://arm:11312", ADDRESSED)
 STATES = ("running", "exited", "created", "paused", "restarting", "dead", "removing")
 STRANGERS = ("robot", "rosproxy", "web", proxy_name(ROBOT), sandbox_name(ROBOT))
@@ -77,6 +78,27 @@ class Hosts(Invariants):
         )
         self.engine.begin(box, pick(STATES[:3], m // 20))
         if networks := sorted(self.engine.networks.keys() - {SETTINGS.uplink}):
+            self.engine.join(box, pick(networks, m))
+
+    def run_zenoh(self, n: int, m: int) -> None:
+        """A container of rmw_zenoh comes, sometimes with a router, or in the network of another."""
+        homes = [box for box in self.strangers() if not box.mode]
+        if len(self.strangers()) > 6:
+            return
+        variables = {"ROS_DISTRO": "kilted", "RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
+        if n % 3 == 0:
+            variables["ZENOH_CONFIG_OVERRIDE"] = f'connect/endpoints=["tcp/{ZENOH_ROUTER}:7447"]'
+        peers = pick(("", "robot", "arm:7448"), m)
+        box = self.engine.add(
+            f"zenoh{next(self.engine.ids)}",
+            labels={"rosproxy.enable": "true", "rosproxy.peers": peers},
+            variables=variables,
+            is_router=n % 5 == 4,
+            mode=f"container:{pick(homes, m).id}" if homes and n % 4 == 3 else "",
+        )
+        self.engine.begin(box, pick(STATES[:3], m // 20))
+        networks = sorted(self.engine.networks.keys() - {SETTINGS.uplink})
+        if networks and not box.mode:
             self.engine.join(box, pick(networks, m))
 
     def change(self, n: int, m: int) -> None:
@@ -178,8 +200,8 @@ class Hosts(Invariants):
         if boxes := self.boxes(role=ROLE_SANDBOX):
             box = pick(boxes, n)
             box.state = "exited" if box.state in SERVING else box.state
-            ports = sorted(box.ports | box.udp)
-            self.take_port(ports[n % len(ports)] - 11400, m)
+            if ports := sorted(box.ports | box.udp):
+                self.take_port(ports[n % len(ports)] - 11400, m)
 
     def let_ports_go(self, _n: int, _m: int) -> None:
         self.engine.hidden.clear()

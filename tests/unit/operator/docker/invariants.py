@@ -7,7 +7,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.port_negotiation import overlap
 from rosproxy_operator.docker.planner.actions import Create, CreateLanRelay, CreateSandbox
 from rosproxy_operator.docker.planner.desired import proxy_spec
-from rosproxy_operator.docker.planner.model import STARTED, Key, Member
+from rosproxy_operator.docker.planner.model import ALIVE, STARTED, ZENOH, Key, Member
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     ROLE_FLUSH,
@@ -93,8 +93,8 @@ class Invariants:
         """Ports of new sandboxes are nobody else's; who has ports keeps them."""
         seen = self.engine.observe()
         for action in plan.actions:
-            if not isinstance(action, CreateSandbox):
-                continue
+            if not isinstance(action, CreateSandbox) or action.key == ZENOH:
+                continue  # the ports of routers are not the host's
             key = action.key
             ports = action.range
             had = [own.range for _, own in self.own() if own.key == key]
@@ -162,9 +162,44 @@ class Invariants:
             if sandbox.udp and self.engine.image:
                 assert flushes[own.key].started > sandbox.started
 
+    def routers_wanted(self, live: list[Member]) -> dict[tuple[int, Key], set[str]]:
+        """The routers that lead to the proxy for rmw_zenoh, by network namespace."""
+        boxes = {box.id: box for box in self.engine.boxes}
+        wanted: dict[tuple[int, Key], set[str]] = {}
+        for member in live if self.engine.image else ():
+            home = boxes.get(member.container.network_container or "", boxes[member.container.id])
+            near = [b for b in boxes.values() if home in (b, self.engine.home(b))]
+            if (
+                member.key == ZENOH
+                and {home.state, member.container.state} <= STARTED
+                and not any(box.is_router and box.state in ALIVE for box in near)
+            ):
+                routers = wanted.setdefault((home.namespace, ZENOH), {"127.0.0.1:7447"})
+                networks = [self.engine.networks[n] for n in home.networks]
+                is_given = "ZENOH_CONFIG_OVERRIDE" in member.container.variables
+                if is_given and not all(network.internal for network in networks):
+                    routers.add("192.0.2.7:7447")
+        return wanted
+
+    def check_routers(self, wanted: dict[tuple[int, Key], set[str]]) -> None:
+        """Each network namespace has a port of the proxy of its own."""
+        runs = [(box, own) for box, own in self.own("running", role=ROLE_PROXY) if own.key == ZENOH]
+        for proxy, own in runs:
+            box = self.engine.home(proxy)
+            if not box or box.state != "running":
+                continue
+            rules = [self.engine.rules[place] for place in wanted]
+            assert [{*map(str, routers)} for routers, _ in rules] == [*wanted.values()]
+            leads = [target for _, target in rules if target]
+            assert {target.host for target in leads} <= {box.address}
+            assert all(target.port in own.range for target in leads)
+            assert len({target.port for target in leads}) == len(leads) == len(wanted)
+
     def check_redirects(self, live: list[Member]) -> None:
         """Who gives the address of his master is led to his proxy, and nobody else is."""
         boxes = {box.id: box for box in self.engine.boxes}
+        routers = self.routers_wanted(live)
+        self.check_routers(routers)
         wanted = {}
         for member in live:
             home = boxes.get(member.container.network_container or "", boxes[member.container.id])
@@ -190,20 +225,21 @@ class Invariants:
         }
         if self.engine.image:
             for (namespace, key), rule in self.engine.rules.items():
-                expected = (namespace, key) in wanted or (namespace, key) in self.forgotten
+                place = namespace, key
+                expected = place in wanted or place in routers or place in self.forgotten
                 assert namespace not in live_namespaces or expected, rule
         for (namespace, key), given in wanted.items():
             if sandbox := runs.get(key):  # else it stays as it is, or comes later
-                master, proxy = self.engine.rules[namespace, key]
+                (master,), proxy = self.engine.rules[namespace, key]
                 assert str(master) == given
                 assert proxy == HostPort(sandbox.address, 11402)
         records = [box.mode for box in self.boxes(role=ROLE_REDIRECT)]
-        assert len(records) <= len(wanted) or not self.engine.image
+        assert len(records) <= len(wanted) + len(routers) or not self.engine.image
 
     def made(self, key: Key, members: list[Member]) -> Create:
         """The proxy that these containers are to have, but for its range."""
         told = {peer for member in members for peer in member.peers}
-        peers = tuple(sorted(told)) if key.is_ros2 else ()
+        peers = tuple(sorted(told)) if key.ros != "1" else ()
         spec = proxy_spec(key, members, SETTINGS)
         return Create("", key, PortRange(0, 0), "", spec, peers=peers)
 

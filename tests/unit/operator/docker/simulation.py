@@ -92,6 +92,8 @@ class Box:
     namespace: int = 0
     redirect: CreateRedirect | None = None
     exit_code: int = 0
+    variables: dict[str, str] = field(default_factory=dict)
+    is_router: bool = False
 
     @property
     def own(self) -> OwnLabels | None:
@@ -128,7 +130,7 @@ class Engine:
         self.image = "image-1"
         self.names_ports = True
         self.redirects_fail = False
-        self.rules: dict[tuple[int, Key], tuple[HostPort | None, HostPort | None]] = {}
+        self.rules: dict[tuple[int, Key], tuple[tuple[HostPort, ...], HostPort | None]] = {}
         self.uninstalls = False
         self.ids = itertools.count()
 
@@ -220,6 +222,8 @@ class Engine:
             udp_ports=box.udp,
             started_at=box.started_at,
             exit_code=box.exit_code,
+            variables=dict(box.variables),
+            is_zenoh_router=box.is_router,
             forged="" if box.own or read_own(box.labels) is None else "the name is not its own",
         )
 
@@ -354,8 +358,8 @@ class Engine:
         if self.redirects_fail:
             raise Failed("ended with 1")
         place = home.namespace, box.redirect.key
-        self.rules[place] = box.redirect.master, box.redirect.proxy
-        if box.redirect.master is None:
+        self.rules[place] = box.redirect.addresses, box.redirect.proxy
+        if not box.redirect.addresses:
             del self.rules[place]
 
     def begin(self, box: Box, state: str) -> None:

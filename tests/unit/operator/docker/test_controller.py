@@ -250,7 +250,7 @@ async def test_a_redirect_that_was_run_again_is_inspected_again(engine: FakeEngi
     looking = observer()
     seen = replace((await looking.look(5.0)).state, image_id=IMAGE)
     master = HostPort("192.0.2.7", 11311)
-    made = CreateRedirect("", KEY, RANGE, "c" * 64, "1", master, HostPort("172.18.0.9", 11311))
+    made = CreateRedirect("", KEY, RANGE, "c" * 64, "1", (master,), HostPort("172.18.0.9", 11311))
     made = _with_fingerprint(made, seen, SETTINGS)
     row = own(made, "r" * 64, f"container:{'c' * 64}", "") | {"State": "exited"}
     state = {"Status": "exited", "StartedAt": "1", "ExitCode": 1}

@@ -5,11 +5,18 @@ from dataclasses import replace
 
 import pytest
 
-from rosproxy.admin.status_document import DomainStatus, ParticipantStatus, ProxyStatus
+from rosproxy.admin.status_document import (
+    DomainStatus,
+    ParticipantStatus,
+    ProxyStatus,
+    ZenohLinkStatus,
+    ZenohNodeStatus,
+    ZenohStatus,
+)
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.host_document import SETTLED, STARTING, host_document
-from rosproxy_operator.docker.planner.model import Attachment, Key
+from rosproxy_operator.docker.planner.model import ZENOH, Attachment, Key
 from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
@@ -157,3 +164,23 @@ def test_a_container_in_the_network_of_another_has_its_participants() -> None:
     (row,) = host_document(state, made, (), answers, SETTINGS, STARTED)["containers"]
     assert row["name"] == talker.name
     assert [p["guid_prefix"] for p in row["participants"]] == ["01.0f.aa"]
+
+
+def test_a_container_of_rmw_zenoh_has_its_nodes_and_its_proxy_the_links() -> None:
+    zenoh = {"ROS_DISTRO": "kilted", "RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
+    talker = container(labels={"rosproxy.enable": "true"}, networks=[TALKER], env="")
+    running = proxy(KEY)
+    own = replace(running.container, name=proxy_name(ZENOH))
+    state = observed(
+        replace(talker, variables=zenoh), proxies=[replace(running, key=ZENOH, container=own)]
+    )
+    made = planned(state, SETTINGS, DockerMemory(), 0.0)
+    nodes = (ZenohNodeStatus("/talker", 0, TALKER.address), ZenohNodeStatus("/robot", 0, ""))
+    routers = ZenohStatus(links=(ZenohLinkStatus("robot:7447", up=True),), nodes=nodes)
+    answers = {proxy_name(ZENOH): ProxyStatus(zenoh=routers)}
+    document = host_document(state, made, (), answers, SETTINGS, STARTED)
+    (row,) = document["proxies"]
+    assert (row["ros"], row["links"], row["used"]) == ("zenoh", {"robot:7447": True}, None)
+    (row,) = document["containers"]
+    assert (row["ros"], [node["name"] for node in row["zenoh_nodes"]]) == ("zenoh", ["/talker"])
+    assert row["redirect"] == {"master": "127.0.0.1:7447", "in_place": False}

@@ -16,7 +16,7 @@ from tests.unit.operator.docker.invariants import SETTINGS
 
 CONTAINERS = (
     Hosts.run, Hosts.change, Hosts.remove, Hosts.attach, Hosts.detach, Hosts.rename, Hosts.stranger,
-    Hosts.forge, Hosts.share, Hosts.fail_redirects,
+    Hosts.forge, Hosts.share, Hosts.fail_redirects, Hosts.run_zenoh,
 )  # fmt: skip
 SURROUNDINGS = (
     Hosts.make_network, Hosts.remove_network, Hosts.take_port, Hosts.take_own_port,

@@ -22,7 +22,7 @@ from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.docker import proxy_sync
 from rosproxy_operator.docker.planner.labels.members import LabelReading
-from rosproxy_operator.docker.planner.model import Attachment, Member
+from rosproxy_operator.docker.planner.model import ZENOH, Attachment, Member
 from rosproxy_operator.docker.proxy_sync import DockerProxySync, silence
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 from tests.unit.operator.docker.builders import KEY, RANGE, SETTINGS, both, container, observed
@@ -135,6 +135,20 @@ async def test_it_is_told_anew_at_each_look_and_to_each_run_of_the_proxy(tasks: 
     for access in (FIRST, FIRST, SECOND):
         sync.update(*look("172.18.0.5", access=access))
         assert await proxies.next() == ["172.18.0.5"]
+
+
+async def test_a_proxy_for_rmw_zenoh_is_not_told_who_may_use_it(tasks: Tasks) -> None:
+    """It would answer that it does not know the call."""
+    proxies = Proxies()
+    proxies.known_status = ProxyStatus()
+    sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
+    seen, members = look("172.18.0.5")
+    (proxy,) = seen.state.proxies
+    seen = replace(seen, state=replace(seen.state, proxies=(replace(proxy, key=ZENOH),)))
+    sync.update(seen, [replace(member, key=ZENOH) for member in members])
+    while not sync.answers(proxy.container.name):
+        await asyncio.sleep(0)
+    assert (proxies.calls, proxies.told, proxies.bodies) == ([[]], [], [])
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,8 @@ def record(made: CreateRedirect, state: str = "exited", code: int = 0) -> Redire
 
 def test_it_is_set_once_where_the_proxy_is_met() -> None:
     made = wanted(observed(node(), **nodes_proxy()))
-    assert (str(made.master), str(made.proxy)) == (f"{ADDRESS}:11311", f"{NEAR}:11311")
+    (master,) = made.addresses
+    assert (str(master), str(made.proxy)) == (f"{ADDRESS}:11311", f"{NEAR}:11311")
     assert (made.target, made.started) == ("id-talker", "2026-01-01T09:00:00Z")
 
     plan = look(observed(node(), **nodes_proxy(), redirects=(record(made),)))
@@ -153,7 +154,7 @@ def test_it_is_taken_away_where_nobody_wants_it_any_more() -> None:
     undo, *then = steps(state, OFF)
     assert steps(by_label) == [undo, *then]
     assert isinstance(undo, CreateRedirect)
-    assert undo.master is None
+    assert undo.addresses == ()
     assert then == [Run(undo.name), Remove(made.name, "outdated"), Remove(undo.name, "done")]
     assert steps(replace(state, redirects=(record(undo),)), OFF) == [Remove(undo.name, "done")]
     both_left = replace(state, redirects=(record(made), record(undo, "created")))
@@ -200,7 +201,7 @@ def test_a_masters_name_may_be_known_by_an_address(address: str) -> None:
     by_name = Key("http://robot:11311", HERE)
     talker = node(master_uri="http://robot:11311")
     state = observed(talker, **nodes_proxy(key=by_name), masters={"robot": address})
-    assert str(wanted(state).master) == f"{ADDRESS}:11311"
+    assert [*map(str, wanted(state).addresses)] == [f"{ADDRESS}:11311"]
 
 
 @pytest.mark.parametrize(
@@ -220,7 +221,7 @@ def test_who_is_not_redirected_is_told(
 ) -> None:
     members, problems = read_members(observed(talker), settings)
     assert text in " ".join(problem.text for problem in problems)
-    assert not any(member.redirected_master for member in members)
+    assert not any(member.redirected for member in members)
 
 
 def test_a_label_can_not_widen() -> None:
@@ -231,7 +232,7 @@ def test_a_label_can_not_widen() -> None:
 def test_without_a_way_outwards_nothing_is_redirected() -> None:
     cell = replace(APP, internal=True)
     (member,), (problem,) = read_members(observed(node(), networks=[UPLINK, cell]))
-    assert member.redirected_master is None
+    assert not member.redirected
     assert "all networks of the container are internal" in problem.text
 
 
@@ -287,6 +288,7 @@ def test_it_has_one_capability_and_bounds() -> None:
         ("Binds", ["/:/host"]),
         ("ReadonlyRootfs", False),
         ("PortBindings", {"80/tcp": [{"HostPort": "80"}]}),
+        ("Sysctls", {"net.ipv4.conf.all.route_localnet": "1"}),
     ],
 )
 def test_what_gives_a_forged_one_away(field: str, value: object) -> None:
@@ -391,7 +393,7 @@ def test_redirects_come_to_rest_as_wished(events: list) -> None:
 def test_the_rules_name_one_address_and_port() -> None:
     rules, none = (
         redirect_config(made, SETTINGS)["Cmd"][0]
-        for made in (MADE, structs.replace(MADE, master=None, proxy=None))
+        for made in (MADE, structs.replace(MADE, addresses=(), proxy=None))
     )
     assert rules.startswith(none)
     assert none.count("\n") == 2

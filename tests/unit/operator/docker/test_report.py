@@ -27,11 +27,12 @@ from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import KEY, RANGE
 
-PROXY = {
+PROXY: dict[str, Any] = {
     "name": "rosproxy-robot-eefee4",
     "ros": "1",
     "domain": None,
     "peers": [],
+    "links": {},
     "lan_relay": None,
     "master_uri": "http://robot:11311",
     "master_address": "192.0.2.7",
@@ -64,6 +65,7 @@ TALKER: dict[str, Any] = {
     "nodes": NODES,
     "ros": "1",
     "participants": [],
+    "zenoh_nodes": [],
     "redirect": None,
 }
 LISTENER = {**TALKER, "name": "listener", "proxy": None, "nodes": []}
@@ -184,6 +186,8 @@ def test_a_plan_waits_for_a_proxy_that_has_just_been_started(
         ({"reached": None}, 0),
         ({"reached": False}, 1),
         ({"master_up": False}, 1),
+        ({"links": {"robot:7447": True}}, 0),
+        ({"links": {"robot:7447": True, "arm:7447": False}}, 1),
         ({"reachable": False, "master_up": None, "reached": None}, 1),
     ],
 )
@@ -311,3 +315,20 @@ def test_both_versions_side_by_side() -> None:
     assert (text.count("! no port is free"), text.count("! is odd")) == (1, 1)
     deaf = {**DOMAIN, "lan_relay": None}
     assert "domain 0, no LAN relay" in render({**every, "proxies": [deaf]}, 120)
+
+
+def test_rmw_zenoh_is_told_with_its_links_and_nodes() -> None:
+    routers = {
+        **PROXY, "name": "rosproxy-zenoh-1f3a9c", "ros": "zenoh", "master_uri": "",
+        "master_up": None, "advertise_host": "", "range": "7448-7479", "used": None,
+        "links": {"arm:7447": True, "robot:7447": False},
+    }  # fmt: skip
+    node = {"name": "/talker", "domain": "0", "publishes": ["/out"], "subscribes": [],
+            "services": ["/add"]}  # fmt: skip
+    talker = {**TALKER, "proxy": routers["name"], "ros": "zenoh", "nodes": [],
+              "zenoh_nodes": [node]}  # fmt: skip
+    text = render({**STATUS, "proxies": [routers], "containers": [talker]}, 120)
+    assert "running  rmw_zenoh         arm:7447, robot:7447 DOWN  7448-7479" in text
+    assert "rosproxy-zenoh-1f3a9c  7448-7479  1" in text
+    assert "    /talker: publishes /out; serves /add" in text
+    assert "no peers" in render({**STATUS, "proxies": [{**routers, "links": {}}]}, 120)

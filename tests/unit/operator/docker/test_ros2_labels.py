@@ -192,8 +192,7 @@ def test_plane_direction_and_rules_are_its_own() -> None:
     assert not told
 
 
-def test_what_is_no_dds_or_no_ipv4_is_left_out() -> None:
-    assert "is not DDS" in refusal(labelled_container(TWO, {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}))
+def test_what_is_no_ipv4_is_left_out() -> None:
     text = refusal(labelled_container(TWO), replace(SETTINGS, advertise_host="2001:db8::1"))
     assert text.endswith("Give an IPv4 address")
 

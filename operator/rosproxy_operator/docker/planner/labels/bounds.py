@@ -93,6 +93,11 @@ def _is_allowed_peer(peer: str, settings: PlanSettings) -> bool:
     return is_unrestricted or _matches(read_peer(peer), settings.allow_peer)
 
 
+def is_allowed_router(router: HostPort, settings: PlanSettings) -> bool:
+    """Whether the proxy for rmw_zenoh may connect to a router outside."""
+    return not settings.allow_peer or _matches(router, settings.allow_peer)
+
+
 def _matches(target: HostPort, patterns: tuple[str, ...]) -> bool:
     pairs = (pattern.rpartition(":")[::2] for pattern in patterns)
     return any(

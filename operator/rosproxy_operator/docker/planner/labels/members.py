@@ -19,7 +19,8 @@ from rosproxy_operator.docker.planner.labels.readers import (
     NoMaster,
     UnusableLabel,
 )
-from rosproxy_operator.docker.planner.model import ALIVE, Container, HostState, Key, Member
+from rosproxy_operator.docker.planner.labels.zenoh import zenoh_member
+from rosproxy_operator.docker.planner.model import ALIVE, ZENOH, Container, HostState, Key, Member
 from rosproxy_operator.docker.planner.specs import MANAGED, master, unresolved_master
 from rosproxy_operator.docker.settings import PlanSettings
 
@@ -73,7 +74,7 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
 def master_hosts(reading: LabelReading, observed: HostState) -> tuple[str, ...]:
     """The hosts of all masters that a proxy is wanted for or there for, in lower case, sorted."""
     wanted = {r.key for r in reading.requests if r.container.alive}
-    keys = (key for key in observed.keys | wanted if not key.is_ros2)
+    keys = (key for key in observed.keys | wanted if key.ros == "1")
     return tuple(sorted({master(key).host.lower() for key in keys}))
 
 
@@ -85,6 +86,9 @@ def find_members(
     problems: list[Problem] = []
     for request in reading.requests:
         container = request.container
+        if request.key == ZENOH:
+            members.append(request)
+            continue
         host = request.key.advertise_host or _advertised(request, observed)
         key = replace(request.key, advertise_host=host)
         if host:
@@ -130,7 +134,7 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
             "container are internal"
         )
     else:
-        return replace(request, redirected_master=by_address), ""
+        return replace(request, redirected=(by_address,)), ""
     return request, text
 
 
@@ -154,14 +158,20 @@ def _requests(
     """What a container gets of what it asks for, by version of ROS, and the warnings for it."""
     readers.refuse_long_values(container.labels)
     served = ros_versions.versions(container)
-    requests = [_request(r, container, observed, settings, proxies) for r in sorted(served)]
+    of_range = sorted(served - {"zenoh"})
+    requests = [_request(r, container, observed, settings, proxies) for r in of_range]
     granted = [bounds.narrowed(r, settings) for r in requests]
     warnings = [*ros_versions.warnings(container, served)]
     for request in requests:
         if request.key.is_ros2:
             warnings += ros_versions.past_the_proxy(container, request.networks, observed)
     warnings += dict.fromkeys(text for _, texts in granted for text in texts)
-    return [request for request, _ in granted], warnings
+    members = [request for request, _ in granted]
+    if "zenoh" in served:
+        member, texts = zenoh_member(container, observed, settings)
+        members.append(member)
+        warnings += texts
+    return members, warnings
 
 
 def _request(
@@ -177,7 +187,7 @@ def _request(
     uri = "" if is_ros2 else _master_uri(container, settings, proxies)
     host = readers.advertise_host(labels, settings)
     if is_ros2:
-        ros_versions.refuse_unserved(container, host)
+        ros_versions.refuse_unserved(host)
     networks = readers.networks(container, observed, settings.uplink)
     return Member(
         container,
@@ -217,7 +227,8 @@ def _exposed(container: Container, settings: PlanSettings) -> bool:
     """Whether a container that does not say gets a proxy."""
     if not settings.expose_by_default:
         return False
-    return bool(_own(container) or container.master_uri or "2" in ros_versions.versions(container))
+    is_ros2 = not ros_versions.versions(container) <= {"1"}
+    return bool(_own(container) or container.master_uri or is_ros2)
 
 
 def _own(container: Container) -> list[str]:

@@ -29,10 +29,11 @@ ROS = "rosproxy.ros"
 DOMAIN = "rosproxy.domain"
 PEERS = "rosproxy.peers"
 REDIRECT = "rosproxy.redirect"
+RMW = "rosproxy.rmw"
 LABELS = (
     *(ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK),
     *(wish.label for wish in WISHES.values()),
-    *(POLICY, ROS, DOMAIN, PEERS, REDIRECT),
+    *(POLICY, ROS, RMW, DOMAIN, PEERS, REDIRECT),
 )
 
 ALIAS = "rosproxy"

@@ -1,8 +1,9 @@
-"""Which ROS a container is of, and what it wants of a proxy for ROS 2.
+"""Which ROS a container is of, and what it wants of a proxy for ROS 2 by DDS.
 
 A label says it, else the container's own variables, which most images with ROS have: ROS_VERSION,
 ROS_DISTRO. Else a label or a variable that one version alone has says it: ROS_MASTER_URI for ROS 1,
-ROS_DOMAIN_ID for ROS 2. Where nothing says it, the container counts as one of ROS 1.
+ROS_DOMAIN_ID for ROS 2. Where nothing says it, the container counts as one of ROS 1. A container of
+ROS 2 has rmw_zenoh instead of DDS if a label or RMW_IMPLEMENTATION says so.
 """
 
 import re
@@ -18,11 +19,14 @@ from rosproxy_operator.common.ros2 import (
 )
 from rosproxy_operator.common.ros2_variables import OF_ROS2
 from rosproxy_operator.docker.planner.labels.readers import (
+    ADVERTISE_HOST,
     ALIAS,
     DOMAIN,
     MASTER_URI,
     PEERS,
+    PORTS,
     REDIRECT,
+    RMW,
     ROS,
     Labels,
     UnusableLabel,
@@ -33,12 +37,36 @@ from rosproxy_operator.docker.planner.model import Container, HostState
 from rosproxy_operator.proxy_spec.spec import WISHES
 
 _OF_ROS1 = (MASTER_URI, REDIRECT, *(w.label for w in WISHES.values() if w.ros == "1"))
-_OF_ROS2 = (DOMAIN, PEERS)
+_OF_ROS2 = (RMW, DOMAIN, PEERS)
+_OF_ZENOH = (RMW, PEERS, REDIRECT)
+_NOT_OF_ZENOH = (
+    *(DOMAIN, PORTS, ADVERTISE_HOST, MASTER_URI),
+    *(wish.label for wish in WISHES.values()),
+)
 UNKNOWN = "no label and no variable states the ROS version"
 
 
 def versions(container: Container) -> frozenset[str]:
-    """The versions of ROS that a container is of: 1, 2 or both. Raises UnusableLabel."""
+    """The versions of ROS that a container is of: 1, 2 or zenoh, or 1 and another one.
+
+    Raises UnusableLabel.
+    """
+    of_ros = _ros_versions(container)
+    if "2" in of_ros and _has_zenoh(container):
+        return of_ros - {"2"} | {"zenoh"}
+    return of_ros
+
+
+def _has_zenoh(container: Container) -> bool:
+    """Whether nodes of ROS 2 in a container use rmw_zenoh. Raises UnusableLabel."""
+    labels = container.labels
+    if RMW in labels and labels[RMW].strip().lower() != "zenoh":
+        fix = f"Write {RMW}=zenoh, or remove the label: the proxy then serves DDS"
+        raise UnusableLabel(f"{named(RMW, labels)} is not zenoh. {fix}")
+    return RMW in labels or not is_dds(container.variables.get("RMW_IMPLEMENTATION", ""))
+
+
+def _ros_versions(container: Container) -> frozenset[str]:
     if ROS in container.labels:
         tokens = frozenset(re.split(r"[,\s]+", container.labels[ROS].strip()))
         if not tokens <= {"1", "2"}:
@@ -91,14 +119,8 @@ def peers(labels: Labels) -> frozenset[str]:
         raise UnusableLabel(f"label {PEERS}: {error}") from None
 
 
-def refuse_unserved(container: Container, host: str) -> None:
+def refuse_unserved(host: str) -> None:
     """Raise UnusableLabel for what a proxy for ROS 2 can't do. ``host``: the advertised one."""
-    rmw = container.variables.get("RMW_IMPLEMENTATION", "")
-    if not is_dds(rmw):
-        text = (
-            f"variable RMW_IMPLEMENTATION={quoted(rmw)} is not DDS, and a proxy forwards DDS only"
-        )
-        raise UnusableLabel(f"{text}. Use rmw_fastrtps_cpp or rmw_cyclonedds_cpp")
     if ":" in host:
         text = f"advertised host {host} is an IPv6 address, and for ROS 2 a proxy uses IPv4 only"
         raise UnusableLabel(f"{text}. Give an IPv4 address")
@@ -138,10 +160,17 @@ def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[st
     labels = container.labels
     if is_guessed(container):
         yield f"{UNKNOWN}, so the operator assumes ROS 1. Add the label {ROS}=1 or {ROS}=2"
-    for version, labels_of_version in (("1", _OF_ROS1), ("2", _OF_ROS2)):
-        if version not in ros_versions:
-            yield from (
-                f"label {label} is ignored: the label is for ROS {version}, the container is not"
-                for label in labels_of_version
-                if label in labels
-            )
+    if ros_versions == {"zenoh"}:
+        ignored = dict.fromkeys(_NOT_OF_ZENOH, "the label has no effect on rmw_zenoh")
+    else:
+        ignored = {
+            label: f"the label is for ROS {version}, the container is not"
+            for version, of_version in (("1", _OF_ROS1), ("2", _OF_ROS2))
+            for label in of_version
+            if version not in ros_versions
+        }
+        served = _OF_ZENOH if "zenoh" in ros_versions else ()
+        ignored = {label: text for label, text in ignored.items() if label not in served}
+    yield from (
+        f"label {label} is ignored: {text}" for label, text in ignored.items() if label in labels
+    )

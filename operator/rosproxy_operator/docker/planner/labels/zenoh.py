@@ -1,0 +1,197 @@
+"""What a container of rmw_zenoh wants: the routers that its proxy dials, and its redirect.
+
+The routers outside are those of the label ``rosproxy.peers``, and those to which the container's
+own ZENOH_CONFIG_OVERRIDE connects. A container that runs a router keeps serving its neighbours, and
+the proxy dials that router.
+"""
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+from rosproxy.net.addresses import HostPort, is_address, is_loopback
+from rosproxy.setting_kinds import read_zenoh_peer
+from rosproxy.settings import MOST_ZENOH_PORTS
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.ros2 import MOST_PEERS
+from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, router_port
+from rosproxy_operator.docker.planner.label_policy import network_owner
+from rosproxy_operator.docker.planner.labels import readers
+from rosproxy_operator.docker.planner.labels.bounds import is_allowed_router
+from rosproxy_operator.docker.planner.labels.readers import (
+    ALIAS,
+    PEERS,
+    POLICY,
+    REDIRECT,
+    Labels,
+    UnusableLabel,
+    quoted,
+)
+from rosproxy_operator.docker.planner.model import ZENOH, Container, HostState, Member
+from rosproxy_operator.docker.planner.specs import proxy_name
+from rosproxy_operator.docker.planner.zenoh_redirect import LOCAL_ROUTER, as_client
+from rosproxy_operator.docker.settings import PlanSettings
+
+
+@dataclass(frozen=True, slots=True)
+class _Router:
+    """A router that a container names; ``neighbour`` is the container in which it runs, if any."""
+
+    address: HostPort
+    source: str
+    neighbour: Container | None = None
+
+    @property
+    def peer(self) -> str:
+        """How the proxy dials it: a container's name leads to its present address."""
+        host = self.neighbour.name if self.neighbour else self.address.host
+        return str(HostPort(host, self.address.port))
+
+
+def zenoh_member(
+    container: Container, observed: HostState, settings: PlanSettings
+) -> tuple[Member, list[str]]:
+    """What a container of rmw_zenoh wants, and the warnings about it. Raises UnusableLabel."""
+    labels = container.labels
+    _refuse_rules(labels, settings)
+    member = Member(
+        container,
+        ZENOH,
+        networks=readers.networks(container, observed, settings.uplink),
+        redirect=readers.redirect(labels),
+    )
+    own = [*_connected(member, observed)]
+    dialed = [r for r in (*_labelled(labels), *own) if _may_be_dialed(r, settings)]
+    refused = [r for r in (*_labelled(labels), *own) if r not in dialed]
+    peers = {router.peer for router in dialed}
+    owner = readers.network_owner(container, observed)
+    if container.is_zenoh_router:
+        port = router_port(container.variables.get(OVERRIDE, ""))
+        peers.add(str(HostPort(owner.name, port)))
+    member = replace(member, peers=frozenset(peers))
+    warnings = [*_refusals(refused), *_by_other_protocols(container)]
+    if _has_router(owner, observed):
+        return member, warnings
+    outside = [router for router in own if router in dialed and not router.neighbour]
+    redirected = [router for router in outside if _is_redirectable(router, owner, observed)]
+    warnings += _past_the_proxy(router for router in outside if router not in redirected)
+    if not settings.redirect or member.redirect is False:
+        return member, [*warnings, _not_redirected()]
+    addresses = (LOCAL_ROUTER, *(router.address for router in redirected))
+    return replace(member, redirected=tuple(dict.fromkeys(addresses))), warnings
+
+
+def _may_be_dialed(router: _Router, settings: PlanSettings) -> bool:
+    return router.neighbour is not None or is_allowed_router(router.address, settings)
+
+
+def with_bounded_containers(
+    members: Iterable[Member],
+) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
+    """The members for which their proxy has a router, and the problems of the others."""
+    every = tuple(members)
+    crowd = [member for member in every if member.key == ZENOH][MOST_ZENOH_PORTS:]
+    text = (
+        f"a proxy for rmw_zenoh serves at most {MOST_ZENOH_PORTS} containers. Remove labels "
+        f"{readers.ENABLE} of other containers"
+    )
+    problems = (Problem(f"container {m.container.name}", text) for m in crowd if m.container.alive)
+    return tuple(member for member in every if member not in crowd), tuple(problems)
+
+
+def _refuse_rules(labels: Labels, settings: PlanSettings) -> None:
+    """Raise UnusableLabel for rules, which have no effect: hidden names would be seen."""
+    if labels.get(POLICY, "").strip():
+        text = "has no effect on rmw_zenoh, so outside would see what it hides. Remove the label"
+        raise UnusableLabel(f"label {POLICY} {text}")
+    if settings.policy:
+        raise UnusableLabel(
+            "uses rmw_zenoh, on which the operator's --policy has no effect. Use DDS in this "
+            "container, or start the operator without --policy"
+        )
+
+
+def _labelled(labels: Labels) -> Iterator[_Router]:
+    """The routers outside that the label names."""
+    names = [name for name in re.split(r"[,\s]+", labels.get(PEERS, "")) if name]
+    if len(names) > MOST_PEERS:
+        raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts. Name fewer hosts")
+    for name in names:
+        try:
+            address = read_zenoh_peer(name.lower())
+        except ValueError as error:
+            raise UnusableLabel(f"label {PEERS}: {error}") from None
+        yield _Router(address, f"label {PEERS}")
+
+
+def _connected(member: Member, observed: HostState) -> Iterator[_Router]:
+    """The routers to which a container's variable connects its nodes; none for a router itself."""
+    container = member.container
+    if container.is_zenoh_router:
+        return
+    for protocol, address in connect_endpoints(container.variables.get(OVERRIDE, "")):
+        host = address.host
+        if protocol == "tcp" and not is_loopback(host) and host not in (ALIAS, proxy_name(ZENOH)):
+            yield _Router(address, f"variable {OVERRIDE}", _neighbour(host, member, observed))
+
+
+def _neighbour(host: str, member: Member, observed: HostState) -> Container | None:
+    """The container on a network of this one that has a name or an address."""
+    for container in observed.containers:
+        for attachment in container.attachments:
+            names = {attachment.address, *map(str.lower, attachment.names)}
+            if attachment.network in member.networks and host in names:
+                return container
+    return None
+
+
+def _has_router(owner: Container, observed: HostState) -> bool:
+    """Whether a router runs in the network of a container."""
+    by_id = {container.id: container for container in observed.containers}
+    routers = (c for c in observed.containers if c.is_zenoh_router and c.alive)
+    return any(network_owner(router, by_id).id == owner.id for router in routers)
+
+
+def _is_redirectable(router: _Router, owner: Container, observed: HostState) -> bool:
+    """Whether a rule of nftables can lead to the proxy what nodes send to a router outside."""
+    # Without a route connect(2) fails before a rule could take effect.
+    internal = {network.name for network in observed.networks if network.internal}
+    host = router.address.host
+    return is_address(host) and ":" not in host and not owner.networks <= internal
+
+
+def _refusals(refused: Iterable[_Router]) -> Iterator[str]:
+    for router in refused:
+        yield (
+            f"{router.source} names {quoted(router.peer)}, which the operator does not allow in "
+            "labels. The proxy does not connect there. To allow it, start the operator with "
+            f"--allow-peer {router.peer}"
+        )
+
+
+def _past_the_proxy(routers: Iterable[_Router]) -> Iterator[str]:
+    """Warnings for routers to which the nodes connect by themselves."""
+    for router in routers:
+        yield (
+            f"{router.source} connects the nodes to {quoted(router.peer)}, and the operator can "
+            "redirect only an IPv4 address with a route. So the nodes bypass the proxy. Remove "
+            f"connect/endpoints from the variable, and add the label {PEERS}={router.peer}"
+        )
+
+
+def _by_other_protocols(container: Container) -> Iterator[str]:
+    for protocol, address in connect_endpoints(container.variables.get(OVERRIDE, "")):
+        if protocol != "tcp":
+            yield (
+                f"variable {OVERRIDE} connects the nodes by {quoted(protocol)}, and the proxy "
+                "connects by tcp only. Remove connect/endpoints from the variable, and add the "
+                f"label {PEERS}={address}"
+            )
+
+
+def _not_redirected() -> str:
+    return (
+        "is not redirected to the proxy, as --no-redirect of the operator or the label "
+        f"{REDIRECT} says. So the nodes do not find the proxy. Remove that, or set "
+        f"{as_client(proxy_name(ZENOH))}"
+    )

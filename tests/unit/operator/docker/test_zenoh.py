@@ -1,0 +1,501 @@
+"""Containers of rmw_zenoh: one proxy for all, a port and a redirect for each network namespace."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from ipaddress import IPv4Network
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.access.layers import PolicyLayer
+from rosproxy.access.rules import parse_rules
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.docker.engine_json import check_inspection, read_container, read_making
+from rosproxy_operator.docker.planner.actions import (
+    Action,
+    Create,
+    CreateRedirect,
+    CreateSandbox,
+    Remove,
+    Run,
+)
+from rosproxy_operator.docker.planner.labels.readers import RMW
+from rosproxy_operator.docker.planner.model import (
+    ZENOH,
+    Attachment,
+    Container,
+    HostState,
+    Member,
+    Network,
+    Proxy,
+    RedirectContainer,
+    Sandbox,
+)
+from rosproxy_operator.docker.planner.own_containers import forgery_reason
+from rosproxy_operator.docker.planner.plan import DockerPlan
+from rosproxy_operator.docker.planner.redirect import redirect_config
+from rosproxy_operator.docker.planner.specs import (
+    container_config,
+    own_labels,
+    proxy_fingerprint,
+    proxy_name,
+    read_own,
+    sandbox_config,
+    sandbox_fingerprint,
+    sandbox_name,
+)
+from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.settings import PlanSettings
+from tests.unit.operator.docker.builders import (
+    IMAGE,
+    SECRET,
+    SETTINGS,
+    UPLINK,
+    container,
+    inspection,
+    observed,
+    place,
+    planned,
+    read_members,
+)
+from tests.unit.operator.docker.hosts import Hosts
+
+ON = {"rosproxy.enable": "true"}
+VARIABLES = {"ROS_DISTRO": "kilted", "RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
+NEAR = "172.18.0.9"
+PORTS = PortRange(7448, 7479)
+ROBOT = 'connect/endpoints=["tcp/192.0.2.7:7447"]'
+LOCAL = HostPort("127.0.0.1", 7447)
+
+
+def node(
+    name: str = "talker",
+    labels: Mapping[str, str] | None = None,
+    override: str = "",
+    mode: str = "",
+    router: bool = False,
+    address: str = "172.18.0.3",
+) -> Container:
+    variables = {**VARIABLES, **({"ZENOH_CONFIG_OVERRIDE": override} if override else {})}
+    made = container(name, {**ON, **(labels or {})}, env="", mode=mode)
+    places = () if mode else (Attachment("app", address, frozenset({name})),)
+    return replace(made, attachments=places, variables=variables, is_zenoh_router=router,
+                   started_at="2026-01-01T09:00:00Z")  # fmt: skip
+
+
+def read(
+    *containers: Container, settings: PlanSettings = SETTINGS, **more: Any
+) -> tuple[tuple[Member, ...], list[str]]:
+    members, problems = read_members(observed(*containers, **more), settings)
+    return members, [problem.text for problem in problems]
+
+
+def look(
+    state: HostState, settings: PlanSettings = SETTINGS, memory: DockerMemory | None = None
+) -> DockerPlan:
+    return planned(state, settings, memory or DockerMemory(), 100.0)
+
+
+def the_proxy(peers: tuple[str, ...] = (), ports: PortRange = PORTS) -> dict[str, Any]:
+    """The proxy as it is to be, with an address on the network of the containers."""
+    box = CreateSandbox(sandbox_name(ZENOH), ZENOH, ports)
+    box_print = sandbox_fingerprint(box, SETTINGS)
+    made = Create(proxy_name(ZENOH), ZENOH, ports, box.name, peers=peers)
+    made_print = proxy_fingerprint(made, SETTINGS, IMAGE, SECRET)
+    at = [place(SETTINGS.uplink, box.name), Attachment("app", NEAR, frozenset({made.name}))]
+    holder = replace(container(box.name, own_labels(box), at, env=""), started_at="2026-01-01T10Z")
+    runs = container(made.name, own_labels(made), (), env="", mode=f"container:id-{box.name}")
+    runs = replace(runs, started_at="2026-01-01T10:00:01Z")
+    return {
+        "sandboxes": [Sandbox(ZENOH, holder, ports, box_print)],
+        "proxies": [Proxy(ZENOH, runs, ports, made_print)],
+    }
+
+
+def redirects(state: HostState, settings: PlanSettings = SETTINGS) -> list[Action]:
+    """What is to be done for redirects alone."""
+    groups = look(state, settings).groups
+    return [action for group in groups if group.subject for action in group.actions]
+
+
+def made_for(state: HostState) -> dict[str, CreateRedirect]:
+    """The redirects that are set, by the container."""
+    made = [action for action in redirects(state) if isinstance(action, CreateRedirect)]
+    return {action.target.removeprefix("id-"): action for action in made}
+
+
+def record(made: CreateRedirect) -> RedirectContainer:
+    own = Container(f"id-{made.name}", made.name, "exited", own_labels(made),
+                    f"container:{made.target}")  # fmt: skip
+    return RedirectContainer(made.key, own, made.range, made.fingerprint)
+
+
+# which containers
+
+
+@pytest.mark.parametrize(
+    ("labels", "variables"),
+    [
+        ({}, VARIABLES),
+        ({}, {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}),
+        ({RMW: "zenoh"}, {}),
+        ({RMW: "Zenoh"}, {"ROS_DISTRO": "kilted", "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}),
+        ({"rosproxy.ros": "2"}, {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}),
+    ],
+)
+def test_a_label_or_a_variable_says_it(
+    labels: Mapping[str, str], variables: Mapping[str, str]
+) -> None:
+    (member,), told = read(replace(node(labels=labels), variables=variables))
+    assert (member.key, member.redirected, told) == (ZENOH, (LOCAL,), [])
+
+
+def test_a_container_may_have_ros_1_as_well() -> None:
+    both = {"rosproxy.ros": "1,2", "rosproxy.master-uri": "http://robot:11311"}
+    members, told = read(replace(node(labels=both), master_uri="http://robot:11311"))
+    assert [member.key.ros for member in members] == ["1", "zenoh"]
+    assert told == []
+
+
+def test_where_variables_are_enough_rmw_zenoh_is_served() -> None:
+    quiet = replace(node(), labels={})
+    (member,), _ = read(quiet, settings=replace(SETTINGS, expose_by_default=True))
+    assert member.key == ZENOH
+
+
+def test_domains_and_hosts_share_one_proxy() -> None:
+    other = replace(node("arm", {"rosproxy.peers": "robot"}), variables={
+        **VARIABLES, "ROS_DOMAIN_ID": "5"})  # fmt: skip
+    plan = look(observed(node(), other), replace(SETTINGS, advertise_host=None))
+    assert [wanted.key for wanted in plan.desired] == [ZENOH]
+    assert plan.problems == ()
+
+
+@pytest.mark.parametrize(
+    ("labels", "text"),
+    [
+        ({RMW: "dds"}, "label rosproxy.rmw='dds' is not zenoh. Write rosproxy.rmw=zenoh"),
+        ({"rosproxy.policy": "deny publish /x"}, "label rosproxy.policy has no effect on rmw_zeno"),
+        ({"rosproxy.peers": "a b"}, ""),
+        ({"rosproxy.peers": "a:b:c"}, "label rosproxy.peers: 'a:b:c' is not of the form HOST or"),
+        ({"rosproxy.peers": ",".join(f"h{n}" for n in range(33))}, "more than 32 hosts"),
+        ({"rosproxy.ports": "40"}, "label rosproxy.ports is ignored: the label has no effect on"),
+        ({"rosproxy.domain": "1"}, "label rosproxy.domain is ignored: the label has no effect"),
+        ({"rosproxy.udp": "true"}, "label rosproxy.udp is ignored: the label has no effect"),
+        ({"rosproxy.redirect": "false"}, 'mode="client";connect/endpoints=["tcp/rosproxy-zenoh-'),
+    ],
+)
+def test_labels_that_can_not_be_had_are_told(labels: Mapping[str, str], text: str) -> None:
+    _, told = read(node(labels=labels))
+    assert bool(text) == bool(told)
+    assert text in " ".join(told)
+
+
+def test_the_label_is_ignored_on_a_container_of_ros_1() -> None:
+    labels = {RMW: "zenoh", "rosproxy.ros": "1", "rosproxy.master-uri": "http://robot:11311"}
+    (member,), told = read(replace(node(labels=labels), master_uri="http://robot:11311"))
+    assert member.key.ros == "1"
+    assert told == ["label rosproxy.rmw is ignored: the label is for ROS 2, the container is not"]
+
+
+def test_rules_of_the_administrator_keep_it_out() -> None:
+    layer = PolicyLayer("administrator", parse_rules("deny publish /x"))
+    members, (text,) = read(node(), settings=replace(SETTINGS, policy=(layer,)))
+    assert not members
+    assert "the operator's --policy has no effect" in text
+
+
+# routers outside
+
+
+def test_the_label_names_routers() -> None:
+    (member,), _ = read(node(labels={"rosproxy.peers": "Robot, 192.0.2.8:7500"}))
+    assert member.peers == {"robot:7447", "192.0.2.8:7500"}
+    assert member.redirected == (LOCAL,)
+
+
+@pytest.mark.parametrize(
+    "override", [ROBOT, f'mode="client";{ROBOT}', f"scouting/delay=1; {ROBOT.replace('=', ' = ')}"]
+)
+def test_a_router_given_by_address_just_works(override: str) -> None:
+    (member,), told = read(node(override=override))
+    assert member.peers == {"192.0.2.7:7447"}
+    assert member.redirected == (LOCAL, HostPort("192.0.2.7", 7447))
+    assert told == []
+
+
+@pytest.mark.parametrize(
+    ("override", "peers", "text"),
+    [
+        ('connect/endpoints=["tcp/robot:7447"]', {"robot:7447"}, "add the label rosproxy.peers=ro"),
+        ('connect/endpoints=["tcp/[2001:db8::7]:7447"]', {"[2001:db8::7]:7447"}, "bypass"),
+        ('connect/endpoints=["tls/robot:7447"]', set(), "connects by tcp only"),
+        ('connect/endpoints=["tcp/localhost:7447"]', set(), ""),
+        ('connect/endpoints=["tcp/rosproxy:7448"]', set(), ""),
+        ('connect/endpoints={peer:["tcp/router:7447"]}', {"router:7447"}, ""),
+        ("connect/endpoints=['tcp/172.18.0.8:7447']", {"router:7447"}, ""),
+        ('connect/endpoints=[]; mode="peer"', set(), ""),
+        ("nonsense", set(), ""),
+    ],
+)
+def test_what_the_variable_names(override: str, peers: set[str], text: str) -> None:
+    """A container on the same network is dialed by its name, and its neighbours go on using it."""
+    router = replace(node("router", address="172.18.0.8"), labels={})
+    (member,), told = read(node(override=override), router)
+    assert member.peers == peers
+    assert member.redirected == (LOCAL,)
+    assert text in " ".join(told)
+    assert bool(text) == bool(told)
+
+
+def test_without_a_route_an_address_can_not_be_redirected() -> None:
+    cell = Network("n1", "app", internal=True, subnets=(IPv4Network("172.18.0.0/16"),))
+    (member,), (text,) = read(node(override=ROBOT), networks=[UPLINK, cell])
+    assert member.redirected == (LOCAL,)
+    assert "an IPv4 address with a route" in text
+
+
+@pytest.mark.parametrize(
+    "named",
+    [
+        {"labels": {"rosproxy.peers": "10.0.0.9"}},
+        {"override": 'connect/endpoints=["tcp/10.0.0.9:7447"]'},
+    ],
+)
+def test_a_router_that_is_not_allowed_is_not_dialed(named: Any) -> None:
+    settings = replace(SETTINGS, allow_peer=("robot*:*",))
+    (member,), (text,) = read(node(**named), settings=settings)
+    assert (member.peers, member.redirected) == (frozenset(), (LOCAL,))
+    assert "start the operator with --allow-peer 10.0.0.9:7447" in text
+
+
+def test_a_container_that_is_a_router_is_dialed_and_left_as_it_is() -> None:
+    """So are the containers in its network namespace."""
+    override = f'listen/endpoints=["tcp/[::]:7500"];{ROBOT}'
+    router = node("router", override=override, router=True)
+    sharing = node("driver", mode="container:id-router")
+    members, told = read(router, sharing, node(address="172.18.0.4"))
+    assert told == []
+    assert {m.container.name: (m.peers, m.redirected) for m in members} == {
+        "router": ({"router:7500"}, ()),
+        "driver": (frozenset(), ()),
+        "talker": (frozenset(), (LOCAL,)),
+    }
+
+
+@pytest.mark.parametrize(
+    ("command", "is_router"),
+    [
+        (["ros2", "run", "rmw_zenoh_cpp", "rmw_zenohd"], True),
+        (["bash", "-c", "source /opt/ros/kilted/setup.bash; rmw_zenohd"], True),
+        (["/zenohd", "--listen", "tcp/0.0.0.0:7447"], True),
+        (["ros2", "launch", "my_zenohd_demo", "all.py"], False),
+        (["ros2", "run", "rmw_zenoh_cpp", "zenohd_monitor"], False),
+    ],
+)
+def test_the_command_tells_a_router(command: list[str], is_router: bool) -> None:
+    config = {"Cmd": command, "Env": ["ZENOH_CONFIG_OVERRIDE=x=1", "OTHER=1"]}
+    row = {"Id": "c" * 64, "Names": ["/router"], "State": "running"}
+    seen = read_container(row, check_inspection({"Config": config}))
+    assert seen.is_zenoh_router is is_router
+    assert seen.variables == {"ZENOH_CONFIG_OVERRIDE": "x=1"}
+
+
+def test_a_router_of_this_host_is_dialed_at_the_gateway() -> None:
+    state = observed(node(labels={"rosproxy.peers": "host.docker.internal"}))
+    (desired,) = look(state).desired
+    assert desired.peers == (f"{UPLINK.gateway}:7447",)
+
+
+def test_a_proxy_takes_so_many_routers() -> None:
+    many = [
+        node(f"n{n}", {"rosproxy.peers": ",".join(f"h{n}-{m}" for m in range(30))})
+        for n in range(3)
+    ]
+    plan = look(observed(*many))
+    assert len(plan.desired[0].peers) == 60
+    (problem,) = plan.problems
+    assert "a proxy takes at most 64 peers" in problem.text
+    assert "ros2-peer" not in problem.text
+
+
+# the proxy
+
+
+def test_the_proxy_publishes_nothing_and_is_told_its_routers() -> None:
+    peers = ("192.0.2.7:7447", "robot:7447")
+    box = sandbox_config(CreateSandbox("n", ZENOH, PORTS), SETTINGS)
+    assert box["HostConfig"]["PortBindings"] == {}
+    # Its own connections take no port of its routers.
+    assert box["HostConfig"]["Sysctls"] == {"net.ipv4.ip_local_port_range": "7704 11000"}
+    made = Create("n", ZENOH, PORTS, "box", peers=peers)
+    config = container_config(made, replace(SETTINGS, data_plane="kernel"), SECRET, "")
+    variables = dict(text.split("=", 1) for text in config["Env"])
+    del variables["ROSPROXY_ADMIN_TOKEN_HASH"]
+    assert variables == {
+        "ROSPROXY_OPERATOR": "docker",
+        "ROSPROXY_ADMIN_BIND": "0.0.0.0:11312",
+        "ROSPROXY_ROS": "zenoh",
+        "ROSPROXY_ZENOH_PORTS": "7448-7479",
+        "ROSPROXY_ZENOH_PEERS": " ".join(peers),
+    }
+    assert "CapAdd" not in config["HostConfig"]
+    assert str(made) == "create container n: proxy of the zenoh network, ports 7448-7479 of box"
+
+
+@pytest.mark.parametrize("role", ["ports", "proxy", "redirect"])
+def test_its_containers_are_known_by_their_labels(role: str) -> None:
+    redirect = CreateRedirect("r", ZENOH, PortRange(7449, 7449), "id", "1")
+    made: Any = {
+        "ports": CreateSandbox("n", ZENOH, PORTS),
+        "proxy": Create("n", ZENOH, PORTS, "box"),
+        "redirect": redirect,
+    }[role]
+    labels = own_labels(made)
+    own = read_own(labels)
+    assert own is not None
+    assert (own.role, own.key, own.range) == (role, ZENOH, made.range)
+    for forged in ("io.rosproxy.domain", "io.rosproxy.master-uri", "io.rosproxy.advertise-host"):
+        assert read_own({**labels, forged: "1"}) is None
+
+
+def test_its_routers_get_more_in_steps_and_never_fewer() -> None:
+    few = look(observed(node()))
+    assert few.memory.planned == {ZENOH: PORTS}
+    crowd = [node(f"n{number:03}") for number in range(33)]
+    many = look(observed(*crowd), memory=few.memory)
+    assert many.memory.planned == {ZENOH: PortRange(7448, 7511)}
+    assert look(observed(node()), memory=many.memory).memory.planned == many.memory.planned
+
+
+def test_more_containers_than_routers_are_told() -> None:
+    crowd = [node(f"n{number:03}") for number in range(258)]
+    plan = look(observed(*crowd))
+    assert plan.memory.planned == {ZENOH: PortRange(7448, 7703)}
+    assert [problem.subject for problem in plan.problems] == ["container n256", "container n257"]
+
+
+def test_its_routers_take_no_port_of_the_host() -> None:
+    plan = look(observed(node(), listening=[7448], ephemeral=PortRange(7000, 8000)))
+    assert plan.memory.planned == {ZENOH: PORTS}
+    assert plan.problems == ()
+
+
+def test_outside_is_not_told_of_its_end() -> None:
+    memory = DockerMemory(absent={ZENOH: 0.0})
+    removed = look(observed(**the_proxy()), memory=memory).actions
+    assert len(removed) == 2
+    assert all(isinstance(action, Remove) and not action.retire for action in removed)
+
+
+# the redirects
+
+
+def test_each_network_namespace_has_a_port_of_its_own() -> None:
+    state = observed(
+        node(),
+        node("listener", override=ROBOT),
+        node("guest", mode="container:id-talker"),
+        **the_proxy(("192.0.2.7:7447",)),
+    )
+    made = made_for(state)
+    assert {name: (action.addresses, action.proxy) for name, action in made.items()} == {
+        "listener": ((LOCAL, HostPort("192.0.2.7", 7447)), HostPort(NEAR, 7448)),
+        "talker": ((LOCAL,), HostPort(NEAR, 7449)),
+    }
+    done = replace(state, redirects=tuple(map(record, made.values())))
+    assert look(done).actions == ()
+
+
+def test_containers_that_share_a_network_look_for_the_routers_of_both() -> None:
+    guest = node("guest", override=ROBOT, mode="container:id-talker")
+    (made,) = made_for(observed(node(), guest, **the_proxy(("192.0.2.7:7447",)))).values()
+    assert made.addresses == (LOCAL, HostPort("192.0.2.7", 7447))
+
+
+def test_a_container_keeps_its_port() -> None:
+    """Also through a restart, and where others come that sort before it."""
+    made = made_for(observed(node("b"), node("c"), **the_proxy()))
+    records = tuple(map(record, made.values()))
+    later = replace(node("c"), started_at="2026-01-01T11:00:00Z")
+    anew = made_for(observed(node("a"), later, **the_proxy(), redirects=records))
+    assert (made["b"].range.first, made["c"].range.first) == (7448, 7449)
+    assert (anew["a"].range.first, anew["c"].range.first) == (7448, 7449)
+
+
+def test_a_port_that_the_proxy_has_not_got_yet_waits() -> None:
+    crowd = [node(f"n{number:03}") for number in range(33)]
+    assert len(made_for(observed(*crowd, **the_proxy()))) == 32
+
+
+def test_the_rules_keep_neighbours_from_loopback() -> None:
+    (made,) = made_for(observed(node(override=ROBOT), **the_proxy(("192.0.2.7:7447",)))).values()
+    config = redirect_config(made, SETTINGS)
+    (rules,) = config["Cmd"]
+    for line in (
+        "    ip daddr 127.0.0.1 tcp dport 7447 dnat to 172.18.0.9:7448\n",
+        "    ip daddr 192.0.2.7 tcp dport 7447 dnat to 172.18.0.9:7448\n",
+        '    iifname != "lo" ip daddr 127.0.0.0/8 drop\n',
+        "    ip daddr 172.18.0.9 tcp dport 7448 ct status dnat masquerade\n",
+    ):
+        assert line in rules
+    assert config["HostConfig"]["Sysctls"] == {"net.ipv4.conf.all.route_localnet": "1"}
+    own = read_own(config["Labels"])
+    assert own is not None
+    assert not forgery_reason(own, made.name, read_making(inspection(config)), IMAGE)
+
+
+def test_with_the_rules_the_sysctl_goes() -> None:
+    state = observed(node(), **the_proxy())
+    (made,) = made_for(state).values()
+    off = replace(SETTINGS, redirect=False)
+    undo, run, *removed = redirects(replace(state, redirects=(record(made),)), off)
+    assert isinstance(undo, CreateRedirect)
+    config = redirect_config(undo, off)
+    assert config["Cmd"][0].startswith("add table ip rosproxy-redirect-")
+    assert "dnat" not in config["Cmd"][0]
+    assert config["HostConfig"]["Sysctls"] == {"net.ipv4.conf.all.route_localnet": "0"}
+    assert [run, *removed] == [
+        Run(undo.name), Remove(made.name, "outdated"), Remove(undo.name, "done"),
+    ]  # fmt: skip
+
+
+def test_where_it_can_not_be_set_a_client_is_the_fix() -> None:
+    state = observed(node(), **the_proxy())
+    (group,) = (g for g in look(state).groups if g.subject)
+    override = f'mode="client";connect/endpoints=["tcp/{proxy_name(ZENOH)}:7448"]'
+    assert group.fix.endswith(f"or set ZENOH_CONFIG_OVERRIDE='{override}'")
+
+
+# whatever happens
+
+
+EVENTS = st.tuples(
+    st.sampled_from(
+        [
+            *(Hosts.run_zenoh, Hosts.run_zenoh, Hosts.run_zenoh, Hosts.change, Hosts.remove),
+            *(Hosts.fail_redirects, Hosts.attach, Hosts.detach, Hosts.meddle, Hosts.break_one),
+            *(Hosts.remove_own, Hosts.look, Hosts.look_and_be_killed, Hosts.look_and_stall),
+            *(Hosts.come_to_rest, Hosts.change_image, Hosts.engine_restarts, Hosts.start_by_hand),
+        ]
+    ),
+    st.integers(0, 59),
+    st.integers(0, 59),
+)
+
+
+@given(st.lists(EVENTS, min_size=5, max_size=25))
+def test_it_comes_to_rest_as_wished(events: list) -> None:
+    host = Hosts()
+    host.run_zenoh(0, 0)
+    host.come_to_rest()
+    assert host.engine.rules
+    for happen, n, m in events:
+        happen(host, n, m)
+        host.check()
+    host.come_to_rest()
+    host.engine.image = "image-1"
+    host.come_to_rest()
