@@ -6,6 +6,9 @@ record of a redirect has this port as its range, since the operator has no disk.
 
 A connection to localhost leaves the namespace only with the sysctl ``route_localnet``. With this
 sysctl, neighbours could reach what listens on loopback there (CVE-2020-8558), so a rule drops that.
+
+A session that a node has opened with a router outside before the redirect would stay, and a router
+passes no data between the node and its own peers. So the rules reset such a session.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -39,15 +42,40 @@ $redirects
     type nat hook postrouting priority 100; policy accept;
     ip daddr $proxy tcp dport $port ct status dnat masquerade
   }
-}
+$resets}
+""")
+# In these hooks redirected packets have the proxy's address on the way out, and their first address
+# again on the way in.
+_RESETS = Template("""\
+  chain resets_out {
+    type filter hook output priority 0; policy accept;
+$out
+  }
+  chain resets_in {
+    type filter hook input priority 0; policy accept;
+    ct status dnat accept
+$in_
+  }
 """)
 
 
 def zenoh_rules(table: str, routers: Iterable[HostPort], proxy: HostPort) -> str:
     """The table of nftables that leads these routers to a port of the proxy."""
-    rules = (f"    ip daddr {r.host} tcp dport {r.port} dnat to {proxy}" for r in routers)
+    every = [*routers]
+    outside = [router for router in every if router != LOCAL_ROUTER]
+    reset = "reject with tcp reset"
+    resets = _RESETS.substitute(
+        out="\n".join(f"    ip daddr {r.host} tcp dport {r.port} {reset}" for r in outside),
+        in_="\n".join(f"    ip saddr {r.host} tcp sport {r.port} {reset}" for r in outside),
+    )
     return _SET.substitute(
-        table=table, redirects="\n".join(rules), proxy=proxy.host, port=proxy.port
+        table=table,
+        redirects="\n".join(
+            f"    ip daddr {r.host} tcp dport {r.port} dnat to {proxy}" for r in every
+        ),
+        proxy=proxy.host,
+        port=proxy.port,
+        resets=resets if outside else "",
     )
 
 

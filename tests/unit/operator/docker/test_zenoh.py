@@ -440,8 +440,11 @@ def test_the_rules_keep_neighbours_from_loopback() -> None:
         "    ip daddr 192.0.2.7 tcp dport 7447 dnat to 172.18.0.9:7448\n",
         '    iifname != "lo" ip daddr 127.0.0.0/8 drop\n',
         "    ip daddr 172.18.0.9 tcp dport 7448 ct status dnat masquerade\n",
+        "    ip daddr 192.0.2.7 tcp dport 7447 reject with tcp reset\n",
+        "    ip saddr 192.0.2.7 tcp sport 7447 reject with tcp reset\n",
     ):
         assert line in rules
+    assert rules.count("reject") == 2
     assert config["HostConfig"]["Sysctls"] == {"net.ipv4.conf.all.route_localnet": "1"}
     own = read_own(config["Labels"])
     assert own is not None
@@ -451,6 +454,7 @@ def test_the_rules_keep_neighbours_from_loopback() -> None:
 def test_with_the_rules_the_sysctl_goes() -> None:
     state = observed(node(), **the_proxy())
     (made,) = made_for(state).values()
+    assert "reject" not in redirect_config(made, SETTINGS)["Cmd"][0]
     off = replace(SETTINGS, redirect=False)
     undo, run, *removed = redirects(replace(state, redirects=(record(made),)), off)
     assert isinstance(undo, CreateRedirect)
