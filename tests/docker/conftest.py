@@ -71,6 +71,11 @@ def ros2_image(_engine: None) -> str:
 
 
 @pytest.fixture(scope="session")
+def zenoh_image(_engine: None) -> str:
+    return images.build_image(images.ZENOH)
+
+
+@pytest.fixture(scope="session")
 def haproxy_image(_engine: None) -> str:
     return images.build_image(images.HAPROXY)
 

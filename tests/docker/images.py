@@ -20,6 +20,7 @@ PROXY = "rosproxy:test"
 OPERATOR = "rosproxy-operator:test"
 ROS = "rosproxy-test-ros:latest"
 ROS2 = "rosproxy-test-ros2:latest"
+ZENOH = "rosproxy-test-zenoh:latest"
 HAPROXY = "rosproxy-test-haproxy:latest"
 _HERE = ROOT / "tests/docker"
 
@@ -46,6 +47,8 @@ def build_image(name: str) -> str:
         ROS: ("--file", _HERE / "ros.Dockerfile", ROOT / "tests/ros/nodes"),
         # One with ROS 2, of two distributions, and with Cyclone DDS.
         ROS2: ("--file", _HERE / "ros2.Dockerfile", ROOT / "tests/ros2"),
+        # One with sessions of zenoh, as rmw_zenoh has them.
+        ZENOH: ("--file", _HERE / "zenoh.Dockerfile", ROOT / "tests/zenoh"),
         HAPROXY: ("--file", _HERE / "haproxy.Dockerfile", _HERE),
     }
     return build(name, "--build-arg", f"BASE_IMAGE={base_image()}", *recipes[name])
