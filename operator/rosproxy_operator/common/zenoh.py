@@ -12,6 +12,7 @@ from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy.setting_kinds import ZENOH_PORT
 
 OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
+SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"
 MOST_ENDPOINTS = 32
 """Endpoints that are read of a variable."""
 _ENDPOINT = re.compile(r"[\"']([a-z]+)/([^\"'/?#;]{1,300})[^\"']*[\"']")

@@ -13,7 +13,7 @@ import msgspec
 
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.ros2_variables import OF_ROS2
-from rosproxy_operator.common.zenoh import OVERRIDE, runs_router
+from rosproxy_operator.common.zenoh import OVERRIDE, SESSION_FILE, runs_router
 from rosproxy_operator.docker.engine_client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
 from rosproxy_operator.docker.planner.own_containers import CreationFacts
@@ -21,7 +21,10 @@ from rosproxy_operator.docker.planner.specs import FORMER_TOKEN, MANAGED, SECRET
 
 # Go's zero time, 0001-01-01T00:00:00Z.
 _NEVER_STARTED = "0001-"
-_VARIABLES = OF_ROS2 | {"ROS_VERSION", "ROS_DISTRO", "ROS_IP", "ROS_HOSTNAME", OVERRIDE}
+_VARIABLES = OF_ROS2 | {
+    *("ROS_VERSION", "ROS_DISTRO", "ROS_IP", "ROS_HOSTNAME"),
+    *(OVERRIDE, SESSION_FILE),
+}
 """Variables that tell the version of ROS in a container, and how its nodes find each other."""
 _KEPT_VARIABLES = _VARIABLES | {"ROS_MASTER_URI", FORMER_TOKEN}
 LONGEST_TEXT = 4096

@@ -10,11 +10,13 @@ from datetime import datetime
 
 from rosproxy import __version__
 from rosproxy.admin.status_document import ParticipantStatus, ProxyStatus, ZenohNodeStatus
-from rosproxy.telemetry.text import listed
+from rosproxy.net.addresses import parse_host_port
+from rosproxy.telemetry.text import brief, listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json
 from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
-from rosproxy_operator.common.ros2_variables import why_unheard
+from rosproxy_operator.common.ros2_variables import LONGEST_VALUE, why_unheard
+from rosproxy_operator.common.zenoh import SESSION_FILE
 from rosproxy_operator.docker.planner.label_policy import network_owner
 from rosproxy_operator.docker.planner.model import (
     ZENOH,
@@ -59,6 +61,7 @@ def host_document(
     silent = _silent(answers, observed, now)
     problems += [problem for problem in silent if problem.subject not in subjects]
     problems += _unheard(planned.members, observed, statuses, now)
+    problems += _unconnected(planned.members, observed, statuses, now)
     subjects = {problem.subject for problem in problems}
     redirects = _redirects(planned.members, observed)
     keys: dict[str, list[Key | None]] = {}
@@ -204,12 +207,40 @@ def _unheard(
         status = statuses.get(proxy_name(member.key))
         if not member.key.is_ros2 or status is None or container.state != "running":
             continue
-        settled = min(status.uptime, now - _unix_time(container.started_at)) >= SETTLED
+        settled = _is_settled(container, status, now)
         addresses = _addresses(container, observed).values()
         reason = why_unheard(container.variables)
         if reason and settled and not participants_by_address(status).keys() & {*addresses}:
             text = "the proxy has discovered no participant of this container. Possible cause: "
             yield Problem(f"container {container.name}", f"{text}{reason}")
+
+
+def _unconnected(
+    members: Iterable[Member], observed: HostState, statuses: ProxyStatuses, now: float
+) -> Iterator[Problem]:
+    """Containers of rmw_zenoh without a session at the proxy, whose own file may be why."""
+    for member in members:
+        container = member.container
+        status = statuses.get(proxy_name(member.key))
+        file = container.variables.get(SESSION_FILE, "")
+        if not file or not member.redirected or not status or not status.zenoh:
+            continue
+        remotes = (parse_host_port(session.remote) for session in status.zenoh.sessions)
+        hosts = {remote.host for remote in remotes if remote}
+        addresses = {*_addresses(container, observed).values()}
+        if _is_settled(container, status, now) and not hosts & addresses:
+            yield Problem(
+                f"container {container.name}",
+                "no node of this container has connected to the proxy. Possible cause: variable "
+                f"{SESSION_FILE}={brief(file, LONGEST_VALUE)}. The file may name other "
+                "endpoints than tcp/localhost:7447. Unset the variable, or change the file",
+            )
+
+
+def _is_settled(container: Container, status: ProxyStatus, now: float) -> bool:
+    """Whether a container and its proxy have run long enough for nodes to be missed."""
+    age = now - _unix_time(container.started_at)
+    return container.state == "running" and min(status.uptime, age) >= SETTLED
 
 
 def _unix_time(text: str) -> float:

@@ -11,6 +11,7 @@ from rosproxy.admin.status_document import (
     ProxyStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
+    ZenohSessionStatus,
     ZenohStatus,
 )
 from rosproxy.leases.ports import PortRange
@@ -164,6 +165,31 @@ def test_a_container_in_the_network_of_another_has_its_participants() -> None:
     (row,) = host_document(state, made, (), answers, SETTINGS, STARTED)["containers"]
     assert row["name"] == talker.name
     assert [p["guid_prefix"] for p in row["participants"]] == ["01.0f.aa"]
+
+
+@pytest.mark.parametrize(
+    ("file", "remote", "age", "is_told"),
+    [
+        ("/my.json5", "172.30.0.9:4000", SETTLED, True),
+        ("/my.json5", f"{TALKER.address}:4000", SETTLED, False),
+        ("/my.json5", "172.30.0.9:4000", 1.0, False),
+        ("", "172.30.0.9:4000", SETTLED, False),
+    ],
+)
+def test_a_file_of_sessions_is_named_where_no_node_has_connected(
+    file: str, remote: str, age: float, is_told: bool
+) -> None:
+    talker = container(labels={"rosproxy.enable": "true"}, networks=[TALKER], env="")
+    variables = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp", "ZENOH_SESSION_CONFIG_URI": file}
+    talker = replace(talker, variables=variables, started_at=STARTED_AT)
+    state = observed(talker)
+    made = planned(state, SETTINGS, DockerMemory(), 0.0)
+    sessions = (ZenohSessionStatus(7448, "peer", "1", "172.30.0.2:7448", remote),)
+    status = ProxyStatus(uptime=SETTLED, zenoh=ZenohStatus(sessions=sessions))
+    answers = {proxy_name(ZENOH): status}
+    document = host_document(state, made, (), answers, SETTINGS, STARTED + age + 1)
+    told = [problem["text"] for problem in document["problems"]]
+    assert any("variable ZENOH_SESSION_CONFIG_URI=/my.json5. " in text for text in told) is is_told
 
 
 def test_a_container_of_rmw_zenoh_has_its_nodes_and_its_proxy_the_links() -> None:
