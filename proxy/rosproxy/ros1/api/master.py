@@ -25,7 +25,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import NO_SPEC, method_spec
 from rosproxy.ros1.protocol.name_lengths import LONGEST_NAME, too_long_to_register
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc import passing
+from rosproxy.ros1.protocol.xmlrpc import fast, passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.limits import Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
@@ -68,10 +68,14 @@ class MasterApi:
     async def __call__(self, call: IncomingCall) -> bytes | LongReply:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
         self._refuse_loop(call)
-        # getUri is answered with the address by which the node itself calls the proxy.
-        caller = Caller(call.source, call.local.host, master=call.host_header or str(call.local))
         metrics = self._context.metrics
         upstream = self._context.upstream
+        # So rospy and roscpp write calls for parameters, unless they set a list or a struct.
+        method = fast.method_of_scalars(call.body) if self._context.policy.idle else None
+        if method and _passes(method):
+            return await count_reply(metrics, "master", method, upstream.pass_to_master(call.body))
+        # getUri is answered with the address by which the node itself calls the proxy.
+        caller = Caller(call.source, call.local.host, master=call.host_header or str(call.local))
         reads_params = self._context.policy.reads_parameters(call.source)
         # roslaunch sets all its parameters by one multicall (launch.py, _load_parameters).
         if not reads_params and await _is_long_and_passes(call.body):

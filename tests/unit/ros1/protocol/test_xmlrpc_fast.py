@@ -48,6 +48,18 @@ def read(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, Any]:
         return "refused", error.code
 
 
+SCALAR_KINDS = {"string", "int", "boolean", "double"}
+
+
+def assert_scalars_as_by_expat(body: bytes) -> None:
+    """What passes unread is a call that expat accepts, with the same method."""
+    method = fast.method_of_scalars(body)
+    if method is not None:
+        verdict, call = by_expat(body)
+        assert (verdict, call.method) == ("call", method)
+        assert {value.kind for value in call.params} <= SCALAR_KINDS
+
+
 def plainly(body: bytes) -> Call | Value | None:
     call = fast.call(body)
     return Call(*call) if call else fast.response(body)
@@ -67,6 +79,19 @@ def test_python_s_replies_are_plain_and_read_with_every_offset_as_by_expat(value
     assert read(body) == by_expat(body)
 
 
+@pytest.mark.parametrize("written", [py_call, cpp_call])
+def test_calls_for_single_parameters_are_told_by_their_method(written: Any) -> None:
+    for value in ("text", "", 5, True, 1.5):
+        assert fast.method_of_scalars(written("setParam", "/n", "/a", value)) == "setParam"
+    for other in (["a"], {"a": 1}, "<&>"):
+        assert fast.method_of_scalars(written("setParam", "/n", "/a", other)) is None
+
+
+def test_a_method_that_a_parser_would_read_otherwise_is_not_told() -> None:
+    body = py_call("registerPublisher").replace(b"Pub", b"&#80;ub")
+    assert fast.method_of_scalars(body) is None
+
+
 def test_xmlrpcpp_s_documents_are_plain() -> None:
     for body in (cpp_call("getPid", "/n", 1, ["a", True]), cpp_reply([1, "ok", ["http://h:1/"]])):
         assert plainly(body) is not None
@@ -82,6 +107,7 @@ def test_a_changed_document_is_read_as_by_expat_or_refused_as_by_it(
         place = data.draw(st.integers(0, len(body) - 1))
         body[place : place + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
     assert read(bytes(body)) == by_expat(bytes(body))
+    assert_scalars_as_by_expat(bytes(body))
 
 
 @given(SOUP, st.sampled_from(["methodCall", "methodResponse"]))
@@ -94,6 +120,7 @@ def test_soup_between_sound_tags_is_read_as_by_expat(soup: str, root: str) -> No
         f"{soup}<{root}>{name}<params></params></{root}>{soup}",
     ):
         assert read(text.encode()) == by_expat(text.encode())
+        assert_scalars_as_by_expat(text.encode())
 
 
 @pytest.mark.parametrize("depth", range(1, 16))
@@ -126,6 +153,8 @@ def test_spaces_cost_no_more_than_their_number() -> None:
     spaces = b" " * 2_000_000
     body = dumps(("a",), "x").encode().replace(b"<param>", spaces + b"<param>" + spaces)
     assert fast.call(body) is not None
+    assert fast.method_of_scalars(body) == "x"
+    assert fast.method_of_scalars(body.replace(b"</param>", b"</parm>")) is None
     assert fast.call(body.replace(b"</param>", b"</parm>")) is None
 
 

@@ -19,6 +19,14 @@ _CALL = re.compile(_PROLOG + rb"<methodCall>\s*<methodName>\s*([^<\s]+)\s*</meth
 _CALL_END = re.compile(rb"\s*</params>\s*</methodCall>\s*\Z")
 _RESPONSE = re.compile(_PROLOG + rb"<methodResponse>\s*<params>")
 _RESPONSE_END = re.compile(rb"\s*</params>\s*</methodResponse>\s*\Z")
+_SCALAR = rb"[\t\n\r\x20-\x25\x27-\x3b=?-\x7e]*+"
+"""Plain text without ``>``, so that no ``]]>`` is in it."""
+_SCALARS_CALL = re.compile(
+    _PROLOG
+    + rb"<methodCall>\s*<methodName>\s*([\w./]+)\s*</methodName>\s*<params>"
+    + rb"(?:\s*<param>\s*<value>(?:\s*<(string|int|i4|i8|boolean|double)>%b</\2>\s*|%b)</value>"
+    rb"\s*</param>)*+" % (_SCALAR, _SCALAR) + _CALL_END.pattern
+)
 # The last group is empty, so that there is always a match: `finditer` would skip what is no token.
 _TOKEN = re.compile(
     rb"""\s*(?:
@@ -74,6 +82,12 @@ def call(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, list[Value]] | N
         return None
     params = _params(body, head.end(), _CALL_END, limits.depth)
     return None if params is None else (head[1].decode(), params)
+
+
+def method_of_scalars(body: bytes) -> str | None:
+    """The method of a plain call all of whose parameters are texts and numbers, else None."""
+    match = _SCALARS_CALL.match(body)
+    return match[1].decode() if match else None
 
 
 def response(body: bytes, limits: Limits = OWN_REPLY) -> Value | None:
