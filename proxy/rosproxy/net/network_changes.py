@@ -1,9 +1,10 @@
 """Notices that this machine's addresses or routes change: containers join networks at any time.
 
-To read the networks from /proc takes as long as a quarter of a call; the kernel tells of changes
-for the price of one system call (rtnetlink(7)).
+To read the networks from /proc takes as long as a quarter of a call. So the kernel tells the event
+loop of changes (rtnetlink(7)).
 """
 
+import asyncio
 import contextlib
 import socket
 
@@ -23,26 +24,37 @@ class NetworkChanges:
     def __init__(self) -> None:
         self._socket: socket.socket | None = None
         self._last: float | None = None
+        self._has_told = False
 
     def noticed(self, now: float) -> bool:
         """Whether the networks may have changed since the last time; True the first time."""
-        if self._socket is not None:
-            return _drain(self._socket)
         if self._last is None:
-            self._socket = _subscribe()
-        elif now - self._last < LOOK_INTERVAL_S:
+            self._subscribe()
+        elif not self._has_told and (self._socket or now - self._last < LOOK_INTERVAL_S):
             return False
+        self._has_told = False
         self._last = now
         return True
 
     def close(self) -> None:
         """Notice nothing any more."""
         if self._socket is not None:
+            asyncio.get_running_loop().remove_reader(self._socket)
             self._socket.close()
             self._socket = None
 
+    def _subscribe(self) -> None:
+        self._socket = sock = _route_socket()
+        if sock is not None:
+            asyncio.get_running_loop().add_reader(sock, self._note, sock)
 
-def _subscribe() -> socket.socket | None:
+    def _note(self, sock: socket.socket) -> None:
+        self._has_told = True
+        with contextlib.suppress(OSError):  # more has changed than the socket could hold (ENOBUFS)
+            sock.recv(_READ_BYTES)
+
+
+def _route_socket() -> socket.socket | None:
     """A socket that the kernel tells of changes; None where it has none, as in gVisor."""
     with contextlib.suppress(OSError):
         sock = socket.socket(
@@ -56,16 +68,3 @@ def _subscribe() -> socket.socket | None:
             raise
         return sock
     return None
-
-
-def _drain(sock: socket.socket) -> bool:
-    """Take what the kernel has told; whether it has told anything."""
-    has_told = False
-    while True:
-        try:
-            sock.recv(_READ_BYTES)
-        except BlockingIOError:
-            return has_told
-        except OSError:  # more has changed than the socket could hold (ENOBUFS)
-            return True
-        has_told = True
