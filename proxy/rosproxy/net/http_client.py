@@ -15,7 +15,7 @@ import re
 import socket
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from typing import Protocol
 
 import aiohttp
@@ -254,12 +254,7 @@ class HttpClient:
         self.late.wait(partial(_drain, sock), sock.close)
 
     def _head(self, path: str, host: str, size: int) -> bytes:
-        if not (_SENDABLE.fullmatch(path) and _SENDABLE.fullmatch(host)):
-            raise ValueError(
-                f"{host}{path} can't be requested: "
-                "the host or the path is empty, or has spaces or control characters"
-            )
-        start = f"POST {path} HTTP/1.1\r\nHost: {host}\r\n"
+        start = _request_start(path, host)
         return f"{start}{self._headers}Content-Length: {size}\r\n\r\n".encode()
 
     async def _ask(
@@ -376,6 +371,16 @@ class HttpClient:
         self._idle = {peer: idle for peer, idle in self._idle.items() if idle}
         if self._idle:
             self._sweeper = loop.call_later(self._keepalive / 2, self._sweep)
+
+
+@lru_cache
+def _request_start(path: str, host: str) -> str:
+    if not (_SENDABLE.fullmatch(path) and _SENDABLE.fullmatch(host)):
+        raise ValueError(
+            f"{host}{path} can't be requested: "
+            "the host or the path is empty, or has spaces or control characters"
+        )
+    return f"POST {path} HTTP/1.1\r\nHost: {host}\r\n"
 
 
 class BadResponse(ValueError):

@@ -11,6 +11,7 @@ import logging
 import socket
 from collections import deque
 from collections.abc import Sequence
+from functools import lru_cache
 from http import HTTPStatus
 
 from aiohttp import HttpVersion, HttpVersion11, StreamReader
@@ -349,10 +350,15 @@ def _host_port(sockname: object) -> HostPort:
 
 def _head(version: HttpVersion, lasts: bool, reply: HttpReply, size: int) -> bytes:
     """A reply's header; that the connection lasts is said where HTTP's version doesn't imply it."""
-    reason = reply.reason or HTTPStatus(reply.status).phrase
-    lines = f"HTTP/{version.major}.{version.minor} {reply.status} {reason}\r\n"
-    lines += f"Content-Type: {reply.content_type}\r\n{reply.lines}"
-    if lasts != (version >= HttpVersion11):
-        lines += f"Connection: {'keep-alive' if lasts else 'close'}\r\n"
+    start = _head_start(version, lasts, reply.status, reply.reason, reply.content_type)
     # roscpp finds the length only with a blank after the colon (XmlRpcClient.cpp, readHeader).
-    return f"{lines}Content-Length: {size}\r\n\r\n".encode()
+    return f"{start}{reply.lines}Content-Length: {size}\r\n\r\n".encode()
+
+
+@lru_cache
+def _head_start(version: HttpVersion, lasts: bool, status: int, reason: str, kind: str) -> str:
+    reason = reason or HTTPStatus(status).phrase
+    start = f"HTTP/{version.major}.{version.minor} {status} {reason}\r\nContent-Type: {kind}\r\n"
+    if lasts != (version >= HttpVersion11):
+        start += f"Connection: {'keep-alive' if lasts else 'close'}\r\n"
+    return start
