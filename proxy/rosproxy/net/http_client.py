@@ -27,6 +27,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_protocol import HttpProtocol, wake
 from rosproxy.net.late_answers import LateAnswers
 from rosproxy.net.sockets import dial
+from rosproxy.net.time_limits import TimeLimit, TimeLimits
 
 MAX_BODY = 64 * 1024 * 1024
 """Longest XML-RPC body in bytes, either way, unless told otherwise."""
@@ -178,7 +179,8 @@ class HttpClient:
         lines = {"Content-Type": "text/xml", "User-Agent": "rosproxy", **headers}
         self._headers = "".join(f"{name}: {text}\r\n" for name, text in lines.items())
         self._keepalive = keepalive
-        self._limit = asyncio.Semaphore(most)
+        self._places = asyncio.Semaphore(most)
+        self._time_limits = TimeLimits()
         self._source = source
         self._longest = longest
         self._idle: dict[HostPort, list[tuple[float, ClientConnection]]] = {}
@@ -203,9 +205,10 @@ class HttpClient:
         aiohttp.ClientError, ValueError.
         """
         head = self._head(path, host, len(body))
-        async with asyncio.timeout(within), self._limit:
-            connection, stream, _ = await self._ask(peer, head, body)
-            return await self._read_whole(peer, connection, stream, longest or self._longest)
+        with TimeLimit(self._time_limits, within):
+            async with self._places:
+                connection, stream, _ = await self._ask(peer, head, body)
+                return await self._read_whole(peer, connection, stream, longest or self._longest)
 
     async def pass_on(
         self, peer: HostPort, path: str, host: str, body: bytes | LongBody, within: float
@@ -218,8 +221,9 @@ class HttpClient:
         """
         if isinstance(body, bytes):
             head = self._head(path, host, len(body))
-            async with asyncio.timeout(within), self._limit:
-                return await self._pass_reply(peer, *await self._ask(peer, head, body))
+            with TimeLimit(self._time_limits, within):
+                async with self._places:
+                    return await self._pass_reply(peer, *await self._ask(peer, head, body))
         # A long body takes no place among the ``most``, or short calls would have to wait for it.
         head = self._head(path, host, body.size)
         async with asyncio.timeout(within):

@@ -31,6 +31,7 @@ from rosproxy.net.http_server import (
     text_reply,
 )
 from rosproxy.net.sockets import end_if_stalled, hang_up, peek
+from rosproxy.net.time_limits import TimeLimit, TimeLimits
 from rosproxy.ros1.clients.master_client import LOOP_HEADER, Unreachable
 from rosproxy.ros1.context import MANY_VALUES, Context
 from rosproxy.ros1.protocol.tcpros import speaks_http
@@ -148,6 +149,7 @@ class XmlRpcServer(HttpServer):
         self._limits = limits
         self._long_calls = long_calls
         self._guard = guard
+        self._time_limits = TimeLimits()
         self._by_port: defaultdict[int, set[HttpConnection]] = defaultdict(set)
         self._mute: dict[HttpConnection, Callable[[], None]] = {}
 
@@ -287,7 +289,7 @@ class XmlRpcServer(HttpServer):
             if size <= passing.SHORT and request.content.is_eof():  # it came with the header
                 await self._take_in(call, request.content.read_nowait())
                 return self._pass_unread(request, call)
-            async with asyncio.timeout(BODY_TIMEOUT):
+            with TimeLimit(self._time_limits, BODY_TIMEOUT):
                 request.invite()
                 if size > passing.SHORT and self._long_calls is not None:
                     long_call = await self._read_head(request, call, size, self._long_calls)
