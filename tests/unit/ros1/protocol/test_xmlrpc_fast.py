@@ -11,6 +11,7 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import fast
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Value, XmlRpcError
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, Limits
+from rosproxy.ros1.protocol.xmlrpc.passing import MulticallWatch
 from tests.unit.builders import cpp_call, cpp_reply, py_call, py_reply
 
 TEXT = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E, exclude_characters="&<>"))
@@ -85,6 +86,42 @@ def test_calls_for_single_parameters_are_told_by_their_method(written: Any) -> N
         assert fast.method_of_scalars(written("setParam", "/n", "/a", value)) == "setParam"
     for other in (["a"], {"a": 1}, "<&>"):
         assert fast.method_of_scalars(written("setParam", "/n", "/a", other)) is None
+
+
+def multicall(*calls: tuple[str, list[Any]]) -> bytes:
+    return py_call("system.multicall", [{"methodName": m, "params": params} for m, params in calls])
+
+
+def watched_methods(body: bytes) -> set[str] | None:
+    """The methods in a multicall that expat takes apart; None if it must not pass."""
+    methods = set[str]()
+    watch = MulticallWatch(lambda method: not methods.add(method))
+    try:
+        watch.see(body)
+        watch.end()
+    except XmlRpcError:
+        return None
+    return methods
+
+
+def test_the_methods_of_a_multicall_are_told() -> None:
+    calls = ("setParam", ["/n", "/a", [1, "b", 2.5]]), ("getParam", ["/n", "/a"])
+    assert fast.methods_of_multicall(multicall(*calls)) == {"setParam", "getParam"}
+    assert fast.methods_of_multicall(multicall()) == set()
+    assert fast.methods_of_multicall(multicall(("setParam", ["/n", "/a", {"b": 1}]))) is None
+    assert fast.methods_of_multicall(py_call("setParam", "/n", "/a", 1)) is None
+
+
+@given(st.lists(VALUES, max_size=2), st.data())
+def test_a_multicall_whose_methods_are_told_is_one_to_expat(
+    values: list[Any], data: st.DataObject
+) -> None:
+    body = bytearray(multicall(("setParam", values), ("x.y", [[1], "a"])))
+    for _ in range(data.draw(st.integers(0, 2))):
+        place = data.draw(st.integers(0, len(body) - 1))
+        body[place : place + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
+    methods = fast.methods_of_multicall(bytes(body))
+    assert methods is None or methods == watched_methods(bytes(body))
 
 
 def test_a_method_that_a_parser_would_read_otherwise_is_not_told() -> None:

@@ -19,14 +19,35 @@ _CALL = re.compile(_PROLOG + rb"<methodCall>\s*<methodName>\s*([^<\s]+)\s*</meth
 _CALL_END = re.compile(rb"\s*</params>\s*</methodCall>\s*\Z")
 _RESPONSE = re.compile(_PROLOG + rb"<methodResponse>\s*<params>")
 _RESPONSE_END = re.compile(rb"\s*</params>\s*</methodResponse>\s*\Z")
-_SCALAR = rb"[\t\n\r\x20-\x25\x27-\x3b=?-\x7e]*+"
+_TEXT_OF_SCALAR = rb"[\t\n\r\x20-\x25\x27-\x3b=?-\x7e]*+"
 """Plain text without ``>``, so that no ``]]>`` is in it."""
+_SCALAR = rb"<value>(?:\s*(?:%b)\s*|%b)</value>" % (
+    b"|".join(
+        b"<%b>%b</%b>" % (kind, _TEXT_OF_SCALAR, kind)
+        for kind in (b"string", b"int", b"i4", b"i8", b"boolean", b"double")
+    ),
+    _TEXT_OF_SCALAR,
+)
 _SCALARS_CALL = re.compile(
     _PROLOG
     + rb"<methodCall>\s*<methodName>\s*([\w./]+)\s*</methodName>\s*<params>"
-    + rb"(?:\s*<param>\s*<value>(?:\s*<(string|int|i4|i8|boolean|double)>%b</\2>\s*|%b)</value>"
-    rb"\s*</param>)*+" % (_SCALAR, _SCALAR) + _CALL_END.pattern
+    + rb"(?:\s*<param>\s*%b\s*</param>)*+" % _SCALAR
+    + _CALL_END.pattern
 )
+_LIST = rb"<value>\s*<array>\s*<data>(?:\s*%b)*+\s*</data>\s*</array>\s*</value>"
+_METHOD = rb"<name>methodName</name>\s*<value>\s*(?:<string>[\w./]+</string>|[\w./]+)\s*</value>"
+_INNER_CALL = (
+    rb"\s*<value>\s*<struct>\s*<member>\s*%b\s*</member>\s*<member>\s*<name>params</name>\s*%b\s*"
+    rb"</member>\s*</struct>\s*</value>"
+) % (_METHOD, _LIST % (rb"(?:%b|%b)" % (_SCALAR, _LIST % _SCALAR)))
+_MULTICALL = re.compile(
+    _PROLOG
+    + rb"<methodCall>\s*<methodName>\s*system\.multicall\s*</methodName>\s*<params>\s*<param>\s*"
+    + rb"<value>\s*<array>\s*<data>(?:%b)*+\s*</data>\s*</array>\s*</value>\s*</param>"
+    % _INNER_CALL
+    + _CALL_END.pattern
+)
+_INNER_METHOD = re.compile(rb"<name>methodName</name>\s*<value>\s*(?:<string>)?([\w./]+)")
 # The last group is empty, so that there is always a match: `finditer` would skip what is no token.
 _TOKEN = re.compile(
     rb"""\s*(?:
@@ -88,6 +109,16 @@ def method_of_scalars(body: bytes) -> str | None:
     """The method of a plain call all of whose parameters are texts and numbers, else None."""
     match = _SCALARS_CALL.match(body)
     return match[1].decode() if match else None
+
+
+def methods_of_multicall(body: bytes) -> set[str] | None:
+    """The methods in a plain multicall all of whose parameters are scalars or lists of such.
+
+    None for any other document.
+    """
+    if not _MULTICALL.match(body):
+        return None
+    return {method.decode() for method in _INNER_METHOD.findall(body)}
 
 
 def response(body: bytes, limits: Limits = OWN_REPLY) -> Value | None:

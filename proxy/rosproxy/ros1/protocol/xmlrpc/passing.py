@@ -8,13 +8,15 @@ rosmaster and nodes read a body to its end before they look into it.
 
 A ``system.multicall``, by which roslaunch sets parameters, is taken apart by expat, piece by piece:
 it passes if each of its calls does. Its grammar is held to the letter, as Python's Unmarshaller
-(xmlrpc/client.py), which keeps a stack and knows no grammar, could see another one.
+(xmlrpc/client.py), which keeps a stack and knows no grammar, could see another one. A regular
+expression has seen the usual document in a twentieth of that time (`fast.methods_of_multicall`).
 """
 
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator
 from xml.parsers import expat
 
+from rosproxy.ros1.protocol.xmlrpc import fast
 from rosproxy.ros1.protocol.xmlrpc.document import (
     INVALID_REQUEST,
     PARSE_ERROR,
@@ -152,6 +154,10 @@ class CallWatch:
     def end(self) -> None:
         """All of it was seen. Raises XmlRpcError if it should not have ended."""
 
+    def passes(self, _body: bytes) -> bool:
+        """Whether a whole document passes at a glance; it is watched otherwise."""
+        return False
+
 
 class MulticallWatch(CallWatch):
     """Watches a multicall that passes; ``may_pass`` says whether calls of a method pass unread."""
@@ -179,6 +185,14 @@ class MulticallWatch(CallWatch):
     def end(self) -> None:
         """All of it was seen. Raises XmlRpcError if it should not have ended."""
         self._parse(b"", last=True)
+
+    def passes(self, body: bytes) -> bool:
+        """Whether a whole document passes at a glance; expat takes twenty times as long."""
+        methods = fast.methods_of_multicall(body)
+        return methods is not None and all(map(self._passes, methods))
+
+    def _passes(self, method: str) -> bool:
+        return method != MULTICALL and self._may_pass(method)
 
     def _parse(self, piece: bytes, last: bool = False) -> None:
         try:
@@ -243,7 +257,7 @@ class MulticallWatch(CallWatch):
             self._members.append("params")
         elif self._elements in (_METHOD, [*_METHOD, "string"]):
             self._members.append("methodName")
-            if self._text == MULTICALL or not self._may_pass(self._text):
+            if not self._passes(self._text):
                 raise XmlRpcError(
                     INVALID_REQUEST, f"{self._text} is not allowed in a long {MULTICALL}"
                 )
