@@ -2,11 +2,13 @@
 
 Each measurement is one kept connection, as rospy keeps one to its master. There are two proxies,
 with uvloop where that is installed and with Python's own event loop, each with a rospy node.
+HAProxy forwards the same HTTP unread.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,17 +22,40 @@ from urllib.parse import urlsplit
 from xmlrpc.client import dumps, loads
 
 from tests.bench.book import DIRECT, Book
-from tests.bench.world import GATEWAY, HOST, MASTER, MASTER_PORT, OUTSIDE, World, world
+from tests.bench.world import GATEWAY, HOST, INSIDE, MASTER, MASTER_PORT, OUTSIDE, World, world
 
 CALL_SECONDS = 0.5
 QUICK_SECONDS = 0.1
 WARM_UP_CALLS = 20
 TOPICS = 100
+PARAMETERS = 1000
+"""That roslaunch sets, all in one multicall."""
+LAUNCH = f"{PARAMETERS} setParam in one multicall"
+NODES = 100
+"""That start at once; each publishes ten topics."""
+FIRST_SLAVE = 50000
 ENDING_TOPICS = 10
 """That a node publishes, and as many that it subscribes to: rospy ends both in one multicall."""
 STRING = "std_msgs/String"
 LOOPS = {"uvloop": 0, "asyncio": 1}
 """What the ports of the proxy on an event loop are counted from."""
+HAPROXY_PORT = 47000
+_HAPROXY = """
+global
+  maxconn 4096
+  nbthread 1
+defaults
+  mode http
+  timeout connect 10s
+  timeout client 1h
+  timeout server 1h
+listen to-master
+  bind {gateway}:{port}
+  server master {master}
+listen to-node
+  bind {host}:{port}
+  server node {node}
+"""
 NODE = """
 import rospy, std_msgs.msg, sys
 rospy.init_node(sys.argv[1])
@@ -84,10 +109,19 @@ def run(book: Book, rounds: int, quick: bool) -> None:
         loops = [name for name in LOOPS if name == "asyncio" or find_spec(name)]
         proxied = [stack.enter_context(proxy(machines, loop)) for loop in loops]
         node = host_and_port(proxied[0].uri)
-        direct = Way(DIRECT, (OUTSIDE, MASTER_PORT), node, "/bench_direct", f"http://{OUTSIDE}:9/")
+        ways = [Way(DIRECT, (OUTSIDE, MASTER_PORT), node, "/bench_direct", f"http://{OUTSIDE}:9/")]
+        if shutil.which("haproxy"):
+            ways.append(stack.enter_context(haproxy(machines, node)))
+        else:
+            book.note("haproxy is not installed and was not compared")
+        ways += proxied
         for _ in range(rounds):
             for method, step in CALLS.items():
-                compare(book, machines, [direct, *proxied], method, step, seconds)
+                compare(book, machines, ways, method, step, seconds)
+            for way in ways:
+                book.add(
+                    f"{NODES} nodes start at once, s", way.path, started_at_once(machines, way)
+                )
 
 
 Step = Callable[[Way, Line, int], None]
@@ -114,11 +148,12 @@ def timed(machines: World, way: Way, method: str, step: Step, seconds: float) ->
     from_outside = method == "requestTopic"
     with machines.entered("outside" if from_outside else "inside"):
         line = Line(way.node if from_outside else way.master)
+    warm_up = 1 if method == LAUNCH else WARM_UP_CALLS
     end = perf_counter() + seconds
-    while perf_counter() < end or len(line.times) <= 2 * WARM_UP_CALLS:
+    while perf_counter() < end or len(line.times) <= 2 * warm_up:
         step(way, line, len(line.times))
     line.close()
-    return line.times[WARM_UP_CALLS:]
+    return line.times[warm_up:]
 
 
 def register(way: Way, line: Line, number: int) -> None:
@@ -148,6 +183,34 @@ def end_node(way: Way, line: Line, _: int) -> None:
     assert [reply[0][::2] for reply in replies] == [[1, 1]] * len(ended), replies
 
 
+def set_parameter(way: Way, line: Line, number: int) -> None:
+    reply = line.call("setParam", way.name, f"/bench{way.name}/{number % TOPICS}", number)
+    assert reply[0] == 1, reply
+
+
+def get_parameter(way: Way, line: Line, _: int) -> None:
+    reply = line.call("getParam", way.name, f"/bench{way.name}/0")
+    assert reply[0] == 1, reply
+
+
+def launch(way: Way, line: Line, number: int) -> None:
+    """All parameters of a launch file, as roslaunch sets them (roslaunch/launch.py)."""
+    names = [f"/bench_launched{way.name}/{index}" for index in range(PARAMETERS)]
+    calls = [{"methodName": "setParam", "params": [way.name, name, number]} for name in names]
+    replies = line.call("system.multicall", calls)
+    assert [reply[0][0] for reply in replies] == [1] * PARAMETERS
+
+
+def started_at_once(machines: World, way: Way) -> float:
+    """Seconds until all of many nodes that start at the same moment have registered."""
+    master = "http://{}:{}/".format(*way.master)
+    name = f"crowd_{way.name[1:]}"
+    numbers = map(str, (FIRST_SLAVE, NODES, NODES))
+    argv = [sys.executable, "-m", "tests.bench.crowd", master, INSIDE, *numbers, name]
+    with machines.running("inside", *argv) as process:
+        return float(process.wait_for(r"^registered (\S+)", timeout=60)[1])
+
+
 def elements(way: Way, calls: list[list[str]]) -> list[dict[str, Any]]:
     return [
         {"methodName": method, "params": [way.name, *params, way.uri]} for method, *params in calls
@@ -155,11 +218,27 @@ def elements(way: Way, calls: list[list[str]]) -> list[dict[str, Any]]:
 
 
 CALLS: dict[str, Step] = {
+    "setParam": set_parameter,
+    "getParam": get_parameter,
+    LAUNCH: launch,
     "registerPublisher": register,
     "lookupNode": look_up,
     "system.multicall": end_node,
     "requestTopic": request_topic,
 }
+
+
+@contextmanager
+def haproxy(machines: World, node: Where) -> Iterator[Way]:
+    """HAProxy in HTTP mode, before the master and before a node."""
+    file = machines.folder / "haproxy-http.conf"
+    values = {"gateway": GATEWAY, "host": HOST, "port": HAPROXY_PORT}
+    targets = {"master": f"{OUTSIDE}:{MASTER_PORT}", "node": "{}:{}".format(*node)}
+    file.write_text(_HAPROXY.format(**values, **targets))
+    with machines.running("host", "haproxy", "-db", "-f", str(file)) as process:
+        machines.wait_listening(process, HOST, HAPROXY_PORT)
+        ends = (GATEWAY, HAPROXY_PORT), (HOST, HAPROXY_PORT)
+        yield Way("haproxy, HTTP", *ends, "/bench_haproxy", f"http://{OUTSIDE}:9/")
 
 
 @contextmanager
@@ -169,7 +248,7 @@ def proxy(machines: World, loop: str) -> Iterator[Way]:
     name = f"/bench_{loop}"
     port = MASTER_PORT + shift
     argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", MASTER, "--advertise-host"]
-    argv += [HOST, "--port-range", f"{45000 + shift}-{45099 + shift}", "--log-level", "info"]
+    argv += [HOST, "--port-range", f"{45000 + shift}-{45249 + shift}", "--log-level", "info"]
     argv += ["--master-port", str(port), "--admin-bind", f"127.0.0.1:{port + 1}"]
     ros = machines.ros_environment("inside") | {"ROS_MASTER_URI": f"http://{GATEWAY}:{port}/"}
     node = "/usr/bin/python3", "-c", NODE, f"__name:={name[1:]}", name[1:]

@@ -1,7 +1,10 @@
-"""Many inside nodes in one process: ``python -m tests.bench.crowd MASTER_URI ADDRESS PORT COUNT``.
+"""Many inside nodes in one process:
 
-Each has a slave API of its own, on ports from PORT on, and publishes ten topics. It prints how
-long their registration took, and serves until it is killed.
+    python -m tests.bench.crowd MASTER_URI ADDRESS PORT COUNT [AT_ONCE [NAME]]
+
+Each has a slave API of its own, on ports from PORT on, and publishes ten topics. AT_ONCE nodes
+register at the same time, each on a connection of its own. It prints how long their registration
+took, and serves until it is killed.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ import asyncio
 import os
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from http.client import HTTPConnection
 from urllib.parse import urlsplit
@@ -17,14 +21,15 @@ from xmlrpc.client import dumps, loads
 
 TOPICS = 10
 AT_ONCE = 8
-"""Nodes that register at the same time, each on a connection of its own."""
+NAME = "crowd"
 STRING = "std_msgs/String"
 
 
 class Slave(asyncio.Protocol):
     """One connection to the slave API of a node."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, name: str, number: int) -> None:
+        self._name = name
         self._number = number
         self._data = b""
 
@@ -38,30 +43,30 @@ class Slave(asyncio.Protocol):
         if end and len(body) >= int(head.lower().partition(b"content-length:")[2].split()[0]):
             self._data = b""
             method = body.partition(b"<methodName>")[2].partition(b"<")[0].decode()
-            reply = dumps((answer(method, self._number),), methodresponse=True).encode()
+            reply = dumps((answer(method, self._name, self._number),), methodresponse=True).encode()
             first = b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: %d\r\n\r\n"
             self._transport.write(first % len(reply) + reply)
 
 
-def answer(method: str, number: int) -> list[object]:
+def answer(method: str, name: str, number: int) -> list[object]:
     if method == "getPid":
         return [1, "", os.getpid()]
     if method == "getPublications":
-        return [1, "", [[topic, STRING] for topic in topics(number)]]
+        return [1, "", [[topic, STRING] for topic in topics(name, number)]]
     if method == "requestTopic":
         return [1, "ready", ["TCPROS", "nowhere", 9]]
     return [1, "", []]
 
 
-def topics(number: int) -> list[str]:
-    return [f"/crowd/{number}/{index}" for index in range(TOPICS)]
+def topics(name: str, number: int) -> list[str]:
+    return [f"/{name}/{number}/{index}" for index in range(TOPICS)]
 
 
-def register(master: str, uri: str, number: int) -> None:
+def register(master: str, uri: str, name: str, number: int) -> None:
     """What one node calls when it starts, on a kept connection."""
     http = HTTPConnection(urlsplit(master).netloc, timeout=60)
-    for topic in topics(number):
-        body = dumps((f"/crowd_{number}", topic, STRING, uri), "registerPublisher").encode()
+    for topic in topics(name, number):
+        body = dumps((f"/{name}_{number}", topic, STRING, uri), "registerPublisher").encode()
         http.request("POST", "/", body, {"Content-Type": "text/xml"})
         (reply,), _ = loads(http.getresponse().read())
         assert isinstance(reply, list)
@@ -69,22 +74,21 @@ def register(master: str, uri: str, number: int) -> None:
     http.close()
 
 
-async def main(master: str, address: str, port: int, count: int) -> None:
+async def main(
+    master: str, address: str, port: int, count: int, at_once: int = AT_ONCE, name: str = NAME
+) -> None:
     loop = asyncio.get_running_loop()
-    limit = asyncio.Semaphore(AT_ONCE)
+    loop.set_default_executor(ThreadPoolExecutor(at_once))
     for number in range(count):
-        await loop.create_server(partial(Slave, number), address, port + number)
-
-    async def start(number: int) -> None:
-        uri = f"http://{address}:{port + number}/"
-        async with limit:
-            await asyncio.to_thread(register, master, uri, number)
-
+        await loop.create_server(partial(Slave, name, number), address, port + number)
     started = time.perf_counter()
-    await asyncio.gather(*map(start, range(count)))
+    uris = [f"http://{address}:{port + number}/" for number in range(count)]
+    await asyncio.gather(
+        *(asyncio.to_thread(register, master, uri, name, n) for n, uri in enumerate(uris))
+    )
     print("registered", time.perf_counter() - started, flush=True)
     await asyncio.sleep(3600)
 
 
 if __name__ == "__main__":
-    asyncio.run(main(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])))
+    asyncio.run(main(*sys.argv[1:3], *map(int, sys.argv[3:6]), *sys.argv[6:]))
