@@ -187,15 +187,19 @@ def _outside_key(name: str, document: Document, key: str, node: PageNode, others
 def _own_links(name: str, document: Document, names: Mapping[str, str]) -> Iterator[PageLink]:
     """The links with an end inside a proxy, by the ``names`` of their ends on the page.
 
-    A proxy shows no others (`rosproxy.page.graph_document`).
+    A proxy shows no others (`rosproxy.page.graph_document`). Each link with a port has the key of
+    this proxy's node, if the document has one.
     """
+    carriers = (names[key] for key, node in document.nodes.items() if node.kind == PROXY)
+    carrier = next(carriers, "")
     for link in document.links.values():
         source = names.get(link.source)
         target = names.get(link.target) if link.target else ""
         if source is None or target is None:
             continue
         if name in (_first_word(source), _first_word(target)):
-            yield replace(link, source=source, target=target)
+            proxy = carrier if link.port else ""
+            yield replace(link, source=source, target=target, proxy=proxy)
 
 
 def _first_word(key: str) -> str:

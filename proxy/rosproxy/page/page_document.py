@@ -69,7 +69,8 @@ class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
     ``target`` is empty where there is none. ``carried``: kernel, splice, copy, UDPROS, or direct
     where it does not pass the proxy; empty if that is not known. ``port``: the proxy's. ``rate`` is
     in bytes and ``hz`` in messages per second, ``since`` when something came last that does not
-    come just now, in seconds since the epoch; None: not known.
+    come just now, in seconds since the epoch; None: not known. ``proxy``: the key of the proxy with
+    the ``port``, where there are several.
     """
 
     kind: str
@@ -86,6 +87,7 @@ class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
     text: str = ""
     fix: str = ""
     quiet: bool = False
+    proxy: str = ""
 
     @property
     def key(self) -> str:

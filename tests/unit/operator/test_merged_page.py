@@ -22,7 +22,7 @@ MASTER = "http://robot:11311"
 LOGS = "docker logs {}".format
 
 
-def shown(name: str, links: int = 1, **changes: Any) -> Document:
+def shown(name: str, count: int = 1, **changes: Any) -> Document:
     """A proxy with a talker inside and a listener outside."""
     document = {
         "proxy": {"master": MASTER, "host": "here", "ports": "11000-11099"},
@@ -40,7 +40,7 @@ def shown(name: str, links: int = 1, **changes: Any) -> Document:
                 "target": "/listener",
                 "state": "ok",
             }
-            for number in range(links)
+            for number in range(count)
         },
         "findings": [{"severity": "error", "subject": "ports", "text": "none is free", "fix": "x"}],
         "left_out": 0,
@@ -116,6 +116,20 @@ def test_of_a_link_that_two_proxies_have_stands_what_tells_more(
     (shown_link,) = merged(documents, "1", LOGS)["links"].values()
     told = (first, second)[wanted]
     assert {key: shown_link.get(key, "unknown") for key in told} == told
+
+
+def test_a_link_names_the_proxy_whose_port_it_has() -> None:
+    """Whatever a proxy says itself; a link without a port passes none."""
+    link = {"kind": "topic", "name": "/t", "source": "/talker", "target": "/listener"}
+    documents = {
+        "one": shown("a", 0, links={"t": {**link, "port": 1, "proxy": "two"}}),
+        "two": shown("b", 0, links={"t": link}),
+    }
+    links = merged(documents, "1", LOGS)["links"].values()
+    assert {link["source"]: link.get("proxy") for link in links} == {
+        "one /talker": "one rosproxy",
+        "two /talker": None,
+    }
 
 
 def test_participants_are_the_same_for_all_proxies() -> None:
