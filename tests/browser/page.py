@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -32,25 +32,33 @@ return [...document.querySelectorAll("#node-rows tr")].map((row) =>
   [...row.cells].map((cell) => cell.textContent));
 """
 LINE = """
-const { cy } = window.rosproxyPage;
-const ends = arguments.length ? [...arguments] : [];
-const line = cy.edges().filter((one) =>
-  one.source().data("label") === ends[0] && one.target().data("label") === ends[1]);
-return line.empty() ? null : { colour: line.style("line-color"), label: line.data("label") };
+const row = [...document.querySelectorAll("#boxes .line")].find((one) =>
+  one.dataset.from === arguments[0] && one.dataset.to === arguments[1]);
+if (!row) return null;
+const ways = [...document.querySelectorAll("#lines g")];
+const way = ways.find((one) => one.dataset.id === row.dataset.id);
+return { colour: getComputedStyle(way).color,
+  label: [...row.children].map((one) => one.textContent).filter(Boolean).join("\\n") };
 """
 CHOOSE = """
-const { cy } = window.rosproxyPage;
-cy.edges().filter((one) => one.source().data("label") === arguments[0]
-  && one.target().data("label") === arguments[1]).select();
+const row = [...document.querySelectorAll("#boxes .line")].find((one) =>
+  one.dataset.from === arguments[0] && one.dataset.to === arguments[1]);
+if (row && !row.hasAttribute("aria-current")) row.click();
 return document.querySelector("#details").textContent;
 """
 PLACES = """
-return Object.fromEntries(
-  window.rosproxyPage.cy.nodes().map((one) => [one.data("label"), one.position().x]));
+return Object.fromEntries([...document.querySelectorAll("#boxes .box")].map((one) =>
+  [one.title.split("\\n")[0], one.getBoundingClientRect().left]));
 """
 BOX = """
-const box = window.rosproxyPage.cy.nodes().filter((one) => one.data("label") === arguments[0]);
-return box.empty() ? "" : box.style("border-color");
+const box = [...document.querySelectorAll("#boxes .box:not(.line)")].find((one) =>
+  one.title.split("\\n")[0] === arguments[0]);
+return box ? getComputedStyle(box).borderTopColor : "";
+"""
+DETAILS = "return document.querySelector('#details').textContent"
+FOCUS_GROUP = """
+const groups = [...document.querySelectorAll("#boxes .group")];
+groups.find((one) => one.title.startsWith(arguments[0])).focus();
 """
 TROUBLE = "return document.querySelector('#findings').innerText"
 TITLE = "return document.title"
@@ -62,6 +70,20 @@ table ip cut {{
   }}
 }}
 """
+
+
+class ThisMachine(Place):
+    """The machine of the tests, in no namespace of its own."""
+
+    def command(self, argv: Sequence[str]) -> list[str]:
+        return [*argv]
+
+    @contextmanager
+    def entered(self) -> Iterator[None]:
+        yield
+
+
+THIS_MACHINE = ThisMachine("tests", "", "")
 
 
 def rows(browser: Browser) -> list[Json]:
@@ -162,10 +184,12 @@ def serving(browser: Browser, place: Place, log: Path, port: int, *words: str) -
 
 
 @contextmanager
-def made_up(lab: Lab, browser: Browser, folder: Path, nodes: int) -> Iterator[Process]:
-    """The browser shows so many nodes that are made up; what serves them."""
-    words = "tests.browser.many", str(nodes)
-    with serving(browser, lab.place("px"), folder / "many.log", MANY_PORT, *words) as server:
+def made_up(
+    browser: Browser, folder: Path, nodes: int, module: str = "many", place: Place = THIS_MACHINE
+) -> Iterator[Process]:
+    """The browser shows so many nodes that are made up, at a place; what serves them."""
+    words = f"tests.browser.{module}", str(nodes)
+    with serving(browser, place, folder / "made-up.log", MANY_PORT, *words) as server:
         yield server
 
 

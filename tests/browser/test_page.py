@@ -11,6 +11,7 @@ import pytest
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.browser.page import (
     CHOOSE,
+    FOCUS_GROUP,
     NODES,
     PLACES,
     UNKNOWN,
@@ -141,18 +142,17 @@ def test_what_every_node_has_is_hidden_until_asked_for(lab: Lab, browser: Browse
     )
 
 
-def test_namespaces_are_folded_until_asked_for(lab: Lab, browser: Browser) -> None:
+def test_nodes_of_a_container_are_a_group(lab: Lab, browser: Browser) -> None:
     for name in ("left", "right"):
-        words = ["__ns:=/arm"]
-        lab.node("roscpp", "c1", "pub", name=name, topic=f"/{name}", rate=5, remap=words)
-        lab.wait_registered(f"/arm/{name}")
+        lab.node("roscpp", "c1", "pub", name=name, topic=f"/{name}", rate=5)
+        lab.wait_registered(f"/{name}")
     browser.open(URL)
-    labels = "return window.rosproxyPage.cy.nodes().map((one) => one.data('label'))"
-    wait_until("the namespace is one box", lambda: "/arm (2)" in browser.run(labels))
-    browser.run("document.querySelector('#namespaces').open = true")
-    browser.run("document.querySelector('#folds button').focus()")
+    wait_until("each node has a box", lambda: {"/left", "/right"} <= browser.run(PLACES).keys())
+    group = lab.place("c1").address
+    browser.run(FOCUS_GROUP, group)
     browser.press("\ue007")
-    wait_until("each node has a box", lambda: {"/arm/left", "/arm/right"} <= {*browser.run(labels)})
+    wait_until("the group is one box", lambda: not {"/left", "/right"} & browser.run(PLACES).keys())
+    assert group in browser.run(PLACES)
 
 
 def test_names_are_text_whatever_they_are(lab: Lab, browser: Browser) -> None:
@@ -195,17 +195,20 @@ def test_the_keyboard_alone_gets_everywhere(lab: Lab, browser: Browser) -> None:
     talk(lab)
     browser.open(URL)
     row(browser, "/chatter", State="ok", To="/listener")
-    focus = "const one = document.activeElement; return one.id || one.className"
-    visited = []
-    for _ in range(6):
+    focus = "const one = document.activeElement; return one.id || one.className.split(' ')[0]"
+    visited: list[str] = []
+    while visited.count("scroll") < 2 and len(visited) < 50:
         browser.press("\ue004")
         visited.append(browser.run(focus))
-    assert visited == ["skip", "filter", "quiet", "unfold", "scroll", "scroll"], "with both tables"
+    boxes = visited.count("box")
+    assert boxes > 3, "two nodes, their line and the proxy"
+    before = ["skip", "filter", "quiet", "unfold", "graph"]
+    assert visited == [*before, *["box"] * boxes, "scroll", "scroll"], "with both tables"
 
 
 def test_a_thousand_nodes(lab: Lab, browser: Browser, tmp_path: Path) -> None:
     """They are made up; what is not shown of them is said, and only changes are sent."""
-    with made_up(lab, browser, tmp_path, 1000):
+    with made_up(browser, tmp_path, 1000, place=lab.place("px")):
         wait_until("there are rows", lambda: len(rows(browser)) == MOST_ROWS, 60)
         told = browser.run("return document.querySelector('#more').textContent")
         assert told == "600 more: narrow it down by a name."

@@ -13,46 +13,40 @@ from pathlib import Path
 
 import pytest
 
-from tests.browser.page import CHOOSE, made_up, rows
-from tests.browser.webdriver import Browser, Json
-from tests.ros.lab import Lab
+from tests.browser.page import CHOOSE, DETAILS, FOCUS_GROUP, THIS_MACHINE, made_up, rows
+from tests.browser.webdriver import Browser
 from tests.ros.processes import Process, wait_until
+from tests.ros.topology import Place
 
-DETAILS = "return document.querySelector('#details').textContent"
 CONNECTION = "return document.querySelector('#connection').textContent"
 FOCUS = """
 const one = document.activeElement;
-return [one.textContent, one.getAttribute("aria-expanded")];
+return [one.title, one.getAttribute("aria-expanded")];
 """
 BREAK = """
 const { state } = window.rosproxyPage;
 const link = [...state.links].find(([, one]) => one.name === arguments[0])[1];
 Object.assign(link, { state: "broken", text: `${link.name} is cut`, fix: arguments[1] });
 """
-COVERED = """
-const { cy } = window.rosproxyPage;
-const [line] = cy.edges("[state = 'broken']").toArray();
-if (!line) return null;
-const text = line.boundingBox({ includeNodes: false, includeEdges: false, includeMainLabels: false,
-  includeTargetLabels: false, includeOverlays: false });
-const box = line.source().boundingBox({ includeLabels: false, includeOverlays: false });
-return { width: text.w, within: text.x2 > box.x1 };
-"""
 FINDINGS = """
 return [...document.querySelectorAll("#findings li")].map((one) => [
   one.querySelector(".what")?.textContent, one.querySelector(".fix")?.textContent,
   one.seen || false]);
 """
-WIDEST = 260
-"""The widest text at a line, with its margins."""
 MARK = "document.querySelectorAll(arguments[0]).forEach((one) => { one.seen = true; });"
 SEEN = "return [...document.querySelectorAll(arguments[0])].every((one) => one.seen);"
 
 
 @pytest.fixture
-def server(lab: Lab, browser: Browser, tmp_path: Path) -> Iterator[Process]:
+def machine() -> Place:
+    """Where page and browser are: no test here needs ROS."""
+    return THIS_MACHINE
+
+
+@pytest.fixture
+def server(browser: Browser, tmp_path: Path) -> Iterator[Process]:
     """The page of some nodes, in namespaces of two or three."""
-    with made_up(lab, browser, tmp_path, 100) as server:
+    with made_up(browser, tmp_path, 100) as server:
         wait_until("there are rows", lambda: len(rows(browser)) == 100)
         yield server
 
@@ -73,14 +67,13 @@ def rates(browser: Browser) -> list[str]:
 
 @pytest.mark.usefixtures("server")
 def test_a_namespace_keeps_the_focus(browser: Browser) -> None:
-    browser.run("document.querySelector('#namespaces').open = true")
-    browser.run("document.querySelector('#folds button').focus()")
-    label, expanded = browser.run(FOCUS)
-    assert (label, expanded) == ("/group0 (3)", "false")
+    name = "/group0\n3 nodes"
+    browser.run(FOCUS_GROUP, name)
+    assert browser.run(FOCUS) == [name, "false"]
     browser.press("\ue007")
-    assert browser.run(FOCUS) == [label, "true"]
+    assert browser.run(FOCUS) == [name, "true"]
     browser.press("\ue007")
-    assert browser.run(FOCUS) == [label, "false"]
+    assert browser.run(FOCUS) == [name, "false"]
 
 
 @pytest.mark.usefixtures("server")
@@ -125,28 +118,6 @@ def test_a_finding_that_is_there_is_not_said_again(browser: Browser, server: Pro
         browser.run(MARK, "#findings li")
         wait_until("both are told", lambda: told(0, 1))
         assert [seen for _, _, seen in browser.run(FINDINGS)] == [True, False]
-
-
-@pytest.mark.parametrize(
-    "fix",
-    [
-        "on the machine of /outside4: nc -vz 192.168.100.100 45001; a firewall or what not",
-        "/a_name_without_a_blank" * 5,
-    ],
-)
-def test_no_box_covers_a_fix(browser: Browser, server: Process, fix: str) -> None:
-    seen: list[Json] = []
-
-    def is_drawn() -> bool:
-        browser.run(BREAK, "/group4/node4/topic0", fix)
-        box = browser.run(COVERED)
-        seen[:] = [box] if box and box["width"] else []
-        return bool(seen)
-
-    with stopped(server):
-        wait_until("it is drawn with its text", is_drawn)
-    assert 150 < seen[0]["width"] < WIDEST
-    assert not seen[0]["within"]
 
 
 @pytest.mark.usefixtures("server")

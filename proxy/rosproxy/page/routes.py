@@ -50,8 +50,8 @@ _JSON_HEADERS = {**_HEADERS, "Content-Type": "application/json; charset=utf-8"}
 _FILES = {
     "/page.js": ("page.js", "text/javascript"),
     "/view.js": ("view.js", "text/javascript"),
+    "/picture.js": ("picture.js", "text/javascript"),
     "/page.css": ("page.css", "text/css"),
-    "/cytoscape.min.js": ("cytoscape.min.js", "text/javascript"),
 }
 _WRONG = '<p role="alert">That is not the token.</p>'
 

@@ -1,35 +1,32 @@
 // The page: takes the document and its changes from /events, and shows it as a graph and a table.
 //
-// All that comes from nodes goes through textContent, or is painted on a canvas; nothing is parsed.
+// All that comes from nodes goes through textContent, or into attributes; nothing is parsed.
 // However many changes come, it is drawn twice a second at most, and only what differs is touched.
 
-import { age, apply, boxesOf, hertz, labelOf, linesOf, megabytes, positions, visibleLinks, visibleNodes,
-  WORDS } from "./view.js";
+import { boxesOf, DIRECT, hasFix, joined, layout, linesOf, selection } from "./picture.js";
+import { age, apply, hertz, labelOf, megabytes, visibleLinks, visibleNodes, WORDS } from "./view.js";
 
 const AT_MOST_EVERY = 500;
 const MOST_ROWS = 400;
 const MOST_FINDINGS = 30;
-const MOST_LABELS = 80;
-const LONGEST_FIX = 120;
+const MOST_CHOSEN = 20;
 const AGAIN = 5000;
 const SILENT = 40000; // the proxy says something every 15 s
 const LOST = "Not connected; what is shown may be old. Trying again…";
 
 const $ = (id) => document.getElementById(id);
 const state = { nodes: new Map(), links: new Map(), proxy: {}, findings: [], left_out: 0 };
-const chosen = { unfolded: new Set(), unfoldAll: false, quiet: false, filter: "" };
+const chosen = { turned: new Map(), unfoldAll: false, quiet: false, filter: "" };
 const rows = new Map();
 const nodeRows = new Map();
 const findings = new Map();
-const folds = new Map();
+const boxes = new Map();
+const ways = new Map();
 let source = null;
 let heard = 0;
 let drawing = null;
-let lines = new Map(); // those of the graph as it is drawn
 let clock = 0; // how many seconds the proxy's is ahead
-let selected = "";
-let fitted = 0;
-let cy = null;
+let selected = ""; // "n:" and a node, "k:" and a link, or the id of a box or a line of the graph
 
 // Events
 
@@ -82,10 +79,10 @@ function show() {
   const items = troubles();
   showHead(found, items);
   showFindings(items);
-  showLinks(found);
-  showNodes();
-  showGraph(found);
-  showDetails();
+  const on = showGraph(found);
+  showLinks(found, on.links);
+  showNodes(on.nodes);
+  showDetails(on);
 }
 
 function showHead(found, items) {
@@ -143,25 +140,25 @@ const NODE_HEADS = ["State", "Name", "Where", "Address", "Ports", "MB/s", "What 
 const NUMBERS = new Set(["Port", "Hz", "MB/s", "Last message"]);
 const PLACES = { robot: "robot, outside", host: "host", container: "container, inside" };
 
-function showLinks(found) {
+function showLinks(found, on) {
   const now = Date.now() / 1000 + clock;
   const listed = found.slice(0, MOST_ROWS);
   showRows($("rows"), rows, LINK_HEADS, listed.map(({ id, link, from, to }) => {
     const kind = link.kind === "topic" ? "" : ` (${link.kind})`;
-    return { id, one: link, texts: [link.name + kind, from, to || "–", link.carried || "–", link.port || "–",
+    return { id, one: link, key: `k:${id}`, on: on.has(id), texts: [link.name + kind, from, to || "–", link.carried || "–", link.port || "–",
       hertz(link), megabytes(link), age(link, now)] };
   }));
   put($("more"), [tellRest(found.length - listed.length),
     state.left_out ? `${state.left_out} more are not sent to the page.` : ""].filter(Boolean).join(" "));
 }
 
-function showNodes() {
+function showNodes(on) {
   const found = visibleNodes(state.nodes, chosen);
   const listed = found.slice(0, MOST_ROWS);
   showRows($("node-rows"), nodeRows, NODE_HEADS, listed.map(({ id, node, label }) => {
     const kind = (node.kind || "node") === "node" ? "" : ` (${node.kind})`;
     const where = PLACES[node.lane] + (node.proxy ? ` of ${node.proxy}` : "");
-    return { id, one: node, texts: [label + kind, where, node.address || "–", node.ports || "–", megabytes(node)] };
+    return { id, one: node, key: `n:${id}`, on: on.has(id), texts: [label + kind, where, node.address || "–", node.ports || "–", megabytes(node)] };
   }));
   put($("more-nodes"), tellRest(found.length - listed.length));
 }
@@ -172,21 +169,23 @@ function tellRest(count) {
 
 // The rows of a table, in this order: each with its state first, and with what is wrong last.
 function showRows(body, elements, heads, listed) {
-  arrange(body, elements, new Map(listed.map((row) => [row.id, row])), () => makeRow(heads), (row, { one, texts }) => {
+  arrange(body, elements, new Map(listed.map((row) => [row.id, row])), ({ key }) => makeRow(heads, key), (row, { one, on, texts }) => {
     const kind = one.state || "unknown";
     [WORDS[kind], ...texts].forEach((text, index) => put(row.cells[index], String(text)));
     if (row.dataset.state !== kind) {
       row.dataset.state = kind;
       row.cells[0].className = `state ${kind}`;
     }
+    mark(row, on);
     put(row.lastChild.firstChild, one.text || "");
     put(row.lastChild.lastChild, one.fix || "");
   });
 }
 
 // Its roles are said: on a phone rows and cells are blocks, which have none of their own.
-function makeRow(heads) {
+function makeRow(heads, key) {
   const row = make("tr");
+  row.addEventListener("click", () => { if (!String(getSelection())) choose(key, true); });
   row.setAttribute("role", "row");
   heads.forEach((head) => {
     const cell = make("td", "", head === "State" ? "state" : NUMBERS.has(head) ? "number" : "");
@@ -198,156 +197,199 @@ function makeRow(heads) {
   return row;
 }
 
+// Draw the graph; returns what is chosen (picture.js, selection).
 function showGraph(found) {
-  if (!cy) return;
+  const proxies = new Map([...state.nodes].filter(([, node]) => node.kind === "proxy"));
+  const { lanes, boxOf } = boxesOf(state.nodes, shownNodes(found), chosen);
+  const links = joined(found, lanes, boxOf, proxies);
+  const all = new Map(lanes.flat().map((box) => [box.id, box]));
+  const on = selection(selected, links, all);
+  on.title = all.has(selected) ? all.get(selected).label : "";
+  const { lines, left } = linesOf(links, on);
+  const places = layout(lanes, lines, proxies, $("graph").clientWidth - 16);
+  const [chosenBoxes, near] = [on.nodes, on.ends].map((ids) => new Set([...ids].map((id) => boxOf.get(id))));
+  for (const box of all.values()) {
+    box.on = box.id === selected || chosenBoxes.has(box.id);
+    box.near = near.has(box.id);
+  }
+  showLanes(places);
+  showBoxes(lanes, lines, proxies, places, all, on);
+  showWays(lines, places);
+  $("picture").classList.toggle("choosing", selected !== "");
+  const rest = left.reduce((sum, line) => sum + line.links.length, 0);
+  put($("more-lines"), left.length ? `${left.length} more lines with ${rest} links are not drawn. Choose a box to see its lines.` : "");
+  return on;
+}
+
+function shownNodes(found) {
   const shown = new Set();
-  for (const [id, node] of state.nodes) if ((node.kind || "node") !== "node") shown.add(id);
   for (const { link } of found) { shown.add(link.source); if (link.target) shown.add(link.target); }
-  if (!chosen.filter) for (const [id, node] of state.nodes) if (chosen.quiet || labelOf(id, node) !== "/rosout") shown.add(id);
-  const { boxOf, boxes, folds: spaces } = boxesOf(state.nodes, shown, chosen);
-  lines = linesOf(found, boxOf);
-  const places = positions(boxes);
-  const wanted = new Map();
+  for (const { id } of visibleNodes(state.nodes, chosen)) shown.add(id);
+  return shown;
+}
+
+function showLanes(places) {
+  places.columns.forEach(({ x, w }, index) => putAt($("lanes").children[index], { x, y: 0, w, h: 24 }));
+  for (const one of [$("lanes"), $("picture")]) putAt(one, { x: 0, y: 0, w: places.width, h: one.id === "lanes" ? 24 : places.height });
+  const size = `0 0 ${places.width} ${places.height}`;
+  if ($("lines").getAttribute("viewBox") !== size) $("lines").setAttribute("viewBox", size);
+}
+
+// Boxes, rows of lines, and the frames around them, in the order of the keyboard: lane by lane.
+function showBoxes(lanes, lines, proxies, places, all, on) {
   const now = Date.now() / 1000 + clock;
-  let fixes = 0;
-  for (const box of boxes.values()) {
-    const count = box.fold ? ` (${box.count})` : "";
-    wanted.set(box.id, { group: "nodes", position: places.get(box.id),
-      data: { id: box.id, label: box.label + count, state: box.state, kind: box.fold ? "fold" : box.kind, fold: box.fold, node: box.node } });
-  }
-  for (const line of lines.values()) {
-    const same = boxes.get(line.from).lane === boxes.get(line.to).lane ? "yes" : "no";
-    const wrong = line.state === "broken" || line.state === "warning";
-    const labelled = wrong ? (fixes += 1) <= MOST_LABELS : lines.size <= MOST_LABELS;
-    wanted.set(line.id, { group: "edges", data: { id: line.id, source: line.from, target: line.to, state: line.state,
-      same, flows: line.flows ? "yes" : "no", label: labelled ? lineLabel(line, now) : "" } });
-  }
-  cy.batch(() => {
-    cy.elements().forEach((one) => { if (!wanted.has(one.id())) one.remove(); });
-    const added = [];
-    for (const [id, one] of wanted) {
-      const known = cy.getElementById(id);
-      if (known.empty()) { added.push(one); continue; }
-      for (const [key, value] of Object.entries(one.data)) if (known.data(key) !== value) known.data(key, value);
-      if (one.position) {
-        const at = known.position();
-        if (at.x !== one.position.x || at.y !== one.position.y) known.position(one.position);
-      }
-    }
-    cy.add(added.filter((one) => one.group === "nodes"));
-    cy.add(added.filter((one) => one.group === "edges"));
-  });
-  if (selected && cy.getElementById(selected).empty()) selected = "";
-  if (fitted !== boxes.size && !selected) { fitted = boxes.size; cy.fit(undefined, 24); }
-  showFolds(spaces);
+  const wanted = new Map();
+  for (const [id, rect] of places.frames) wanted.set(`frame ${id}`, { id: `frame ${id}`, kind: "frame", rect });
+  const [outside, host, inside] = lanes.map((lane) => lane.map((box) => boxOfGroup(box, places.boxes.get(box.id))));
+  const heads = [...places.heads].map(([id, rect]) => boxOfProxy(id, proxies.get(id), rect, on));
+  const rowsOfLines = [...places.rows].map(([id, rect]) => rowOfLine(lines.get(id), rect, all, now));
+  for (const one of [...outside, ...heads, ...rowsOfLines, ...host, ...inside]) wanted.set(one.id, one);
+  arrange($("boxes"), boxes, wanted, makeBox, updateBox);
 }
 
-// What stands at a line: what is wrong first with its fix; else what is known of its one link.
-function lineLabel(line, now) {
+function boxOfGroup(box, rect) {
+  const sign = box.key ? (box.open ? "▾ " : "▸ ") : "";
+  return { ...box, rect, texts: [sign + marked(box.state, box.label), box.note, ""], title: `${box.label}\n${box.note}` };
+}
+
+function boxOfProxy(id, proxy, rect, on) {
+  if (id === DIRECT) return { id, kind: "past", rect, texts: ["past the proxies", "", ""], state: "ok", title: "" };
+  const state = proxy.state || "ok";
+  const label = labelOf(id, proxy);
+  return { id: `n:${id}`, kind: "proxy", rect, state, on: on.nodes.has(id), texts: [marked(state, label), proxy.ports || "", ""],
+    title: `${label}\n${proxy.ports || ""}` };
+}
+
+function rowOfLine(line, rect, all, now) {
+  const ends = [line.a, line.b].map((id) => all.get(id).label);
+  const names = line.forth ? ends : [ends[1], ends[0]];
+  const [what, note, fix] = lineTexts(line, now);
+  return { id: line.id, kind: "line", rect, state: line.state, on: line.on, texts: [what, note, fix], from: names[0], to: names[1],
+    title: `${names.join(line.forth && line.back ? " ↔ " : " → ")}\n${what}\n${note}` };
+}
+
+function marked(state, label) {
+  return (state === "broken" ? "✖ " : state === "warning" ? "⚠ " : "") + label;
+}
+
+// What stands at a line: what is wrong first with its fix; else what is known of its links.
+function lineTexts(line, now) {
   const { link } = line.links[0]; // the worst: see visibleLinks
-  const more = line.links.length > 1 ? ` and ${line.links.length - 1} more` : "";
-  if (line.state === "broken" || line.state === "warning") {
-    return [`${WORDS[line.state]}: ${link.name}${more}`, short(link.fix || link.text)].filter(Boolean).join("\n");
-  }
-  if (more) return `${line.links.length} links`;
-  const measures = [link.hz === undefined ? "" : `${hertz(link)} Hz`, link.rate === undefined ? "" : `${megabytes(link)} MB/s`,
+  const count = line.links.length;
+  const what = count > 1 ? `${link.name} and ${count - 1} more` : link.name;
+  if (hasFix(line)) return [`${WORDS[line.state]}: ${what}`, "", link.fix || link.text || ""];
+  const rates = line.links.flatMap((one) => one.link.rate ?? []);
+  const rate = rates.length ? `${megabytes({ rate: rates.reduce((sum, one) => sum + one, 0) })} MB/s` : "";
+  if (count > 1) return [what, rate, ""];
+  const measures = [link.hz === undefined ? "" : `${hertz(link)} Hz`, rate,
     link.carried || "", link.flows || link.since === undefined ? "" : age(link, now)];
-  return [link.name, measures.filter(Boolean).join(", ")].filter(Boolean).join("\n");
+  return [what, measures.filter(Boolean).join(", "), ""];
 }
 
-function short(text = "") {
-  return text.length > LONGEST_FIX ? `${text.slice(0, LONGEST_FIX)}…` : text;
+function makeBox({ kind }) {
+  if (kind === "frame") return make("div", "", "frame");
+  const box = make(kind === "past" ? "p" : "button", "", `box ${kind}`);
+  box.append(make("span", "", "what"), make("span", "", "note"), make("span", "", "fix"));
+  if (kind !== "past") {
+    box.type = "button";
+    box.addEventListener("click", () => press(box));
+  }
+  return box;
 }
 
-function showFolds(spaces) {
-  const sorted = [...spaces].sort((a, b) => (a.key < b.key ? -1 : 1));
-  $("namespaces").hidden = sorted.length === 0;
-  arrange($("folds"), folds, new Map(sorted.map((fold) => [fold.key, fold])), (fold) => {
-    const button = make("button");
-    button.type = "button";
-    button.addEventListener("click", () => toggle(fold.key));
-    return button;
-  }, (button, fold) => {
-    put(button, `${fold.label} (${fold.count})`);
-    if (button.getAttribute("aria-expanded") !== String(fold.open)) button.setAttribute("aria-expanded", String(fold.open));
+function updateBox(element, one) {
+  putAt(element, one.rect);
+  const data = { id: one.id, state: one.state || "", key: one.key || "", from: one.from || "", to: one.to || "" };
+  for (const [key, value] of Object.entries(data)) if (element.dataset[key] !== value) element.dataset[key] = value;
+  if (one.kind === "frame") return;
+  one.texts.forEach((text, index) => put(element.children[index], text));
+  if (element.title !== one.title) element.title = one.title;
+  mark(element, Boolean(one.on));
+  element.classList.toggle("near", Boolean(one.near));
+  if (one.key && element.getAttribute("aria-expanded") !== String(one.open)) element.setAttribute("aria-expanded", String(one.open));
+}
+
+function showWays(lines, places) {
+  const wanted = new Map([...places.ways].map(([id, way]) => [id, { way, line: lines.get(id) }]));
+  const svg = $("lines");
+  arrange(svg, ways, wanted, () => {
+    const group = document.createElementNS(svg.namespaceURI, "g");
+    for (const name of ["way", "arrow"]) {
+      const path = document.createElementNS(svg.namespaceURI, "path");
+      path.setAttribute("class", name);
+      group.append(path);
+    }
+    return group;
+  }, (group, { way, line }) => {
+    const values = [[group, "class", `${line.state} ${line.flow}${line.on ? " on" : ""}`], [group, "data-id", line.id],
+      [group.children[0], "d", way.d], [group.children[1], "d", way.arrows]];
+    for (const [one, name, value] of values) if (one.getAttribute(name) !== value) one.setAttribute(name, value);
   });
 }
 
-function toggle(key) {
-  if (!chosen.unfolded.delete(key)) chosen.unfolded.add(key);
-  fitted = 0;
-  show();
+// A group unfolds or folds; all else is chosen, or chosen no more.
+function press(box) {
+  const { key, id } = box.dataset;
+  if (key) chosen.turned.set(key, box.getAttribute("aria-expanded") !== "true");
+  choose(id, false);
 }
 
-function showDetails() {
-  const element = selected && cy ? cy.getElementById(selected) : null;
-  const parts = element && element.nonempty() ? details(element) : [];
+function choose(id, reveal) {
+  selected = selected === id ? "" : id;
+  show();
+  if (selected && reveal) $("boxes").querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
+}
+
+function mark(element, on) {
+  if (on === element.hasAttribute("aria-current")) return;
+  if (on) element.setAttribute("aria-current", "true");
+  else element.removeAttribute("aria-current");
+}
+
+function showDetails(on) {
+  if (selected && !on.nodes.size && !on.links.size) selected = "";
+  const parts = selected ? details(on) : [];
   const kinds = parts.map(([kind]) => kind).join(" ");
   if ($("details").dataset.kinds !== kinds) $("details").replaceChildren(...parts.map(([kind]) => make(kind)));
   $("details").dataset.kinds = kinds;
   parts.forEach(([, text], index) => put($("details").children[index], text));
 }
 
-function details(element) {
-  if (element.isNode()) {
-    const node = state.nodes.get(element.data("node")) || {};
+function details(on) {
+  const now = Date.now() / 1000 + clock;
+  const parts = [["h3", on.title]];
+  if (selected.startsWith("n:")) {
+    const id = selected.slice(2);
+    const node = state.nodes.get(id) || {};
     const ports = node.ports ? `ports ${node.ports}` : "";
     const rate = node.rate === undefined ? "" : `${megabytes(node)} MB/s through it`;
-    return [["h3", element.data("label")], ["p", [node.address, ports, rate].filter(Boolean).join(" · ")],
-      ["p", node.text || ""], ["code", node.fix || ""]].filter(([, text]) => text);
+    parts.push(["h3", labelOf(id, node)], ["p", [node.address, ports, rate].filter(Boolean).join(" · ")],
+      ["p", node.text || ""], ["code", node.fix || ""]);
   }
-  const ends = [element.source().id(), element.target().id()];
-  const line = lines.get(element.id());
-  const now = Date.now() / 1000 + clock;
-  const parts = [["h3", ends.map((id) => cy.getElementById(id).data("label")).join(" to ")]];
-  for (const { link } of (line ? line.links : []).slice(0, 20)) {
-    parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name}, ${hertz(link)} Hz, ${megabytes(link)} MB/s, ` +
-      `last message ${age(link, now)}, carried by ${link.carried || "–"}, port ${link.port || "–"}`]);
-    if (link.text) parts.push(["p", link.text], ["code", link.fix || ""]);
+  const links = [...on.links.values()];
+  for (const { link, from, to } of links.slice(0, MOST_CHOSEN)) {
+    parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name} from ${from}${to ? ` to ${to}` : ""}, ${hertz(link)} Hz, ` +
+      `${megabytes(link)} MB/s, last message ${age(link, now)}, carried by ${link.carried || "–"}, port ${link.port || "–"}`],
+    ["p", link.text || ""], ["code", link.text ? link.fix || "" : ""]);
   }
-  return parts;
-}
-
-// The canvas
-
-function style() {
-  const own = getComputedStyle(document.documentElement);
-  const colour = (name) => own.getPropertyValue(`--${name}`).trim();
-  const states = ["ok", "unknown", "warning", "broken"];
-  return [
-    { selector: "node", style: { label: "data(label)", shape: "round-rectangle", width: 150, height: 30,
-      "background-color": colour("back"), "border-width": 1.5, color: colour("text"), "font-size": 11,
-      "text-valign": "center", "text-halign": "center", "text-wrap": "ellipsis", "text-max-width": 140,
-      "min-zoomed-font-size": 5 } },
-    { selector: "node[kind = 'fold']", style: { "border-style": "double", "border-width": 4 } },
-    { selector: "node[kind = 'proxy'], node[kind = 'master']", style: { shape: "hexagon" } },
-    { selector: "edge", style: { width: 2, "curve-style": "straight", "target-arrow-shape": "triangle", "arrow-scale": 0.8,
-      "source-label": "data(label)", "source-text-offset": 122, "source-text-rotation": "autorotate",
-      "font-size": 9, color: colour("text"), "text-wrap": "wrap", "text-overflow-wrap": "anywhere", "text-max-width": 230, "text-background-color": colour("box"),
-      "text-background-opacity": 0.85, "text-background-padding": 2, "min-zoomed-font-size": 6 } },
-    { selector: "edge[same = 'yes']", style: { "curve-style": "unbundled-bezier", "control-point-distances": 110, "control-point-weights": 0.5 } },
-    { selector: "edge[flows = 'no']", style: { "line-style": "dashed" } },
-    ...states.map((name) => ({ selector: `node[state = '${name}']`, style: { "border-color": colour(name) } })),
-    ...states.map((name) => ({ selector: `edge[state = '${name}']`, style: { "line-color": colour(name), "target-arrow-color": colour(name) } })),
-    { selector: "edge[state = 'broken']", style: { width: 4, "text-background-opacity": 1, "z-index": 2 } },
-    { selector: ":selected", style: { "border-width": 4, "overlay-opacity": 0.12 } },
-  ];
+  if (links.length > MOST_CHOSEN) parts.push(["p", `${links.length - MOST_CHOSEN} more are marked in the table.`]);
+  return parts.filter(([, text]) => text);
 }
 
 function start() {
-  cy = window.cytoscape({ container: $("graph"), style: style(), layout: { name: "preset" }, minZoom: 0.05, maxZoom: 3,
-    autoungrabify: true, boxSelectionEnabled: false, hideEdgesOnViewport: true, textureOnViewport: true, pixelRatio: 1 });
-  cy.on("tap", "node", (event) => { const fold = event.target.data("fold"); if (fold) toggle(fold); });
-  cy.on("select unselect", () => { selected = cy.$(":selected").map((one) => one.id())[0] || ""; showDetails(); });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => cy.style(style()));
-  addEventListener("resize", () => { fitted = 0; draw(); });
+  new ResizeObserver(draw).observe($("graph"));
   $("controls").addEventListener("submit", (event) => event.preventDefault());
-  $("filter").addEventListener("input", (event) => { chosen.filter = event.target.value; fitted = 0; draw(); });
-  $("quiet").addEventListener("change", (event) => { chosen.quiet = event.target.checked; fitted = 0; draw(); });
-  $("unfold").addEventListener("change", (event) => { chosen.unfoldAll = event.target.checked; fitted = 0; draw(); });
+  $("filter").addEventListener("input", (event) => { chosen.filter = event.target.value; draw(); });
+  $("quiet").addEventListener("change", (event) => { chosen.quiet = event.target.checked; draw(); });
+  $("unfold").addEventListener("change", (event) => {
+    chosen.unfoldAll = event.target.checked;
+    chosen.turned.clear();
+    draw();
+  });
+  addEventListener("keydown", (event) => { if (event.key === "Escape" && selected) choose(selected, false); });
   setInterval(() => { draw(); watch(); }, 1000); // ages grow
-  // For tests, and whoever looks into it: the graph itself.
-  window.rosproxyPage = { cy, state };
+  // For tests, and whoever looks into it.
+  window.rosproxyPage = { state };
   listen();
 }
 
@@ -369,6 +411,13 @@ function arrange(parent, elements, wanted, create, update) {
     if (element === place) place = place.nextSibling;
     else parent.insertBefore(element, place);
   }
+}
+
+function putAt(element, { x, y, w, h }) {
+  const at = `${x} ${y} ${w} ${h}`;
+  if (element.dataset.at === at) return;
+  element.dataset.at = at;
+  Object.assign(element.style, { left: `${x}px`, top: `${y}px`, width: `${w}px`, height: `${h}px` });
 }
 
 function put(element, text) {

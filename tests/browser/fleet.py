@@ -1,0 +1,148 @@
+"""A live page of an operator with three proxies and any number of nodes, which are made up.
+
+python -m tests.browser.fleet PORT NODES
+
+A third of the nodes is of ROS 1, the others are of two domains of ROS 2, each behind a proxy of its
+own. Containers have up to five nodes. One link in twelve is broken. What makes and serves the
+document is the operator's own code.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from collections.abc import AsyncGenerator, Iterator
+from typing import Any
+
+from aiohttp import web
+
+from rosproxy.net.tasks import Tasks
+from rosproxy.page.feed import Feed
+from rosproxy.page.page_document import (
+    BROKEN,
+    CONTAINER,
+    HOST,
+    OK,
+    ROBOT,
+    WARNING,
+    Document,
+    PageLink,
+    PageNode,
+    PageProxy,
+)
+from rosproxy.page.routes import Page
+from rosproxy.page.visitors import Visitors
+from rosproxy_operator.common.merged_page import merged
+
+PROXIES = {"ros1": "", "domain-0": "0", "domain-7": "7"}
+"""The domains of the proxies; the first one has ROS 1."""
+EACH = 5
+"""Nodes of a container, and of a machine outside."""
+PARTS = ("arm", "base", "camera", "lidar", "planner", "teleop", "battery", "gripper")
+SINCE = time.time() - 300
+"""When the idle links carried something last, in seconds since the epoch."""
+
+
+def documents(nodes: int) -> dict[str, Document | str]:
+    """What the proxies tell of so many nodes in all."""
+    return {
+        name: _document(number, domain, [*range(number, nodes, len(PROXIES))])
+        for number, (name, domain) in enumerate(PROXIES.items())
+    }
+
+
+def _document(proxy: int, domain: str, numbers: list[int]) -> Document:
+    inside = {_key(domain, n): _node(proxy, domain, i, True) for i, n in enumerate(numbers[::2])}
+    outside = {_key(domain, n): _node(proxy, domain, i, False) for i, n in enumerate(numbers[1::2])}
+    links = {link.key: link for link in _links(domain, [*inside], [*outside])}
+    nodes = {"rosproxy": PageNode(HOST, "proxy", "rosproxy", ports="11412-11443, 9 used, 23 free")}
+    if not domain:
+        nodes["master"] = PageNode(ROBOT, "master", "master", address="http://robot:11311/")
+    return Document(
+        {**nodes, **inside, **outside}, links, proxy=PageProxy("laptop", "http://robot:11311")
+    )
+
+
+def _key(domain: str, number: int) -> str:
+    """A node's name, or the domain and the GUID prefix of a participant."""
+    if domain:
+        return f"{domain} 01.0f.{number:08x}"
+    return f"/{PARTS[number % len(PARTS)]}/driver_of_the_unit_{number}"
+
+
+def _node(proxy: int, domain: str, index: int, is_inside: bool) -> PageNode:
+    place = index // EACH
+    host = f"172.{18 + proxy}.{place // 250}.{2 + place % 250}"
+    if not is_inside:
+        host = f"10.94.{10 * proxy + place // 250}.{2 + place % 250}"
+    lane = CONTAINER if is_inside else ROBOT
+    if domain:
+        label = f"{host} 01.00.{index:02x}"
+        return PageNode(lane, "participant", label, address=f"{host}, Fast DDS", ports="11420")
+    state = BROKEN if is_inside and index == 1 else OK
+    port = 35000 + index
+    return PageNode(
+        lane, state=state, address=f"{host}:{port}" if is_inside else f"http://{host}:{port}/"
+    )
+
+
+def _links(domain: str, inside: list[str], outside: list[str]) -> Iterator[PageLink]:
+    """Two links of each node inside: one outwards, and one in either direction."""
+    for i, node in enumerate(inside):
+        if not outside:
+            return
+        yield _link(domain, i, node, outside[i % len(outside)])
+        other = outside[(i + 1) % len(outside)]
+        yield _link(domain, i + 1, *((other, node) if i % 3 else (node, other)))
+        if i % 4 == 3:
+            yield _link(domain, i, node, inside[i - 3], is_direct=True)
+
+
+def _link(domain: str, i: int, source: str, target: str, is_direct: bool = False) -> PageLink:
+    name = f"/{PARTS[i % len(PARTS)]}/a_topic_with_a_long_name/state_{i}"
+    state = BROKEN if i % 12 == 5 else WARNING if i % 30 == 7 else OK
+    text = ""
+    fix = ""
+    if state != OK:
+        text = f"{target} has not connected to 10.94.0.1:11420"
+        fix = f"on the machine of {target}: nc -vz 10.94.0.1 11420; a firewall or a broken network"
+    flows = state == OK and not domain and i % 3 > 0
+    return PageLink(
+        "topic",
+        name,
+        source,
+        target,
+        carried="direct" if is_direct else "" if state == BROKEN else "splice",
+        port=None if is_direct else 11412 + i % 32,
+        hz=None if domain else 5.0 * flows,
+        rate=None if domain else 1200.0 * flows,
+        since=None if domain or flows else SINCE,
+        flows=flows,
+        state=state,
+        text=text,
+        fix=fix,
+    )
+
+
+async def serve(port: int, nodes: int) -> None:
+    """Serve the page for good."""
+
+    async def make() -> AsyncGenerator[dict[str, Any]]:
+        while True:
+            yield merged(documents(nodes), "0", "docker logs {}".format)
+            await asyncio.sleep(3600)
+
+    page = Page(Feed(Tasks(), make), Visitors(None, time.monotonic))
+    app = web.Application()
+    for (method, path), handler in page.routes.items():
+        app.router.add_route(method, path, handler)
+    runner = web.AppRunner(app, access_log=None)
+    await runner.setup()
+    await web.TCPSite(runner, "127.0.0.1", port).start()
+    print("serving", flush=True)
+    await asyncio.Event().wait()
+
+
+if __name__ == "__main__":
+    asyncio.run(serve(int(sys.argv[1]), int(sys.argv[2])))

@@ -1,0 +1,161 @@
+"""The graph of the live page with 5 to 1,000 nodes, which are made up: what an engineer sees of it.
+
+The pages are those of an operator with three proxies (`tests.browser.fleet`). No test here needs
+ROS: page and browser run on this machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.browser.page import DETAILS, THIS_MACHINE, made_up
+from tests.browser.webdriver import Browser
+from tests.ros.processes import wait_until
+from tests.ros.topology import Place
+
+SIZES = (5, 30, 100, 1000)
+MOST_UNFOLDED = 100
+"""Nodes whose unfolded picture is measured; of more, this takes minutes."""
+GEOMETRY = Path(__file__).with_name("geometry.js").read_text()
+NODES = 'return document.querySelectorAll("#boxes .box.node, #boxes .box.participant").length'
+ROWS = "return document.querySelectorAll('#rows tr').length"
+TEXTS = "return [...document.querySelectorAll(arguments[0])].map((one) => one.textContent)"
+MARKED_ROWS = "#rows tr[aria-current] td:nth-child(2)"
+MARKED_BOXES = ".box:not(.line)[aria-current]"
+MARKED_LINES = ".box.line[aria-current]"
+PICTURE = """
+return import("/picture.js").then(({ boxesOf }) => {
+  const nodes = new Map(arguments[0].map((one, index) => [`/n${index}`, one]));
+  const chosen = { unfoldAll: false, turned: new Map(arguments[1]) };
+  const { lanes } = boxesOf(nodes, new Set(nodes.keys()), chosen);
+  return lanes.map((lane) => lane.map(({ level, label, note }) =>
+    `${"  ".repeat(level)}${label}, ${note}`));
+});
+"""
+
+
+@pytest.fixture
+def machine() -> Place:
+    """Where page and browser are."""
+    return THIS_MACHINE
+
+
+@contextmanager
+def fleet(browser: Browser, folder: Path, nodes: int) -> Iterator[None]:
+    """The browser shows so many nodes of three proxies."""
+    with made_up(browser, folder, nodes, "fleet"):
+        wait_until("there are rows", lambda: browser.run(ROWS) > 0)
+        yield
+
+
+def click(browser: Browser, selector: str, text: str) -> None:
+    """Click the first element with a text."""
+    script = """
+    const all = [...document.querySelectorAll(arguments[0])];
+    all.find((one) => one.textContent.includes(arguments[1])).click();
+    """
+    browser.run(script, selector, text)
+
+
+def texts(browser: Browser, selector: str) -> list[str]:
+    """The texts of all elements that a selector matches."""
+    found: list[str] = browser.run(TEXTS, selector)
+    return found
+
+
+@pytest.mark.parametrize("nodes", SIZES)
+def test_the_picture_reads(browser: Browser, tmp_path: Path, nodes: int) -> None:
+    with fleet(browser, tmp_path, nodes):
+        for width, height in ((1500, 1000), (2560, 1300), (360, 740)):
+            browser.resize(width, height)
+            wait_until("the picture has this width", lambda: not geometry(browser))
+        browser.run("document.querySelector('#unfold').click()")
+        wait_until("each node has a box", lambda: browser.run(NODES) >= nodes)
+        if nodes <= MOST_UNFOLDED:
+            assert geometry(browser) == []
+
+
+def geometry(browser: Browser) -> list[str]:
+    """What is wrong with the picture; raises AssertionError if there is none."""
+    answer: dict[str, Any] = browser.run(GEOMETRY)
+    assert answer["boxes"]
+    assert answer["lines"]
+    found: list[str] = answer["found"]
+    return found
+
+
+def test_what_is_chosen_is_marked_in_graph_and_table(browser: Browser, tmp_path: Path) -> None:
+    with fleet(browser, tmp_path, 30):
+        click(browser, "#rows tr", "/gripper/")
+        (name,) = texts(browser, MARKED_ROWS)
+        (line,) = texts(browser, MARKED_LINES)
+        assert line.startswith(name)
+        assert name in browser.run(DETAILS)
+        browser.press("\ue00c")
+        assert not browser.run(DETAILS)
+        assert not texts(browser, MARKED_ROWS)
+        click(browser, "#boxes .line", "BROKEN")
+        assert "/teleop/" in texts(browser, MARKED_ROWS)[0]
+        click(browser, "#node-rows tr", "/battery/")
+        assert "/battery/" in texts(browser, MARKED_BOXES)[0]
+        marked = len(texts(browser, MARKED_ROWS))
+        assert marked == len(texts(browser, MARKED_LINES)) == 2
+        click(browser, "#boxes .proxy", "domain-7")
+        assert len(texts(browser, MARKED_ROWS)) == 10, "all that the proxy carries"
+
+
+def places(browser: Browser, folder: Path, nodes: list[dict[str, str]], *turned: str) -> Any:
+    """The boxes inside, of nodes that are all inside; groups that a click has turned are open."""
+    with made_up(browser, folder, 10):
+        return browser.run(PICTURE, nodes, [[key, True] for key in turned])[2]
+
+
+def inside(*addresses: str, **more: str) -> list[dict[str, str]]:
+    """Nodes with these addresses."""
+    return [{"lane": "container", "address": address, **more} for address in addresses]
+
+
+def test_few_nodes_are_all_shown_by_container(browser: Browser, tmp_path: Path) -> None:
+    nodes = inside("172.18.0.10:1", "172.18.0.9:1", "172.18.0.10:2")
+    assert places(browser, tmp_path, nodes) == [
+        "/n1, 172.18.0.9",
+        "172.18.0.10, 2 nodes",
+        "  /n0, ",
+        "  /n2, ",
+    ]
+
+
+def test_many_nodes_are_folded_by_container(browser: Browser, tmp_path: Path) -> None:
+    nodes = [one for n in range(9) for one in inside(*[f"172.18.0.{n}:1"] * 4)]
+    nodes[5]["state"] = "broken"
+    shown = places(browser, tmp_path, nodes, "container  172.18.0.2")
+    assert shown[:3] == [
+        "172.18.0.0, 4 nodes",
+        "172.18.0.1, 4 nodes, 1 wrong",
+        "172.18.0.2, 4 nodes",
+    ]
+    assert shown[3:7] == [f"  /n{n}, " for n in range(8, 12)]
+    assert len(shown) == 9 + 4
+
+
+def test_of_very_many_containers_some_are_shown(browser: Browser, tmp_path: Path) -> None:
+    nodes = inside(*(f"172.18.{n // 200}.{n % 200}:1" for n in range(300)))
+    nodes[250]["state"] = "broken"
+    shown = places(browser, tmp_path, nodes)
+    assert len(shown) == 24
+    assert "/n250, 172.18.1.50" in shown, "which is broken"
+    assert shown[-1] == "277 more containers, 277 nodes"
+
+
+def test_each_of_several_proxies_has_places(browser: Browser, tmp_path: Path) -> None:
+    nodes = [
+        *inside(*(f"172.18.0.{n}:1" for n in range(100)), proxy="one"),
+        *inside("172.19.0.1:1", proxy="two"),
+    ]
+    shown = places(browser, tmp_path, nodes)
+    assert shown[-2:] == ["89 more containers, 89 nodes, of one", "/n100, 172.19.0.1 of two"]
