@@ -163,7 +163,7 @@ def check_contents(wheel: Path, sdist: Path) -> None:
     """What has to be in them, and what has not."""
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    page = ("page.js", "view.js", "picture.js", "page.css", "index.html")
+    page = ("page.js", "view.js", "picture.js", "findings.js", "page.css", "index.html")
     needed = {"rosproxy/py.typed", "rosproxy_operator/py.typed", "rosproxy/cli/main.py"}
     needed |= {f"rosproxy/page/files/{name}" for name in (*page, "login.html")}
     tops = {name.partition("/")[0].partition("-")[0] for name in names}

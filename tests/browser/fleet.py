@@ -16,6 +16,7 @@ from collections.abc import AsyncGenerator, Iterator
 from typing import Any
 
 from aiohttp import web
+from msgspec.structs import replace
 
 from rosproxy.net.tasks import Tasks
 from rosproxy.page.feed import Feed
@@ -40,6 +41,8 @@ PROXIES = {"ros1": "", "domain-0": "0", "domain-7": "7"}
 EACH = 5
 """Nodes of a container, and of a machine outside."""
 PARTS = ("arm", "base", "camera", "lidar", "planner", "teleop", "battery", "gripper")
+ENDED = 3
+"""Nodes in the first container that have ended."""
 SINCE = time.time() - 300
 """When the idle links carried something last, in seconds since the epoch."""
 
@@ -80,11 +83,14 @@ def _node(proxy: int, domain: str, index: int, is_inside: bool) -> PageNode:
     if domain:
         label = f"{host} 01.00.{index:02x}"
         return PageNode(lane, "participant", label, address=f"{host}, Fast DDS", ports="11420")
-    state = BROKEN if is_inside and index == 1 else OK
     port = 35000 + index
-    return PageNode(
-        lane, state=state, address=f"{host}:{port}" if is_inside else f"http://{host}:{port}/"
-    )
+    if not is_inside:
+        return PageNode(lane, address=f"http://{host}:{port}/")
+    node = PageNode(lane, address=f"{host}:{port}")
+    if index >= ENDED:
+        return node
+    text = f"registered as http://{host}:{port}/, but nothing answers there"
+    return replace(node, state=BROKEN, text=text, fix="run rosnode cleanup (answer y)")
 
 
 def _links(domain: str, inside: list[str], outside: list[str]) -> Iterator[PageLink]:

@@ -27,6 +27,7 @@ ROWS = "return document.querySelectorAll('#rows tr').length"
 TEXTS = "return [...document.querySelectorAll(arguments[0])].map((one) => one.textContent)"
 MARKED_ROWS = "#rows tr[aria-current] td:nth-child(2)"
 MARKED_BOXES = ".box:not(.line)[aria-current]"
+MARKED_FINDINGS = "#findings li[aria-current] .what"
 MARKED_LINES = ".box.line[aria-current]"
 PICTURE = """
 return import("/picture.js").then(({ boxesOf }) => {
@@ -101,6 +102,7 @@ def test_what_is_chosen_is_marked_in_graph_and_table(browser: Browser, tmp_path:
         assert not texts(browser, MARKED_ROWS)
         click(browser, "#boxes .line", "BROKEN")
         assert "/teleop/" in texts(browser, MARKED_ROWS)[0]
+        assert "/teleop/" in texts(browser, MARKED_FINDINGS)[0]
         click(browser, "#node-rows tr", "/battery/")
         assert "/battery/" in texts(browser, MARKED_BOXES)[0]
         marked = len(texts(browser, MARKED_ROWS))

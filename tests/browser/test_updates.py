@@ -108,10 +108,10 @@ def test_a_finding_that_is_there_is_not_said_again(browser: Browser, server: Pro
         findings = []
         for number in numbers:
             node = f"/group{number}/node{number}"
-            browser.run(BREAK, f"{node}/topic0", "mend it")
-            findings.append(f"BROKEN: {node}/topic0 from {node} to /outside{number}")
-        shown = [(what, fix) for what, fix, _ in browser.run(FINDINGS)]
-        return shown == [(what, "mend it") for what in findings]
+            browser.run(BREAK, f"{node}/topic0", f"mend {number}")
+            what = f"BROKEN: {node}/topic0 from {node} to /outside{number}"
+            findings.append([what, f"mend {number}"])
+        return [[what, fix] for what, fix, _ in browser.run(FINDINGS)] == findings
 
     with stopped(server):  # it would send the links anew, as they are there
         wait_until("the first is told", lambda: told(0))

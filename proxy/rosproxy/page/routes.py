@@ -51,6 +51,7 @@ _FILES = {
     "/page.js": ("page.js", "text/javascript"),
     "/view.js": ("view.js", "text/javascript"),
     "/picture.js": ("picture.js", "text/javascript"),
+    "/findings.js": ("findings.js", "text/javascript"),
     "/page.css": ("page.css", "text/css"),
 }
 _WRONG = '<p role="alert">That is not the token.</p>'

@@ -30,7 +30,7 @@ from tests.integration.net import (
 from tests.integration.proxy import Proxy
 
 TOKEN = "0123456789abcdef"
-FILES = ("/page.js", "/view.js", "/picture.js", "/page.css")
+FILES = ("/page.js", "/view.js", "/picture.js", "/findings.js", "/page.css")
 LINK = "topic /chatter /talker /outside"
 
 

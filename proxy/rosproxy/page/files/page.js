@@ -3,8 +3,9 @@
 // All that comes from nodes goes through textContent, or into attributes; nothing is parsed.
 // However many changes come, it is drawn twice a second at most, and only what differs is touched.
 
+import { causesOf, follow, titleOf } from "./findings.js";
 import { boxesOf, DIRECT, hasFix, joined, layout, linesOf, selection } from "./picture.js";
-import { age, apply, hertz, labelOf, megabytes, visibleLinks, visibleNodes, WORDS } from "./view.js";
+import { age, apply, duration, hertz, labelOf, megabytes, visibleLinks, visibleNodes, WORDS } from "./view.js";
 
 const AT_MOST_EVERY = 500;
 const MOST_ROWS = 400;
@@ -20,13 +21,17 @@ const chosen = { turned: new Map(), unfoldAll: false, quiet: false, filter: "" }
 const rows = new Map();
 const nodeRows = new Map();
 const findings = new Map();
+const eventRows = new Map();
+const seen = new Map(); // causes, with the time at which this page first saw them
+let events = [];
+let isFirst = true; // no document was shown yet
 const boxes = new Map();
 const ways = new Map();
 let source = null;
 let heard = 0;
 let drawing = null;
 let clock = 0; // how many seconds the proxy's is ahead
-let selected = ""; // "n:" and a node, "k:" and a link, or the id of a box or a line of the graph
+let selected = ""; // "n:" and a node, "k:" and a link, or the key of a box, a line or a cause
 
 // Events
 
@@ -76,63 +81,90 @@ function draw() {
 
 function show() {
   const found = visibleLinks(state.links, state.nodes, chosen);
-  const items = troubles();
-  showHead(found, items);
-  showFindings(items);
-  const on = showGraph(found);
+  const causes = causesOf(state);
+  events = follow(seen, causes, events, Date.now(), isFirst);
+  isFirst = isFirst && state.nodes.size === 0;
+  showHead(found, causes);
+  const on = showGraph(found, causes.find(({ key }) => key === selected));
+  showFindings(causes, on);
+  showEvents();
   showLinks(found, on.links);
   showNodes(on.nodes);
   showDetails(on);
 }
 
-function showHead(found, items) {
+function showHead(found, causes) {
   const { proxy } = state;
   put($("host"), proxy.host || "");
   const ports = proxy.ports ? `ports ${proxy.ports}: ${proxy.used} used, ${proxy.free} free` : "";
   const parts = [`${state.nodes.size} nodes`, `${found.length} links`, ports,
     proxy.plane ? `forwards by ${proxy.plane}` : "", proxy.version ? `version ${proxy.version}` : ""];
   put($("summary"), parts.filter(Boolean).join(" · "));
-  const broken = items.filter((item) => item.kind === "broken").length;
+  const broken = causes.filter(({ kind }) => kind === "broken").length;
+  const warnings = causes.length - broken;
+  put($("count"), [broken ? `${broken} broken` : "", warnings ? `${warnings} warnings` : ""].filter(Boolean).join(", "));
   const title = broken ? `(${broken} broken) rosproxy` : "rosproxy";
   if (document.title !== title) document.title = title;
 }
 
-// All that is wrong, what is broken first: those with one text and one fix are one.
-function troubles() {
-  const told = new Map();
-  const tell = (what, kind, text, fix) => {
-    const key = JSON.stringify([kind, text, fix]);
-    const known = told.get(key);
-    if (known) known.what.push(what);
-    else told.set(key, { what: [what], kind, text, fix });
-  };
-  for (const one of state.findings) tell(one.subject, one.severity === "error" ? "broken" : "warning", one.text, one.fix);
-  for (const link of state.links.values()) {
-    if (link.state !== "broken" && link.state !== "warning") continue;
-    const ends = [link.source, link.target].filter(Boolean).map((id) => labelOf(id, state.nodes.get(id)));
-    tell(`${link.name} from ${ends.join(" to ")}`, link.state, link.text || "", link.fix || "");
-  }
-  for (const [id, node] of state.nodes) {
-    if (node.state === "broken" || node.state === "warning") tell(labelOf(id, node), node.state, node.text || "", node.fix || "");
-  }
-  return [...told.values()].sort((a, b) => (a.kind === "broken" ? 0 : 1) - (b.kind === "broken" ? 0 : 1));
+// A line for each cause. A screen reader says what is put in: so what is there already stays, and
+// ages are hidden from screen readers.
+function showFindings(causes, on) {
+  const shown = new Map(causes.slice(0, MOST_FINDINGS).map((cause) => {
+    const { kind, text, fix, nodes, links } = cause;
+    const { since, old } = seen.get(cause.key);
+    const isOn = cause.key === selected || [...nodes].some((id) => on.nodes.has(id)) || [...links].some((id) => on.links.has(id));
+    return [cause.key, { key: cause.key, kind, isOn, what: `${WORDS[kind]}: ${titleOf(cause)}`, text, fix,
+      since: `for ${old ? "over " : ""}${duration((Date.now() - since) / 1000)}` }];
+  }));
+  const rest = causes.length - shown.size;
+  if (rest > 0) shown.set("rest", { kind: "", what: `and ${rest} more` });
+  if (!causes.length) shown.set("none", { kind: "none", what: "Nothing wrong was found." });
+  arrange($("findings"), findings, shown, makeFinding, updateFinding);
 }
 
-function showFindings(items) {
-  const shown = new Map(items.slice(0, MOST_FINDINGS).map((item) => {
-    const more = item.what.length > 3 ? ` and ${item.what.length - 3} more` : "";
-    const what = `${WORDS[item.kind]}: ${item.what.slice(0, 3).join("; ")}${more}`;
-    return [JSON.stringify([item.kind, item.text, item.fix]), [item.kind, what, item.text, item.fix]];
-  }));
-  const rest = items.length - shown.size;
-  if (rest > 0) shown.set("rest", ["", `and ${rest} more`, "", ""]);
-  if (!items.length) shown.set("none", ["none", "Nothing wrong was found.", "", ""]);
-  // A screen reader says what is put in: so what is there already stays.
-  arrange($("findings"), findings, shown, ([kind]) => {
-    const li = make("li", "", kind);
-    li.append(make("div", "", "what"), make("div"), make("code", "", "fix"));
+function makeFinding({ key, kind }) {
+  const li = make("li", "", kind);
+  if (!key) {
+    li.append(make("span", "", "what"));
     return li;
-  }, (li, [, ...texts]) => texts.forEach((text, index) => put(li.children[index], text)));
+  }
+  const [cause, fix, copyButton] = [make("button", "", "cause"), make("code", "", "fix"), make("button", "Copy", "copy")];
+  cause.append(make("span", "", "what"), make("span", "", "text"));
+  cause.addEventListener("click", () => choose(key, true));
+  copyButton.addEventListener("click", () => copy(fix, copyButton));
+  for (const button of [cause, copyButton]) button.type = "button";
+  const since = make("span", "", "since");
+  since.setAttribute("aria-hidden", "true");
+  li.append(cause, fix, copyButton, since);
+  return li;
+}
+
+function updateFinding(li, { key, isOn, what, text, fix, since }) {
+  put(li.querySelector(".what"), what);
+  if (!key) return;
+  put(li.querySelector(".text"), text);
+  put(li.querySelector(".fix"), fix);
+  put(li.querySelector(".since"), since);
+  li.querySelector(".copy").hidden = !fix;
+  mark(li, isOn);
+}
+
+// navigator.clipboard exists only on pages of https and of loopback.
+function copy(element, button) {
+  getSelection().selectAllChildren(element);
+  put(button, document.execCommand("copy") ? "Copied" : "Not copied");
+  getSelection().removeAllRanges();
+  setTimeout(() => put(button, "Copy"), 2000);
+}
+
+function showEvents() {
+  const shown = new Map(events.map((event) => [`${event.at} ${event.over} ${event.title}`, event]));
+  put($("happened").firstElementChild, events.length ? `What happened (${events.length})` : "What happened: nothing since this page was opened");
+  arrange($("events"), eventRows, shown, () => make("li"), (li, { at, over, kind, title, since }) => {
+    const time = new Date(at).toLocaleTimeString();
+    put(li, over ? `${time} over after ${duration((at - since) / 1000)}: ${title}` : `${time} ${WORDS[kind]}: ${title}`);
+  });
 }
 
 const LINK_HEADS = ["State", "Name", "From", "To", "Carried by", "Port", "Hz", "MB/s", "Last message", "What is wrong"];
@@ -198,13 +230,13 @@ function makeRow(heads, key) {
 }
 
 // Draw the graph; returns what is chosen (picture.js, selection).
-function showGraph(found) {
+function showGraph(found, cause) {
   const proxies = new Map([...state.nodes].filter(([, node]) => node.kind === "proxy"));
   const { lanes, boxOf } = boxesOf(state.nodes, shownNodes(found), chosen);
   const links = joined(found, lanes, boxOf, proxies);
   const all = new Map(lanes.flat().map((box) => [box.id, box]));
-  const on = selection(selected, links, all);
-  on.title = all.has(selected) ? all.get(selected).label : "";
+  const on = selection(selected, links, all, cause);
+  on.title = cause ? titleOf(cause) : all.has(selected) ? all.get(selected).label : "";
   const { lines, left } = linesOf(links, on);
   const places = layout(lanes, lines, proxies, $("graph").clientWidth - 16);
   const [chosenBoxes, near] = [on.nodes, on.ends].map((ids) => new Set([...ids].map((id) => boxOf.get(id))));
@@ -215,7 +247,7 @@ function showGraph(found) {
   showLanes(places);
   showBoxes(lanes, lines, proxies, places, all, on);
   showWays(lines, places);
-  $("picture").classList.toggle("choosing", selected !== "");
+  $("picture").classList.toggle("choosing", on.nodes.size + on.links.size > 0);
   const rest = left.reduce((sum, line) => sum + line.links.length, 0);
   put($("more-lines"), left.length ? `${left.length} more lines with ${rest} links are not drawn. Choose a box to see its lines.` : "");
   return on;
@@ -347,7 +379,7 @@ function mark(element, on) {
 }
 
 function showDetails(on) {
-  if (selected && !on.nodes.size && !on.links.size) selected = "";
+  if (selected && !on.nodes.size && !on.links.size && !seen.has(selected)) selected = "";
   const parts = selected ? details(on) : [];
   const kinds = parts.map(([kind]) => kind).join(" ");
   if ($("details").dataset.kinds !== kinds) $("details").replaceChildren(...parts.map(([kind]) => make(kind)));
@@ -358,6 +390,11 @@ function showDetails(on) {
 function details(on) {
   const now = Date.now() / 1000 + clock;
   const parts = [["h3", on.title]];
+  const { cause } = seen.get(selected) || {};
+  if (cause) {
+    const names = [...cause.nodes].slice(0, MOST_CHOSEN).map((id) => labelOf(id, state.nodes.get(id)));
+    parts.push(["p", cause.text], ["code", cause.fix], ["p", names.length > 1 ? names.join(", ") : ""]);
+  }
   if (selected.startsWith("n:")) {
     const id = selected.slice(2);
     const node = state.nodes.get(id) || {};
@@ -370,7 +407,7 @@ function details(on) {
   for (const { link, from, to } of links.slice(0, MOST_CHOSEN)) {
     parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name} from ${from}${to ? ` to ${to}` : ""}, ${hertz(link)} Hz, ` +
       `${megabytes(link)} MB/s, last message ${age(link, now)}, carried by ${link.carried || "–"}, port ${link.port || "–"}`],
-    ["p", link.text || ""], ["code", link.text ? link.fix || "" : ""]);
+    ["p", link.text || ""], ["code", link.text && !cause ? link.fix || "" : ""]);
   }
   if (links.length > MOST_CHOSEN) parts.push(["p", `${links.length - MOST_CHOSEN} more are marked in the table.`]);
   return parts.filter(([, text]) => text);

@@ -149,11 +149,12 @@ export function joined(found, lanes, boxOf, proxies) {
 }
 
 // What is chosen: nodes, links, and the nodes at the ends of these links. `key`: "n:" and a node,
-// "k:" and a link, or the id of a box or a line.
-export function selection(key, links, boxes) {
-  const nodes = new Set(boxes.has(key) ? boxes.get(key).ids : key.startsWith("n:") ? [key.slice(2)] : []);
-  const isChosen = ({ id, link, line, via }) => line === key || `k:${id}` === key || `n:${via}` === key ||
-    nodes.has(link.source) || nodes.has(link.target);
+// "k:" and a link, or the id of a box, a line or a `cause`.
+export function selection(key, links, boxes, cause) {
+  const named = key.startsWith("n:") ? [key.slice(2)] : [];
+  const nodes = new Set(cause ? cause.nodes : boxes.has(key) ? boxes.get(key).ids : named);
+  const isChosen = ({ id, link, line, via }) => cause ? cause.links.has(id) :
+    line === key || `k:${id}` === key || `n:${via}` === key || nodes.has(link.source) || nodes.has(link.target);
   const chosen = new Map(key ? links.filter(isChosen).map((one) => [one.id, one]) : []);
   const ends = new Set([...chosen.values()].flatMap(({ link }) => [link.source, link.target]));
   return { nodes, links: chosen, ends };

@@ -75,9 +75,13 @@ export function megabytes(link) {
 export function age(link, now) {
   if (link.flows) return "just now";
   if (link.since === undefined || link.since === null) return "–";
-  const seconds = Math.max(0, Math.round(now - link.since));
-  if (seconds < 120) return `${seconds} s ago`;
-  return seconds < 7200 ? `${Math.round(seconds / 60)} min ago` : `${Math.round(seconds / 3600)} h ago`;
+  return `${duration(now - link.since)} ago`;
+}
+
+export function duration(exact) {
+  const seconds = Math.max(0, Math.round(exact));
+  if (seconds < 120) return `${seconds} s`;
+  return seconds < 7200 ? `${Math.round(seconds / 60)} min` : `${Math.round(seconds / 3600)} h`;
 }
 
 export const WORDS = { ok: "ok", unknown: "not looked at", warning: "warning", broken: "BROKEN" };

@@ -1,0 +1,67 @@
+// What is wrong, one entry for each cause, and what happened: pure functions, without a DOM.
+
+import { hostOf, labelOf, RANK } from "./view.js";
+
+const MOST_EVENTS = 50;
+
+// The causes, the worst first. What has one fix and one place (a container or a machine) is one
+// cause: a container that ends leaves many links with a problem.
+export function causesOf({ nodes, links, findings }) {
+  const causes = new Map();
+  const add = (kind, place, { what, text, fix }, ids) => {
+    const key = `f:${JSON.stringify([kind, place, fix || text])}`;
+    if (!causes.has(key)) causes.set(key, { key, kind, place, what, text, fix, count: 0, nodes: new Set(), links: new Set() });
+    const cause = causes.get(key);
+    cause.count += 1;
+    if (ids.node) cause.nodes.add(ids.node);
+    if (ids.link) cause.links.add(ids.link);
+  };
+  for (const one of findings) {
+    add(one.severity === "error" ? "broken" : "warning", "", { what: one.subject, text: one.text, fix: one.fix }, {});
+  }
+  for (const [id, node] of nodes) {
+    if (isWrong(node)) add(node.state, hostOf(node.address), { what: labelOf(id, node), text: node.text || "", fix: node.fix || "" }, { node: id });
+  }
+  for (const [id, link] of links) {
+    if (!isWrong(link)) continue;
+    const ends = [link.source, link.target].filter(Boolean);
+    const what = `${link.name} from ${ends.map((end) => labelOf(end, nodes.get(end))).join(" to ")}`;
+    add(link.state, placeOf(link, ends, nodes), { what, text: link.text || "", fix: link.fix || "" }, { link: id });
+  }
+  return [...causes.values()].sort((a, b) => RANK[b.kind] - RANK[a.kind] || b.count - a.count);
+}
+
+function isWrong({ state }) {
+  return state === "broken" || state === "warning";
+}
+
+// The place of the end that has the same problem, else of the end inside.
+function placeOf(link, ends, nodes) {
+  const known = ends.map((end) => nodes.get(end)).filter(Boolean);
+  const node = known.find((one) => one.state === link.state && one.fix === link.fix)
+    || known.find((one) => one.lane === "container") || known[0];
+  return node ? hostOf(node.address) : "";
+}
+
+export function titleOf({ what, count, place }) {
+  return count > 1 ? `${count}${place ? ` at ${place}` : " times"}: ${what}, …` : what;
+}
+
+// Note which causes are new and which are over. `seen`: the causes by their keys, with the time of
+// their beginning in milliseconds; those of the first document are `old`, and began earlier.
+// Returns the events, the newest first.
+export function follow(seen, causes, events, now, isFirst) {
+  const found = [];
+  const present = new Set(causes.map(({ key }) => key));
+  for (const [key, { cause, since }] of seen) {
+    if (present.has(key)) continue;
+    seen.delete(key);
+    found.push({ at: now, over: true, kind: cause.kind, title: titleOf(cause), since });
+  }
+  for (const cause of causes) {
+    const { since, old } = seen.get(cause.key) || { since: now, old: isFirst };
+    if (!seen.has(cause.key) && !isFirst) found.push({ at: now, over: false, kind: cause.kind, title: titleOf(cause), since });
+    seen.set(cause.key, { cause, since, old });
+  }
+  return [...found, ...events].slice(0, MOST_EVENTS);
+}

@@ -1,0 +1,103 @@
+"""What is wrong and what happened on the live page, of nodes and links that are made up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.browser.page import THIS_MACHINE, made_up
+from tests.browser.test_picture import MARKED_BOXES, MARKED_ROWS, fleet, texts
+from tests.browser.webdriver import Browser, Json
+from tests.ros.processes import wait_until
+from tests.ros.topology import Place
+
+CAUSES = """
+return import("/findings.js").then(({ causesOf, titleOf }) => {
+  const [nodes, links, findings] = arguments;
+  const state = { nodes: new Map(Object.entries(nodes)), links: new Map(Object.entries(links)) };
+  return causesOf({ ...state, findings }).map((cause) => `${titleOf(cause)}: ${cause.fix}`);
+});
+"""
+FOLLOW = """
+return import("/findings.js").then(({ follow, titleOf }) => {
+  const seen = new Map();
+  let events = [];
+  arguments[0].forEach((titles, second) => {
+    const causes = titles.map((what) => ({ key: what, what, count: 1, kind: "broken" }));
+    events = follow(seen, causes, events, 1000 * second, second === 0);
+  });
+  return events.map(({ at, over, title, since }) => [at, over, title, since]);
+});
+"""
+MEND = """
+const { state } = window.rosproxyPage;
+const broken = [...state.nodes.values()].filter((node) => node.text);
+for (const node of broken) Object.assign(node, { state: "ok", text: "", fix: "" });
+"""
+CLEANUP = "run rosnode cleanup (answer y)"
+
+
+@pytest.fixture
+def machine() -> Place:
+    """Where page and browser are: no test here needs ROS."""
+    return THIS_MACHINE
+
+
+def broken(fix: str, **more: str) -> Json:
+    return {"state": "broken", "text": "it does not answer", "fix": fix, **more}
+
+
+def test_a_container_that_ends_is_one_cause(browser: Browser, tmp_path: Path) -> None:
+    inside = {"lane": "container", "address": "172.18.0.2:1"}
+    nodes: dict[str, Any] = {name: broken(CLEANUP, **inside) for name in ("/a", "/b")}
+    nodes["/c"] = broken(CLEANUP, lane="container", address="172.18.0.3:1")
+    nodes["/d"] = {"lane": "robot", "address": "10.0.0.2"}
+    links = {
+        f"{source} {target}": broken(fix, name="/t", source=source, target=target)
+        for source, target, fix in (
+            ("/a", "/d", CLEANUP),
+            ("/d", "/b", CLEANUP),
+            ("/d", "/c", "nc -vz 10.0.0.1 11412"),
+        )
+    }
+    finding = {"severity": "warning", "subject": "ports", "text": "few are free", "fix": "more"}
+    with made_up(browser, tmp_path, 10):
+        assert browser.run(CAUSES, nodes, links, [finding]) == [
+            f"4 at 172.18.0.2: /a, …: {CLEANUP}",
+            f"/c: {CLEANUP}",
+            "/t from /d to /c: nc -vz 10.0.0.1 11412",
+            "ports: more",
+        ]
+
+
+def test_what_comes_and_goes_is_an_event(browser: Browser, tmp_path: Path) -> None:
+    with made_up(browser, tmp_path, 10):
+        follow = [["a"], ["a", "b"], ["b"], []]
+        assert browser.run(FOLLOW, follow) == [
+            [3000, True, "b", 1000],
+            [2000, True, "a", 0],
+            [1000, False, "b", 1000],
+        ]
+        assert len(browser.run(FOLLOW, [[], *([[str(n)] for n in range(90)])])) == 50
+
+
+def test_a_finding_is_shown_in_graph_and_table_and_leaves(browser: Browser, tmp_path: Path) -> None:
+    with fleet(browser, tmp_path, 30):
+        first = texts(browser, "#findings li:first-child span")
+        assert first[0] == "BROKEN: 3 at 172.18.0.2: /arm/driver_of_the_unit_0, …"
+        assert first[-1].startswith("for over ")
+        browser.run("document.querySelector('#findings .cause').click()")
+        assert len(texts(browser, MARKED_BOXES)) == 3
+        assert len(texts(browser, "#node-rows tr[aria-current]")) == 3
+        assert not texts(browser, MARKED_ROWS), "no link has this problem"
+        browser.run("document.querySelector('#findings .copy').focus()")
+        browser.press("\ue007")  # a script alone may not copy
+        assert texts(browser, "#findings .copy")[0] == "Copied"
+        browser.run(MEND)
+        wait_until("it is over", lambda: len(texts(browser, "#events li")) == 1)
+        (event,) = texts(browser, "#events li")
+        assert "over after" in event
+        assert first[0].removeprefix("BROKEN: ") in event
+        assert not texts(browser, MARKED_BOXES)
