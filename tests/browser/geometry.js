@@ -26,6 +26,8 @@ for (const { box, rect } of boxes) {
   }
   if (!heads.some((head) => rect.left >= head.left - 1 && rect.right <= head.right + 1)) found.push(`${name(box)} has no heading`);
 }
+const page = document.documentElement;
+if (page.scrollWidth > innerWidth) found.push(`the page has ${page.scrollWidth} of ${innerWidth} px`);
 const graph = document.querySelector("#graph");
 const used = Math.max(...boxes.map(({ rect }) => rect.right)) - Math.min(...boxes.map(({ rect }) => rect.left));
 if (used < 0.96 * graph.clientWidth) found.push(`the lanes fill ${used} of ${graph.clientWidth} px`);

@@ -17,7 +17,7 @@ from tests.ros.lab import Lab
 from tests.ros.topology import SHARED, Topology, remove_leftovers
 
 WIDTH = 1200
-HIGH = 960
+HIGH = 760
 
 
 def paint(lab: Lab, folder: Path) -> bytes:

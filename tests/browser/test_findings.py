@@ -49,7 +49,7 @@ def broken(fix: str, **more: str) -> Json:
     return {"state": "broken", "text": "it does not answer", "fix": fix, **more}
 
 
-def test_a_container_that_ends_is_one_cause(browser: Browser, tmp_path: Path) -> None:
+def test_one_fix_in_one_place_is_one_cause(browser: Browser, tmp_path: Path) -> None:
     inside = {"lane": "container", "address": "172.18.0.2:1"}
     nodes: dict[str, Any] = {name: broken(CLEANUP, **inside) for name in ("/a", "/b")}
     nodes["/c"] = broken(CLEANUP, lane="container", address="172.18.0.3:1")
@@ -59,15 +59,16 @@ def test_a_container_that_ends_is_one_cause(browser: Browser, tmp_path: Path) ->
         for source, target, fix in (
             ("/a", "/d", CLEANUP),
             ("/d", "/b", CLEANUP),
-            ("/d", "/c", "nc -vz 10.0.0.1 11412"),
+            ("/d", "/c", "on the machine of /c: nc -vz 10.0.0.1 11412"),
+            ("/c", "/d", "on the machine of /d: nc -vz 10.0.0.1 11413"),
         )
     }
     finding = {"severity": "warning", "subject": "ports", "text": "few are free", "fix": "more"}
     with made_up(browser, tmp_path, 10):
         assert browser.run(CAUSES, nodes, links, [finding]) == [
             f"4 at 172.18.0.2: /a, …: {CLEANUP}",
+            "2 at 172.18.0.3: /t from /c to /d, …: on the machine of /d: nc -vz 10.0.0.1 11413",
             f"/c: {CLEANUP}",
-            "/t from /d to /c: nc -vz 10.0.0.1 11412",
             "ports: more",
         ]
 

@@ -5,11 +5,13 @@ import { hostOf, labelOf, RANK } from "./view.js";
 const MOST_EVENTS = 50;
 
 // The causes, the worst first. What has one fix and one place (a container or a machine) is one
-// cause: a container that ends leaves many links with a problem.
+// cause: a container that ends, or a firewall, leaves many links with a problem. Names of nodes and
+// numbers, such as ports, make no other fix.
 export function causesOf({ nodes, links, findings }) {
   const causes = new Map();
-  const add = (kind, place, { what, text, fix }, ids) => {
-    const key = `f:${JSON.stringify([kind, place, fix || text])}`;
+  const add = (kind, place, { what, text, fix }, ids, names = []) => {
+    const shape = names.reduce((rest, name) => rest.replaceAll(name, ""), fix || text).replace(/\d+/g, "");
+    const key = `f:${JSON.stringify([kind, place, shape])}`;
     if (!causes.has(key)) causes.set(key, { key, kind, place, what, text, fix, count: 0, nodes: new Set(), links: new Set() });
     const cause = causes.get(key);
     cause.count += 1;
@@ -20,13 +22,14 @@ export function causesOf({ nodes, links, findings }) {
     add(one.severity === "error" ? "broken" : "warning", "", { what: one.subject, text: one.text, fix: one.fix }, {});
   }
   for (const [id, node] of nodes) {
-    if (isWrong(node)) add(node.state, hostOf(node.address), { what: labelOf(id, node), text: node.text || "", fix: node.fix || "" }, { node: id });
+    if (isWrong(node)) add(node.state, hostOf(node.address), { what: labelOf(id, node), text: node.text || "", fix: node.fix || "" }, { node: id }, [id, labelOf(id, node)]);
   }
   for (const [id, link] of links) {
     if (!isWrong(link)) continue;
     const ends = [link.source, link.target].filter(Boolean);
-    const what = `${link.name} from ${ends.map((end) => labelOf(end, nodes.get(end))).join(" to ")}`;
-    add(link.state, placeOf(link, ends, nodes), { what, text: link.text || "", fix: link.fix || "" }, { link: id });
+    const labels = ends.map((end) => labelOf(end, nodes.get(end)));
+    const what = `${link.name} from ${labels.join(" to ")}`;
+    add(link.state, placeOf(link, ends, nodes), { what, text: link.text || "", fix: link.fix || "" }, { link: id }, [...ends, ...labels]);
   }
   return [...causes.values()].sort((a, b) => RANK[b.kind] - RANK[a.kind] || b.count - a.count);
 }

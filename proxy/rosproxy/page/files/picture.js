@@ -248,7 +248,7 @@ function carriersOf(lines, proxies, places) {
   for (const line of lines.values()) carriers.get(line.via).lines.push(line);
   for (const one of found) {
     const ends = one.lines.map((line) => heightOf(line.a, places));
-    one.y = ends.reduce((sum, y) => sum + y, 0) / Math.max(1, ends.length);
+    one.y = ends.length ? ends.reduce((sum, y) => sum + y, 0) / ends.length : Number.MAX_VALUE;
   }
   return [...found.sort((p, q) => p.y - q.y), carriers.get(DIRECT)];
 }
