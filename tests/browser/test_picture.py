@@ -29,6 +29,11 @@ MARKED_ROWS = "#rows tr[aria-current] td:nth-child(2)"
 MARKED_BOXES = ".box:not(.line)[aria-current]"
 MARKED_FINDINGS = "#findings li[aria-current] .what"
 MARKED_LINES = ".box.line[aria-current]"
+SHOWN = """
+return { boxes: [...document.querySelectorAll("#boxes .box")].map((one) => one.title),
+  marked: [...document.querySelectorAll(".box[aria-current]")].map((one) => one.title),
+  filter: document.querySelector("#filter").value };
+"""
 PICTURE = """
 return import("/picture.js").then(({ boxesOf }) => {
   const nodes = new Map(arguments[0].map((one, index) => [`/n${index}`, one]));
@@ -109,6 +114,33 @@ def test_what_is_chosen_is_marked_in_graph_and_table(browser: Browser, tmp_path:
         assert marked == len(texts(browser, MARKED_LINES)) == 2
         click(browser, "#boxes .proxy", "domain-7")
         assert len(texts(browser, MARKED_ROWS)) == 10, "all that the proxy carries"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "count"),
+    [("172.18.0.2", 11), ("domain-7", 11), ("domain 0", 11), ("/arm/driver", 5)],
+)
+def test_the_filter_finds_hosts_proxies_and_domains(
+    browser: Browser, tmp_path: Path, wanted: str, count: int
+) -> None:
+    with fleet(browser, tmp_path, 30):
+        browser.run("document.querySelector('#filter').focus()")
+        browser.press(wanted)
+        wait_until("the others are gone", lambda: browser.run(ROWS) == count)
+
+
+def test_an_address_shows_the_same_again(browser: Browser, tmp_path: Path) -> None:
+    with fleet(browser, tmp_path, 100):
+        browser.run("document.querySelector('#filter').focus()")
+        browser.press("172.18.0.3")
+        click(browser, "#boxes .group", "172.18.0.3")
+        click(browser, "#boxes .node", "/arm/")
+        shown = browser.run(SHOWN)
+        assert shown["marked"]
+        address = browser.run("return location.href")
+        browser.open("about:blank")
+        browser.open(address)
+        wait_until("it is the same", lambda: browser.run(SHOWN) == shown)
 
 
 def places(browser: Browser, folder: Path, nodes: list[dict[str, str]], *turned: str) -> Any:

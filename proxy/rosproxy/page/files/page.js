@@ -91,6 +91,7 @@ function show() {
   showLinks(found, on.links);
   showNodes(on.nodes);
   showDetails(on);
+  writeAddress();
 }
 
 function showHead(found, causes) {
@@ -379,7 +380,7 @@ function mark(element, on) {
 }
 
 function showDetails(on) {
-  if (selected && !on.nodes.size && !on.links.size && !seen.has(selected)) selected = "";
+  if (selected && !isFirst && !on.nodes.size && !on.links.size && !seen.has(selected)) selected = "";
   const parts = selected ? details(on) : [];
   const kinds = parts.map(([kind]) => kind).join(" ");
   if ($("details").dataset.kinds !== kinds) $("details").replaceChildren(...parts.map(([kind]) => make(kind)));
@@ -413,7 +414,29 @@ function details(on) {
   return parts.filter(([, text]) => text);
 }
 
+// The address of the page has what is shown, and can be sent to others.
+function writeAddress() {
+  const words = new URLSearchParams();
+  for (const [name, value] of Object.entries({ filter: chosen.filter, quiet: chosen.quiet, unfold: chosen.unfoldAll, chosen: selected })) {
+    if (value) words.set(name, value);
+  }
+  for (const [key, open] of chosen.turned) words.append(open ? "open" : "fold", key);
+  if (String(words) !== location.hash.slice(1)) history.replaceState(null, "", `#${words}`);
+}
+
+function readAddress() {
+  if (!location.hash.includes("=")) return;
+  const words = new URLSearchParams(location.hash.slice(1));
+  chosen.filter = $("filter").value = words.get("filter") || "";
+  chosen.quiet = $("quiet").checked = words.has("quiet");
+  chosen.unfoldAll = $("unfold").checked = words.has("unfold");
+  chosen.turned = new Map([...words.getAll("open").map((key) => [key, true]), ...words.getAll("fold").map((key) => [key, false])]);
+  selected = words.get("chosen") || "";
+}
+
 function start() {
+  readAddress();
+  addEventListener("hashchange", () => { readAddress(); draw(); });
   new ResizeObserver(draw).observe($("graph"));
   $("controls").addEventListener("submit", (event) => event.preventDefault());
   $("filter").addEventListener("input", (event) => { chosen.filter = event.target.value; draw(); });

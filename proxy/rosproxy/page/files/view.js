@@ -16,15 +16,21 @@ export function namespaceOf(label) {
   return parts[0] === "" && parts.length > 2 ? `/${parts[1]}` : "";
 }
 
+// What a filter finds of a node: names, the host, and the proxy, master or domain in the key.
+function wordsOf(id, node = {}) {
+  const domain = node.kind === "participant" ? ` domain ${id.split(" ").at(-2)}` : "";
+  return `${labelOf(id, node)} ${id} ${hostOf(node.address)}${domain}`;
+}
+
 // The links that are wanted, those that are broken first, then by name.
 export function visibleLinks(links, nodes, { quiet, filter }) {
   const wanted = filter.trim().toLowerCase();
   const found = [];
   for (const [id, link] of links) {
     if (link.quiet && !quiet && link.state !== "broken") continue;
-    const ends = [link.source, link.target || ""].map((end) => labelOf(end, nodes.get(end)));
-    const text = `${link.name} ${ends.join(" ")}`.toLowerCase();
-    if (wanted && !text.includes(wanted)) continue;
+    const ids = [link.source, link.target || ""];
+    const ends = ids.map((end) => labelOf(end, nodes.get(end)));
+    if (wanted && ![link.name, ...ids.map((end) => wordsOf(end, nodes.get(end)))].some((text) => text.toLowerCase().includes(wanted))) continue;
     found.push({ id, link, from: ends[0], to: ends[1] });
   }
   const order = (one) => RANK[one.link.state || "unknown"] >= 2 ? RANK[one.link.state] : 0;
@@ -40,7 +46,7 @@ export function visibleNodes(nodes, { quiet, filter }) {
   const found = [];
   for (const [id, node] of nodes) {
     const label = labelOf(id, node);
-    if (wanted ? !label.toLowerCase().includes(wanted) : label === "/rosout" && !quiet) continue;
+    if (wanted ? !wordsOf(id, node).toLowerCase().includes(wanted) : label === "/rosout" && !quiet) continue;
     const order = RANK[node.state || "ok"] >= 2 ? RANK[node.state] : 0;
     found.push({ id, node: { ...node, state: node.state || "ok" }, label, order, key: `${LANES.indexOf(node.lane)} ${label} ${id}` });
   }
