@@ -34,10 +34,23 @@ return { boxes: [...document.querySelectorAll("#boxes .box")].map((one) => one.t
   marked: [...document.querySelectorAll(".box[aria-current]")].map((one) => one.title),
   filter: document.querySelector("#filter").value };
 """
+FOLDS = """
+return import("/picture.js").then(({ boxesOf }) => {
+  const chosen = { unfoldAll: false, turned: new Map(), depths: {} };
+  return arguments[0].map((count) => {
+    const numbers = [...Array(count).keys()];
+    const nodes = new Map(numbers.map((number) =>
+      [`/n${number}`, { lane: "container", address: `172.18.0.${number % 4}:1` }]));
+    const { lanes, depths } = boxesOf(nodes, new Set(nodes.keys()), chosen);
+    chosen.depths = depths;
+    return lanes[2].length;
+  });
+});
+"""
 PICTURE = """
 return import("/picture.js").then(({ boxesOf }) => {
   const nodes = new Map(arguments[0].map((one, index) => [`/n${index}`, one]));
-  const chosen = { unfoldAll: false, turned: new Map(arguments[1]) };
+  const chosen = { unfoldAll: false, turned: new Map(arguments[1]), depths: {} };
   const { lanes } = boxesOf(nodes, new Set(nodes.keys()), chosen);
   return lanes.map((lane) => lane.map(({ level, label, note }) =>
     `${"  ".repeat(level)}${label}, ${note}`));
@@ -175,6 +188,11 @@ def test_many_nodes_are_folded_by_container(browser: Browser, tmp_path: Path) ->
     ]
     assert shown[3:7] == [f"  /n{n}, " for n in range(8, 12)]
     assert len(shown) == 9 + 4
+
+
+def test_a_node_that_comes_and_goes_turns_no_group(browser: Browser, tmp_path: Path) -> None:
+    with made_up(browser, tmp_path, 10):
+        assert browser.run(FOLDS, [26, 27, 26, 21, 20, 26]) == [30, 4, 4, 4, 24, 30]
 
 
 def test_of_very_many_containers_some_are_shown(browser: Browser, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ const LOST = "Not connected; what is shown may be old. Trying again…";
 
 const $ = (id) => document.getElementById(id);
 const state = { nodes: new Map(), links: new Map(), proxy: {}, findings: [], left_out: 0 };
-const chosen = { turned: new Map(), unfoldAll: false, quiet: false, filter: "" };
+const chosen = { turned: new Map(), unfoldAll: false, quiet: false, filter: "", depths: {} };
 const rows = new Map();
 const nodeRows = new Map();
 const findings = new Map();
@@ -233,7 +233,8 @@ function makeRow(heads, key) {
 // Draw the graph; returns what is chosen (picture.js, selection).
 function showGraph(found, cause) {
   const proxies = new Map([...state.nodes].filter(([, node]) => node.kind === "proxy"));
-  const { lanes, boxOf } = boxesOf(state.nodes, shownNodes(found), chosen);
+  const { lanes, boxOf, depths } = boxesOf(state.nodes, shownNodes(found), chosen);
+  chosen.depths = depths;
   const links = joined(found, lanes, boxOf, proxies);
   const all = new Map(lanes.flat().map((box) => [box.id, box]));
   const on = selection(selected, links, all, cause);
@@ -337,6 +338,8 @@ function updateBox(element, one) {
   if (one.kind === "frame") return;
   one.texts.forEach((text, index) => put(element.children[index], text));
   if (element.title !== one.title) element.title = one.title;
+  const spoken = [...one.title.split("\n").filter(Boolean), WORDS[one.state]].join(", ");
+  if (one.kind !== "past" && element.ariaLabel !== spoken) element.ariaLabel = spoken;
   mark(element, Boolean(one.on));
   element.classList.toggle("near", Boolean(one.near));
   if (one.key && element.getAttribute("aria-expanded") !== String(one.open)) element.setAttribute("aria-expanded", String(one.open));
@@ -439,7 +442,7 @@ function start() {
   addEventListener("hashchange", () => { readAddress(); draw(); });
   new ResizeObserver(draw).observe($("graph"));
   $("controls").addEventListener("submit", (event) => event.preventDefault());
-  $("filter").addEventListener("input", (event) => { chosen.filter = event.target.value; draw(); });
+  $("filter").addEventListener("input", (event) => { chosen.filter = event.target.value; chosen.depths = {}; draw(); });
   $("quiet").addEventListener("change", (event) => { chosen.quiet = event.target.checked; draw(); });
   $("unfold").addEventListener("change", (event) => {
     chosen.unfoldAll = event.target.checked;

@@ -9,7 +9,8 @@
 import { flowOf, hostOf, labelOf, LANES, namespaceOf, RANK } from "./view.js";
 
 export const DIRECT = "direct";
-const SHOWN_ROWS = 30; // of a lane that unfolds by itself
+const MOST_ROWS = 30; // of a lane that unfolds by itself
+const FEW_ROWS = 24; // of a lane that unfolds again: so a node that comes and goes turns no group
 const MOST_PLACES = 24;
 const MOST_LINES = 60;
 const LEAST_WIDTH = 600;
@@ -22,18 +23,23 @@ const INDENT = 14;
 
 // Groups
 
-// The boxes of each lane from top to bottom, and the box that shows each node.
+// The boxes of each lane from top to bottom, the box that shows each node, and the depths to which
+// groups are unfolded by lane, for the next time.
 export function boxesOf(nodes, shown, chosen) {
   const boxOf = new Map();
+  const depths = {};
   const lanes = LANES.map((lane) => {
     const found = [...shown].filter((id) => nodes.has(id) && laneOf(nodes.get(id)) === lane && nodes.get(id).kind !== "proxy");
     const places = placesOf(lane, found, nodes);
-    const depth = chosen.unfoldAll ? Infinity : depthThatFits(places);
+    const most = depthThatFits(places, MOST_ROWS);
+    const former = Math.min(most, chosen.depths[lane] ?? most);
+    depths[lane] = Math.max(former, depthThatFits(places, FEW_ROWS));
+    const depth = chosen.unfoldAll ? Infinity : depths[lane];
     const boxes = [];
     for (const place of places) addBoxes(place, 0, { boxes, boxOf, nodes, depth, turned: chosen.turned, place: place.key, owner: place.note });
     return boxes;
   });
-  return { lanes, boxOf };
+  return { lanes, boxOf, depths };
 }
 
 function laneOf(node) {
@@ -90,7 +96,7 @@ function leafOf(id, nodes) {
 }
 
 // How many levels of groups unfold by themselves: as many as stay readable.
-function depthThatFits(places) {
+function depthThatFits(places, most) {
   let level = places;
   let rows = places.length;
   for (let depth = 0; ; depth += 1) {
@@ -98,7 +104,7 @@ function depthThatFits(places) {
     if (!groups.length) return Infinity;
     level = groups.flatMap((one) => one.children);
     rows += level.length;
-    if (rows > SHOWN_ROWS) return depth;
+    if (rows > most) return depth;
   }
 }
 
