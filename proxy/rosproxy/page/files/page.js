@@ -287,7 +287,7 @@ function boxOfGroup(box, rect) {
 }
 
 function boxOfProxy(id, proxy, rect, on) {
-  if (id === DIRECT) return { id, kind: "past", rect, texts: ["past the proxies", "", ""], state: "ok", title: "" };
+  if (id === DIRECT) return { id: "past", kind: "past", rect, texts: ["past the proxies", "", ""], state: "ok", title: "" };
   const state = proxy.state || "ok";
   const label = labelOf(id, proxy);
   return { id: `n:${id}`, kind: "proxy", rect, state, on: on.nodes.has(id), texts: [marked(state, label), proxy.ports || "", ""],

@@ -8,7 +8,7 @@
 
 import { flowOf, hostOf, labelOf, LANES, namespaceOf, RANK } from "./view.js";
 
-export const DIRECT = "direct";
+export const DIRECT = ""; // the key of no proxy
 const MOST_ROWS = 30; // of a lane that unfolds by itself
 const FEW_ROWS = 24; // of a lane that unfolds again: so a node that comes and goes turns no group
 const MOST_PLACES = 24;
