@@ -3,8 +3,8 @@
 python -m tests.browser.fleet PORT NODES
 
 A third of the nodes is of ROS 1, the others are of two domains of ROS 2, each behind a proxy of its
-own. Containers have up to five nodes. One link in twelve is broken. What makes and serves the
-document is the operator's own code.
+own. Containers have up to five nodes. A fifth of the outside nodes of ROS 1 is on the host. One
+link in twelve is broken. What makes and serves the document is the operator's own code.
 """
 
 from __future__ import annotations
@@ -84,6 +84,8 @@ def _node(proxy: int, domain: str, index: int, is_inside: bool) -> PageNode:
         label = f"{host} 01.00.{index:02x}"
         return PageNode(lane, "participant", label, address=f"{host}, Fast DDS", ports="11420")
     port = 35000 + index
+    if not is_inside and index % EACH == EACH - 1:
+        return PageNode(HOST, address=f"http://laptop:{port}/")
     if not is_inside:
         return PageNode(lane, address=f"http://{host}:{port}/")
     node = PageNode(lane, address=f"{host}:{port}")

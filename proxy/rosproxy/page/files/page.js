@@ -103,7 +103,7 @@ function showHead(found, causes) {
   put($("summary"), parts.filter(Boolean).join(" · "));
   const broken = causes.filter(({ kind }) => kind === "broken").length;
   const warnings = causes.length - broken;
-  put($("count"), [broken ? `${broken} broken` : "", warnings ? `${warnings} warnings` : ""].filter(Boolean).join(", "));
+  put($("count"), [broken ? `${broken} broken` : "", warnings ? `${warnings} warning${warnings > 1 ? "s" : ""}` : ""].filter(Boolean).join(", "));
   const title = broken ? `(${broken} broken) rosproxy` : "rosproxy";
   if (document.title !== title) document.title = title;
 }

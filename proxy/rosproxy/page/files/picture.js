@@ -344,9 +344,10 @@ function wayOf(line, a, b, row, places) {
   };
 }
 
-// A curve in a channel, flat at both ends. A box on the host is on the same edge as its row.
+// A curve in a channel, flat at both ends. A box on the host is on the same edge as its row: the
+// longer such a curve, the wider.
 function curve(x, y, toX, toY) {
-  const bend = x === toX ? x - 3 * PAD : (x + toX) / 2;
+  const bend = x === toX ? x - Math.min(7 * PAD, 2 * PAD + Math.abs(toY - y) / PAD) : (x + toX) / 2;
   return `C${bend},${y} ${bend},${toY} ${toX},${toY}`;
 }
 
