@@ -1,13 +1,11 @@
-"""A demonstration that needs nothing but Python: two sides, NAT between them, and the real proxy.
+"""A demonstration that needs only Python: two sides with NAT between, and the real proxy.
 
-`python -m examples.demo` plays a scenario (:mod:`.scenario`) with a small ROS master and small
-nodes that speak real XML-RPC and real TCPROS, with nodes of ROS 2 that speak real RTPS
-(:mod:`.ros2_acts`), and with the proxy as a process of its own, which is killed and started again
-in the middle. The master and the nodes of ROS 1 (:mod:`.fake_http`, :mod:`.fake_master`,
-:mod:`.fake_node`) are also those of the integration tests; what a test may set on them has no use
-here.
+`python -m examples.demo` plays a scenario (:mod:`.scenario`) with a small ROS master, small ROS 1
+nodes that speak real XML-RPC and TCPROS, and small ROS 2 nodes that speak real RTPS
+(:mod:`.ros2_acts`). The proxy is a separate process. The scenario kills and restarts this process
+in the middle. The integration tests use the same master and ROS 1 nodes (:mod:`.fake_http`,
+:mod:`.fake_master`, :mod:`.fake_node`), and some attributes are only for tests.
 
-The nodes of ROS 2 are small ones of its own (:mod:`.fake_participant`) and no library's: a DDS
-can't be told to live at 127.0.2.11 alone and to turn away what comes from 127.0.1.0/24, and would
-be the one thing to install.
+The ROS 2 nodes (:mod:`.fake_participant`) use no DDS library. A library cannot stay at 127.0.2.11
+alone and reject datagrams from 127.0.1.0/24, and users would have to install it.
 """

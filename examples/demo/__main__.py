@@ -1,4 +1,4 @@
-"""`python -m examples.demo`: play the demonstration and say whether it worked."""
+"""`python -m examples.demo`: play the demonstration and print the results."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ INTERRUPTED = 130
 
 
 async def perform(scenario: Scenario, console: Console) -> bool:
-    """Play to the end, or to the first signal: False; no process is left in either case."""
+    """Play to the end. False if a signal came first. No process is left in either case."""
     playing = asyncio.create_task(scenario.play())
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -51,7 +51,7 @@ def main(seconds: float, quiet: bool) -> None:
     the middle the proxy is killed and restarted. Exits with 0 only if all worked and every message
     count fits.
     """
-    # The inside names resolve nowhere; a resolver that is slow to say so must not slow us down.
+    # The inside names do not resolve. A slow resolver must not delay the demonstration.
     os.environ["RES_OPTIONS"] = "timeout:1 attempts:1"
     console = Console(quiet=quiet)
     scenario = Scenario(seconds)

@@ -1,9 +1,8 @@
-"""TCP and HTTP as the fakes speak them, over asyncio streams.
+"""TCP and HTTP servers of the fakes, over asyncio streams.
 
-A fake master or node is an XML-RPC server, and a node a TCPROS server besides. Both are a
-:class:`FakeTcpServer`: it knows its connections and ends them all when it stops. The HTTP server
-reads requests and leaves the whole response to a function, so that a test can have an answer as
-odd as it likes. `call` is the client.
+A fake master or node is an XML-RPC server, and a node has a TCPROS server, too. Both servers are a
+:class:`FakeTcpServer`, which ends all connections when stopped. The HTTP server reads requests, and
+a function writes the whole response, so that a test can give any answer. `call` is the client.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 ServeConnection = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 CALL_SECONDS = 20.0
-"""How long a call may take in all."""
+"""Time limit of a call."""
 
 
 class End(Enum):
-    """What to do instead of answering."""
+    """Ways to end a call without an answer."""
 
     RESET = "reset the connection"
     CLOSE = "close the connection"
@@ -39,7 +38,7 @@ class End(Enum):
 
 
 Answer = bytes | End
-"""A whole HTTP response, or none."""
+"""A whole HTTP response, or a way to end without a response."""
 
 
 @dataclass
@@ -77,7 +76,7 @@ def value(result: Any) -> bytes:
 
 
 def host_and_port(uri: str) -> Address:
-    """Host and port of a URI; raises ValueError when it lacks one."""
+    """Host and port of a URI. Raises ValueError if either is missing."""
     parts = urlsplit(uri)
     if not parts.hostname or not parts.port:
         raise ValueError(f"no host and port in {uri!r}")
@@ -85,7 +84,7 @@ def host_and_port(uri: str) -> Address:
 
 
 def is_free(port: int, address: str = "", kind: int = socket.SOCK_STREAM) -> bool:
-    """Whether a port could be bound, for TCP or UDP; 0 asks whether there is such an address."""
+    """Whether a port is free, for TCP or UDP. Port 0: whether this machine has the address."""
     with socket.socket(type=kind) as probe:
         try:
             probe.bind((address, port))
@@ -95,17 +94,17 @@ def is_free(port: int, address: str = "", kind: int = socket.SOCK_STREAM) -> boo
 
 
 class PortDraws:
-    """Draws ports that nobody uses, for TCP or UDP, from a range that is gone through in order.
+    """Draws ports that are free for TCP and UDP from a range, in order.
 
-    So a port that was freed comes again only after all others: who had it may be looked for yet.
-    It begins anywhere, since other processes may draw from the same range.
+    So a freed port comes again only after all other ports: peers may still look for its former
+    program. The first port is random, because other processes may draw from the same range.
     """
 
     def __init__(self, ports: range) -> None:
         self.keep_to(ports)
 
     def keep_to(self, ports: range) -> None:
-        """Draw from these from now on."""
+        """Draw from this range from now on."""
         self.ports = ports
         self._next = random.choice(ports)  # noqa: S311
 
@@ -122,7 +121,7 @@ class PortDraws:
 
 
 PORTS = PortDraws(range(15000, 32000))
-"""Below the ephemeral range, from which the kernel draws for whoever doesn't mind."""
+"""Below the ephemeral range, from which the kernel chooses ports for clients."""
 free_ports = PORTS.draw
 
 
@@ -131,7 +130,7 @@ async def call(
 ) -> Any:
     """The value of an XML-RPC call. Raises Fault, ValueError, OSError, EOFError, TimeoutError.
 
-    `source` is the address to call from; `host` what to call the peer, where that isn't `address`.
+    `source` is the address to call from. `host` replaces the address in the Host header.
     """
     target = host_and_port(address) if isinstance(address, str) else address
     body = xmlrpc.client.dumps(params, method).encode()
@@ -148,14 +147,14 @@ async def call(
 
 
 def authority(address: Address) -> str:
-    """A host and port as they stand in a URI."""
+    """Host and port in the form of a URI."""
     host, port = address
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 async def connect(address: Address, source: str = "") -> Streams:
-    """Open a connection, from `source` if it is of the same family. Raises OSError."""
-    # Not by the event loop: uvloop's look-up logs a traceback when who waits for it is cancelled.
+    """Open a connection, from `source` if the family is the same. Raises OSError."""
+    # Not by the event loop: uvloop's look-up logs a traceback when the waiting task is cancelled.
     addresses = await resolve(address[0])
     if not addresses:
         raise OSError(f"{address[0]} has no address")
@@ -164,9 +163,9 @@ async def connect(address: Address, source: str = "") -> Streams:
 
 
 class FakeTcpServer:
-    """A server that ends its connections when it stops, as a process does that ends.
+    """A server that ends all connections when stopped, like a process that ends.
 
-    `admits` tells of a peer's address whether it may connect. `connections` counts all that came.
+    `admits` decides by the peer's address. `connections` counts the accepted connections.
     """
 
     def __init__(self, serve: ServeConnection) -> None:
@@ -180,18 +179,18 @@ class FakeTcpServer:
 
     @property
     def listening(self) -> bool:
-        """Whether it takes connections."""
+        """Whether the server accepts connections."""
         return self._server is not None
 
     async def start(self, address: str, port: int = 0) -> None:
-        """Listen; on a free port if none is given."""
+        """Listen; on a free port if `port` is 0."""
         port = port or free_ports(1)
         self._is_stopped = False
         self._server = await asyncio.start_server(self._accept, address, port, backlog=256)
         self.address = self._server.sockets[0].getsockname()[:2]
 
     def stop_listening(self) -> None:
-        """Take no more connections; those that are open stay."""
+        """Accept no more connections. Open connections stay."""
         if self._server is not None:
             self._server.close()
             self._server = None
@@ -203,7 +202,7 @@ class FakeTcpServer:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        for _ in range(10):  # let connections end that were accepted in this moment
+        for _ in range(10):  # connections that were just accepted end, too
             await asyncio.sleep(0)
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -223,7 +222,7 @@ class FakeTcpServer:
             self._tasks.discard(task)
 
     async def _close(self, writer: asyncio.StreamWriter) -> None:
-        """Close a connection when what was written is sent; at once after `stop`."""
+        """Close a connection after the written data is sent; at once after `stop`."""
         if self._is_stopped:
             writer.transport.abort()
         else:

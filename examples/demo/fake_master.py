@@ -1,13 +1,13 @@
-"""A small ROS master, with rosmaster's own bookkeeping.
+"""A small ROS master with rosmaster's bookkeeping.
 
-One node name has one slave URI: whoever registers it from elsewhere takes the former node's
-registrations away, and that one is told to shut down. A service has one provider, the last one.
-Only the very string that was registered is unregistered. Subscribers hear of every change of a
-topic's publishers or of a parameter (rosmaster/master_api.py, registrations.py). Unlike
-rosmaster, it takes names as they are, and a parameter's key for its whole name.
+A node name has a single slave URI. If a node registers with another URI, the master removes the
+former node's registrations and calls `shutdown` on the former node. A service has a single
+provider, the last. An unregistration must have the registered string. Subscribers get every change
+of a topic's publishers or of a parameter (rosmaster/master_api.py, registrations.py). Unlike
+rosmaster, this master does not resolve names, and takes the key of a parameter as the whole name.
 
-For tests, `answers` replaces the answer to a method, `delay` holds all answers up, and `calls` and
-`requests` are what came.
+For tests, `answers` replaces the answer to a method, and `delay` delays all answers. `calls` and
+`requests` have everything that came.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ Provider = tuple[str, str]
 """caller_id, and the node's slave URI or (for a service) the service's URI."""
 
 UNSET: dict[str, Any] = {}
-"""What subscribers are told of a parameter that is not there."""
+"""The value that subscribers get for a parameter that is not set."""
 ODD_PARAMETERS = (TypeError, AttributeError, LookupError, ValueError)
 CALL_ERRORS = (OSError, EOFError, ValueError, xmlrpc.client.Error)
-"""What a call may raise: the peer is gone, out of reach, or talks nonsense."""
+"""Errors of a call: the peer is gone, out of reach, or gives an invalid answer."""
 
 
 class FakeMaster:
     """A ROS master; see the module.
 
-    `nodes` are the slave URIs by node name; `tables` hold the providers of each topic, service and
-    parameter. Switch `calls_back` off for one that can't reach any node.
+    `nodes` has the slave URI of each node name. `tables` have the providers of each topic, service
+    and parameter. Without `calls_back` the master reaches no node.
     """
 
     def __init__(self, address: str, port: int = 0) -> None:
@@ -57,29 +57,29 @@ class FakeMaster:
 
     @property
     def uri(self) -> str:
-        """Its URI."""
+        """The URI of the master."""
         return f"http://{authority(self.http.address)}"
 
     async def start(self, address: str = "") -> None:
-        """Listen; on the same port as before, and on the same address unless another is given."""
+        """Listen on the same port as before, and on the same address unless `address` is given."""
         await self.http.start(address or self.http.address[0], self.http.address[1])
 
     async def stop(self) -> None:
-        """Go down."""
+        """Stop listening and calling nodes."""
         for task in self._callbacks:
             task.cancel()
         await asyncio.gather(*self._callbacks, return_exceptions=True)
         await self.http.stop()
 
     async def restart(self) -> None:
-        """Die and come back as a new process without memory."""
+        """Stop, and start like a new process without memory."""
         await self.stop()
         self.forget()
         self.pid += 1
         await self.start()
 
     def forget(self) -> None:
-        """Lose all state, as a master does that is started anew."""
+        """Lose all state."""
         kinds = ("publishers", "subscribers", "services", "params")
         self.nodes: dict[str, str] = {}
         self.tables: dict[str, dict[str, list[Provider]]] = {kind: {} for kind in kinds}
@@ -95,14 +95,14 @@ class FakeMaster:
         return [params for method, params in self.calls if method in methods]
 
     def register(self, kind: str, key: str, caller: str, api: str) -> None:
-        """Note a publisher, a subscriber, or who subscribes to a parameter."""
+        """Note a publisher, a subscriber, or a parameter subscription."""
         self._admit(caller, api)
         providers = self.tables[kind].setdefault(key, [])
         if (caller, api) not in providers:
             providers.append((caller, api))
 
     def _admit(self, caller: str, api: str) -> None:
-        """Note a node's URI; the former node of this name loses everything."""
+        """Note a node's URI. The former node of this name loses all registrations."""
         former = self.nodes.get(caller, api)
         self.nodes[caller] = api
         if former != api:
@@ -121,9 +121,9 @@ class FakeMaster:
     # Calling nodes back
 
     def _notify(self, uri: object, method: str, *params: Any) -> None:
-        """Have a node called in the background: one call at a time, in order.
+        """Call a node in the background: one call at a time, in order.
 
-        Where ``uri`` is none, nobody is called: a real master has refused it before.
+        No call if ``uri`` is no string: a real master has refused such a URI before.
         """
         if isinstance(uri, str) and self.calls_back:
             task = asyncio.ensure_future(self._call_back(uri, method, params))

@@ -1,13 +1,13 @@
-"""A small ROS node: slave API and TCPROS server, and what it calls at its master.
+"""A small ROS node: slave API, TCPROS server, and calls to the master.
 
-It lives at `address` and calls itself `host`, which nobody need be able to resolve. What it says
-on a TCPROS connection after the header is up to `stream`: the tests have it echo, the
-demonstration's nodes (:mod:`.players`) publish and serve.
+The node listens at `address` and registers as `host`, which need not resolve. After the header,
+`stream` handles a TCPROS connection: in the tests `stream` echoes, in the demonstration
+(:mod:`.players`) the nodes publish and serve.
 
 For tests, `answers` replaces the answer to a slave API method (a function gets the parameters),
-`delay` holds all answers up, and `hang` never answers; `calls` are the calls that came, `requests`
-the same on the wire, `headers` those of all TCPROS connections. `own_ports` has the servers of
-topics and services that do not share the node's, as in some client libraries.
+`delay` delays all answers, and with `hang` the node never answers. `calls` are the received calls,
+`requests` the same on the wire, `headers` the headers of all TCPROS connections. `own_ports` has
+the servers of topics and services with a separate port, as in some client libraries.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Header = dict[str, str]
 Stream = Callable[["FakeNode", asyncio.StreamReader, asyncio.StreamWriter, Header], Awaitable[None]]
 
 STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1"}
-"""The fields of a connection header that name the one message type in use here."""
+"""The fields of a connection header for the only message type in use here."""
 
 
 async def read_header(reader: asyncio.StreamReader) -> Header:
@@ -45,7 +45,7 @@ async def read_header(reader: asyncio.StreamReader) -> Header:
 async def echo(
     node: FakeNode, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, _header: Header
 ) -> None:
-    """Answer a TCPROS header and send back all that follows, until the peer ends it."""
+    """Answer a TCPROS header and echo all data until the peer ends the connection."""
     writer.write(encode_header({"callerid": node.name, "md5sum": "*", "node_uri": node.uri}))
     while data := await reader.read(65536):
         writer.write(data)
@@ -64,7 +64,8 @@ class FakeNode:
         self.stream: Stream = echo
         self.pid = 100
         self.uri_form = "http://{}/"
-        # Every ROS node offers it; a proxy that starts anew asks for it to find the TCPROS port.
+        # Every ROS node publishes /rosout. A restarted proxy asks for this topic to find the TCPROS
+        # port.
         self.published = {"/rosout": "rosgraph_msgs/Log"}
         self.subscribed: dict[str, str] = {}
         self.hang = False
@@ -77,17 +78,17 @@ class FakeNode:
 
     @property
     def uri(self) -> str:
-        """What it calls itself."""
+        """The slave URI."""
         return self.uri_form.format(authority((self.host, self.slave.address[1])))
 
     @property
     def service_api(self) -> str:
-        """Where it says its services are, unless they have ports of their own."""
+        """The `service_api` of all services without a separate port."""
         return f"rosrpc://{authority((self.host, self.tcpros_port))}"
 
     @property
     def tcpros_port(self) -> int:
-        """The port of its TCPROS server."""
+        """The port of the TCPROS server."""
         return self.tcpros.address[1]
 
     def port_of(self, name: str) -> int:
@@ -95,18 +96,18 @@ class FakeNode:
         return self.own_ports.get(name, self.tcpros).address[1]
 
     async def start(self) -> None:
-        """Listen; the slave API on the same port as before if there was one."""
+        """Listen; the slave API on the same port as before, if any."""
         await self.slave.start(self.address, self.slave.address[1])
         await self.tcpros.start(self.address)
 
     async def stop(self) -> None:
-        """End, without a word to anybody."""
+        """End without unregistering."""
         for server in (self.tcpros, *self.own_ports.values()):
             await server.stop()
         await self.slave.stop()
 
     async def call(self, master: Address | str, method: str, *params: Any) -> Any:
-        """Call its master, under its own name and from its own address."""
+        """Call the master, with the node's name and from the node's address."""
         return await call(master, method, self.name, *params, source=self.address)
 
     async def publish(self, master: Address | str, topic: str = "/chatter") -> list[Any]:
@@ -125,7 +126,7 @@ class FakeNode:
         return await self._register(master, "registerService", service, api)
 
     async def open_own_port(self, name: str) -> None:
-        """Have a topic or service on a port of its own, which is for nothing else."""
+        """Serve a topic or service on a separate port, which is for nothing else."""
 
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             header = await read_header(reader)
@@ -140,12 +141,12 @@ class FakeNode:
         await server.start(self.address)
 
     def name_port_for_any_topic(self) -> None:
-        """Answer ``requestTopic`` for topics that it does not publish, too, as roscpp does."""
+        """Answer ``requestTopic`` for topics that the node does not publish, too, like roscpp."""
         protocol = ["TCPROS", self.host, self.tcpros_port]
         self.answers["requestTopic"] = value([1, "", protocol])
 
     async def close_own_port(self, name: str) -> None:
-        """End such a server."""
+        """Close the separate port of a topic or service."""
         if name in self.own_ports:
             await self.own_ports.pop(name).stop()
 
@@ -154,7 +155,7 @@ class FakeNode:
         return triple
 
     def updates(self, topic: str = "/chatter") -> list[list[str]]:
-        """The publishers of each publisherUpdate that came for a topic."""
+        """The publishers of each received publisherUpdate for a topic."""
         return [p[2] for method, p in self.calls if method == "publisherUpdate" and p[1] == topic]
 
     async def _respond(self, request: FakeRequest) -> Answer:

@@ -1,13 +1,13 @@
-"""A small participant of DDS, which is what a node of ROS 2 is: discovery, and a reliable topic.
+"""A small DDS participant, as a ROS 2 node has: discovery, and a reliable topic.
 
-Each second it announces itself where it is told to (SPDP). Whoever hears that answers in the same
-way; then each tells the other of its writers and readers (SEDP), and where topic and type are the
-same on both sides, samples go from the one to the other. All goes to the addresses that the other
-one gives in its announcements, its *locators*. Of these it has two, a socket for each: one for
-discovery, one for what users send.
+The participant announces itself each second to given addresses (SPDP), and answers a new
+participant with an announcement. Then both describe their writers and readers to each other (SEDP).
+If topic and type match, the writer sends samples to the reader. Datagrams go to the locators in the
+announcements of the receiver. This participant has two locators, with a socket for each: one for
+discovery, one for user data.
 
-It talks with any DDS in this way. What it lacks of one: liveliness, fragments, descriptions of
-types, the names of nodes; and it forgets nobody.
+The participant works with any DDS. It lacks liveliness, fragments, type descriptions and node
+names, and never forgets another participant.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from rosproxy.ros2.registry.participants import EndpointKind
 from rosproxy.ros2.rewriting.discovery import Announcement, BuiltinWriter, read_discovery
 
 ANNOUNCE_INTERVAL = 1.0
-"""Seconds between announcements; Fast DDS takes three."""
+"""Seconds between announcements. Fast DDS waits three."""
 HEARTBEAT_INTERVAL = 0.1
 LEASE = 100
-"""Seconds for which others remember it unheard: what DDS has where nothing is said (9.6.3.2)."""
-ANYBODY = bytes(12)
+"""Lease duration in seconds: the default of DDS (9.6.3.2)."""
+ALL_PARTICIPANTS = bytes(12)
 PARTICIPANT = 0x000001C1
 SPDP_READER = 0x000100C7
 WRITER = 0x00000103
 READER = 0x00000104
-"""The entity id of the writer or reader that it may have; they have no key (9.3.1.2)."""
+"""Entity ids of the writer and the reader. Their topic has no key (9.3.1.2)."""
 TO_READER = 5
-"""From the entity id of a writer of SEDP to that of its reader."""
+"""Difference between the entity ids of an SEDP writer and its reader."""
 BUILT_IN = {BuiltinWriter.PUBLICATIONS: (0x04, 0x08), BuiltinWriter.SUBSCRIPTIONS: (0x10, 0x20)}
-"""The bits that say whether a participant has a writer of SEDP, and its reader (9.3.2.12)."""
+"""Bits for the writer and the reader of each kind of SEDP (9.3.2.12)."""
 RELIABILITY = 0x1A
 RELIABLE = struct.pack("<IiI", 2, 0, 0)
-"""The one quality of service that isn't what DDS has where nothing is said."""
+"""The only QoS policy that differs from the default of DDS."""
 STRING_TYPE = "std_msgs::msg::dds_::String_"
 
 
 @dataclass
 class DdsPeer:
-    """Another participant: its locators for discovery and for users, and when it was heard."""
+    """Another participant: locators for discovery and user data, time of the last announcement."""
 
     discovery: HostPort
     user: HostPort
@@ -62,11 +62,11 @@ class DdsPeer:
 
 
 class FakeParticipant(asyncio.DatagramProtocol):
-    """A participant at an address; see the module. `start` it in a running event loop.
+    """A participant at an address; see the module. `start` needs a running event loop.
 
-    `admits` tells of a datagram's source whether it is let in; `turned_away` counts the others.
-    `peers` are those that it has heard of, by prefix; `locators` are its own, for discovery and for
-    users.
+    `admits` decides by the source whether the participant accepts a datagram. `turned_away` counts
+    the rejected datagrams. `peers` are the discovered participants by prefix. `locators` are for
+    discovery and for user data, in this order.
     """
 
     def __init__(self, name: str, address: str, topic: str) -> None:
@@ -89,7 +89,7 @@ class FakeParticipant(asyncio.DatagramProtocol):
 
     @property
     def listening(self) -> bool:
-        """Whether it is there."""
+        """Whether the participant runs."""
         return bool(self._sockets)
 
     async def start(self) -> None:
@@ -103,7 +103,7 @@ class FakeParticipant(asyncio.DatagramProtocol):
         self._ticking = asyncio.create_task(self._tick())
 
     async def stop(self) -> None:
-        """End, without a word to anybody."""
+        """End without a dispose message."""
         if self._ticking:
             self._ticking.cancel()
             await asyncio.gather(self._ticking, return_exceptions=True)
@@ -112,12 +112,12 @@ class FakeParticipant(asyncio.DatagramProtocol):
         self._sockets.clear()
 
     def announce_to(self, to: list[HostPort]) -> None:
-        """Announce itself there from now on, and nowhere else."""
+        """Announce this participant at these addresses only, now and each second."""
         self._announced_to = to
         self._announce(to)
 
     def describe(self, entity: int, by: BuiltinWriter) -> None:
-        """Tell all others of the one writer or reader that it has."""
+        """Describe the writer or reader to all participants."""
         parameters = [
             (Pid.ENDPOINT_GUID, self._guid(entity)),
             (Pid.TOPIC_NAME, string(self.dds_topic)),
@@ -135,10 +135,10 @@ class FakeParticipant(asyncio.DatagramProtocol):
             self._send_to(reader, *parts)
 
     def hear(self, payload: bytes) -> None:
-        """Take in a sample of its topic."""
+        """Process a sample of the topic."""
 
     def datagram_received(self, datagram: bytes, sender: tuple[str, int]) -> None:
-        """Take in what comes to either socket."""
+        """Process a datagram of either socket."""
         if not self.admits(sender[0]):
             self.turned_away += 1
             return
@@ -146,7 +146,7 @@ class FakeParticipant(asyncio.DatagramProtocol):
             if destination(datagram) in (None, self.prefix):
                 self._take(datagram, source_prefix(datagram))
 
-    def _announce(self, to: list[HostPort], meant: bytes = ANYBODY) -> None:
+    def _announce(self, to: list[HostPort], meant: bytes = ALL_PARTICIPANTS) -> None:
         discovery, user = (pack_locator(locator, "<") for locator in self.locators)
         payload = parameter_list(
             [
@@ -179,7 +179,7 @@ class FakeParticipant(asyncio.DatagramProtocol):
             self._heed(prefix, submessage)
 
     def _meet(self, prefix: bytes, announced: Announcement, datagram: bytes) -> None:
-        """Take in what a participant announces of itself; answer it if it is new."""
+        """Process a participant's announcement. Answer a new participant."""
         locators = dict(reversed([*announced.reached_at(datagram)]))
         discovery = locators.get(Pid.METATRAFFIC_UNICAST_LOCATOR)
         if discovery is None:
@@ -196,7 +196,7 @@ class FakeParticipant(asyncio.DatagramProtocol):
                 self.writers[writer].match(prefix + (writer + TO_READER).to_bytes(4, "big"))
 
     def _match(self, prefix: bytes, announced: Announcement, datagram: bytes) -> None:
-        """Take in what a participant says of a reader or writer of its own."""
+        """Process the description of a reader or writer."""
         entity = announced.endpoint(datagram)
         type_name = announced.parameters.text(datagram, Pid.TYPE_NAME)
         if not entity or (announced.topic(datagram), type_name) != (self.dds_topic, STRING_TYPE):
@@ -210,7 +210,7 @@ class FakeParticipant(asyncio.DatagramProtocol):
             self.readers[READER].match(guid)
 
     def _heed(self, prefix: bytes, submessage: Told) -> None:
-        """Take in a heartbeat or a gap for a reader, or an ACKNACK for a writer."""
+        """Process a heartbeat or a gap for a reader, or an ACKNACK for a writer."""
         if submessage.kind == SubmessageId.ACKNACK:
             guid = prefix + submessage.reader.to_bytes(4, "big")
             if submessage.writer in self.writers and (
@@ -245,7 +245,7 @@ class FakeParticipant(asyncio.DatagramProtocol):
         return self.prefix + entity.to_bytes(4, "big")
 
     def _send_to(self, guid: bytes, *parts: bytes) -> None:
-        """Send to a reader or writer, where it says itself that it is, or its participant."""
+        """Send to the own locator of a reader or writer, otherwise to the participant's locator."""
         peer = self.peers[guid[:12]]
         is_built_in = guid[15] & 0xC0 == 0xC0
         usual = peer.discovery if is_built_in else peer.user

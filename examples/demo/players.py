@@ -1,8 +1,8 @@
 """The demonstration's nodes: a talker, a listener and an adder, over real TCPROS.
 
-Real ROS subscribers differ in how they come back to a publisher that they lost: roscpp tries
-again, after 0.1 s and then twice as long each time; rospy when the master's next publisherUpdate
-names the publisher. The listener does both.
+When a connection to a publisher ends, roscpp tries again after 0.1 s, and then after twice as long
+each time. rospy tries again when the master's next publisherUpdate names the publisher. The
+listener does both.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ LENGTH = struct.Struct("<I")
 
 
 class Refused(ConnectionError):
-    """What a node was asked for and doesn't give; the text is its reason."""
+    """A node refused a request; the text is the node's reason."""
 
 
 def in_words(problem: BaseException) -> str:
-    """What went wrong, for people."""
+    """The text of an error, for people."""
     if isinstance(problem, OSError) and problem.errno:
-        # asyncio puts addresses into the text, and look-ups have negative numbers of their own.
+        # asyncio puts addresses into the text, and look-ups have negative error numbers.
         return os.strerror(problem.errno) if problem.errno > 0 else problem.strerror or ""
     return str(problem) or type(problem).__name__
 
 
 class Player(FakeNode):
-    """A node that connects to others."""
+    """A node that connects to other nodes."""
 
     async def register(self, master: str) -> None:
         """Register at the master; like every ROS node, as a publisher of /rosout."""
@@ -71,7 +71,7 @@ class Player(FakeNode):
         return reader, writer
 
     async def add(self, master: str, service: str, a: int, b: int) -> int:
-        """Look an adder up at the master and call it. Raises Refused, and CALL_ERRORS."""
+        """Look up an adder at the master and call the service. Raises Refused, and CALL_ERRORS."""
         address = host_and_port(await self.ask(master, "lookupService", service))
         async with asyncio.timeout(2.0):
             reader, writer = await self.greet(address, service=service, **ADD_TWO_INTS)
@@ -85,10 +85,9 @@ class Player(FakeNode):
 
 
 class Talker(Player):
-    """Publishes numbers from 1 on; `sent` are those that a subscriber was connected for.
+    """Publishes the numbers from 1. `sent` has the numbers for which a subscriber was connected.
 
-    `connections` counts the subscribers that have come, and `sent_over` has for each number how
-    many had come by then.
+    `connections` counts the subscribers so far. `sent_over` has this count for each sent number.
     """
 
     def __init__(self, *who: str, topic: str) -> None:
@@ -103,7 +102,7 @@ class Talker(Player):
 
     @property
     def connected(self) -> bool:
-        """Whether somebody listens."""
+        """Whether a subscriber is connected."""
         return bool(self.subscribers)
 
     async def register(self, master: str) -> None:
@@ -137,7 +136,7 @@ class Talker(Player):
 
 
 class Listener(Player):
-    """Subscribes; `received` are the numbers with their times, `problem` why nothing comes."""
+    """Subscribes. `received` has each number with its time, `problem` the last error."""
 
     def __init__(self, *who: str, topic: str) -> None:
         super().__init__(*who)
@@ -151,7 +150,7 @@ class Listener(Player):
         """Subscribe, and follow the topic's publishers from now on."""
         await super().register(master)
         answer = await self.subscribe(master, self.topic)
-        if not self.updates(self.topic):  # one that overtook the answer is newer
+        if not self.updates(self.topic):  # an update that overtook the answer is newer
             self._follow(answer[2])
 
     def run(self, method: str, params: tuple[Any, ...]) -> list[Any]:

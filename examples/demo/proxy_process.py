@@ -1,4 +1,4 @@
-"""The real proxy, as a process of its own: `python -m rosproxy run`."""
+"""The real proxy as a separate process: `python -m rosproxy run`."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from pathlib import Path
 from time import monotonic
 
 START_SECONDS = 60.0
-"""How long it may take to start; a slow machine is no reason to fail."""
+"""Time limit of a start. Long, so that a slow machine does not fail."""
 STOP_SECONDS = 10.0
-"""How long it may take to end when asked to, before it is killed."""
+"""Time from SIGTERM to SIGKILL."""
 
 
 class DemoError(Exception):
-    """Something that keeps the demonstration from going on; the text is for the user."""
+    """The demonstration cannot go on; the text is for the user."""
 
 
 def clean_environment(**more: str) -> dict[str, str]:
-    """The environment, without what is meant for ROS, for a proxy or for another terminal."""
+    """The environment without the variables of ROS, of a proxy and of the terminal."""
     foreign = ("ROS_", "ROSPROXY_", "COLUMNS", "LINES")
     kept = {k: v for k, v in os.environ.items() if not k.startswith(foreign)}
     return kept | more
@@ -33,7 +33,7 @@ def clean_environment(**more: str) -> dict[str, str]:
 class ProxyProcess:
     """A proxy with the given `options`.
 
-    `state` is one of "not started", "starting", "ready", "killed", "ended"; `log` holds its last
+    `state` is "not started", "starting", "ready", "killed" or "ended". `log` has the last log
     lines.
     """
 
@@ -45,10 +45,10 @@ class ProxyProcess:
         self._reader: asyncio.Task[None] | None = None
 
     async def start(self) -> float:
-        """Start it and wait until it is ready; the seconds that took. Raises DemoError."""
+        """Start the proxy and wait until ready. Return the seconds. Raises DemoError."""
         began = monotonic()
         self.state = "starting"
-        # In a session of its own, so that Ctrl-C ends the demonstration and not the proxy.
+        # In a separate session, so that Ctrl-C ends the demonstration and not the proxy.
         self._process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "rosproxy", "run", *self.options),
             stdin=DEVNULL,
@@ -66,12 +66,12 @@ class ProxyProcess:
         return monotonic() - began
 
     async def kill(self) -> None:
-        """End it with SIGKILL."""
+        """Kill the proxy with SIGKILL."""
         await self._end(signal.SIGKILL)
         self.state = "killed"
 
     async def stop(self) -> None:
-        """Ask it to end, and kill it if it doesn't."""
+        """Stop the proxy with SIGTERM, and kill a proxy that does not end."""
         await self._end(signal.SIGTERM)
 
     async def _end(self, number: signal.Signals) -> None:
@@ -84,7 +84,7 @@ class ProxyProcess:
             await self._reader
 
     async def _read(self, process: Process, ready: asyncio.Event) -> None:
-        """Keep its log until it has ended."""
+        """Keep the log until the process has ended."""
         if process.stdout is not None:
             async for line in process.stdout:
                 self.log.append(line.decode("utf-8", "replace").rstrip())

@@ -1,8 +1,8 @@
-"""Both halves of a reliable topic of DDS (DDSI-RTPS 2.5, 8.4): nothing is lost while both live.
+"""Writer and reader of a reliable DDS topic (DDSI-RTPS 2.5, 8.4): no sample is lost.
 
-A writer keeps its samples, and says by heartbeats what it has, until its readers have acknowledged
-all. A reader answers with what it lacks, and takes samples in their order. Each knows the others by
-their GUIDs, and is given what these have told; it gives what is to be sent (:mod:`.rtps_messages`).
+A writer keeps samples and sends heartbeats until all readers have acknowledged the samples. A
+reader takes samples in order, and asks for missing samples. Both are known by GUID, process parsed
+submessages, and return the submessages to send (:mod:`.rtps_messages`).
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from examples.demo.rtps_messages import Told, acknack, data, heartbeat
 
 @dataclass
 class ReliableWriter:
-    """Keeps samples; `acknowledged` is up to which number each of its readers has them.
+    """Keeps samples. `acknowledged` has the last acknowledged number for each reader.
 
-    One that is `durable` keeps all, for whoever comes; of others a reader gets what is written from
-    its coming on.
+    A `durable` writer keeps all samples for later readers. Otherwise a reader gets only the samples
+    that are written after the match.
     """
 
     entity: int
@@ -28,27 +28,27 @@ class ReliableWriter:
     _count: int = 0
 
     def match(self, reader: bytes) -> None:
-        """Have a reader from now on."""
+        """Add a reader."""
         self.acknowledged.setdefault(reader, 0 if self.durable else self.last)
 
     def write(self, payload: bytes) -> None:
-        """Write a sample; without readers it is nobody's."""
+        """Write a sample. Without readers, only a durable writer keeps the sample."""
         self.last += 1
         if self.durable or self.acknowledged:
             self.samples[self.last] = payload
 
     def sample(self, reader: bytes, number: int) -> bytes:
-        """What tells a reader a sample."""
+        """The DATA submessage with a sample for a reader."""
         return data(_entity(reader), self.entity, number, self.samples[number])
 
     def heartbeat(self, reader: bytes) -> bytes:
-        """What tells a reader which samples there are."""
+        """The HEARTBEAT submessage for a reader."""
         self._count += 1
         first = next(iter(self.samples), self.last + 1)
         return heartbeat(_entity(reader), self.entity, first, self.last, self._count)
 
     def heed(self, reader: bytes, submessage: Told) -> list[bytes]:
-        """Take in what a reader has got; what it lacks."""
+        """Process an ACKNACK. Return the samples that the reader lacks."""
         if reader not in self.acknowledged:
             return []
         self.acknowledged[reader] = max(self.acknowledged[reader], submessage.first - 1)
@@ -59,9 +59,9 @@ class ReliableWriter:
 
 @dataclass
 class ReliableReader:
-    """Takes samples in their order: of each writer only the next one, whose number is `expected`.
+    """Takes samples in order: from each writer only the `expected` number.
 
-    Any other that comes is let go; it is asked for when its turn has come.
+    The reader drops any other sample, and asks for the sample again later.
     """
 
     entity: int
@@ -69,23 +69,23 @@ class ReliableReader:
     _count: int = 0
 
     def match(self, writer: bytes) -> None:
-        """Have a writer from now on."""
+        """Add a writer."""
         self.expected.setdefault(writer, 1)
 
     def take(self, writer: bytes, number: int) -> bool:
-        """Whether it is a sample's turn."""
+        """Take the next sample of a writer; False for any other sample."""
         if number != self.expected.get(writer):
             return False
         self.expected[writer] += 1
         return True
 
     def skip(self, writer: bytes, first: int, last: int) -> None:
-        """Expect none of the samples from `first` to `last`: there are none."""
+        """Skip the samples from `first` to `last`, which do not exist."""
         if first <= self.expected[writer] <= last:
             self.expected[writer] = last + 1
 
     def answer(self, writer: bytes, last: int) -> bytes:
-        """What tells a writer with samples up to `last` what this reader has and lacks."""
+        """The ACKNACK for a writer with samples up to `last`."""
         self._count += 1
         base = self.expected[writer]
         return acknack(self.entity, _entity(writer), base, range(base, last + 1), self._count)

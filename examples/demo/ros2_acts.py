@@ -1,12 +1,13 @@
-"""The part of ROS 2 in the demonstration: a talker and a listener on either side, and their domain.
+"""ROS 2 in the demonstration: a talker and a listener on either side, and a free domain.
 
-Nodes of ROS 2 have no master. Those inside announce themselves to the proxy at the domain's
-well-known port, as real ones do with `ROS_STATIC_PEERS`; those outside to the proxy's first port,
-and they are its peers. As with NAT, inside turns away every datagram from an outside address.
+ROS 2 nodes have no master. Nodes inside announce themselves at the proxy's well-known port of the
+domain, like real nodes with `ROS_STATIC_PEERS`. Nodes outside announce themselves at the first port
+of the range, and are peers of the proxy. As with NAT, nodes inside reject every datagram from an
+outside address.
 
-The domain is one that nobody on this machine has, neither real nodes nor another demonstration. A
-domain is a row of 250 UDP ports, some of which DDS has no use for; holding one of these keeps other
-demonstrations away, and nobody else (`reserve_domain`).
+Neither real nodes nor another demonstration on this machine use the domain. A domain is a row of
+250 UDP ports, and DDS does not use all of these. `reserve_domain` holds an unused port to keep
+other demonstrations away. Real nodes are not affected.
 """
 
 from __future__ import annotations
@@ -32,13 +33,15 @@ from rosproxy.ros2.domain_settings import (
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 DOMAINS = range(1, 31)
-"""Those whose ports lie below what `free_ports` chooses from, and not the one that all have."""
+"""Domains with ports below the range of `free_ports`, without the default domain 0."""
 RESERVING = SPDP_MULTICAST + 2
-"""The port that is held, in domain 0: DDS has 7400, 7401, and those from 7410 on (9.6.2.3)."""
+"""The port that the demonstration holds, in domain 0. DDS uses 7400, 7401, and 7410 upwards
+(9.6.2.3).
+"""
 
 
 class Ros2Talker(FakeParticipant):
-    """Publishes numbers from 1 on; `sent` are those that there was a subscriber for."""
+    """Publishes the numbers from 1. `sent` has the numbers for which there was a subscriber."""
 
     def __init__(self, name: str, address: str, topic: str) -> None:
         super().__init__(name, address, topic)
@@ -49,7 +52,7 @@ class Ros2Talker(FakeParticipant):
 
     @property
     def connected(self) -> bool:
-        """Whether somebody listens."""
+        """Whether there is a subscriber."""
         return bool(self.writers[WRITER].acknowledged)
 
     async def talk(self) -> None:
@@ -63,7 +66,7 @@ class Ros2Talker(FakeParticipant):
 
 
 class Ros2Listener(FakeParticipant):
-    """Subscribes; `received` are the numbers with their times."""
+    """Subscribes. `received` has each number with its time."""
 
     def __init__(self, name: str, address: str, topic: str) -> None:
         super().__init__(name, address, topic)
@@ -77,12 +80,12 @@ class Ros2Listener(FakeParticipant):
         return bool(self.readers[READER].expected)
 
     def hear(self, payload: bytes) -> None:
-        """Take in a message."""
+        """Note a message."""
         self.received.append((int(unpack_string(payload)), monotonic()))
 
 
 class Ros2Acts:
-    """The four nodes, and what is done with them; `domain` is theirs once they are there."""
+    """The four nodes, and the actions on them. `start` sets `domain`."""
 
     def __init__(self, robot: str, inside: tuple[str, str], admits: Callable[[str], bool]) -> None:
         first, second = inside
@@ -99,7 +102,7 @@ class Ros2Acts:
         self._reserved: socket.socket | None = None
 
     async def start(self) -> None:
-        """Choose a domain and start the nodes, which nobody is told of yet. Raises DemoError."""
+        """Choose a domain and start the nodes without announcements. Raises DemoError."""
         self.domain, self._reserved = reserve_domain()
         for node in self.nodes:
             await node.start()
@@ -112,7 +115,7 @@ class Ros2Acts:
             self._reserved.close()
 
     def proxy_options(self) -> list[str]:
-        """What the proxy is told."""
+        """The options of the proxy for ROS 2."""
         peers = [f"--ros2-peer={node.locators[0]}" for node in self.outside]
         return ["--ros=1", "--ros=2", f"--ros2-domain={self.domain}", *peers]
 
@@ -121,7 +124,7 @@ class Ros2Acts:
         self.talker.announce_to([self.far_listener.locators[0]])
 
     def announce_to_proxy(self, inside: str, outside: HostPort) -> None:
-        """Have all announce themselves to the proxy, at its address inside, or its port outside."""
+        """Have all nodes announce themselves to the proxy, from inside or from outside."""
         well_known = HostPort(inside, SPDP_UNICAST + PORTS_PER_DOMAIN * self.domain)
         for node in self.inside:
             node.announce_to([well_known])
@@ -129,31 +132,31 @@ class Ros2Acts:
             node.announce_to([outside])
 
     def is_connected(self, since: float) -> bool:
-        """Whether messages have come on both sides, and outside has heard from all inside."""
+        """Whether both sides have received messages, and outside knows all nodes inside."""
         both_hear = self.listener.received and self.far_listener.received
         return bool(both_hear) and self.are_heard(since)
 
     def are_heard(self, since: float) -> bool:
-        """Whether outside has heard from all inside since then, by way of the proxy."""
+        """Whether outside has an announcement of each node inside since then."""
         peers = self.far_listener.peers
         return all(
             node.prefix in peers and peers[node.prefix].heard >= since for node in self.inside
         )
 
     def addresses(self) -> dict[str, str]:
-        """Where outside finds each node inside: for discovery, and for what users send."""
+        """The outside addresses of each node inside: for discovery, and for user data."""
         told = {node.name: self.far_listener.peers[node.prefix] for node in self.inside}
         return {name: f"{peer.discovery} {peer.user}" for name, peer in told.items()}
 
     def seen(self, node: FakeParticipant) -> str:
-        """Where the other side sends what users send to a node; empty if it doesn't know it yet."""
+        """The address at which the other side sends user data to a node; empty before discovery."""
         other = self.far_listener if node in self.inside else self.talker
         peer = other.peers.get(node.prefix)
         return str(peer.user) if peer else ""
 
 
 def reserve_domain() -> tuple[int, socket.socket]:
-    """A domain that nobody on this machine has, and what reserves it. Raises DemoError."""
+    """A domain that no program on this machine uses, and the reservation. Raises DemoError."""
     for domain in random.sample(DOMAINS, len(DOMAINS)):
         offset = PORTS_PER_DOMAIN * domain
         reservation = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -1,10 +1,10 @@
-"""RTPS as the demonstration's participants write it, and what of it the proxy has no need to read.
+"""RTPS messages of the demonstration, and the submessages that the proxy does not parse.
 
-A message is for one participant, and is a row of submessages: samples (DATA), what a writer has
-(HEARTBEAT), and what a reader has got and lacks (ACKNACK). Those who announce themselves write a
-list of parameters as their sample, the talkers a `std_msgs/String`. Layouts and names are
-DDSI-RTPS 2.5's, 8.3 and 9.4; all numbers are little-endian. The rest of reading, locators too, are
-`rosproxy.ros2.protocol`'s.
+A message is for a single participant, and is a row of submessages: samples (DATA), the numbers that
+a writer has (HEARTBEAT), and the numbers that a reader has and lacks (ACKNACK). The sample of an
+announcement is a parameter list, the sample of a talker a `std_msgs/String`. Layouts and names are
+from DDSI-RTPS 2.5, 8.3 and 9.4. All numbers are little-endian. `rosproxy.ros2.protocol` parses
+everything else, locators too.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from dataclasses import dataclass
 from rosproxy.ros2.protocol.rtps import MAGIC, SENTINEL, VERSION, SubmessageId, submessages
 
 VENDOR = b"\x01\xff"
-"""The id of an implementation that OMG's list does not have."""
+"""A vendor id that is not in OMG's list."""
 MOST_ASKED = 32
-"""Samples that an ACKNACK asks for at once: one word of bits; there may be eight (9.4.2.6)."""
+"""Samples that an ACKNACK asks for at once: a single word of bits, of at most eight (9.4.2.6)."""
 _LITTLE = 0x01
 _FINAL = 0x02
 _PAYLOAD = 0x04
 _CDR = b"\x00\x01\x00\x00"
 _PARAMETER_LIST = b"\x00\x03\x00\x00"
-"""How a payload is encoded: CDR_LE, PL_CDR_LE."""
+"""Encodings of a payload: CDR_LE, PL_CDR_LE."""
 
 
 @dataclass(frozen=True)
 class Told:
-    """What a submessage tells a reader of a writer, or a writer of a reader.
+    """A HEARTBEAT, GAP or ACKNACK submessage.
 
-    A heartbeat: the first and the last number that there are; `asks`: it wants an answer. A gap:
-    the numbers from `first` to `last` are for nobody. An ACKNACK: all before `first` have been got,
-    `missing` are asked for.
+    HEARTBEAT: the writer has the numbers from `first` to `last`; with `asks`, the writer wants an
+    answer. GAP: the numbers from `first` to `last` do not exist. ACKNACK: the reader has all
+    numbers before `first`, and asks for `missing`.
     """
 
     kind: int
@@ -46,27 +46,27 @@ class Told:
 
 
 def message(prefix: bytes, to: bytes, *parts: bytes) -> bytes:
-    """A message of a participant's for the one with the prefix `to`: bytes(12) for anybody."""
+    """A message for the participant with the prefix `to`; bytes(12) for all participants."""
     meant = _submessage(SubmessageId.INFO_DST, 0, to)
     return MAGIC + VERSION + VENDOR + prefix + meant + b"".join(parts)
 
 
 def data(reader: int, writer: int, sequence: int, payload: bytes) -> bytes:
-    """A sample; with reader 0 for all of them."""
+    """A sample for a reader; for all readers with reader 0."""
     body = struct.pack("<HH", 0, 16) + struct.pack(">II", reader, writer) + _number(sequence)
     return _submessage(SubmessageId.DATA, _PAYLOAD, body + payload)
 
 
 def heartbeat(reader: int, writer: int, first: int, last: int, count: int) -> bytes:
-    """Which samples a writer has: none if `first` is greater than `last`. It wants an answer."""
+    """A heartbeat that wants an answer. If `first` exceeds `last`, the writer has no samples."""
     body = struct.pack(">II", reader, writer) + _number(first) + _number(last)
     return _submessage(SubmessageId.HEARTBEAT, 0, body + struct.pack("<i", count))
 
 
 def acknack(reader: int, writer: int, base: int, missing: range, count: int) -> bytes:
-    """That a reader has all samples before `base` and lacks those from there on; no answer."""
+    """An ACKNACK that wants no answer: the reader has all before `base`, and lacks `missing`."""
     bits = min(len(missing), MOST_ASKED)
-    bitmap = 2**MOST_ASKED - 2 ** (MOST_ASKED - bits)  # the first one is the highest bit
+    bitmap = 2**MOST_ASKED - 2 ** (MOST_ASKED - bits)  # the first number is the highest bit
     asked = struct.pack("<II", bits, bitmap) if bits else struct.pack("<I", 0)
     body = struct.pack(">II", reader, writer) + _number(base) + asked
     return _submessage(SubmessageId.ACKNACK, _FINAL, body + struct.pack("<i", count))
@@ -114,7 +114,7 @@ def unpack_string(payload: bytes) -> str:
 
 
 def _submessage(kind: int, flags: int, body: bytes) -> bytes:
-    body += bytes(-len(body) % 4)  # the next one begins at a multiple of four
+    body += bytes(-len(body) % 4)  # the next submessage begins at a multiple of four
     return struct.pack("<BBH", kind, flags | _LITTLE, len(body)) + body
 
 
@@ -123,13 +123,13 @@ def _number(value: int) -> bytes:
 
 
 def _numbers(mark: str, body: bytes) -> list[int]:
-    """The sequence numbers in a row of them, as many as there may be."""
+    """The sequence numbers in a body. A remainder of less than 8 bytes is ignored."""
     whole = struct.iter_unpack(mark + "iI", body[: len(body) // 8 * 8])
     return [(high << 32) + low for high, low in whole]
 
 
 def _missing(mark: str, numbers: bytes) -> tuple[int, ...]:
-    """The members of a set of sequence numbers: the first that may be one, and a bit for each."""
+    """The members of a set of sequence numbers (9.4.2.6): a base, and a bit for each number."""
     (base,) = _numbers(mark, numbers[:8])
     (bits,) = struct.unpack_from(mark + "I", numbers, 8)
     words = struct.unpack_from(f"{mark}{-(-bits // 32)}I", numbers, 12)

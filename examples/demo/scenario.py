@@ -1,10 +1,10 @@
-"""What the demonstration shows, act by act, and whether it worked.
+"""The acts of the demonstration, and the checks of each act.
 
-All of 127.0.0.0/8 is loopback on Linux, so each side gets a network of its own there without root:
-outside is 127.0.1.0/24, inside is 127.0.2.0/24. As with NAT, inside nodes turn away every
-connection from an outside address, and announce host names that no resolver knows. The proxy,
-which lives on both sides, is a plain process without any restriction. A system that knows
-127.0.0.1 alone (macOS) has both sides there, and only the names are left to separate them.
+All of 127.0.0.0/8 is loopback on Linux, so each side gets a separate network without root: outside
+is 127.0.1.0/24, inside is 127.0.2.0/24. As with NAT, inside nodes reject every connection from an
+outside address, and announce host names that no resolver knows. The proxy is a plain process
+without any restriction, and reaches both sides. A system that has only 127.0.0.1 (macOS) has both
+sides at that address. There only the names separate the sides.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from examples.demo.ros2_acts import Ros2Acts, Ros2Listener, Ros2Talker
 from rosproxy.net.addresses import HostPort
 
 PATIENCE = 30.0
-"""Seconds that anything may take, so that what is slow can be told from what never comes."""
+"""Seconds to wait for an event. Long, so that a slow machine does not fail the demonstration."""
 LEASES = 8
-"""Ports of the range. ROS 1 takes one for a node; ROS 2 two, of UDP, and one for the proxy."""
+"""Ports of the range. A ROS 1 node takes one; a ROS 2 node two of UDP, and the proxy one of UDP."""
 
 AnyTalker = Talker | Ros2Talker
 AnyListener = Listener | Ros2Listener
@@ -35,7 +35,7 @@ AnyListener = Listener | Ros2Listener
 
 @dataclass(frozen=True)
 class Layout:
-    """Who lives where. `outside_network` is the one that inside turns away: empty for none."""
+    """Addresses of all parts. Inside rejects connections from `outside_network`, unless empty."""
 
     host: str = "127.0.1.1"
     robot: str = "127.0.1.10"
@@ -62,7 +62,7 @@ def detect() -> Layout:
 
 @dataclass(frozen=True)
 class Check:
-    """One promise of the proxy and whether it was kept."""
+    """A promise of the proxy, and whether the proxy kept the promise."""
 
     promise: str
     kept: bool
@@ -71,7 +71,7 @@ class Check:
 
 @dataclass
 class Scenario:
-    """Plays the acts; `checks`, `events` (time and text) and `act` tell how far it is."""
+    """Plays the acts. `checks`, `events` (time and text) and `act` show the progress."""
 
     seconds: float
     layout: Layout = field(default_factory=detect)
@@ -109,12 +109,12 @@ class Scenario:
 
     @property
     def ok(self) -> bool:
-        """Whether all was shown and worked."""
+        """Whether all checks passed."""
         return all(check.kept for check in self.checks)
 
     @property
     def pairs(self) -> dict[tuple[str, str], tuple[AnyTalker, AnyListener]]:
-        """Who talks to whom, by version of ROS and direction."""
+        """Talker and listener, by version of ROS and direction."""
         outwards = "inside to outside"
         inwards = "outside to inside"
         ros2 = self.ros2
@@ -134,7 +134,7 @@ class Scenario:
         self.events.append((self.clock(), text))
 
     async def play(self) -> None:
-        """Play all acts; a failure that ends them early is a failed check."""
+        """Play all acts. A failure that ends the demonstration early is a failed check."""
         async with AsyncExitStack() as ending:
             try:
                 await self._play(ending)
@@ -207,7 +207,7 @@ class Scenario:
         self._talking.pop(talker).cancel()
 
     def _check_ros2_without_proxy(self) -> None:
-        """Whether discovery and messages have stayed on their side, where there are two sides."""
+        """Check that discovery and messages stayed inside, unless the sides share an address."""
         if not self.layout.outside_network:
             return
         inside = self.ros2.talker
@@ -256,7 +256,7 @@ class Scenario:
         await asyncio.sleep(max(1.0, moment - self.clock()))
 
     async def _call_both_ways(self) -> tuple[bool, str]:
-        """Call each side's service from the other."""
+        """Call the service of each side from the other side."""
         told = []
         for way, caller, master, service in (
             ("outside calls inside", self.far_listener, self.master.uri, self.adder.service),
@@ -271,7 +271,7 @@ class Scenario:
         return all(outcome.endswith(": 2 + 3 = 5") for outcome in told), ", ".join(told)
 
     async def _addresses_of_inside(self) -> dict[str, str]:
-        """Where outside finds each inside node; that the right one answers there is asked."""
+        """The outside address of each inside node, checked by the pid that answers there."""
         addresses = {}
         for node in self.inside:
             uri = await self.far_listener.ask(self.master.uri, "lookupNode", node.name)
@@ -281,7 +281,7 @@ class Scenario:
         return addresses
 
     async def _kill_and_restart(self) -> None:
-        """Kill the proxy, start it again, and wait until all works as before."""
+        """Kill and restart the proxy, and wait until all works as before."""
         self.act = "SIGKILL; no node is restarted"
         self.cut = {talker: talker.connections for talker in (self.talker, self.far_talker)}
         killed = monotonic()
@@ -305,7 +305,7 @@ class Scenario:
         self._tell_recovery("ROS 2", took, ready - killed)
 
     def _tell_recovery(self, ros: str, took: dict[str, float], away: float) -> None:
-        """Tell the seconds that things took to work again; `away` is for how long none could."""
+        """Report the seconds until each thing worked again after an outage of `away` seconds."""
         slowest = max(took.values())
         times = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in took.items())
         self.tell(f"{ros}: {times} later; outage {away + slowest:.2f} s")
@@ -326,21 +326,21 @@ class Scenario:
     async def _count(self) -> None:
         self.act = "the talkers stop; counting"
         self._fall_silent()
-        # TCP ends with the proxy, and with it what is on its way; a writer of DDS sends that again.
+        # TCP connections end with the proxy and lose the messages on the way. A DDS writer resends.
         counts = {
             which: (talker, listener, self._sent_before_the_kill(talker))
             for which, (talker, listener) in self.pairs.items()
         }
-        with suppress(DemoError):  # the count tells what is missing
+        with suppress(DemoError):  # the count shows the missing messages
             await self._until(
                 lambda: all(count(*flow)[0] for flow in counts.values()), "all arrive"
             )
-        await asyncio.sleep(0.2)  # in which what would arrive twice arrives
+        await asyncio.sleep(0.2)  # time for duplicates to arrive
         for (ros, way), flow in counts.items():
             self._check(f"{ros}: every message {way} arrived once", *count(*flow))
 
     def _sent_before_the_kill(self, talker: AnyTalker) -> frozenset[int]:
-        """What a talker of ROS 1 sent over connections that ended with the proxy."""
+        """The numbers that a ROS 1 talker sent over connections that ended with the proxy."""
         if not isinstance(talker, Talker):
             return frozenset()
         cut = self.cut[talker]
@@ -357,7 +357,7 @@ class Scenario:
             task.cancel()
 
     async def _until(self, condition: Callable[[], Any], expectation: str) -> None:
-        """Wait until `condition`, maybe a coroutine function, holds; DemoError after PATIENCE."""
+        """Wait for a condition, maybe a coroutine function. Raises DemoError after PATIENCE."""
         end = monotonic() + PATIENCE
         while True:
             result = condition()
@@ -371,10 +371,10 @@ class Scenario:
 def count(
     talker: AnyTalker, listener: AnyListener, before: frozenset[int] = frozenset()
 ) -> tuple[bool, str]:
-    """Whether each message arrived once, but for those on the way as the proxy was killed.
+    """Whether each message arrived once, except messages on the way when the proxy was killed.
 
-    Of those sent over connections that it had `before`, only the last may be missing: a connection
-    keeps the order.
+    Numbers in `before` were sent over connections of the killed proxy. Only the last of these may
+    be missing, because a connection keeps the order.
     """
     received = [number for number, _ in listener.received]
     missing = talker.sent.keys() - {*received}
@@ -387,6 +387,6 @@ def count(
     if cut_off:
         told += f", {len(cut_off)} on the way when the proxy was killed"
     if unheard := talker.number - len(talker.sent):
-        told += f", {unheard} published while nobody was connected"
+        told += f", {unheard} published while no subscriber was connected"
     told += f"; lost {lost}, duplicated {twice}"
     return bool(received) and not (lost or twice or strange), told

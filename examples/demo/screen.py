@@ -1,4 +1,4 @@
-"""The demonstration on the terminal: a live table, or plain lines where there is none."""
+"""The demonstration on the terminal: a live table, or plain lines without a terminal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EVENTS_SHOWN = 6
 
 
 def state_of(node: Actor | Ros2Talker | Ros2Listener) -> str:
-    """What a node is up to, in few words."""
+    """The state of a node, in few words."""
     if not (node.listening if isinstance(node, FakeParticipant) else node.slave.listening):
         return "stopped"
     if isinstance(node, Adder):
@@ -28,7 +28,7 @@ def state_of(node: Actor | Ros2Talker | Ros2Listener) -> str:
     if node.connected:
         return "connected"
     if isinstance(node, Talker | Ros2Talker):
-        return "nobody listens"
+        return "no subscriber"
     return (node.problem if isinstance(node, Listener) else "") or "no publisher"
 
 
@@ -40,7 +40,7 @@ def moments_of(node: AnyTalker | AnyListener) -> list[float]:
 
 
 def rows(scenario: Scenario) -> Iterator[tuple[str, Actor | Ros2Talker | Ros2Listener, str, str]]:
-    """Of all nodes: the version of ROS, what they call themselves, and what others call them."""
+    """Of each node: version of ROS, node, own address, and the address that the other side uses."""
     for node in scenario.nodes:
         address = f"{node.host}:{node.slave.address[1]}"
         yield "1", node, address, scenario.seen.get(node.name, "")
@@ -54,13 +54,13 @@ def rows(scenario: Scenario) -> Iterator[tuple[str, Actor | Ros2Talker | Ros2Lis
 
 
 def frame(scenario: Scenario) -> Group:
-    """The whole screen: what is being played, the nodes, and what happened last."""
+    """The whole screen: the act, the nodes, and the last events."""
     title = f"{scenario.clock():5.1f} s  [rosproxy {scenario.proxy.state}]  {scenario.act}"
     table = Table(box=None, header_style="dim", padding=(0, 1, 0, 0))
     for name in ("ROS", "SIDE", "NODE", "CALLS ITSELF", "OTHER SIDE USES"):
         table.add_column(name, no_wrap=True)
     table.add_column("MSGS", justify="right", no_wrap=True)
-    table.add_column("STATE")  # where the table is too wide, this column alone is cut
+    table.add_column("STATE")  # if the table is too wide, rich cuts this column alone
     for version, node, address, seen in rows(scenario):
         _, side, name = node.name.split("/")
         state = Text(state_of(node), no_wrap=True, overflow="ellipsis")
@@ -78,7 +78,7 @@ def event_line(moment: float, text: str) -> str:
 
 
 def counts_line(scenario: Scenario) -> str:
-    """Where the play is, and how many messages have come to either side, of those sent to it."""
+    """The act, and the received of the sent messages for each side."""
     counts = [
         f"{ros} {way.split()[-1]} {len(moments_of(listener))}/{len(moments_of(talker))}"
         for (ros, way), (talker, listener) in scenario.pairs.items()
@@ -87,7 +87,7 @@ def counts_line(scenario: Scenario) -> str:
 
 
 async def show(scenario: Scenario, console: Console) -> None:
-    """Draw until cancelled, and once more then."""
+    """Draw until cancelled, and a last time then."""
     live = Live(console=console, auto_refresh=False) if console.is_terminal else None
     shown = 0
     with live or nullcontext():
@@ -99,7 +99,7 @@ async def show(scenario: Scenario, console: Console) -> None:
 
 
 def _draw(scenario: Scenario, on: Live | Console, shown: int) -> int:
-    """Draw anew, or print the events since the first `shown` ones; how many there are by now."""
+    """Draw anew, or print the events after the first `shown`. Return the number of events."""
     if isinstance(on, Live):
         on.update(frame(scenario), refresh=True)
     else:
@@ -110,7 +110,7 @@ def _draw(scenario: Scenario, on: Live | Console, shown: int) -> int:
 
 
 def print_summary(scenario: Scenario, console: Console) -> None:
-    """Print what was shown, and what did not work."""
+    """Print all checks with their results."""
     console.out("")
     for check in scenario.checks:
         verdict = ("ok    ", "green") if check.kept else ("FAILED", "red")

@@ -144,7 +144,7 @@ def test_wrong_options_are_refused():
         ({1, 2, 3}, {1}, [1, 3], False, "lost 1"),
         ({1}, {1}, [1, 1], False, "lost 0, duplicated 1"),
         ({1}, {1}, [1, 2], False, "sent 1, received 2"),
-        ({}, {}, [], False, "5 published while nobody was connected"),
+        ({}, {}, [], False, "5 published while no subscriber was connected"),
     ],
 )
 def test_what_counts_as_lost_cut_off_duplicated_or_unheard(sent, before, received, kept, told):
@@ -186,7 +186,7 @@ async def test_the_frame_has_the_act_the_nodes_and_the_events(scenario):
         assert phrase in text
     rows = {tuple(line.split()[:3]): line for line in text.splitlines() if line.strip()}
     assert "10" in rows["1", "inside", "talker"]
-    assert rows["1", "inside", "talker"].rstrip().endswith("nobody listens")
+    assert rows["1", "inside", "talker"].rstrip().endswith("no subscriber")
     assert rows["1", "inside", "listener"].rstrip().endswith("Connection refused")
     assert rows["1", "outside", "adder"].rstrip().endswith("stopped")
 

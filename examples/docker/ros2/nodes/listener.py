@@ -1,4 +1,4 @@
-"""Logs what it hears."""
+"""Logs each received message."""
 
 import rclpy
 from std_msgs.msg import String

@@ -1,4 +1,4 @@
-"""Says something twice a second: the node of any ROS 2 tutorial, and nothing of the proxy in it."""
+"""Publishes twice a second, like any ROS 2 tutorial; the code knows nothing of the proxy."""
 
 import rclpy
 from std_msgs.msg import String
