@@ -1,7 +1,7 @@
-"""Which layers of tests there are: what each needs, and how it is run.
+"""The layers of tests: what each layer needs, and how each layer runs.
 
-A layer is a directory under tests/, or some tests of one in other surroundings. `test_layers` runs
-them.
+A layer is a directory under tests/, or some tests of a directory with another environment.
+`test_layers` runs the layers.
 """
 
 import os
@@ -58,13 +58,13 @@ COMMANDS = {name: [f"scripts/{name}.sh"] for name in (*PREPARATIONS, ABUSE_TOOLS
 
 @dataclass(frozen=True)
 class Layer:
-    """A directory of tests, or some ``tests`` of another one, and how they are run.
+    """A directory of tests, or some ``tests`` of another directory.
 
-    ``setup``: what prepares this machine for it; ``smoke_setup``: those of them that its smoke
-    needs. ``smoke``: ALL of its tests are in the smoke, those that are MARKED, or NONE.
-    ``workers``: how many processes of pytest share the tests, one file each at a time.
-    ``environment``: variables that they are told. ``obstacle`` says why it can't run here, if so.
-    ``second_look``: whether what failed among others is run once more.
+    ``setup``: steps that prepare this machine. ``smoke_setup``: the steps that smoke tests need.
+    ``smoke``: the tests that run with --smoke, as ALL, MARKED or NONE. ``workers``: the number of
+    pytest processes that share the files. ``environment``: variables for the tests. ``obstacle``:
+    the reason why the layer cannot run here, or None. ``second_look``: whether failed tests run
+    once more.
     """
 
     name: str
@@ -83,11 +83,11 @@ class Layer:
         return LOGS / f"{self.name}-cache"
 
     def report(self, again: bool = False) -> Path:
-        """The JUnit report of the first try, or of the second."""
+        """The JUnit report of the first run, or of the second."""
         return LOGS / f"{self.name}{'-again' * again}.xml"
 
     def command(self, smoke: bool, again: bool = False) -> list[str]:
-        """What runs it; ``again``: only what failed the last time, one after the other."""
+        """The command for the tests; with ``again`` only failed tests, one after the other."""
         words = ["env", *self.environment, sys.executable, "-m", "pytest"]
         words += [*(self.tests or (f"tests/{self.name}",)), f"--junitxml={self.report(again)}"]
         words += ["--tb=short", "--durations=15", "-o", f"cache_dir={self.cache}"]
@@ -152,7 +152,7 @@ ALIKE = (
     *("inside-to-inside", "inside-to-outside"),
     *("inside-about-inside", "inside-about-itself", "outside-about-inside"),
 )
-"""Cases of `ros` in which nobody inside wants anything of outside, by their names."""
+"""Names of cases in `ros` where inside needs nothing from outside."""
 ISOLATED = Layer(
     "isolated",
     setup=(ROS, NODES),
@@ -170,10 +170,10 @@ ISOLATED = Layer(
     ),
     environment=("ROS_TESTS_ISOLATED=1",),
 )
-"""Inside has no way out but the proxy: what goes inwards, is asked from inside, or is recovered.
+"""Tests where inside has no way out but the proxy: traffic inwards, calls from inside, recovery.
 
-All of tests/ros may run so, which takes as long again. What is left out is the same in `ros`, or
-rests on what runs here.
+All of tests/ros can run so, which takes as long again. The omitted tests are the same in `ros`, or
+depend on paths that these tests cover.
 """
 ROS1_CLIENTS = Layer(
     "clients", setup=(ROS, NODES, CLIENTS), workers=2, obstacle=debian_root_obstacle
@@ -212,8 +212,8 @@ ALONE_FIRST = (INTEGRATION,)
 ON_THE_ENGINE = (DOCKER_ENGINE, IMAGE, CLUSTER)
 SIDE_BY_SIDE = (ROS_NODES, ROS2_NODES, ISOLATED, ROS1_CLIENTS, ZENOH_NODES, BROWSER, CHART)
 ALONE_LAST = (ABUSE, ROS2_CLUSTER)
-"""When which layers run, in this order; ON_THE_ENGINE and SIDE_BY_SIDE begin together.
+"""The order of the layers. ON_THE_ENGINE and SIDE_BY_SIDE begin together.
 
-Layers on the one Docker engine take turns: an operator with `--expose-by-default` takes over
-whatever containers run there.
+Layers on the Docker engine take turns: an operator with `--expose-by-default` takes over all
+containers of the engine.
 """

@@ -1,11 +1,11 @@
-"""The pins of what rosproxy needs with some extras, hashes and all: a requirements file for pip.
+"""Print the pinned requirements of rosproxy and some extras, with hashes, for pip.
 
     python scripts/pins.py [EXTRA,EXTRA...]
 
-``build-system`` is an extra here, too: what builds rosproxy itself. All pins are in
-constraints.txt (``make lock``), each with who needs it in its ``# via`` lines; pyproject.toml says
-what rosproxy and its extras need. pip can't take the pins as constraints: where it checks hashes,
-it wants them from requirements.
+The extra ``build-system`` stands for the build requirements. All pins are in constraints.txt
+(``make lock``), with the requiring projects in ``# via`` lines. pyproject.toml has the requirements
+of rosproxy and of each extra. The pins must be a requirements file, because pip does not take
+hashes from constraints.
 """
 
 import re
@@ -22,7 +22,7 @@ _VIA = re.compile(r"#\s+(?:via\s*)?(.*)")
 
 
 class Pin(NamedTuple):
-    """A pinned project: its name, its lines, and who needs it."""
+    """A pinned project: name, lines, and the projects that require it."""
 
     name: str
     text: str
@@ -30,7 +30,7 @@ class Pin(NamedTuple):
 
 
 def pins(extras: Iterable[str]) -> list[Pin]:
-    """The pins of rosproxy's requirements with some extras, and of whatever these need.
+    """The pins of rosproxy's requirements with some extras, and of all indirect requirements.
 
     Raises KeyError if there is no such extra, LookupError if a requirement has no pin.
     """
@@ -65,7 +65,7 @@ def _required(project: dict[str, Any], extra: str) -> Iterator[str]:
 
 
 def _read(text: str) -> Iterator[Pin]:
-    """The pins of a file that ``uv pip compile`` or ``pip-compile`` has written."""
+    """The pins in a file of ``uv pip compile`` or ``pip-compile``."""
     for block in re.split(r"^(?=[A-Za-z0-9])", text, flags=re.M):
         if not _NAME.match(block):
             continue  # the heading
@@ -77,7 +77,7 @@ def _read(text: str) -> Iterator[Pin]:
 
 
 def _name(text: str) -> str:
-    """The name that a requirement begins with, as indexes compare names (PEP 503)."""
+    """The name at the start of a requirement, normalised (PEP 503)."""
     match = _NAME.match(text)
     return re.sub(r"[-_.]+", "-", match[0]).lower() if match else ""
 

@@ -1,15 +1,15 @@
-"""Build all that a release consists of into dist/, and try it as users would.
+"""Build all parts of a release into dist/, and try each part like a user.
 
-    python scripts/release_check.py              what stands here: `make release-check`
-    python scripts/release_check.py --tag v1.2.3 a release of that name, which has to be in order
+    python scripts/release_check.py              this working tree: `make release-check`
+    python scripts/release_check.py --tag v1.2.3 the release with this tag
     … --registry ghcr.io/me                      with the images' names in chart and manifest
     … --repository https://github.com/me/rosproxy    with links there in chart and alerts
     … --only packages                            some steps only
 
-Steps: versions (one everywhere), packages (wheel and sdist, the same bytes whoever builds them;
-installed from them alone), sbom (CycloneDX, of what was installed), chart (linted, packed), images
-(built, and asked for their version), registry (images and chart pushed to one on this machine, and
-pulled from there). A step that can't be done fails. Nothing is published.
+Steps: versions (the same everywhere), packages (wheel and sdist: reproducible, and installed
+without the sources), sbom (CycloneDX, of the installed packages), chart (linted, packed), images
+(built, and asked for the version), registry (images and chart pushed to a registry on this machine,
+and pulled). A step that cannot run fails. Nothing is published.
 """
 
 import argparse
@@ -44,20 +44,20 @@ DIST = ROOT / "dist"
 CHART = ROOT / "charts/rosproxy-operator"
 BIN = Path(sys.executable).parent
 PROGRAMS = {"rosproxy": "", "rosproxy-operator": "operator"}
-"""What is installed, and with which extra of the wheel."""
+"""The installed programs, each with the required extra of the wheel."""
 SETTINGS = ("--master-uri", "http://127.0.0.1:11311", "--advertise-host", "127.0.0.1")
 
 
 class Wrong(Exception):
-    """What is wrong, and what to do."""
+    """The release is not in order; the text says what to do."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """``tag`` is its name in git, empty if there is none; ``base_image`` what images are built on.
+    """A release. ``tag`` is the git tag, or empty; ``base_image`` the base of the images.
 
-    ``registry`` stands before the images' names in chart and manifest, ``repository`` is where
-    chart and alerts link to, if they are given.
+    ``registry`` is the prefix of the images' names in chart and manifest. ``repository`` is the URL
+    for links in chart and alerts. Either may be empty.
     """
 
     version: str
@@ -68,7 +68,7 @@ class Release:
 
     @property
     def runbook(self) -> str:
-        """Where one who is on call reads of alerts."""
+        """The page about alerts, for the person on call."""
         at = f"{self.repository}/blob/v{self.version}/" if self.repository else ""
         return f"{at}docs/guide/alerts.md"
 
@@ -78,7 +78,7 @@ class Release:
 
 
 def run(*command: str | Path, **more: str) -> str:
-    """Run a program; what it prints. Raises Wrong with that if it fails."""
+    """Run a program and return the output. If the program fails, raises Wrong with the output."""
     done = subprocess.run(
         [str(argument) for argument in command], cwd=ROOT, env={**os.environ, **more}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
@@ -89,7 +89,7 @@ def run(*command: str | Path, **more: str) -> str:
 
 
 def project_version() -> str:
-    """The version that the code has."""
+    """The version in the code."""
     text = (ROOT / "proxy/rosproxy/__init__.py").read_text()
     match = re.search(r'^__version__ = "(\d+\.\d+\.\d+)"$', text, re.M)
     if match is None:
@@ -101,7 +101,7 @@ def project_version() -> str:
 
 
 def check_versions(release: Release) -> None:
-    """One version everywhere; with a tag it is the tag's, and the changelog has it."""
+    """Check that all files have the same version; with a tag, tag and changelog, too."""
     chart = yaml.safe_load((CHART / "Chart.yaml").read_text())
     told = {"Chart.yaml, version": chart["version"], "Chart.yaml, appVersion": chart["appVersion"]}
     manifest = (ROOT / "manifests/install.yaml").read_text()
@@ -117,11 +117,11 @@ def check_versions(release: Release) -> None:
     differing = {source: version for source, version in told.items() if version != release.version}
     if differing:
         text = f"the code has {release.version}, and others another version: {differing}"
-        raise Wrong(f"{text}; docs/releasing.md says what is to be changed")
+        raise Wrong(f"{text}; docs/releasing.md lists the places to change")
 
 
 def newest(changelog: Path) -> str:
-    """The version of the newest entry. Raises Wrong while there are changes above it."""
+    """The version of the newest entry. Raises Wrong if there are unreleased changes."""
     headings = re.findall(r"^## \[(.*?)\](?: - \d{4}-\d{2}-\d{2})?$", changelog.read_text(), re.M)
     unreleased = changelog.read_text().partition("## [Unreleased]")[2].partition("\n## ")[0]
     if unreleased.strip():
@@ -133,7 +133,7 @@ def newest(changelog: Path) -> str:
 
 
 def check_packages(release: Release) -> None:
-    """Wheel and sdist, twice alike, and installed."""
+    """Build wheel and sdist twice, compare, install."""
     for path in DIST.glob("rosproxy-*"):
         path.unlink()
     with tempfile.TemporaryDirectory() as again:
@@ -149,18 +149,18 @@ def check_packages(release: Release) -> None:
             raise Wrong(f"built twice, these differ: {differing}")
     wheel, sdist = (DIST / name for name in expected)
     check_contents(wheel, sdist)
-    # As `python -m build` has made it of the sdist, so that one suffices here.
+    # `python -m build` makes the wheel from the sdist, so testing the wheel suffices.
     for program, extra in PROGRAMS.items():
         environment = install(wheel, extra)
         for words in (("--version",), ("--help",)):
             said = run(environment / "bin" / program, *words)
             if words == ("--version",) and release.version not in said:
-                raise Wrong(f"{program} of {wheel.name} says it is {said}")
+                raise Wrong(f"{program} of {wheel.name} has version {said}")
     run(ROOT / "build/release/rosproxy/bin/rosproxy", "run", "--check", *SETTINGS)
 
 
 def check_contents(wheel: Path, sdist: Path) -> None:
-    """What has to be in them, and what has not."""
+    """Check for required and unwanted files."""
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     page = ("page.js", "view.js", "picture.js", "findings.js", "page.css", "index.html")
@@ -184,7 +184,7 @@ def digest(path: Path) -> str:
 
 
 def install(wheel: Path, extra: str) -> Path:
-    """A fresh environment with the wheel, and of all else only what is pinned."""
+    """A fresh environment with the wheel and the pinned requirements only."""
     target = ROOT / "build/release" / ("rosproxy-operator" if extra else "rosproxy")
     shutil.rmtree(target, ignore_errors=True)
     run(BIN / "python", "-m", "venv", "--without-pip", target)
@@ -201,7 +201,7 @@ def install(wheel: Path, extra: str) -> Path:
 
 
 def check_sbom(release: Release) -> None:
-    """Of each program, from what was installed: all that is pinned is in it."""
+    """Write an SBOM for each program, and check for all installed packages."""
     for program in PROGRAMS:
         python = ROOT / "build/release" / program / "bin/python"
         if not python.exists():
@@ -220,7 +220,7 @@ def check_sbom(release: Release) -> None:
 
 
 def check_chart(release: Release) -> None:
-    """Linted, packed with the images' names; what it makes pulls them, and the manifest does."""
+    """Lint and pack the chart. Check that chart and manifest pull the right images."""
     helm = shutil.which("helm") or cluster_program("helm")
     with tempfile.TemporaryDirectory() as directory:
         chart = Path(directory) / CHART.name
@@ -252,7 +252,7 @@ def check_chart(release: Release) -> None:
 
 
 def adapt(chart: Path, release: Release) -> None:
-    """Write into a chart where its images and its pages are, its licence and what has changed."""
+    """Write images, links, licence and changes into a chart."""
     shutil.copy(ROOT / "LICENSE", chart)
     values = chart / "values.yaml"
     about = chart / "Chart.yaml"
@@ -268,9 +268,9 @@ def adapt(chart: Path, release: Release) -> None:
 
 
 def describe(about: dict[str, Any], release: Release) -> dict[str, Any]:
-    """Chart.yaml as it is published: with links, icon, and what Artifact Hub shows.
+    """Chart.yaml with links, icon, and annotations for Artifact Hub.
 
-    There is no ``artifacthub.io/signKey``: Artifact Hub finds keyless signatures by itself.
+    ``artifacthub.io/signKey`` is not necessary: Artifact Hub finds keyless signatures.
     """
     images = [{"name": program, "image": release.image(program)} for program in PROGRAMS]
     changes = chart_changes((ROOT / "CHANGELOG.md").read_text(), release.version)
@@ -290,7 +290,7 @@ def describe(about: dict[str, Any], release: Release) -> dict[str, Any]:
 
 
 def chart_changes(changelog: str, version: str) -> list[str]:
-    """The changes of a version under the heading Kubernetes, without Markdown's links."""
+    """The changes of a version under the heading Kubernetes, without Markdown links."""
     entry = changelog.partition(f"## [{version}]")[2].partition("\n## ")[0]
     section = entry.partition("### Kubernetes\n")[2].partition("\n### ")[0]
     items = re.findall(r"^- (.*(?:\n  .*)*)", section, re.M)
@@ -307,14 +307,14 @@ def cluster_program(name: str) -> Path:
 
 
 def check_images(release: Release) -> None:
-    """Built, and both are of this version."""
+    """Build both images, and check the versions."""
     told = {"TAG": release.version, "REGISTRY": release.registry, "BASE_IMAGE": release.base_image}
     run("make", "image", *(f"{name}={value}" for name, value in told.items()))
     for program in PROGRAMS:
         image = release.image(program)
         said = run("docker", "run", "--rm", "--network", "none", image, "--version")
         if release.version not in said:
-            raise Wrong(f"the image {image} says it is {said}")
+            raise Wrong(f"the image {image} has version {said}")
         size = int(run("docker", "image", "inspect", "--format", "{{.Size}}", image))
         print(f"  {image}: {size / 1e6:.0f} MB")
 
@@ -323,7 +323,7 @@ def check_images(release: Release) -> None:
 
 
 def check_registry(release: Release) -> None:
-    """What was pushed is what comes back: both images, and the chart by oci://."""
+    """Check that both images, and the chart by oci://, are the same after push and pull."""
     with tempfile.TemporaryDirectory() as directory, running_registry(Path(directory)) as address:
         for program in PROGRAMS:
             check_pulled(release.image(program), f"{address}/{program}:{release.version}")
@@ -333,12 +333,12 @@ def check_registry(release: Release) -> None:
         wanted = (f"oci://{address}/charts/rosproxy-operator", "--version", release.version)
         pulled = run(helm, "template", "r", *wanted, "--plain-http", "--kube-version", "1.30.0")
         made = run(helm, "template", "r", package, "--kube-version", "1.30.0")
-        if not pulled.endswith(made):  # before it stands where it was pulled from
+        if not pulled.endswith(made):  # Helm prints the address of the pull first
             raise Wrong(f"the chart of {wanted[0]} makes other objects than {package.name}")
 
 
 def check_pulled(image: str, pushed: str) -> None:
-    """Push an image under a name, and use it from there."""
+    """Push an image, pull the image, and run it."""
     identity = ("docker", "image", "inspect", "--format", "{{.Id}}")
     before = run(*identity, image)
     try:
@@ -347,7 +347,7 @@ def check_pulled(image: str, pushed: str) -> None:
         run("docker", "rmi", pushed)
         run("docker", "pull", pushed)
         if run(*identity, pushed) != before:
-            raise Wrong(f"{image} is another one when it is pulled again")
+            raise Wrong(f"{image} differs after push and pull")
         run("docker", "run", "--rm", "--network", "none", pushed, "--version")
     finally:
         subprocess.run(["docker", "rmi", pushed], capture_output=True, check=False)
@@ -355,7 +355,7 @@ def check_pulled(image: str, pushed: str) -> None:
 
 @contextmanager
 def running_registry(directory: Path) -> Iterator[str]:
-    """A registry on loopback, which Docker takes without TLS; where it is."""
+    """Run a registry on loopback, where Docker needs no TLS. Yield the address."""
     program = run(ROOT / "scripts/install-registry.sh").splitlines()[-1]
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"127.0.0.1:{free.getsockname()[1]}"
@@ -404,9 +404,9 @@ STEPS: dict[str, Callable[[Release], None]] = {
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--tag", default="", help="the release's tag in git: v and the version")
-    parser.add_argument("--base-image", default="", help="what the images are built on")
-    parser.add_argument("--registry", default="", help="what stands before the images' names")
-    parser.add_argument("--repository", default="", help="where chart and alerts link to")
+    parser.add_argument("--base-image", default="", help="the base image")
+    parser.add_argument("--registry", default="", help="the prefix of the images' names")
+    parser.add_argument("--repository", default="", help="the URL for links in chart and alerts")
     parser.add_argument("--only", nargs="+", choices=STEPS, default=list(STEPS), metavar="STEP")
     options = parser.parse_args()
     DIST.mkdir(exist_ok=True)

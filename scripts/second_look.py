@@ -1,13 +1,13 @@
-"""What a second try of the tests that failed says: whether the product is wrong, or the try was.
+"""Decide from a second run of failed tests whether a test is flaky or the change is wrong.
 
-Where hundreds of real nodes, an engine or a cluster share two processors, a test may fail because
-the machine was late, and another one each time: of thousands it takes one to refuse a change that
-is right. So tests that failed among others are run once more when all layers have ended, alone.
-What fails again is wrong. What passes is *flaky*: a bug, too, of the product or of the test, but
-not one that this change need have made. It is shown with both durations, not hidden, and more
-than `ALLOWED` of them refuse the run all the same. Who sees one mends it.
+If hundreds of real nodes, an engine or a cluster share two processors, a test may fail because the
+machine was late, and another test each time. A single such test would refuse a correct change. So
+failed tests run once more at the end, alone. If a test fails again, the run is red. If the test
+passes, the test is *flaky*: a bug of the product or of the test, but perhaps not of this change.
+The summary shows flaky tests with both durations, and more than `ALLOWED` refuse the run. Mend a
+flaky test as soon as you see it.
 
-Here are the decisions, over the JUnit reports of both tries; `test_layers` runs them.
+This module decides, from the JUnit reports of both runs. `test_layers` runs the tests.
 """
 
 from collections.abc import Iterable, Mapping
@@ -16,16 +16,16 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 ALLOWED = 3
-"""How many flaky tests a run may have; none where it is strict."""
+"""Allowed number of flaky tests in a run; 0 if the run is strict."""
 MOST = 12
-"""Where more than these failed the product is wrong, and a second look only takes time."""
+"""If more tests failed, the product is wrong, and a second run would only take time."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A test in a report: its node ID, the seconds that it took, and what became of it.
+    """A test in a report: node ID, duration in seconds, result.
 
-    ``failed`` is also who could not be set up, collected or cleaned up.
+    ``failed`` includes failed setup, collection and teardown.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Flake:
-    """A test that failed among others and passed alone, with the seconds of both tries."""
+    """A test that failed at first and passed alone, with the seconds of both runs."""
 
     name: str
     seconds: float
@@ -49,9 +49,9 @@ class Flake:
 
 
 def read_cases(report: Path) -> dict[str, Case]:
-    """The tests of a JUnit report by their node IDs.
+    """The tests of a JUnit report by node ID.
 
-    A test whose clean-up fails, too, stands there twice: its times are added up.
+    If the teardown of a failed test fails, too, the report has the test twice. Add the times.
     """
     cases: dict[str, Case] = {}
     for element in ElementTree.parse(report).getroot().iter("testcase"):
@@ -68,12 +68,12 @@ def read_cases(report: Path) -> dict[str, Case]:
 
 
 def worth_a_look(cases: Iterable[Case]) -> bool:
-    """Whether so few of the tests of a run failed that a second look may say something."""
+    """Whether few enough tests failed for a second run."""
     return sum(case.failed for case in cases) <= MOST
 
 
 def flakes(first: Mapping[str, Case], again: Mapping[str, Case]) -> tuple[Flake, ...]:
-    """The tests that failed at first, if all of them passed again; otherwise none."""
+    """The tests that failed at first, if all passed in the second run; otherwise none."""
     failed = [case for case in first.values() if case.failed]
     if not all(case.name in again and again[case.name].passed for case in failed):
         return ()
@@ -81,7 +81,7 @@ def flakes(first: Mapping[str, Case], again: Mapping[str, Case]) -> tuple[Flake,
 
 
 def too_many(count: int, strict: bool) -> str | None:
-    """Why so many flaky tests refuse a run, if they do."""
+    """The reason why the number of flaky tests refuses a run, or None."""
     if strict and count:
         return "flaky tests, and STRICT=1 allows none"
     if count > ALLOWED:
@@ -90,5 +90,7 @@ def too_many(count: int, strict: bool) -> str | None:
 
 
 def _node_id(classname: str, name: str) -> str:
-    """As pytest takes it; the module is all of ``classname``, since no test is in a class."""
+    """The node ID in the form of pytest. ``classname`` is the module, because no test is in a
+    class.
+    """
     return f"{classname.replace('.', '/')}.py::{name}" if classname else name

@@ -1,30 +1,31 @@
-"""Run layers of tests, and say what ran and how long it took.
+"""Run layers of tests, and report results and durations.
 
     python -m scripts.test_layers --smoke          what `make test` runs
     python -m scripts.test_layers                  what `make test-all` runs
     python -m scripts.test_layers unit ros         these layers only
 
-How it works (`layers` says which there are):
+The steps (`layers` declares the layers):
 
-  1. What layers need is prepared: packages, programs and images, by scripts that do nothing where
-     their work is done already. Beside it the unit tests, which mind nobody.
-  2. The integration tests, alone: they count in tenths of seconds.
-  3. Layers with real nodes, engines and browsers, two side by side; three were at a load of 30 to
-     55 on two processors, where what takes a second takes a minute. Those with a Docker engine are
-     one side, and take turns: they share it, are the longest, and mostly wait.
-  4. Alone: those with bad neighbours, which hold how long an answer may take, and ROS 2 in a
-     cluster. There two dozen participants meet anew each time when a proxy's pod is replaced, for
-     which Fast DDS takes all of two processors for seconds, and minutes beside others.
-  5. What failed, once more and alone (`second_look` says why). Not of layers that have no second
-     look: what fails there once is wrong.
+  1. Install packages, programs and images that the layers need, by scripts that do nothing if all
+     is installed. Meanwhile run the unit tests, which load does not disturb.
+  2. Run the integration tests alone, because these check tenths of seconds.
+  3. Run the layers with real nodes, engines and browsers, two side by side. With three, the load
+     was 30 to 55 on two processors, and a second became a minute. The layers with a Docker engine
+     take turns on one side: these share the engine, take longest, and mostly wait.
+  4. Run alone: the abuse layer, which limits the time of an answer, and ROS 2 in a cluster. In the
+     cluster two dozen participants rediscover each other after each replaced pod of a proxy. For
+     this Fast DDS takes two whole processors for seconds, and minutes beside other layers.
+  5. Run failed tests once more, alone (`second_look` has the reason), except in layers without a
+     second look: there a single failure is final.
 
-With --smoke, only tests marked `smoke` run of the layers that have such, and layers without are
-left to `make test-all`. So all that `make test` runs is part of `make test-all`.
+With --smoke, the unit and integration tests run as a whole. The other layers run only the tests
+marked `smoke`, or do not run. So `make test-all` includes all of `make test`.
 
-What a step prints goes to build/test-logs. A layer's is shown whole when it ends, a preparation's
-when it fails. A layer that this machine cannot run is named together with the reason; with CI=true
-in the environment that counts as a failure, so a pipeline never turns green by leaving a layer out.
-Flaky tests stand at the end and in build/test-logs/flaky.txt; with STRICT=1 they are failures.
+The output of each step goes to build/test-logs. The output of a layer is shown when the layer ends,
+the output of a preparation only when the preparation fails. The summary names each layer that this
+machine cannot run, with the reason. With CI=true in the environment such a layer is a failure, so a
+pipeline never turns green by leaving a layer out. The end of the summary and
+build/test-logs/flaky.txt list flaky tests; with STRICT=1 these are failures.
 """
 
 import argparse
@@ -47,15 +48,15 @@ from scripts.layers import COMMANDS, LAYERS, LOGS, MARKED, NONE, ROOT, Layer
 from scripts.second_look import Case, Flake, flakes, read_cases, too_many, worth_a_look
 
 TESTS_FAILED = 1
-"""With this pytest ends where all was run and some of it failed, and not something of its own."""
+"""Exit code of pytest if all tests ran and some failed, without an error of pytest."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a layer: whether it ran, whether that is good, and numbers or a reason.
+    """The result of a layer. ``text`` has numbers, or the reason why the layer did not run.
 
-    ``cases``: its tests, where some have failed and all have been run. ``flaky``: those that
-    failed and passed at the second look, and are good.
+    ``cases``: all tests of the layer, only if some failed. ``flaky``: tests that passed in the
+    second run.
     """
 
     layer: Layer
@@ -67,14 +68,14 @@ class Outcome:
 
     @property
     def mark(self) -> str:
-        """One word for a table."""
+        """The word for the summary."""
         if not self.good:
             return "FAILED"
         return "flaky" if self.flaky else "ok" if self.ran else "--"
 
 
 class Run:
-    """One run of some layers."""
+    """A run of some layers."""
 
     def __init__(self, wanted: Iterable[Layer], smoke: bool) -> None:
         self.layers = list(wanted)
@@ -114,13 +115,13 @@ class Run:
         return layer.smoke_setup if self.smoke else layer.setup
 
     def _some(self, *queues: deque[Layer]) -> list[Outcome]:
-        """Run layers one after another, until none is left: others may take from them, too."""
+        """Run layers until the queues are empty, from which another thread may take, too."""
         outcomes = []
         for left in queues:
             while left:
                 try:
                     layer = left.popleft()
-                except IndexError:  # another was faster
+                except IndexError:  # another thread was faster
                     break
                 if layer in self.layers:
                     outcomes.append(self._layer(layer))
@@ -146,7 +147,7 @@ class Run:
         return Outcome(layer, True, code == 0, text, cases)
 
     def _look_again(self, outcome: Outcome) -> Outcome:
-        """Run once more what failed of a layer, if it is of those that have a second look."""
+        """Run the failed tests of a layer once more, if the layer has a second look."""
         layer = outcome.layer
         if not outcome.cases or not layer.second_look:
             return outcome
@@ -158,7 +159,7 @@ class Run:
         return replace(outcome, good=bool(flaky), flaky=flaky)
 
     def _run(self, title: str, command: list[str]) -> tuple[int, str]:
-        """Run a step; its exit code and what it has printed."""
+        """Run a step. Return the exit code and the output."""
         log = LOGS / f"{title.replace('/', '-').replace(' ', '-')}.log"
         began = time.monotonic()
         self._say(f"{title} …")
@@ -174,7 +175,7 @@ class Run:
             print(f"[{time.monotonic() - self._started:4.0f} s] {text}", flush=True)
 
     def summary(self, outcomes: list[Outcome], refusal: str | None) -> str:
-        """What ran, for the end; ``refusal``: why flaky tests refuse the run."""
+        """The summary of all layers. ``refusal``: why flaky tests refuse the run."""
         minutes, seconds = divmod(round(time.monotonic() - self._started), 60)
         lines = ["", f"Test layers, {minutes} min {seconds} s in all:"]
         for outcome in outcomes:
@@ -192,7 +193,7 @@ class Run:
 
 
 def note_flaky(outcomes: Iterable[Outcome]) -> int:
-    """Write the flaky tests to a file, one a line; how many there are."""
+    """Write the flaky tests to a file, one a line. Return the number."""
     flaky = [flake for outcome in outcomes for flake in outcome.flaky]
     (LOGS / "flaky.txt").write_text("".join(f"{flake}\n" for flake in flaky))
     return len(flaky)
@@ -215,14 +216,17 @@ def count(report: Path) -> str:
 def main() -> int:
     names = [layer.name for layer in LAYERS]
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--smoke", action="store_true", help="of real programs a small part only")
+    parser.add_argument(
+        "--smoke", action="store_true", help="run a small part of the layers with real programs"
+    )
     parser.add_argument("layers", nargs="*", metavar="layer", help=", ".join(names))
     options = parser.parse_args()
     if unknown := set(options.layers) - set(names):
         parser.error(f"no such layer: {', '.join(sorted(unknown))}")
-    # Hundreds of programs are started: each would compile the project anew.
+    # The tests start hundreds of programs. Without bytecode files each would compile the project
+    # anew.
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-    # In the background a shell has it ignored, and programs under test inherit that.
+    # A shell ignores SIGINT for background jobs, and programs under test inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     wanted = [layer for layer in LAYERS if not options.layers or layer.name in options.layers]
     if options.smoke:
