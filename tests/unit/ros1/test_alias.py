@@ -1,4 +1,4 @@
-"""The alias: which ports it takes, which it gives up, and what it changes in replies."""
+"""The alias: bound ports, released ports, and rewritten replies."""
 
 from typing import Any
 

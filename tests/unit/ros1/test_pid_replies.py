@@ -1,4 +1,4 @@
-"""What nodes answer to ``getPid``, which they are asked over and over."""
+"""Replies to ``getPid``, which the proxy calls often."""
 
 import xmlrpc.client
 from typing import Any, cast
@@ -22,7 +22,7 @@ def test_pids() -> None:
 
 
 def test_a_document_in_place_of_a_pid_is_not_read() -> None:
-    """Each of its values takes time, and many nodes may send one every few seconds."""
+    """Each value takes time to parse, and many nodes may send such a document every few seconds."""
     with pytest.raises(Unreachable) as caught:
         read_pid([1, "", [0] * 1000])
     assert caught.value.probe is ProbeResult.ANSWERED

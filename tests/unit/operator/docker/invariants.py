@@ -1,4 +1,4 @@
-"""What must always hold on a simulated host, and once nothing happens any more."""
+"""Invariants of a simulated host: at any moment, and after the operator has settled."""
 
 from msgspec import structs
 
@@ -44,7 +44,7 @@ INNER = "inner"
 
 
 class Invariants:
-    """A host with the operator, and what must hold there."""
+    """A simulated host with the operator."""
 
     def __init__(self) -> None:
         self.engine = Engine(SETTINGS, EPHEMERAL)
@@ -69,28 +69,30 @@ class Invariants:
     def strangers(self) -> list[Box]:
         return [box for box in self.engine.boxes if not box.own]
 
-    # what must hold
+    # Invariants
 
     def check(self) -> None:
-        """What holds at any moment."""
+        """Check the invariants of any moment."""
         running = [(own.key, own.role) for _, own in self.own(*SERVING)]
-        assert len(running) == len(set(running)), "one of each runs for each key"
+        assert len(running) == len(set(running)), "at most one of each role runs"
         for _, own in self.own(*SERVING, role=ROLE_SANDBOX):
             served = self.served.get(own.key)
             if served is not None and own.key not in self.may_move:
-                assert own.range.first == served.first, "who serves keeps its ports"
+                assert own.range.first == served.first, "a serving sandbox keeps its ports"
                 assert len(own.range) >= len(served)
             self.served[own.key] = own.range
             self.may_move.discard(own.key)
-        # One that was never started has no ports yet: it gives way to who has served on them.
+        # A sandbox that never started holds no ports: a former sandbox may get the range back.
         boxes = self.own(role=ROLE_SANDBOX)
         ranges = [(own.key, own.range) for box, own in boxes if box.state != "created"]
         for key, ports in ranges:
             other_ranges = [other for owner, other in ranges if owner != key]
-            assert not any(overlap(ports, other) for other in other_ranges), "ports are one's own"
+            assert not any(overlap(ports, other) for other in other_ranges), (
+                "no two keys share ports"
+            )
 
     def check_new_ranges(self, plan: DockerPlan) -> None:
-        """Ports of new sandboxes are nobody else's; who has ports keeps them."""
+        """New sandboxes get free ports. A key with ports keeps these."""
         seen = self.engine.observe()
         for action in plan.actions:
             if not isinstance(action, CreateSandbox) or action.key == ZENOH:
@@ -140,10 +142,10 @@ class Invariants:
         self.check_no_name_is_shared()
 
     def check_no_name_is_shared(self) -> None:
-        """No proxy answers to a name of a stranger on the same network."""
+        """No proxy has an alias that is a name of another container on the same network."""
         strangers = [box for box in self.strangers() if box.state not in ("dead", "removing")]
         for sandbox, own in self.own("running", "paused", role=ROLE_SANDBOX):
-            # The simulated engine keeps the name that a container had when it joined.
+            # The simulated engine keeps the name that a container had on joining.
             container_names = {sandbox.name, sandbox_name(own.key)}
             for network, (_, names) in sandbox.networks.items():
                 others = {
@@ -155,9 +157,9 @@ class Invariants:
                 assert not (names - container_names) & others, network
 
     def check_flushes(self) -> None:
-        """Each sandbox with UDP ports has its conntrack entries deleted since its last start."""
+        """The operator deletes conntrack entries after each start of a sandbox with UDP ports."""
         flushes = {own.key: box for box, own in self.own(role=ROLE_FLUSH)}
-        assert len(flushes) == len(self.boxes(role=ROLE_FLUSH)), "one record for each key"
+        assert len(flushes) == len(self.boxes(role=ROLE_FLUSH)), "a key has at most one record"
         for sandbox, own in self.own("running", role=ROLE_SANDBOX):
             if sandbox.udp and self.engine.image:
                 assert flushes[own.key].started > sandbox.started
@@ -196,7 +198,7 @@ class Invariants:
             assert len({target.port for target in leads}) == len(leads) == len(wanted)
 
     def check_redirects(self, live: list[Member]) -> None:
-        """Who gives the address of his master is led to his proxy, and nobody else is."""
+        """Only containers with an address in ROS_MASTER_URI have a redirect, to their proxy."""
         boxes = {box.id: box for box in self.engine.boxes}
         routers = self.routers_wanted(live)
         self.check_routers(routers)
@@ -229,7 +231,7 @@ class Invariants:
                 expected = place in wanted or place in routers or place in self.forgotten
                 assert namespace not in live_namespaces or expected, rule
         for (namespace, key), given in wanted.items():
-            if sandbox := runs.get(key):  # else it stays as it is, or comes later
+            if sandbox := runs.get(key):  # otherwise the redirect stays, or comes later
                 (master,), proxy = self.engine.rules[namespace, key]
                 assert str(master) == given
                 assert proxy == HostPort(sandbox.address, 11402)
@@ -237,7 +239,7 @@ class Invariants:
         assert len(records) <= len(wanted) + len(routers) or not self.engine.image
 
     def made(self, key: Key, members: list[Member]) -> Create:
-        """The proxy that these containers are to have, but for its range."""
+        """The expected proxy of these containers, except the range."""
         told = {peer for member in members for peer in member.peers}
         peers = tuple(sorted(told)) if key.ros != "1" else ()
         spec = proxy_spec(key, members, SETTINGS)
@@ -272,7 +274,7 @@ class Invariants:
     def check_lan_relay(
         self, lan_relay: Box, hears: OwnLabels, sandbox: Box, near: HostPort
     ) -> None:
-        """It runs, and knows where its proxy is."""
+        """The LAN relay runs, and knows the address of its proxy."""
         assert lan_relay.state in ("running", "restarting")
         assert self.is_named(lan_relay, lan_relay_name(hears.key))
         if self.engine.image:
@@ -281,11 +283,11 @@ class Invariants:
             assert hears.fingerprint == lan_relay_fingerprint(made, SETTINGS, self.engine.image, "")
 
     def is_named(self, box: Box, name: str) -> bool:
-        """Whether it has its name, if no stranger has."""
+        """Whether the container has the name, unless another container has."""
         return (box.name == name) != any(stranger.name == name for stranger in self.strangers())
 
     def check_names(self, member: Member, networks: frozenset[str]) -> None:
-        """By the name that a container uses it finds its own proxy and nobody else."""
+        """The name in ROS_MASTER_URI leads to the proxy of the container alone."""
         for network in networks if member.wanted_alias else ():
             answering = [
                 box.own.key if box.own else box.name

@@ -25,7 +25,7 @@ OUTSIDE = "http://robot:40001/"
 
 
 def make(*registrations: tuple[str, Kind, str, bool]) -> Addressing:
-    """A registry of nodes at 10.0.0.1, 10.0.0.2, …, each with what it holds and whether hidden."""
+    """A registry of nodes at 10.0.0.1, 10.0.0.2, …, each with a registration that may be hidden."""
     registry = Registry(PORTS)
     for number, (name, kind, resource, is_hidden) in enumerate(registrations, 1):
         address = f"10.0.0.{number}"

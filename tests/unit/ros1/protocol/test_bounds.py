@@ -1,4 +1,4 @@
-"""Names and URIs that are longer than any system's are refused where they would be kept."""
+"""The registry refuses names and URIs that are longer than any system's."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""system.multicall: each call by its own row, each result by its own row."""
+"""system.multicall: the proxy treats each call and each result like a single call."""
 
 from typing import Any
 
@@ -51,7 +51,7 @@ def refuse(uri: str) -> bool:
 
 
 SHUTDOWN = [
-    # what rospy sends when it ends (rospy/impl/registration.py)
+    # rospy's calls on shutdown (rospy/impl/registration.py)
     element("unregisterSubscriber", "/n", "/held", OWN),
     element("unregisterPublisher", "/n", "/held", OWN),
     element("unregisterService", "/n", "/held", SERVICE),
@@ -204,7 +204,7 @@ def test_what_holds_no_call_goes_to_the_master_as_it_is(params: tuple[Any, ...])
 
 
 def test_a_multicall_in_a_multicall_is_refused() -> None:
-    """rosmaster carries it out, so its addresses would reach the master as they are."""
+    """rosmaster accepts a nested multicall, and would get the addresses unchanged."""
     inner = element("system.multicall", [GOOD])
     with pytest.raises(XmlRpcError) as caught:
         exchange(world(), NODE, py_call("system.multicall", [GOOD, inner]), b"")
@@ -212,7 +212,7 @@ def test_a_multicall_in_a_multicall_is_refused() -> None:
 
 
 def test_names_are_resolved_for_the_caller_of_each_call() -> None:
-    """They were resolved for the first call's caller."""
+    """Not for the caller of the first call."""
     addressing = world()
     calls = [
         element("getPid", "/elsewhere/x"),

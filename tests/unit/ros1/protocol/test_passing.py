@@ -1,4 +1,4 @@
-"""Long calls that pass unread: what their head says, and what they must not hide."""
+"""Long calls that pass unread: the head, and content that must not pass unread."""
 
 import xmlrpc.client
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ PLAIN = {"setParam", "getParam"}
 
 
 def pieces(body: bytes, size: int) -> Iterable[bytes]:
-    """The first one holds the head, as the server has it."""
+    """The parts of a body. The first part has the whole head, as in the server."""
     first = max(size, min(len(body), 200))
     yield body[:first]
     for start in range(first, len(body), size):

@@ -1,4 +1,4 @@
-"""The TCPROS connection header, and what tells it from HTTP."""
+"""The TCPROS connection header, and how the proxy distinguishes TCPROS from HTTP."""
 
 import struct
 from contextlib import suppress

@@ -1,4 +1,4 @@
-"""Addresses in URIs: what is one, what is none, and the inside address in a path."""
+"""Addresses in URIs: valid URIs, other text, and the inside address in a path."""
 
 import pytest
 from hypothesis import given
@@ -151,7 +151,7 @@ def test_inside_paths_round_trip(node: HostPort, address: str, outside: HostPort
 def test_the_uri_that_another_proxy_advertises_is_kept(
     node: HostPort, first: HostPort, second: HostPort
 ) -> None:
-    """Of two proxies in a row the outer one's URI carries the inner one's, with all it carries."""
+    """With two proxies in a row, the outer proxy's URI contains the inner proxy's whole URI."""
     inner = slave_uri(first, inside_path(InsidePath(node, "10.0.0.5")))
     outer = slave_uri(second, inside_path(InsidePath(first, "10.0.0.9", path_of(inner))))
     parsed = parse_inside_path(outer)

@@ -1,4 +1,4 @@
-"""XML-RPC documents: what is found in them and what a rewrite leaves as it was."""
+"""XML-RPC documents: parsed values, and bytes that a rewrite leaves unchanged."""
 
 import pytest
 
@@ -141,7 +141,7 @@ def test_a_byte_order_mark_moves_no_offset() -> None:
 
 
 def test_a_self_closing_value_ends_where_its_tag_ends() -> None:
-    """Its end was taken to be that of the next tag; with white space next it was refused."""
+    """Not with the next tag, and white space may follow."""
     body = raw_call("<value><array><data><value/>\n<value>x</value><value/></data></array></value>")
     array = xmlrpc.parse_call(body).params[0]
     assert [item.raw for item in array.items] == [b"<value/>", b"<value>x</value>", b"<value/>"]
@@ -271,7 +271,7 @@ ATTRIBUTES = "".join(f" a{number}=''" for number in range(100))
 @pytest.mark.parametrize("content", [" " * xmlrpc.LONGEST_TAG, ATTRIBUTES * 10, " a='>'" * 1000])
 @pytest.mark.parametrize("name", ["value", "größe"])
 def test_the_length_of_a_tag_is_bounded(name: str, content: str) -> None:
-    """One of 4 MiB took 460 MB: 100 bytes for each byte, and 200 for each attribute."""
+    """A tag of 4 MiB took 460 MB: 100 bytes for each byte, and 200 for each attribute."""
     with pytest.raises(XmlRpcError, match=f"a tag of more than {xmlrpc.LONGEST_TAG} bytes"):
         xmlrpc.parse_call(raw_call(f"<{name}{content}>x</{name}>"))
 

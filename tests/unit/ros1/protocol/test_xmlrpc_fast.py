@@ -1,4 +1,4 @@
-"""The plain form of documents is read as expat reads it, and nothing else is taken for it."""
+"""The fast parser gives the same results as expat, and accepts only the plain form."""
 
 from typing import Any
 from xmlrpc.client import dumps
@@ -33,7 +33,7 @@ SOUP = st.lists(
 
 
 def by_expat(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, Any]:
-    """What expat makes of a document, and whether it accepts it at all."""
+    """The result of expat for a document, or the error."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fast, "call", lambda *_: None)
         patch.setattr(fast, "response", lambda *_: None)
@@ -186,7 +186,7 @@ def test_what_needs_an_xml_parser_is_left_to_expat(text: str) -> None:
 
 
 def test_spaces_cost_no_more_than_their_number() -> None:
-    """Each token begins with any number of them: they must not be tried again and again."""
+    """Each token may begin with spaces. The regular expression must not backtrack over spaces."""
     spaces = b" " * 2_000_000
     body = dumps(("a",), "x").encode().replace(b"<param>", spaces + b"<param>" + spaces)
     assert fast.call(body) is not None

@@ -70,7 +70,7 @@ def strings(value: Value) -> list[Value]:
 
 
 def swapped(value: Any, old: str, new: str) -> Any:
-    """A value with a string replaced wherever it occurs, but in no member's name."""
+    """A value with each occurrence of a string replaced, except in names of members."""
     if isinstance(value, list):
         return [swapped(item, old, new) for item in value]
     if isinstance(value, dict):
@@ -97,7 +97,7 @@ def test_values_are_read_as_python_reads_them(values: list[Any], call: Any) -> N
 
 
 def swapped_booleans(value: Any) -> Any:
-    """Booleans as text, as ``python_value`` gives them."""
+    """Booleans as text, like the result of ``python_value``."""
     if isinstance(value, list):
         return [swapped_booleans(item) for item in value]
     return str(int(value)) if isinstance(value, bool) else value
@@ -147,7 +147,7 @@ def test_the_slave_side_leaves_other_values_alone(
 
 
 def everything(body: bytes) -> None:
-    """Do all that the shell does with a body from somebody else."""
+    """Do everything that the shell does with a foreign body."""
     request = master_calls.read_request(body, CALLER)
     exported(request)
     parsed = xmlrpc.parse_call(body)
@@ -158,7 +158,7 @@ def everything(body: bytes) -> None:
 
 
 def everything_in_reply(reply: bytes) -> None:
-    """Do all that the shell does with a reply from somebody else."""
+    """Do everything that the shell does with a foreign reply."""
     call = xmlrpc.parse_call(py_call("requestTopic", "/a", "/b", [["TCPROS"]]))
     slave_api.topic_port(call, reply)
     slave_api.rewrite_reply(call, reply, REACHED, VIEW)

@@ -1,4 +1,4 @@
-"""XML-RPC documents that the proxy puts together, from parts that others wrote or its own."""
+"""XML-RPC documents that the proxy composes from foreign and own parts."""
 
 import pytest
 from hypothesis import given
@@ -24,7 +24,7 @@ def test_a_call_of_a_multicall_stands_alone(dialect: str) -> None:
 
 
 def test_a_part_of_a_latin1_document_is_taken_out_in_utf8() -> None:
-    """It was put as it was into a document that declares no encoding, which made it unreadable."""
+    """A document without a declared encoding is UTF-8, so Latin-1 bytes would be unreadable."""
     call = xmlrpc.parse_call(raw_call("<value>é</value>", encoding="iso-8859-1"))
     assert decoded(multicall.single_call(call)) == (("é",), "m")
     reply = (

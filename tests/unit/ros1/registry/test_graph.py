@@ -1,4 +1,4 @@
-"""The graph as the master tells it, whatever it tells."""
+"""The graph of the master, read from any answer."""
 
 from typing import Any
 

@@ -59,7 +59,7 @@ def test_a_node_that_was_cleaned_up_says_so_until_it_is_registered_again() -> No
         ([A], 4.9, False),
         ([A], 5.0, True),
         ([A, A], 5.5, False),  # the second was at 1
-        ([R], 0.1, True),  # one failure: ask again at once
+        ([R], 0.1, True),  # after a failure: ask again at once
         ([A, S], 1.1, True),
         ([S, S], 1.9, False),  # down: once a second
         ([S, S], 2.0, True),
@@ -122,9 +122,9 @@ def test_a_node_that_is_known_to_have_ended_is_down_at_once() -> None:
     health.note(A, 1.0)
     health.end(2.0)
     assert (health.down, health.has_ended) == (True, True)
-    assert health.clean_up(2.0, after=30.0)  # at the next look, if it could not be done at once
+    assert health.clean_up(2.0, after=30.0)  # at the next look, if not at once
     assert not health.clean_up(2.0, after=0.0)
-    health.note(S, 3.0)  # its address is silent, but it won't come back
+    health.note(S, 3.0)  # the address is silent, but the node won't come back
     assert (health.down, health.has_ended) == (True, True)
     assert not health.note(A, 4.0)
     assert not health.down

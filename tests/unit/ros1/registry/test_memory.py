@@ -1,4 +1,4 @@
-"""What outlasts the proxy: where the node of each lease is, in one text."""
+"""The text that outlasts the proxy: the node of each lease, and the node's location."""
 
 from hypothesis import given
 from hypothesis import strategies as st

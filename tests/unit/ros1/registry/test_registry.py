@@ -1,4 +1,4 @@
-"""The registry: endpoints by address and port, their leases and registrations."""
+"""The registry: endpoints by address and port, leases, registrations."""
 
 import pytest
 
@@ -93,8 +93,8 @@ def test_a_node_that_changes_its_uri_keeps_its_lease() -> None:
     assert registry.by_node(at(own_uri("10.0.0.5"))) == [endpoint]
 
 
-def test_nobody_renames_the_endpoint_of_somebody_else() -> None:
-    """A registration from elsewhere, under another name of the same place, renamed it."""
+def test_a_registration_from_another_source_renames_no_endpoint() -> None:
+    """Not even with another name of the same host and port."""
     registry = make_registry()
     endpoint = node(registry, 5)
     forged = admit(registry, "http://alias:40001/", "10.0.0.5", "10.0.0.66", confirmed=False)
@@ -113,7 +113,7 @@ def test_an_endpoint_that_was_only_claimed_is_confirmed_by_its_own_address() -> 
 
 
 def test_a_source_that_means_another_node_by_now_stays_admitted_when_the_old_one_goes() -> None:
-    """Removing the old endpoint took the new one's admission along."""
+    """Removing the old endpoint must not remove the new endpoint's admission."""
     registry = make_registry()
     uri = "http://node:40001/"
     old = admit(registry, uri, "10.0.0.5", "10.0.0.9")
@@ -179,7 +179,7 @@ def test_the_endpoint_that_was_idle_longest_is_given_up_first() -> None:
 
 
 def test_an_endpoint_that_waits_for_the_masters_reply_is_not_given_up() -> None:
-    """It has no registration yet, and counted as the one that was idle longest."""
+    """An endpoint without a registration is not idle."""
     registry = make_registry()
     node(registry, 5)
     assert registry.longest_idle() is None
@@ -269,7 +269,7 @@ def test_a_service_has_one_provider() -> None:
     registration = register(registry, new, SRV, "/s", "/new")
     assert registry.services.get("/s") == (new, registration)
     assert old.names(SRV) == []
-    registry.unregister(SRV, "/s", "/old")  # too late: the service is somebody else's
+    registry.unregister(SRV, "/s", "/old")  # too late: another node has the service
     assert registry.services.get("/s") == (new, registration)
     registry.unregister(SRV, "/s", "/new")
     assert registry.services.get("/s") is None
@@ -462,7 +462,7 @@ def failing(
 
 
 def given_up(registry: Registry) -> list[str]:
-    """Who is given up for nodes that live, one after the other."""
+    """The endpoints that give way to live nodes, in order."""
     hosts = []
     while (endpoint := registry.dead_endpoint()) is not None:
         hosts.append(endpoint.location.address.removeprefix("10.0.0."))
@@ -472,8 +472,8 @@ def given_up(registry: Registry) -> list[str]:
 
 def test_the_dead_give_way_in_order() -> None:
     registry = make_registry(16)
-    node(registry, 1)  # just admitted: nothing is known of it yet
-    failing(registry, 2, source=2, proven=True)  # may come back: it has failed once only
+    node(registry, 1)  # just admitted: not probed yet
+    failing(registry, 2, source=2, proven=True)  # may come back after a single failure
     silent = failing(registry, 3, source=3, proven=True, failures=2)
     ended = failing(registry, 4, source=4, proven=True, failures=2)
     ended.health.refused = True
@@ -494,7 +494,7 @@ def test_what_only_the_master_tells_of_gives_way_once_it_was_asked_in_vain() -> 
     claim = registry.restore(own_uri("10.0.0.5"), address, place, 45000)
     assert claim
     register(registry, claim, PUB, "/a")
-    assert registry.dead_endpoint() is None  # it is being asked
+    assert registry.dead_endpoint() is None  # the proxy is asking the node
     claim.health.failures = 1
     assert registry.dead_endpoint() is claim
     # something answers that is not the node
@@ -524,7 +524,7 @@ def test_few_uris_are_remembered_for_one_endpoint_and_the_oldest_go() -> None:
     remembered = [uri for uri in uris if registry.admitted(at(uri), "10.0.0.5") is endpoint]
     assert remembered == uris[2:]
     assert len(endpoint.admissions) == MOST_ADMISSIONS
-    admit(registry, uris[2], "10.0.0.5")  # used again: it is the newest now
+    admit(registry, uris[2], "10.0.0.5")  # used again: now the newest
     admit(registry, uris[0], "10.0.0.5")
     assert registry.admitted(at(uris[2]), "10.0.0.5") is endpoint
     assert registry.admitted(at(uris[3]), "10.0.0.5") is None

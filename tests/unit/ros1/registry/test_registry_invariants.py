@@ -23,7 +23,7 @@ KINDS = st.sampled_from(Kind)
 
 
 class Registries(RuleBasedStateMachine):
-    """A registry, and by its side what it must hold: (kind, name, caller) by endpoint key."""
+    """A registry, and the expected content: the endpoint of each (kind, name, caller)."""
 
     def __init__(self) -> None:
         super().__init__()

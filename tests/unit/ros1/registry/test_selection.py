@@ -1,4 +1,4 @@
-"""Who may use the proxy as its master."""
+"""Sources that may use the proxy as their master."""
 
 from ipaddress import ip_network
 

@@ -1,4 +1,4 @@
-"""Stand-ins for nodes outside: their second ports."""
+"""Second ports of stand-ins for nodes outside."""
 
 from itertools import count
 
@@ -23,8 +23,8 @@ def open_fast_port(stand_ins: StandIns, stand_in: StandIn) -> HostPort:
     return candidate
 
 
-def test_two_whose_ports_would_be_the_same_get_one_each() -> None:
-    """Their URIs give the same number; of a hundred nodes outside, two do in one case of two."""
+def test_stand_ins_with_the_same_computed_port_get_a_port_each() -> None:
+    """With a hundred nodes outside, two URIs give the same port with a probability of a half."""
     stand_ins = make_stand_ins(direction="both")
     first = make_stand_in(1)
     second = next(

@@ -1,4 +1,4 @@
-"""Which address stands for a node, by who asks: tables of import and export."""
+"""The address of a node for each caller: tables of import and export."""
 
 import pytest
 
@@ -47,7 +47,7 @@ def test_an_advertised_uri_tells_the_port_alone(uri: str, address: str | None) -
         ("", True),
         ("/RPC2", True),
         ("/10.0.0.5:40001/", True),  # as former versions advertised it
-        ("/10.0.0.5:40009/", False),  # whoever had the port before
+        ("/10.0.0.5:40009/", False),  # a former node of the port
         ("/c5:40001/10.0.0.6/", False),
     ],
 )
@@ -66,7 +66,7 @@ def test_advertised_ports_have_an_offset() -> None:
     assert addressing.advertised_uri(endpoint) == outside
     assert addressing.import_slave(outside, STRANGER) == RELAYED
     assert addressing.export_slave(RELAYED, STRANGER) == outside
-    assert addressing.import_slave(OUTSIDE, STRANGER) == OUTSIDE  # nobody's port outside
+    assert addressing.import_slave(OUTSIDE, STRANGER) == OUTSIDE  # the port is not advertised
     assert addressing.lease_of(OUTSIDE) is None
 
 
@@ -84,11 +84,11 @@ def test_an_advertised_ipv6_host_has_brackets() -> None:
 
 
 IMPORTS = [
-    # who asks, about a node with this host name and address, gets
+    # caller, URI and host name of a node, the URI that the caller gets
     ("the node itself", make_caller("10.0.0.5"), LITERAL, None, LITERAL),
     ("a neighbour", NEIGHBOUR, LITERAL, None, LITERAL),
     ("a stranger", STRANGER, LITERAL, None, RELAYED),
-    ("one of another family", make_caller("fd00::6", proxy="fd00::1"), LITERAL, None, None),
+    ("another family", make_caller("fd00::6", proxy="fd00::1"), LITERAL, None, None),
     (
         "the node, by an unresolvable name",
         make_caller("10.0.0.5"),
@@ -147,8 +147,8 @@ def test_neighbours_share_a_network(
 UNTOUCHED = [
     "http://laptop:33445/",
     "http://robot-host:11311/",
-    "http://robot-host:45001/10.0.0.5:40001/",  # another port of ours, which nobody has
-    "http://robot-host:45000/10.0.0.5:40009/",  # a left-over of whoever had the port before
+    "http://robot-host:45001/10.0.0.5:40001/",  # another port of the proxy, without an endpoint
+    "http://robot-host:45000/10.0.0.5:40009/",  # a former node of the port
     "http://ROBOT-HOST:45000/10.0.0.5:40001/",
     "https://robot-host:45000/10.0.0.5:40001/",
     "rosrpc://robot-host:45000",
@@ -217,7 +217,7 @@ def test_a_uri_that_a_caller_would_take_for_its_own_is_not_given_to_it() -> None
 
 
 def test_a_node_behind_source_nat_means_itself_by_its_uri() -> None:
-    """It registers from the gateway's address and is found at its own."""
+    """The node registers from the gateway's address, and the proxy finds the node's own address."""
     addressing = make_addressing()
     uri = "http://node:40001/"
     add_node(addressing, uri, "10.0.0.6")
@@ -228,8 +228,8 @@ def test_a_node_behind_source_nat_means_itself_by_its_uri() -> None:
     assert exported == addressing.advertised_uri(endpoint)
 
 
-def test_a_node_that_has_moved_is_sent_nobody_to_the_address_that_it_gives() -> None:
-    """Not even its own machine; it itself goes on by its own URI, which tells it who it is."""
+def test_a_node_that_has_moved_is_relayed_for_every_other_caller() -> None:
+    """Callers on the node's own machine, too. Only the node itself gets its own URI."""
     addressing = make_addressing()
     endpoint = add_node(addressing)
     addressing.registry.move({endpoint: NodeLocation("10.0.0.9", named=False, stale=True)})
@@ -242,8 +242,8 @@ def test_a_node_that_has_moved_is_sent_nobody_to_the_address_that_it_gives() -> 
     assert addressing.export_slave(LITERAL, make_caller("10.0.0.9")) == outside
 
 
-def test_uris_of_a_removed_endpoint_mean_the_same_until_its_port_is_somebody_elses() -> None:
-    """Its literal URI was no longer exported, so that no tool inside could unregister it."""
+def test_uris_of_a_removed_endpoint_mean_the_same_until_another_node_has_the_port() -> None:
+    """Otherwise no tool inside can unregister the endpoint by its literal URI."""
     addressing = make_addressing(listen=(45000, 45000))
     endpoint = add_node(addressing)
     addressing.registry.remove(endpoint)
@@ -277,7 +277,7 @@ def test_uris_that_the_proxy_handed_out(uri: str, handed_out: bool) -> None:
 
 
 SERVICES = [
-    # who asks, gets
+    # caller, the URI that the caller gets
     (make_caller("10.0.0.5"), "rosrpc://10.0.0.5:50001"),
     (NEIGHBOUR, "rosrpc://10.0.0.5:50001"),
     (STRANGER, f"rosrpc://{PROXY}:45000"),
@@ -295,7 +295,7 @@ def test_a_service_is_imported_and_exported(caller, given: str) -> None:
 
 @pytest.mark.parametrize("caller", [caller for caller, _ in SERVICES])
 def test_a_service_that_was_rebuilt_from_the_master(caller) -> None:
-    """Its own URI is not known until the node has answered for it."""
+    """The proxy does not know the service's own URI before the node has answered."""
     addressing = make_addressing()
     endpoint = add_node(addressing)
     registration = add_registration(addressing, endpoint, Kind.SERVICE, "/s")
@@ -309,7 +309,7 @@ def test_a_service_that_was_rebuilt_from_the_master(caller) -> None:
 
 
 def test_a_service_that_is_not_known_is_relayed() -> None:
-    """It was guessed to be at the node's TCPROS port, and could not be exported again."""
+    """The proxy must not guess the node's TCPROS port: the proxy could not export such a URI."""
     addressing = make_addressing()
     add_node(addressing).topic_ports["/a"] = 50001
     given = addressing.import_service("rosrpc://robot-host:45000", "/s", NEIGHBOUR)

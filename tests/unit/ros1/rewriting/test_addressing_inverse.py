@@ -29,7 +29,7 @@ OFFSETS = st.sampled_from([0, -15000, 5, 100])
 
 @dataclass(frozen=True)
 class Member:
-    """A node of a random topology: where it is, what it calls itself, what it serves."""
+    """A node of a random topology: address, own name, port, host of its service."""
 
     address: str
     name: str | None
@@ -59,7 +59,7 @@ MEMBERS = st.builds(
 
 @st.composite
 def topologies(draw: st.DrawFn, distinct: bool = False) -> tuple[Addressing, list[Endpoint]]:
-    """A proxy with nodes behind it; ``distinct``: no two call themselves the same."""
+    """A proxy with nodes behind. With ``distinct`` no two nodes have the same host and port."""
     first = 45000 + draw(OFFSETS)
     addressing = make_addressing(draw(HOSTS), (45000, 45009), (first, first + 9), draw(NETWORKS))
     members = draw(
@@ -74,7 +74,7 @@ def topologies(draw: st.DrawFn, distinct: bool = False) -> tuple[Addressing, lis
 
 @st.composite
 def callers(draw: st.DrawFn, addressing: Addressing) -> tuple[Caller, Caller]:
-    """Somebody as the proxy gives it addresses, and as it is when it sends them back."""
+    """A caller twice: when the proxy hands out addresses, and when the caller sends them back."""
     proxy = draw(PROXIES)
     endpoint = draw(st.none() | st.sampled_from(list(addressing.registry)))
     address = endpoint.location.address if endpoint else draw(ADDRESSES)

@@ -40,7 +40,9 @@ NODE = make_caller("10.0.0.5", master=MASTER)
 
 
 def world() -> Addressing:
-    """The node itself, a neighbour, and one that it can't reach; all publish and serve."""
+    """The node itself, a neighbour, and a node that the neighbours cannot reach. All publish and
+    serve.
+    """
     addressing = make_addressing()
     for uri, name in ((OWN, ID), (OTHER, "/other"), (FAR, "/far")):
         endpoint = add_node(addressing, uri)
@@ -50,7 +52,7 @@ def world() -> Addressing:
 
 
 EXPORTED = [
-    # method, parameters as the node sends them, as the master gets them
+    # method, parameters from the node, parameters to the master
     ("registerPublisher", [ID, TOPIC, TYPE, OWN], [ID, TOPIC, TYPE, OUT]),
     ("registerSubscriber", [ID, TOPIC, TYPE, OWN], [ID, TOPIC, TYPE, OUT]),
     ("registerService", [ID, "/s", SERVICE, OWN], [ID, "/s", OUT_SERVICE, OUT]),
@@ -65,7 +67,7 @@ EXPORTED = [
     ),
     ("unregisterService", [ID, "talker/held", SERVICE], [ID, "talker/held", OUT_SERVICE]),
     ("unregisterService", [ID, "~held", SERVICE], [ID, "~held", OUT_SERVICE]),
-    # rosnode cleanup: somebody else's node, by the URI that the proxy gave for it
+    # rosnode cleanup: another node, by the URI that the proxy gave
     ("unregisterPublisher", ["/other", TOPIC, OTHER], ["/other", TOPIC, OTHER_OUT]),
     ("unregisterPublisher", ["/far", TOPIC, FAR_RELAYED], ["/far", TOPIC, FAR_OUT]),
     ("unregisterSubscriber", ["/laptop", TOPIC, LAPTOP], ["/laptop", TOPIC, LAPTOP]),
@@ -310,9 +312,8 @@ def test_a_tool_inside_ends_the_registration_of_another_node() -> None:
 def test_a_node_that_makes_room_for_its_successor_ends_none_of_its_registrations(
     method: str, params: list[Any]
 ) -> None:
-    """The master shuts the older node of a name down, which then unregisters with its own URI.
-
-    The master answers 1 to that; taken at its word, it ended the newer node's lease.
+    """The master shuts down the older node of a name. This node unregisters with its own URI, and
+    the master answers 1. That answer must not end the newer node's lease.
     """
     addressing = world()
     done = exchange(addressing, NODE, py_call(method, *params), py_reply([1, "not known", 0]))
@@ -321,7 +322,9 @@ def test_a_node_that_makes_room_for_its_successor_ends_none_of_its_registrations
 
 
 def test_a_registration_with_a_uri_that_the_proxy_handed_out_ends_none() -> None:
-    """Made in the name of somebody else it has no endpoint, and was taken for an ending."""
+    """A registration in the name of another node has no endpoint, but is no unregistration
+    either.
+    """
     addressing = world()
     request = master_calls.read_request(
         py_call("registerPublisher", "/far", "/far/held", TYPE, FAR_RELAYED), NODE

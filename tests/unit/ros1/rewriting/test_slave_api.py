@@ -53,7 +53,7 @@ def outward(method: str, reply: bytes, reached: HostPort = OUTSIDE) -> bytes:
 
 
 UPDATES = [
-    # publishers as the master gives them, as the node gets them
+    # publishers from the master, publishers to the node
     ([], []),
     ([LAPTOP], [LAPTOP]),
     ([OUT], [OWN]),

@@ -14,7 +14,7 @@ HERE = HostPort("10.0.0.1", 25000)
 
 
 def header(topic: str) -> xmlrpc.client.Binary:
-    """As roscpp writes it, without the length of the whole."""
+    """A header of roscpp without the total length."""
     return xmlrpc.client.Binary(encode_header({"topic": topic, "callerid": "/n"})[4:])
 
 

@@ -1,4 +1,4 @@
-"""Nodes that registered around the proxy: who they are, where, and why they are shut down."""
+"""Nodes that registered at the real master directly: identity, location, reason for shutdown."""
 
 from collections.abc import Mapping, Sequence
 
@@ -81,14 +81,14 @@ def direct(caller_id: str, topics: Sequence[str], *addresses: str, kind: Kind = 
 SIX = "10.0.0.6:40001"
 SEVEN = "10.0.0.7:40001"
 LOCATED = [
-    # what a node has at the master, what the nodes at its places say, where it is
+    # topics at the master, topics of the node at each place, location
     (["/a"], {SIX: ["/a"]}, SIX),
     (["/a", "/rosout"], {SIX: ["/a", "/rosout"]}, SIX),
     (["/rosout"], {SIX: ["/rosout"]}, SIX),
     (["/a", "/rosout"], {SIX: ["/rosout"]}, None),  # another node
     (["/a"], {SIX: []}, None),
-    ([], {SIX: ["/a"]}, None),  # nothing bears it out
-    (["/a"], {}, None),  # nobody answers
+    ([], {SIX: ["/a"]}, None),  # no confirmation
+    (["/a"], {}, None),  # no answer
     (["/a"], {SIX: ["/b"], SEVEN: ["/a"]}, SEVEN),
     (["/a", "/b"], {SIX: ["/a"], SEVEN: ["/a", "/b"]}, SEVEN),
     (["/a", "/b"], {SIX: ["/a", "/b", "/c"], SEVEN: ["/a"]}, SIX),
@@ -101,7 +101,7 @@ Located = tuple[dict[HostPort, list[DirectNode]], dict[str, str]]
 
 
 def locate(nodes: Sequence[DirectNode], said: Mapping[str, Sequence[str]]) -> Located:
-    """Where nodes are, if those at places publish these topics."""
+    """The locations of nodes, if the nodes at these places publish these topics."""
     infos = {
         places(address)[0]: NodeInfo(7, dict.fromkeys(topics, "t"), {})
         for address, topics in said.items()
@@ -200,7 +200,7 @@ def test_whose_uri_has_changed(caller_id: str, reason: str, name: str | None) ->
 LITERAL = "http://c1:40001/"
 ADVERTISED = "http://robot-host:45000/"
 NAMES = [
-    # registered around the proxy before? what the master has, whether no other has its name
+    # adopted before? URI at the master, whether the name is unique
     (False, ADVERTISED, True),
     (True, ADVERTISED, True),
     (False, LITERAL, True),

@@ -22,7 +22,7 @@ def test_only_who_answers_is_alive() -> None:
 
 
 def test_restarted_container_keeps_its_new_node() -> None:
-    """Its address is back, and its node has just registered, but takes its time to answer."""
+    """The address is back. The node has just registered, but answers slowly."""
     addressing = make_addressing()
     fresh, old, calling, ended = (
         add_node(addressing, f"http://10.0.0.5:4000{n}/") for n in range(4)
@@ -73,13 +73,13 @@ def test_the_place_of_a_node_that_has_moved(uri: str, stale: bool, confirmed: bo
 
 
 SAME = [
-    # pid known, pid found, whether its topics bear it out, same?
+    # known pid, found pid, whether the topics confirm the node, same process?
     (7, 7, True, True),
     (7, 8, True, False),
     (1, 1, False, False),  # pid 1, as in every container
-    (7, 7, None, True),  # it has no topics, or does not tell
+    (7, 7, None, True),  # no topics, or no answer about topics
     (7, 8, None, False),
-    (7, None, True, True),  # it does not tell its pid any more
+    (7, None, True, True),  # no answer about the pid any more
     (7, None, None, False),
     (None, 7, True, True),  # recovered, and not asked yet
     (-1, 7, True, True),  # suspected
@@ -149,7 +149,7 @@ def test_a_thousand_that_are_well_are_passed_over() -> None:
 def test_a_process_that_hangs_up_is_called_from_then_on_and_another_is_not() -> None:
     endpoint = add_node(make_addressing())
     health = endpoint.health
-    assert not liveness.may_be_kept(endpoint)  # it has never answered
+    assert not liveness.may_be_kept(endpoint)  # no answer yet
     health.note(ProbeResult.ANSWERED, 1.0)
     health.pid = 7
     assert liveness.may_be_kept(endpoint)

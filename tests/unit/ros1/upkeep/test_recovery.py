@@ -1,4 +1,4 @@
-"""Recovery from what the master knows: claims, who bears them out, and what the master lost."""
+"""Recovery from the master's registrations: claims, confirmation, lost registrations."""
 
 from collections.abc import Collection, Sequence
 from ipaddress import ip_network
@@ -36,7 +36,7 @@ MEMORY = remembered_leases.read_leases(
     make_addressing().ports,
 )
 URIS = [
-    # what the master has for a node, the claim: port, what it calls itself, where it is looked for
+    # URI at the master, the claim: port, own host and port of the node, address to ask
     ("http://robot-host:45003/", (45003, "10.0.0.5:40001", "10.0.0.5")),
     ("http://robot-host:45003", (45003, "10.0.0.5:40001", "10.0.0.5")),
     ("http://robot-host:45003/RPC2", (45003, "10.0.0.5:40001", "10.0.0.5")),
@@ -133,18 +133,18 @@ def claim(
 A = "10.0.0.5"
 B = "10.0.0.6"
 SETTLED = [
-    # claims: port, address, topics at the master, topics that the node asked said; who is kept
+    # claims: port, address, topics at the master, topics from the node; kept claims
     ([], []),
     ([claim(1, A, ["/a"]), claim(2, B, ["/a"])], [(1, A), (2, B)]),
-    # one port, two nodes: a left-over, or a forgery of many topics that no node bears out
+    # one port, two nodes: a left-over, or a forgery of many topics that no node confirms
     ([claim(1, A, ["/a"], ["/a"]), claim(1, B, ["/a", "/b"])], [(1, A)]),
     ([claim(1, A, ["/a", "/b", "/c"]), claim(1, B, ["/b"], ["/b"])], [(1, B)]),
     ([claim(1, A, ["/a"], ["/x"]), claim(1, B, ["/b"], ["/b"])], [(1, B)]),
-    # a forgery that leads to a real node, but claims too much of it
+    # a forgery that leads to a real node, but claims too many topics
     ([claim(1, A, ["/a"], ["/a"]), claim(1, B, ["/c", "/x", "/y"], ["/c"])], [(1, A)]),
-    # one node, two ports: as many topics as it has, no more
+    # a node with two ports: no more topics than the node has
     ([claim(1, A, ["/a"], ["/a", "/b"]), claim(2, A, ["/a", "/b"], ["/a", "/b"])], [(2, A)]),
-    # nobody answered: the one with more registrations
+    # no answer: the claim with more registrations
     ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], [(1, B)]),
     # an answer that bears out nothing is still better than none
     ([claim(1, A, ["/a"], []), claim(1, B, ["/a", "/b"])], [(1, A)]),
@@ -222,8 +222,8 @@ def test_only_addresses_in_an_inside_network_are_recovered(address: str, allowed
         (["/rosout", "/chatter"], ["/rosout"], ["/chatter"], True),
         (["/rosout"], ["/rosout", "/other"], [], True),
         (["/rosout"], [], [], False),
-        ([], ["/rosout"], [], None),  # a service alone: no node can be asked for those
-        # what it does not tell is not what it does not have
+        ([], ["/rosout"], [], None),  # only a service: a node cannot be asked for services
+        # no answer about subscriptions says nothing
         (["/rosout", "/chatter"], ["/rosout"], None, None),
         (["/rosout", "/chatter"], ["/rosout", "/chatter"], None, True),
         (["/rosout", "/chatter"], None, ["/chatter"], True),

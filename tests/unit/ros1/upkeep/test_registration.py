@@ -31,7 +31,7 @@ def make_registration(
 
 
 def said(published: Iterable[str] | None, subscribed: Iterable[str] | None = ()) -> NodeInfo:
-    """What a node says of itself, None where it does not tell; the type of /a is t/a."""
+    """A node's answers, None for no answer. The type of /a is t/a."""
     types = [
         None if names is None else {name: f"t{name}" for name in names}
         for names in (published, subscribed)
@@ -82,12 +82,12 @@ HELD = [(PUB, "/a"), (SUB, "/b"), (SRV, "/s"), (PARAM, "/p")]
     ("published", "subscribed", "same_process", "kept"),
     [
         ({"/a"}, {"/b"}, True, HELD),
-        ({"/a"}, {"/b"}, False, HELD[:2]),  # another process: only what it names itself
+        ({"/a"}, {"/b"}, False, HELD[:2]),  # another process: only topics that this process names
         ({"/a"}, set(), True, [HELD[0], *HELD[2:]]),
         ({"/b"}, {"/a"}, True, []),  # the kinds are not the same
         (set(), set(), True, []),
         ({"/rosout"}, set(), True, []),
-        # what it does not tell holds
+        # no answer: keep all
         (None, None, True, HELD),
         (None, None, False, HELD[:2]),
         (set(), None, True, HELD[1:]),
@@ -129,7 +129,7 @@ LEFT_OVER = [
     ([*OLD, *NEW], {"/rosout", "/a"}, {"/b"}, []),  # two names in one process
     ([*OLD, (SUB, "/b", "/new", 20.0)], {"/rosout"}, set(), OLD),  # is being made right now
     ([*OLD, (SRV, "/late", "/old", 12.0), (SUB, "/b", "/new", 20.0)], {"/rosout"}, set(), OLD),
-    # it does not tell whether it still has the old one's
+    # no answer about the old node's publications
     ([*OLD, *NEW], None, {"/b"}, []),
     ([*OLD, *NEW], {"/rosout"}, None, OLD),
     ([*OLD, *NEW], None, None, []),
@@ -156,7 +156,7 @@ def test_what_a_process_that_is_gone_has_left_behind(
 def test_topics_that_a_node_has_and_the_master_does_not_know_of() -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
-    assert decisions.unregistered_topics(endpoint, said({"/a"})) == []  # whose would they be?
+    assert decisions.unregistered_topics(endpoint, said({"/a"})) == []  # no known node name
     add_registration(addressing, endpoint, PUB, "/a", "/n")
     topics = decisions.unregistered_topics(endpoint, said({"/a", "/b"}, {"/a"}))
     assert topics == [Registration(PUB, "/b", "/n", "t/b"), Registration(SUB, "/a", "/n", "t/a")]
@@ -251,7 +251,7 @@ LOST = [
     ([make_registration("/a", since=9.9)], [], [make_registration("/a", since=9.9)]),
     ([make_registration("/a", since=10.0)], [], []),  # made while the master was being asked
     ([make_registration("/a", since=11.0)], [], []),
-    # parameters are not in the master's state: lost if their node is
+    # getSystemState has no parameters: lost if the node is lost
     ([make_registration("/p", kind=PARAM)], [], []),
     ([make_registration("/a"), make_registration("/p", kind=PARAM)], [make_registration("/a")], []),
     (

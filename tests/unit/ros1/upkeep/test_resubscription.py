@@ -1,4 +1,4 @@
-"""Who has no connection to a publisher behind the proxy: no relay, no UDPROS, no forwarding."""
+"""Subscribers without a connection to a publisher inside, by relay, UDPROS or forwarding."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -75,7 +75,7 @@ def test_two_publishers_of_a_topic_in_one_process_are_one() -> None:
     ("address", "options", "count"),
     [
         ("10.0.0.6", {}, 0),
-        ("10.0.0.6", {"named": False}, 1),  # its host name leads nowhere: neighbours need the proxy
+        ("10.0.0.6", {"named": False}, 1),  # no host name that neighbours can resolve
         ("10.0.1.6", {}, 1),  # in another network
         ("172.20.0.7", {}, 1),  # in none
     ],
@@ -145,15 +145,15 @@ def test_a_subscriber_by_udpros_is_not_silent_and_one_by_tcpros_may_be() -> None
 
 
 FORWARDED = [
-    # connections that the kernel forwards, by peer; who is named by the publisher; who is silent
+    # forwarded connections by peer; subscribers that the publisher names; silent subscribers
     ({}, [], ["/a", "/b", "/c"]),
     ({LAPTOP: 2}, [], ["/c"]),
-    ({LAPTOP: 3}, [], ["/c"]),  # one too many: an old one that the kernel has not forgotten
+    ({LAPTOP: 3}, [], ["/c"]),  # one too many: an old connection that the kernel still tracks
     ({LAPTOP: 2, ROBOT: 1}, [], []),
     ({ROBOT: 1}, [], ["/a", "/b"]),
     ({LAPTOP: 1, ROBOT: 1}, [], ["/a", "/b"]),  # which of the two is not known
     ({LAPTOP: 1, ROBOT: 1}, ["/a"], ["/b"]),
-    ({LAPTOP: 1, ROBOT: 1}, ["/a", "/b"], ["/a", "/b"]),  # one of them has vanished
+    ({LAPTOP: 1, ROBOT: 1}, ["/a", "/b"], ["/a", "/b"]),  # one subscriber has vanished
     ({ELSEWHERE: 3}, [], []),  # the peers' addresses are hidden
     ({ELSEWHERE: 2}, ["/a", "/c"], ["/b"]),
     ({ELSEWHERE: 2}, [], ["/a", "/b", "/c"]),

@@ -1,4 +1,4 @@
-"""What nodes have counted between two answers, and what is summed up of it."""
+"""Growth of the nodes' counts between two answers, and the sums."""
 
 import pytest
 from hypothesis import given
@@ -59,7 +59,7 @@ def test_numbers_that_begin_anew(former: int, newest: int, grown: int) -> None:
 
 
 def test_a_subscriber_of_roscpp_that_connects_again_is_not_counted_anew() -> None:
-    """Two answers of a real one, before and after its connection was lost."""
+    """Two answers of a real subscriber, before and after a lost connection."""
     before, after = (
         read_bus_stats([[], [["/rosout", connections]]])
         for connections in ([[0, 4100, 100, 0, 0]], [[1, 4223, 103, 0, 0]])
@@ -109,7 +109,9 @@ def test_nothing_that_a_node_answers_is_too_odd(answer: object) -> None:
 
 
 def test_only_what_a_node_has_registered_counts() -> None:
-    """It may answer with any name, and as a publisher of what it only hears."""
+    """A node may answer with any name, or as the publisher of a topic that it only
+    subscribes to.
+    """
     addressing = make_addressing()
     endpoint = add_node(addressing, "http://10.0.0.5:40000/")
     add_registration(addressing, endpoint, Kind.PUBLISHER, "/image", "/camera")
