@@ -1,4 +1,4 @@
-"""Datagrams of real participants, as ``tests/ros2/record.py`` has recorded them."""
+"""Datagrams of real participants, recorded by ``tests/ros2/record.py``."""
 
 from pathlib import Path
 
@@ -6,13 +6,13 @@ import msgspec
 
 FOLDER = Path(__file__).parent / "recordings"
 VENDORS = "cyclone", "jazzy", "kilted"
-"""Whose they are: Cyclone DDS, Fast DDS 2.14 and 3.2."""
+"""The implementations: Cyclone DDS, Fast DDS 2.14 and 3.2."""
 PUBLISHER = "172.30.1.11"
 SUBSCRIBER = "172.30.1.12"
 
 
 class Datagram(msgspec.Struct, frozen=True):
-    """A datagram, where it came from and where it went, each as ``host:port``; it is in hex."""
+    """A datagram. ``source`` and ``target`` are ``host:port``, ``payload`` is in hex."""
 
     source: str
     target: str
@@ -20,7 +20,7 @@ class Datagram(msgspec.Struct, frozen=True):
 
     @property
     def host(self) -> str:
-        """The address that it came from."""
+        """The host of the source."""
         return self.source.partition(":")[0]
 
     @property
@@ -30,6 +30,6 @@ class Datagram(msgspec.Struct, frozen=True):
 
 
 def recorded(vendor: str) -> list[Datagram]:
-    """What was recorded of an implementation, in the order in which it was sent."""
+    """The recorded datagrams of an implementation, in the order of sending."""
     lines = (FOLDER / f"{vendor}.jsonl").read_bytes()
     return msgspec.json.Decoder(Datagram).decode_lines(lines)

@@ -1,4 +1,4 @@
-"""What keeps participants from meeting, as the status of a domain tells it."""
+"""Problems in the status of a domain: reasons why participants do not discover each other."""
 
 import pytest
 from msgspec.structs import replace
@@ -64,7 +64,7 @@ def test_of_a_participant_the_first_cause_alone_is_told() -> None:
     [{"security": "authenticated"}, {"security": "protected", "vendor": "Cyclone DDS"}],
 )
 def test_dds_security_that_passes(changes: dict[str, object]) -> None:
-    """Seen: addresses in SEDP that can be read, or none there, as Cyclone DDS has it."""
+    """SEDP with readable addresses, or without addresses, as in Cyclone DDS."""
     assert with_inside(**changes) == []
 
 
@@ -79,7 +79,7 @@ def test_a_longer_range_is_no_fix_for_too_many_locators() -> None:
 
 
 def test_outside_is_not_reached_in_direction_both_where_its_addresses_are_protected() -> None:
-    """They are replaced there, too; it was told of those inside alone."""
+    """The proxy rewrites the addresses of both sides, but cannot rewrite protected addresses."""
     secured = replace(OUTSIDE, security="protected", vendor="Fast DDS")
     both_ways = replace(DOMAIN, direction="both")
     (problem,) = domain_problems(replace(both_ways, outside=(secured,)))

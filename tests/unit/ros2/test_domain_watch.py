@@ -1,4 +1,4 @@
-"""Problems of ROS 2 are told once, and go when they are mended."""
+"""Each ROS 2 problem is reported once, and removed after the repair."""
 
 import asyncio
 import logging
@@ -18,7 +18,7 @@ TCP = replace(GOOD, locator_fault="tcp")
 
 
 class Told(Ros2State):
-    """A state of which a test says what it is."""
+    """A state whose domain a test sets."""
 
     def __init__(self) -> None:
         super().__init__((), cast(DomainPlane, None))
@@ -79,7 +79,7 @@ def test_so_many_are_told_and_no_more() -> None:
 
 
 def test_an_address_with_many_problems_hides_no_other() -> None:
-    """The problems of one address, whose prefixes sorted first, were all that was noted."""
+    """Otherwise an address with low prefixes would take all places of the list."""
     told = Told()
     problems = Problems()
     watch = DomainWatch(told, problems)

@@ -1,4 +1,4 @@
-"""What real participants have sent is read, rewritten, and told as it is."""
+"""The proxy reads, rewrites and reports recorded datagrams of real participants."""
 
 from collections.abc import Iterable
 from contextlib import suppress
@@ -26,7 +26,7 @@ ALL = [datagram for vendor in VENDORS for datagram in recorded(vendor)]
 
 
 def messages(vendor: str, host: str = "") -> list[DiscoveryMessage]:
-    """What an implementation has sent, from both machines or from one."""
+    """The recorded messages of an implementation, from both machines or from `host`."""
     return [
         read_discovery(message)
         for datagram in recorded(vendor)
@@ -44,7 +44,7 @@ def exported(message: DiscoveryMessage) -> bytes:
 
 
 def passed(domain: Domain, datagram: Datagram) -> list[Outgoing]:
-    """What the proxy sends because of a datagram, if it is between the two."""
+    """The datagrams that a proxy between the two machines sends for a datagram."""
     host, _, port = datagram.target.partition(":")
     target = HostPort(host, int(port))
     content = datagram.content
@@ -106,13 +106,13 @@ def test_no_address_of_inside_is_left_and_nothing_else_changes(vendor: str) -> N
 
 @OF_EACH
 def test_no_machine_takes_itself_for_the_other(vendor: str) -> None:
-    """Both have the same machine id, as the containers of one image may."""
+    """Both machines have the same machine id, like containers of the same image."""
     told = messages(vendor, PUBLISHER)
     after = [read_discovery(exported(message)) for message in told]
     assert (FastDdsPid.MACHINE_ID in _pids(told)) is (vendor == "kilted")
     assert FastDdsPid.MACHINE_ID not in _pids(after)
     assert len(_pids(after)) == len(_pids(told))
-    if vendor != "cyclone":  # which has something else there
+    if vendor != "cyclone":  # Cyclone DDS uses the parameter for something else
         assert any(_network_configurations(told))
         assert not any(_network_configurations(after))
 

@@ -64,7 +64,7 @@ def test_the_addresses_of_the_advertised_host(
 
 
 class Listening:
-    """A domain's server that notes where it is told that the host and the peers are."""
+    """A domain's server that notes the addresses of the host and of the peers."""
 
     hosts: tuple[str, ...] = ()
     peers: tuple[HostPort, ...] = ()
@@ -79,7 +79,7 @@ class Listening:
         """The networks do not matter here."""
 
     def note_gateways(self, gateways: frozenset[str]) -> None:
-        """Nor do their gateways."""
+        """Not used here."""
 
 
 async def test_names_are_looked_up_again_and_hold_while_no_name_server_answers(
@@ -113,7 +113,7 @@ async def test_names_are_looked_up_again_and_hold_while_no_name_server_answers(
 
 
 async def test_a_peer_on_loopback_may_be_inside_as_well() -> None:
-    """In a trial on one machine both sides may have one address."""
+    """In a trial on a single machine both sides may have the same address."""
     told: dict[str, Any] = {"ros": ("2",), "advertise_host": "127.0.0.1"}
     told |= {"ros2_peer": ("127.0.0.1:7410",), "inside_network": ("127.0.0.1/32",)}
     ros2 = Ros2(Runtime(parse_settings(told)))

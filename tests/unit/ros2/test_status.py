@@ -1,4 +1,4 @@
-"""What the status tells of a domain: topics, types, and who does not match."""
+"""The status of a domain: topics, types, and readers and writers that do not match."""
 
 import struct
 from dataclasses import dataclass
@@ -184,7 +184,7 @@ def test_metrics_tell_how_many_have_not_proved_to_receive() -> None:
 
 
 def test_outside_comes_in_or_may_still_do_so() -> None:
-    """A participant that crashed at once was reported as one that does not reach the range."""
+    """A participant that crashed at once must not count as unable to reach the range."""
     domain = make_domain()
     domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
     for seconds, is_proven in ((0.0, True), (COMES_IN_WITHIN_S, False)):

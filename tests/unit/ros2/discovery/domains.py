@@ -1,4 +1,4 @@
-"""A domain as tests need one, and datagrams of participants for it."""
+"""A domain for tests, and datagrams of participants."""
 
 import struct
 from collections.abc import Iterable, Sequence
@@ -86,7 +86,7 @@ def of_vendor(datagram: bytes, vendor: bytes = CYCLONE_DDS) -> bytes:
 
 
 def carried(source: str, datagram: bytes) -> bytes:
-    """What the LAN relay sends the proxy of a datagram that it has heard from an address."""
+    """The LAN relay's message to the proxy for a datagram from an address."""
     return PROOF.sealed(Direction.TO_PROXY, wrapped(source, datagram))
 
 
@@ -121,7 +121,7 @@ def reached_at(datagram: bytes) -> list[HostPort]:
 def kept_number(
     port_store: bytes, prefix: bytes, number: int, writer: int = BuiltinWriter.PUBLICATIONS
 ) -> bytes:
-    """What a participant answers a writer: the number that it expects next."""
+    """A participant's answer to a writer, with the next expected number."""
     body = struct.pack(">II", writer + 5, writer)
     body += struct.pack("<iIIi", number >> 32, number & 0xFFFFFFFF, 0, 1)
     return message(submessage(0x0E, 0, port_store), submessage(0x06, 2, body), prefix=prefix)
@@ -171,13 +171,13 @@ def finished(domain: Domain, sent: Sequence[Outgoing], now: float = NOW) -> list
 
 
 def settle(domain: Domain, now: float) -> list[Outgoing]:
-    """Let in all that have waited for long enough, and have others meet."""
+    """Admit participants that waited long enough, and end their separations."""
     admitted = [out for p in domain.former_ports.ready(now) for out in domain.admit(p, now)]
     return admitted + finished(domain, domain.settle(now), now)
 
 
 def to(outgoing: Sequence[Outgoing], host: str) -> list[bytes]:
-    """What is sent to a host; what is for the LAN relay has its proof."""
+    """The datagrams to a host. Datagrams to the LAN relay are unwrapped."""
     return [
         PROOF.opened(Direction.TO_LAN, sent.datagram) if sent.target == LAN_RELAY else sent.datagram
         for sent in outgoing

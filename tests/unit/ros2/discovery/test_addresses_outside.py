@@ -1,4 +1,4 @@
-"""Which addresses of a participant outside inside is told of, where it sends there by itself."""
+"""The outside addresses that the proxy announces inside, if inside sends to outside directly."""
 
 from collections.abc import Callable
 
@@ -45,7 +45,7 @@ def writer(*hosts: str) -> bytes:
 
 
 def told_of_participant(domain: Domain, *hosts: str) -> list[str]:
-    """Where inside finds one outside, which the LAN relay has heard."""
+    """The announced addresses of an outside participant that the LAN relay has heard."""
     told = carried(ROBOT, participant(ROBOT, *hosts))
     (datagram,) = to(domain.heard_outside(told, LAN_RELAY.host, NOW), INSIDE)
     metatraffic, *users = [locator.host for locator in reached_at(datagram)]
@@ -64,10 +64,10 @@ def told_of_writer(domain: Domain, *hosts: str) -> list[str]:
 @pytest.mark.parametrize(
     ("announced", "passed"),
     [
-        # Fast DDS sends to all of them, Cyclone DDS to that of its own network alone.
+        # Fast DDS sends to all addresses, Cyclone DDS only to the address on its own network.
         ((GATEWAY, ROBOT, "172.17.0.1"), [ROBOT]),
         ((ROBOT,), [ROBOT]),
-        # Behind NAT: none is the one that it was heard from.
+        # Behind NAT: no announced address is the source.
         (("192.168.7.7", GATEWAY), ["192.168.7.7", GATEWAY]),
         (("192.168.7.7", "127.0.0.1"), ["192.168.7.7"]),
         # Inside may have the other family alone.

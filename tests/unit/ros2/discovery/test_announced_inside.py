@@ -84,7 +84,7 @@ def test_an_announcement_is_rewritten_once_for_all_inside(monkeypatch: pytest.Mo
 
 
 def test_a_change_of_policy_reads_no_announcement_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With 256 long announcements outside and 50 participants inside it took 29 seconds."""
+    """Reading 256 long announcements again for 50 participants inside took 29 seconds."""
     domain = met()
     calls = count_calls(monkeypatch, "read_discovery")
     for insider in domain.inside.by_prefix.values():
@@ -119,7 +119,7 @@ def test_an_announcement_inside_follows_the_stand_in_and_the_announcement() -> N
 
 
 def test_inside_is_told_what_a_participant_announces_of_itself_alone() -> None:
-    """Heartbeats for the discovery participant went to all inside, as if they were for these."""
+    """Heartbeats for the discovery participant must not reach participants inside."""
     domain = met()
     stamp = submessage(0x09, 0, bytes(8))
     locator = pack_locator(HostPort(ROBOT, 9000), "<")
@@ -134,7 +134,7 @@ def test_inside_is_told_what_a_participant_announces_of_itself_alone() -> None:
 
 
 def test_so_many_participants_announce_themselves_in_a_datagram() -> None:
-    """All inside are told of each, in one round of the event loop."""
+    """The proxy announces each to all participants inside, in the same round of the event loop."""
     domain = make_domain()
     domain.heard_outside(speaking(MOST_ANNOUNCED), ROBOT, NOW)
     assert domain.refused.count == 0

@@ -1,4 +1,4 @@
-"""Many participants inside meet many outside: a few at a time, and each of them in the end."""
+"""Many participants inside discover many outside: a few at a time, and all in the end."""
 
 from collections import Counter
 from itertools import chain
@@ -29,7 +29,7 @@ LONG_RANGE = PortMap(PortRange(45000, 45999), PortRange(45000, 45999))
 
 
 class Policy:
-    """What it says of all, and how often it was asked."""
+    """A policy with the same verdict for everything. `count` is the number of questions."""
 
     def __init__(self) -> None:
         self.allows = True
@@ -49,7 +49,7 @@ def outside(number: int) -> bytes:
 
 
 def crowd(policy: Policy) -> Domain:
-    """A domain with many at one address inside, one at another, and many outside."""
+    """A domain with many participants at an inside address, one at another, and many outside."""
     domain = make_domain(judge=policy, ports=LONG_RANGE)
     for number in range(OUTSIDE_COUNT):
         domain.heard_outside(spdp(outside(number), ROBOT, 4000 + number), ROBOT, NOW)
@@ -70,7 +70,7 @@ def parts(domain: Domain, first: list[Outgoing], now: float) -> list[list[Outgoi
 
 
 def told(sent: list[Outgoing], ended: bool) -> Counter[str]:
-    """How many announcements, or dispose messages, of those outside an address inside gets."""
+    """For each inside address, the number of announcements or dispose messages of outside."""
     return Counter(
         out.target.host
         for out in sent

@@ -259,7 +259,7 @@ def test_a_forged_vendor_does_not_outlast_the_participants_own_word() -> None:
 def test_a_port_of_another_participant_at_the_address_is_read(
     vendor: bytes, is_named_first: bool
 ) -> None:
-    """A participant named the port for discovery of another one as its own port for user data."""
+    """A participant may announce the discovery port of another participant for user data."""
     domain = make_domain()
     # The port for user data of C is the port for discovery of A.
     said = [of_vendor(spdp(A, INSIDE, 7410), vendor), spdp(C, INSIDE, 7409)]

@@ -1,4 +1,4 @@
-"""Both directions by the proxy: stand-ins for what those outside have, and nothing else."""
+"""Direction both: stand-ins for the locators of participants outside, and for nothing else."""
 
 import struct
 from itertools import count, islice
@@ -147,8 +147,8 @@ def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
     assert domain.at_stand_in(20_000, elsewhere, INSIDE, NOW) == []
 
 
-def test_fragments_go_to_whom_each_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The last of them has those of all go on."""
+def test_each_fragment_goes_to_the_reader_that_it_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last fragment releases the fragments for all readers."""
     monkeypatch.setattr(
         "rosproxy.ros2.ports.stand_ins.order_for", lambda key, ports: iter([20_000])
     )

@@ -1,4 +1,4 @@
-"""The proxy's own participant: it asks for what it lacks, and for nothing else."""
+"""The discovery participant asks only for samples that it lacks."""
 
 import struct
 import tracemalloc
@@ -22,7 +22,7 @@ def heartbeat(first: int, last: int) -> bytes:
 
 
 def asked(answer: bytes) -> tuple[int, list[int], bool]:
-    """The base of an ACKNACK, the numbers that it asks for, and whether it is final."""
+    """The base of an ACKNACK, the requested numbers, and the final flag."""
     *_, (kind, flags, body) = submessages(answer)
     assert (kind, source_prefix(answer), destination(answer)) == (0x06, OWN, PEER)
     high, low, bits = struct.unpack_from("<iII", answer, body.start + 8)

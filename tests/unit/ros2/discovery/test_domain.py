@@ -1,4 +1,4 @@
-"""A domain: what becomes of each datagram, honest ones and forged ones."""
+"""A domain: the fate of each datagram, honest or forged."""
 
 import struct
 
@@ -77,7 +77,7 @@ def test_a_participant_inside_is_told_outside_with_ports_of_the_range() -> None:
 
 
 def test_participants_that_share_a_datagram_are_all_taken_in() -> None:
-    """Cyclone DDS has those of a program share; all that they said was dropped as malformed."""
+    """Cyclone DDS packs the participants of a program into a datagram."""
     domain = make_domain()
     source = submessage(0x0C, 0, bytes(4) + b"\x02\x03\x01\x0f" + B)
     sent = domain.heard_inside(spdp(A, INSIDE) + source + spdp(B, INSIDE, 7412)[20:], INSIDE, NOW)
@@ -286,7 +286,7 @@ def test_a_range_that_is_too_short_is_told() -> None:
         address = f"172.30.0.{number}"
         prove(domain, address, prefixes=[prefix])
         domain.heard_inside(spdp(prefix, address), address, NOW)
-    assert len(domain.mappings.by_port) == 15  # of sixteen, one is for discovery
+    assert len(domain.mappings.by_port) == 15  # of 16 ports, the first is for discovery
     shortages = domain.mappings.shortages.values()
     assert all("got no port: no port of" in shortage.text for shortage in shortages)
     assert {shortage.kind for shortage in shortages} == {ShortageKind.RANGE}
@@ -327,7 +327,7 @@ def test_a_participant_says_which_ports_it_had() -> None:
     domain.heard_inside(answer, OTHER, 0.2)
     assert (
         not domain.proxy_participants.port_store.prefixes
-    )  # from somewhere else it is nobody's word
+    )  # an answer from another address does not count
     domain.heard_inside(answer, INSIDE, 0.2)
     settle(domain, SETTLING)
     ports = {mapping.target.port: port for port, (_, mapping) in domain.mappings.by_port.items()}
@@ -375,12 +375,12 @@ def reminded(domain: Domain) -> set[bytes]:
     return set[bytes]().union(*told)
 
 
-def test_one_participant_of_a_process_keeps_its_ports() -> None:
-    """Those of Cyclone DDS have one number together: the two took turns, and had the rest ask."""
+def test_a_participant_that_shares_its_locator_keeps_its_ports() -> None:
+    """Participants of a Cyclone DDS process share a locator, and must not take turns."""
     domain = make_domain()
     meet(domain, A)
     meet(domain, B)
-    assert reminded(domain) == {A, B}  # neither has proved to be there
+    assert reminded(domain) == {A, B}  # neither has answered
     prove(domain, INSIDE, prefixes=[B])
     assert reminded(domain) == {B}
     prove(domain, INSIDE, prefixes=[A])
@@ -439,12 +439,11 @@ def test_an_announcement_is_charged_with_what_it_leads_to() -> None:
     assert allowance_left(domain, INSIDE) == before - cost(len(announcement)) - led_to
 
 
-def test_nothing_is_read_for_a_participant_that_is_told_nothing(
+def test_nothing_is_read_for_a_participant_that_gets_no_announcements(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """72 bytes without a locator had the proxy read what 100 outside had announced: 1.5 ms.
-
-    The source was charged for its own datagram alone.
+    """For 72 bytes without a locator, the proxy read the announcements of 100 participants in 1.5
+    ms, and charged the source only for its own datagram.
     """
     domain = make_domain()
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
@@ -460,7 +459,7 @@ def test_nothing_is_read_for_a_participant_that_is_told_nothing(
 
 
 def test_a_long_announcement_is_charged_for_each_copy() -> None:
-    """Copies counted as one each, whatever their length."""
+    """The charge of a copy grows with its length."""
     domain = make_domain(peers=[f"10.0.1.{number}" for number in range(32)])
     before = allowance_left(domain, INSIDE)
     domain.heard_inside(spdp(A, INSIDE, padding=7000), INSIDE, NOW)
@@ -473,12 +472,12 @@ def targets_of(domain: Domain, announcement: bytes, now: float) -> set[HostPort]
 
 
 def test_an_announcement_is_repeated_where_a_peers_participants_are() -> None:
-    """Each announcement went to 32 ports of each peer, however often it came."""
+    """Once the peer's participants are known, only to their ports, not to 32 ports each time."""
     domain = make_domain(peers=[])
     domain.settings.peers = (HostPort(ROBOT, 0),)
     everywhere = {HostPort(ROBOT, port) for port in range(7410, 7474, 2)}
     assert targets_of(domain, spdp(A, INSIDE), NOW) == everywhere
-    assert targets_of(domain, spdp(A, INSIDE), NOW + 3) == everywhere  # nothing is known of it
+    assert targets_of(domain, spdp(A, INSIDE), NOW + 3) == everywhere  # no participant known
     domain.heard_outside(spdp(B, ROBOT, 7440), ROBOT, NOW + 3)
     known = {HostPort(ROBOT, port) for port in (7410, 7412, 7414, 7440)}
     assert targets_of(domain, spdp(A, INSIDE), NOW + 6) == known
@@ -486,7 +485,7 @@ def test_an_announcement_is_repeated_where_a_peers_participants_are() -> None:
 
 
 def test_a_peer_with_many_participants_is_told_at_more_ports() -> None:
-    """A robot had 46 of them, and 32 were met."""
+    """A robot may have more participants than the 32 usual ports."""
     domain = make_domain(peers=())
     domain.settings.peers = (HostPort(ROBOT, 0),)
 
@@ -505,12 +504,12 @@ def test_a_peer_with_many_participants_is_told_at_more_ports() -> None:
     meet_robots(46)
     assert ports_told() == set(range(7410, 7410 + 2 * 92, 2))
     meet_robots(200)
-    assert max(ports_told()) < 7650, "the next ports are those of the next domain"
+    assert max(ports_told()) < 7650, "the next ports belong to the next domain"
 
 
 @pytest.mark.parametrize("outside", [False, True])
 def test_an_answer_to_the_proxy_is_told_to_all(outside: bool) -> None:
-    """Cyclone DDS answers with its own announcement, which names the discovery participant."""
+    """Cyclone DDS answers with an announcement to the discovery participant alone."""
     domain = make_domain()
     meet(domain)
     told = spdp(B, ROBOT if outside else OTHER)
@@ -526,9 +525,10 @@ def test_an_answer_to_the_proxy_is_told_to_all(outside: bool) -> None:
     assert [destination(datagram) for datagram in sent] == [None]
 
 
-def test_who_has_heard_the_discovery_participant_may_announce_itself() -> None:
-    """On a LAN, whose participants are nobody's peers, they answer it directly, where one of the
-    same host was heard by the LAN relay."""
+def test_an_answer_to_the_discovery_participant_may_announce_its_sender() -> None:
+    """On a LAN participants are not configured as peers. They answer directly once the LAN relay
+    has heard a participant of the same host.
+    """
     domain = make_domain(peers=())
     meet(domain)
     neighbour = b"\x01\x10" + bytes(10)
@@ -571,14 +571,14 @@ def test_who_is_gone_is_ended_outside_on_his_behalf() -> None:
 def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
     is_told: bool,
 ) -> None:
-    """It was ended without a word to outside, or with a number that it never reaches."""
+    """Outside gets a dispose message with the next sequence number of the participant."""
     domain = make_domain()
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     domain.rediscovery.lan_relay_heard = True
     first = domain.inside.by_prefix[A].announcement
     elsewhere = spdp(A, OTHER)
-    assert not to(domain.heard_inside(elsewhere, OTHER, NOW), ROBOT), "it is served at the first"
+    assert not to(domain.heard_inside(elsewhere, OTHER, NOW), ROBOT), "served at the first"
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 15)
     ended = domain.gone({INSIDE}) if is_told else domain.expire(NOW + 21)
     (dispose_message_of_first,) = to(ended, ROBOT)
@@ -601,9 +601,8 @@ def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
 
 @pytest.mark.parametrize("count", [1, MOST_MAPPINGS])
 def test_a_participant_with_other_locators_than_before_is_met_anew(count: int) -> None:
-    """Others were announced in its name, before it announced itself again after a start.
-
-    With 16 others it got no port. Fast DDS takes no new locators of a participant that it knows.
+    """After a restart, a forged announcement may come before the participant's own. With 16 forged
+    locators the participant got no port. Fast DDS ignores new locators of a known participant.
     """
     domain = make_domain(lan_relay=None, ports=LONG_RANGE)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
@@ -656,13 +655,13 @@ def test_who_is_gone_gets_no_port_any_more() -> None:
     assert not domain.inside.by_prefix
 
 
-def test_who_ends_while_he_waits_is_not_announced() -> None:
-    """Outside was told of him once all others were, and took him for there."""
+def test_a_participant_that_ends_while_waiting_is_not_announced() -> None:
+    """Outside would take the participant for present."""
     domain = make_domain()
     domain.former_ports.note_recorded({A: [45003]}, ())
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     domain.heard_inside(spdp(B, OTHER), OTHER, 0.1)
-    domain.heard_inside(dispose_message(B), INSIDE, 0.2)  # nobody ends one at another address
+    domain.heard_inside(dispose_message(B), INSIDE, 0.2)  # from another address: ignored
     domain.heard_inside(dispose_message(A), INSIDE, 0.2)
 
     sent = settle(domain, SETTLING + ANSWER_TIME)

@@ -1,4 +1,4 @@
-"""A process that crashed sends no dispose message: the next process at its port ends it."""
+"""A crashed process sends no dispose message. The next process at its port ends its participant."""
 
 import pytest
 
@@ -27,7 +27,7 @@ SECOND_OF_NEXT = FAST_DDS + bytes([7, 7, 2, 2, 2, 2, 1, 0, 0, 0])
 
 
 def ended(sent: list[Outgoing], host: str) -> list[bytes]:
-    """The participants of which a host is told that they have ended."""
+    """The participants whose dispose messages go to a host."""
     disposed = (
         source_prefix(out.datagram)
         for out in sent
@@ -78,7 +78,7 @@ def test_outside_a_new_process_ends_the_former_one() -> None:
 
 @pytest.mark.parametrize("side", [inside, outside])
 def test_without_an_answer_nothing_ends(side: object) -> None:
-    """Its source may be forged."""
+    """The source may be forged."""
     assert callable(side)
     domain = make_domain()
     side(domain, FORMER)
@@ -114,7 +114,7 @@ def test_another_address_or_port_is_another_process() -> None:
 
 @pytest.mark.parametrize(("vendor", "is_ended"), [(CYCLONE_DDS, True), (RTI, False)])
 def test_of_implementations_that_share_no_port(vendor: bytes, is_ended: bool) -> None:
-    """Of others it is not known."""
+    """Of other implementations, the proxy does not know whether two processes share a port."""
     domain = make_domain()
     former = vendor + bytes([3] * 10)
     domain.heard_inside(of_vendor(spdp(former, INSIDE), vendor), INSIDE, NOW)
@@ -123,7 +123,7 @@ def test_of_implementations_that_share_no_port(vendor: bytes, is_ended: bool) ->
 
 
 def test_a_former_process_ends_for_one_that_waited_for_ports() -> None:
-    """While ports are scarce a participant gets none before it has answered."""
+    """While ports are scarce, a participant gets a port only after an answer."""
     domain = make_domain()
     lives = [FAST_DDS + bytes([7, 7, life, 1, 1, 1, 0, 0, 0, 0]) for life in range(20)]
     for life in lives:

@@ -1,4 +1,4 @@
-"""Announcements in fragments: rewritten as whole ones are, whatever they were cut into."""
+"""Announcements in fragments of any size: rewritten like whole announcements."""
 
 import random
 import struct
@@ -25,7 +25,7 @@ HEARTBEAT = submessage(0x07, 0, bytes(28))
 
 
 def described(padding: int) -> bytes:
-    """The payload of an announcement: a locator in front, one at the end, and much between."""
+    """The payload of an announcement: a locator in front, padding, a locator at the end."""
     return payload(
         [
             (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(LOCATOR, "<")),
@@ -36,7 +36,7 @@ def described(padding: int) -> bytes:
 
 
 def cut(whole: bytes, size: int, sequence: int = 1) -> list[bytes]:
-    """A datagram for each fragment, each with something else behind it."""
+    """A datagram for each fragment, each followed by a heartbeat."""
     chunks = [whole[at : at + size] for at in range(0, len(whole), size)]
     return [
         message(fragment(chunk, number, size, len(whole), sequence=sequence), HEARTBEAT)
@@ -64,10 +64,10 @@ def through(
     st.randoms(use_true_random=False),
     st.booleans(),
 )
-def test_fragments_carry_what_the_whole_would(
+def test_fragments_carry_the_rewritten_whole(
     padding: int, size: int, dice: random.Random, twice: bool
 ) -> None:
-    """In any order, some of them twice, and again after all is there."""
+    """In any order, once or twice."""
     whole = described(padding)
     (expected,) = through(FragmentStores(), message(data(whole)))
     after = expected[-len(whole) :]
@@ -107,8 +107,8 @@ def test_each_way_has_its_own_fragments() -> None:
         assert store.rewritten(PORT + 1, read_discovery(datagram), READER, led) == ([], [])
 
 
-def test_who_sends_a_fragment_again_is_asked_for_the_others() -> None:
-    """As Cyclone DDS does: it sends the first alone to who asks for a sample."""
+def test_a_repeated_fragment_makes_the_proxy_ask_for_the_others() -> None:
+    """Cyclone DDS answers a request for a sample with the first fragment alone."""
     store = FragmentStores()
     sent = cut(described(100), 128, sequence=7)
     first = read_discovery(sent[0])
@@ -153,7 +153,9 @@ def test_an_announcement_can_not_change_its_size() -> None:
 def test_so_much_is_remembered_of_a_participant_and_no_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Datagrams that wait took 600 MB with all that was read of them; small samples were free."""
+    """Waiting datagrams and their parsed content once took 600 MB, and small samples cost
+    nothing.
+    """
     monkeypatch.setattr(fragments, "MOST_BYTES", 4 * OVERHEAD)
     stores = FragmentStores()
     for sequence in range(1, 30):

@@ -1,4 +1,4 @@
-"""Datagrams that one implementation reads in another way than the next: none passes a policy."""
+"""Datagrams that two implementations read differently: none passes a policy."""
 
 import struct
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ def metatraffic(domain: Domain) -> int:
 
 
 def crossing(domain: Domain, submessages: bytes) -> Iterator[list[Outgoing]]:
-    """What goes on of a message from inside, and of one from outside."""
+    """The datagrams that the proxy forwards for a message from inside, then from outside."""
     (stand_in,) = domain.stand_ins.by_port
     yield domain.at_stand_in(stand_in, message(submessages, prefix=A), INSIDE, NOW)
     yield domain.at_range_port(metatraffic(domain), message(submessages, prefix=B), ROBOT, NOW)
@@ -59,7 +59,7 @@ def announced(parameters: bytes, little: bool = True) -> bytes:
 
 
 def behind_an_unaligned_parameter() -> bytes:
-    """Read without rounding up, the next three bytes begin one that ends before what is allowed."""
+    """Without rounding up, three bytes begin a parameter that ends before the allowed topic."""
     denied = topic("rt/secret", False)
     allowed = topic("rt/public", False)
     end = parameter(1, b"", False)
@@ -72,7 +72,7 @@ def behind_an_unaligned_parameter() -> bytes:
 
 
 def behind_an_unaligned_submessage() -> bytes:
-    """Read without rounding up, the next three bytes begin an unknown one, up to the end."""
+    """Without rounding up, three bytes begin an unknown submessage that spans the rest."""
     denied = topic("rt/secret") + parameter(1, b"")
     filler = parameter(0x8000, bytes(0x114 - len(announced(denied)) - 4))
     hidden = announced(filler + denied + b"\0\0")
@@ -85,7 +85,7 @@ def behind_an_unaligned_submessage() -> bytes:
     "hidden", [behind_an_unaligned_parameter(), behind_an_unaligned_submessage()]
 )
 def test_what_is_behind_an_unaligned_length_is_not_passed(hidden: bytes) -> None:
-    """Fast DDS rounds it up and reads the topic that is denied; the proxy read another, or none."""
+    """Fast DDS rounds lengths up and reads the denied topic. The proxy must not read another."""
     domain = denying()
     for count, sent in enumerate(crossing(domain, hidden), 1):
         assert sent == []

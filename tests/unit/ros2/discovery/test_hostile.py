@@ -1,4 +1,4 @@
-"""Datagrams that are made to hurt a domain: none breaks it, costs much, or passes the policy."""
+"""Hostile datagrams: none breaks a domain, costs much time, or passes the policy."""
 
 import struct
 from collections.abc import Iterator
@@ -63,7 +63,7 @@ def heartbeat(first: int, last: int) -> bytes:
 
 
 def test_a_number_that_has_no_next_one_is_malformed() -> None:
-    """It broke writing a GAP, an answer or a dispose message, and kept a policy from others."""
+    """The proxy could write no GAP, answer or dispose message, and applied no policy any more."""
     domain = make_domain(judge=lambda kind, *_: kind is not RuleKind.PUBLISH)
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
@@ -80,8 +80,8 @@ def test_a_number_that_has_no_next_one_is_malformed() -> None:
     assert to(domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW), ROBOT)
 
 
-def test_what_stands_behind_an_announcement_is_judged_as_well() -> None:
-    """An end went on as it came, and what outside announced was not judged."""
+def test_the_policy_judges_submessages_behind_an_announcement() -> None:
+    """Behind a dispose message, too, and in both directions."""
     domain = make_domain(judge=lambda *_: False)
     meet(domain)
     behind = data(payload([TOPIC]), writer=SEDP_WRITERS)
@@ -95,7 +95,7 @@ def test_what_stands_behind_an_announcement_is_judged_as_well() -> None:
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_fragments_behind_an_announcement_are_not_passed_unread(count: int) -> None:
-    """They went on as they came, and were kept to be told to whoever came later."""
+    """The proxy must not keep the fragments for later participants either."""
     whole = payload([TOPIC, (0x8000, bytes(200))])
     size = len(whole) // count
     behind = b"".join(
@@ -166,8 +166,9 @@ def test_what_is_split_is_not_multiplied() -> None:
 def test_an_unproven_participant_has_no_credit_for_copies(
     is_at_range_port: bool, size: int
 ) -> None:
-    """What a message became when it was split counted as received: a victim was sent 30 times what
-    came in its name."""
+    """The parts of a split message must not count as received. Otherwise a victim gets 30 times the
+    bytes that came in its name.
+    """
     domain = make_domain(peers=[])
     domain.heard_outside(carried(STRANGER, spdp(B, STRANGER)), LAN_RELAY.host, NOW)
     meet(domain)
@@ -185,7 +186,7 @@ def test_an_unproven_participant_has_no_credit_for_copies(
 def test_an_exhausted_range_is_not_searched_for_each_locator(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A datagram with two thousand locators took 140 ms, by which nobody else was served."""
+    """A datagram with two thousand locators blocked the proxy for 140 ms."""
     domain = make_domain()
     ordered = list[str]()
 
@@ -202,17 +203,17 @@ def test_an_exhausted_range_is_not_searched_for_each_locator(
     meet(domain)
     long = message(data(payload([TOPIC, *locators]), writer=SEDP_WRITERS), prefix=A)
     domain.heard_inside(long, INSIDE, NOW)
-    assert len(set(ordered)) == 14  # the ports that one address may have
+    assert len(set(ordered)) == 14  # the limit of an address
 
 
 def test_one_address_leaves_ports_for_others() -> None:
-    """Sixty participants at one address, as many as there may be, took all ports of the range."""
+    """Even if the address has as many participants as allowed."""
     domain = make_domain()
     prefixes = [bytes([1, 15, number]) + bytes(9) for number in range(30)]
     prove(domain, INSIDE, OTHER, prefixes=[*prefixes, B])
     for number, prefix in enumerate(prefixes):
         domain.heard_inside(spdp(prefix, INSIDE, 7410 + 10 * number), INSIDE, NOW)
-    assert domain.ports.pool.free == 1  # of 16 the first is the proxy's own, and two are for others
+    assert domain.ports.pool.free == 1  # of 16: one is for discovery, 14 the limit of an address
     assert "as many" in domain.mappings.shortages[prefixes[-1]].text
     meet(domain, B, OTHER)
     assert len(domain.inside.by_prefix[B].mappings) == 1
@@ -237,7 +238,7 @@ def test_users_data_of_before_a_restart_is_not_charged() -> None:
 
 
 def test_announcements_and_topics_have_a_length() -> None:
-    """They are kept: of 64 kB each, those of one address could take gigabytes."""
+    """The proxy keeps them: with 64 kB each, a single address could take gigabytes."""
     domain = make_domain()
     meet(domain)
     long = message(data(payload([(Pid.TOPIC_NAME, bytes(2000))])), prefix=B)
@@ -251,7 +252,7 @@ def test_announcements_and_topics_have_a_length() -> None:
 
 
 def test_the_texts_of_an_address_take_so_many_bytes() -> None:
-    """One wide character makes each of a text take four bytes: 8,192 of them took 34 MB."""
+    """In Python a wide character makes each character take four bytes: 8,192 texts took 34 MB."""
     notes = EndpointNotes()
     many = [Participant(bytes([n]) * 12, INSIDE, b"", 0) for n in range(4)]
     for participant in many:
@@ -311,8 +312,8 @@ def test_one_host_outside_does_not_keep_others_from_being_met() -> None:
     assert not domain.outside.count_by_address
 
 
-def test_nobody_proves_anything_by_the_lan_relay() -> None:
-    """Whoever can send as the LAN relay's host could have the proxy send to any address."""
+def test_the_lan_relay_proves_no_address() -> None:
+    """Otherwise a program on the LAN relay's host could make the proxy send to any address."""
     domain = make_domain(peers=())
     domain.proxy_participants.discovery_participant.prefix = bytes([7]) * 12
     meet(domain)
@@ -335,7 +336,7 @@ def test_who_waits_does_not_take_the_prefix_of_somebody_met_meanwhile() -> None:
 
 
 def test_an_announcement_that_names_half_a_destination_hinders_no_policy() -> None:
-    """It was kept without its message, and every later look at all participants failed by it."""
+    """Keeping such an announcement made every later change of the policy fail."""
     denied: list[str] = []
     domain = make_domain(judge=lambda _kind, name, _address: name not in denied)
     domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
@@ -365,9 +366,10 @@ NAMELESS = data(payload([]), writer=SEDP_WRITERS)
     "behind",
     [NAMELESS, data(payload([(Pid.TOPIC_NAME, b"\1\0\0\0\0\0\0\0")]), writer=SEDP_WRITERS)],
 )
-def test_a_writer_without_a_topic_hinders_nobody(behind: bytes) -> None:
-    """Who announced one that was hidden was taken in nevertheless, and every later change of the
-    policy, and every announcement of others, failed by him."""
+def test_a_writer_without_a_topic_is_refused_without_harm(behind: bytes) -> None:
+    """Once the proxy admitted the participant of a hidden writer without a topic. Every later
+    change of the policy and every announcement of others then failed.
+    """
     denied = [""]
     domain = make_domain(judge=lambda _kind, name, _address: name not in denied)
     domain.heard_inside(spdp(EVIL, INSIDE) + behind, INSIDE, NOW)
@@ -384,7 +386,9 @@ def test_a_writer_without_a_topic_hinders_nobody(behind: bytes) -> None:
     assert settle(domain, NOW + SEPARATION_S)
 
 
-def test_who_can_not_be_rewritten_is_not_taken_in(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_announcement_that_cannot_be_rewritten_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def refuse(_: object) -> None:
         raise RtpsError("it can't be withheld")
 

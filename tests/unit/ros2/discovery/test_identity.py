@@ -1,4 +1,4 @@
-"""Whom an announcement is about: nobody announces or ends another, whatever names him."""
+"""The subject of an announcement: no participant announces or ends another."""
 
 from collections.abc import Iterator
 
@@ -58,8 +58,10 @@ def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
 
 
 @pytest.mark.parametrize("whose", ["discovery-participant", "port-store", "port-proof"])
-def test_no_participant_has_the_prefix_of_one_of_the_proxys_own(whose: str) -> None:
-    """The end of the port store, told by any machine on the LAN, had inside forget its ports."""
+def test_no_participant_has_a_prefix_of_the_proxy(whose: str) -> None:
+    """A forged dispose message of the port store would make participants inside forget
+    their ports.
+    """
     domain = make_domain(port_store_key=b"a key")
     meet(domain)
     port_store = domain.proxy_participants.port_store
@@ -84,7 +86,7 @@ def test_no_participant_has_the_prefix_of_one_of_the_proxys_own(whose: str) -> N
 
 
 def said_of(prefix: bytes, pid: int, writer: int) -> dict[str, bytes]:
-    """Announcements and ends by which somebody names a participant."""
+    """Announcements and dispose messages that name a participant in several ways."""
     named = (pid, prefix + ENTITY)
     key = parameter_list([named, ENDED])
     part = payload([TOPIC, (0x8000, bytes(200))])
@@ -103,10 +105,10 @@ def said_of(prefix: bytes, pid: int, writer: int) -> dict[str, bytes]:
 @pytest.mark.parametrize("how", said_of(C, Pid.KEY_HASH, BuiltinWriter.PARTICIPANTS))
 @pytest.mark.parametrize("pid", IDENTITIES)
 @pytest.mark.parametrize("writer", BuiltinWriter)
-def test_nobody_speaks_for_another_under_his_own_prefix(
+def test_no_participant_speaks_for_another_under_its_own_prefix(
     how: str, pid: int, writer: BuiltinWriter
 ) -> None:
-    """Fast DDS ends or takes in whom the parameter names; it passed as it was."""
+    """Fast DDS ends or admits the participant in the parameter."""
     domain = met()
     for count, sent in enumerate(crossing(domain, said_of(C, pid, writer)[how]), 1):
         assert sent == []

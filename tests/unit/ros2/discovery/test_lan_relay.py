@@ -1,4 +1,4 @@
-"""The LAN relay: whom the proxy takes for it, and which addresses it may claim."""
+"""The LAN relay: the proof of its identity, and the addresses that it may claim."""
 
 from collections.abc import Callable
 
@@ -52,19 +52,19 @@ def made_at(seconds: float, secret: str = SECRET) -> RelayProof:
 
 CLAIM = wrapped(STRANGER, spdp(B, STRANGER))
 WITHOUT_THE_SECRET: dict[str, tuple[bytes, str]] = {
-    "an announcement of its own": (spdp(B, LAN_RELAY.host), "not_a_peer"),
+    "the relay's own announcement": (spdp(B, LAN_RELAY.host), "not_a_peer"),
     "an envelope without a proof": (CLAIM, "relay_proof"),
     "half a proof": (carried(STRANGER, spdp(B, STRANGER))[:20], "relay_proof"),
     "a proof of another secret": (
         made_at(0, "another secret").sealed(Direction.TO_PROXY, CLAIM),
         "relay_proof",
     ),
-    "another address in a good one": (
+    "another address in a valid envelope": (
         carried(ROBOT, spdp(B, STRANGER)).replace(wrapped(ROBOT, b""), wrapped(STRANGER, b"")),
         "relay_proof",
     ),
     "what the proxy sends the relay": (PROOF.sealed(Direction.TO_LAN, CLAIM), "relay_proof"),
-    "a good one, repeated later": (
+    "a valid envelope, repeated later": (
         made_at(-WINDOW_S - 1).sealed(Direction.TO_PROXY, CLAIM),
         "relay_proof",
     ),
@@ -104,7 +104,9 @@ def test_a_proof_from_another_address_is_not_looked_at() -> None:
 
 
 def test_nothing_is_read_before_the_proof(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor is anything charged to the relay, whose allowance others would use up."""
+    """The proxy does not charge the relay either: forged datagrams would use up the relay's
+    allowance.
+    """
     domain = make_domain()
     for unread in ("read_messages", "credited_messages", "unwrapped"):
         monkeypatch.setattr(discovery_domain, unread, None)
@@ -161,14 +163,16 @@ def test_a_claimed_address_is_not_inside_nor_the_proxys(address: str) -> None:
 
 
 def test_a_participant_inside_that_the_relay_hears_is_no_fault() -> None:
-    """With IPv6 the relay hears it where another program on the host has joined its network."""
+    """With IPv6 the relay hears such a participant if a program on the host has joined the
+    network.
+    """
     domain = make_domain()
     meet(domain)
     reasons = watched(domain)
     before = dict(domain.rates._by_source)
     assert domain.heard_outside(carried(INSIDE, spdp(A, INSIDE)), LAN_RELAY.host, NOW) == []
     assert not reasons
-    # Nor is its own allowance charged, which a forged source on the LAN would use up.
+    # No charge for the participant: a forged source on the LAN would use up its allowance.
     assert domain.rates._by_source == before
 
 
@@ -240,7 +244,7 @@ def test_other_locators_of_an_announcement_get_no_stand_in(host: str, port: int)
     ]
     told = [(pid, pack_locator(locator, "<")) for pid, locator in located]
     datagram = message(data(payload(told)), prefix=B)
-    if host == HOST:  # the first one for discovery at the claimed address is the one that counts
+    if host == HOST:  # only the first locator for discovery at the claimed address counts
         datagram = message(data(payload(told[1:])), prefix=B)
     assert to(domain.heard_outside(carried(HOST, datagram), LAN_RELAY.host, NOW), INSIDE)
     leads = {
@@ -252,8 +256,8 @@ def test_other_locators_of_an_announcement_get_no_stand_in(host: str, port: int)
     }
 
 
-def test_what_the_relay_carries_waits_as_the_one_that_was_heard() -> None:
-    """Else a flood on the LAN would have all that it carries wait."""
+def test_a_datagram_from_the_relay_waits_under_its_original_source() -> None:
+    """Otherwise a flood on the LAN would delay all datagrams of the relay."""
     domain = make_domain()
     heard = carried(ROBOT, spdp(B, ROBOT))
     assert domain.source_of(heard, LAN_RELAY.host) == ROBOT

@@ -1,4 +1,4 @@
-"""Networks without multicast, and a proxy that has another address than the one before it."""
+"""Networks without multicast, and a proxy with another address than its former process."""
 
 import pytest
 
@@ -57,7 +57,9 @@ def test_those_inside_are_introduced_to_each_other_as_they_are() -> None:
 
 
 def test_processes_of_one_pod_are_introduced_to_each_other() -> None:
-    """They have one address, and Fast DDS sends no multicast where it has ROS_STATIC_PEERS."""
+    """Processes of a pod share an address, and Fast DDS with ROS_STATIC_PEERS sends no
+    multicast.
+    """
     domain = make_domain()
     meet(domain, A, INSIDE)
 
@@ -72,8 +74,8 @@ def test_processes_of_one_pod_are_introduced_to_each_other() -> None:
     assert by(B, to(heard, INSIDE)) == []
 
 
-def test_nobody_is_announced_to_himself() -> None:
-    """Nor participants of one process, which have one locator in Cyclone DDS."""
+def test_no_participant_gets_its_own_announcement() -> None:
+    """Nor the announcement of another participant at the same locator, as in Cyclone DDS."""
     domain = make_domain()
     for prefix in (A, B, A, B):
         assert by(prefix, to(meet(domain, prefix, INSIDE), INSIDE)) == []
@@ -81,7 +83,7 @@ def test_nobody_is_announced_to_himself() -> None:
 
 @pytest.mark.parametrize("port", [7400, 7410])
 def test_announcements_do_not_go_round(port: int) -> None:
-    """Who is on the proxy's own machine may say that he is found where the proxy listens."""
+    """A participant on the proxy's machine may announce a port of the proxy."""
     domain = make_domain()
     for prefix, own_port in ((A, port), (B, port), (C, 7418), (A, port), (C, 7418)):
         sent = domain.heard_inside(spdp(prefix, NEAR, own_port), NEAR, NOW)
@@ -120,7 +122,7 @@ def test_those_on_other_networks_are_not_introduced() -> None:
 
 
 def moved(lan_relay: HostPort | None = None) -> Domain:
-    """One whose participant has known the proxy at another address; the robot is there."""
+    """A domain with the robot, and with a participant that knew the proxy at another address."""
     domain = make_domain(peers=(ROBOT,), lan_relay=lan_relay)
     domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
     domain.former_ports.note_recorded({A: PORTS}, domain.inside.by_prefix)
@@ -152,7 +154,9 @@ def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
 
 
 def test_they_meet_anew_once_the_lan_relay_is_heard() -> None:
-    """It starts after the proxy. What outside is not told it does not forget."""
+    """The LAN relay starts after the proxy. Without the relay, no dispose message reaches
+    outside.
+    """
     domain = moved(LAN_RELAY)
     meet(domain)
     assert settle(domain, NOW) == settle(domain, NOW + 1) == []
@@ -217,10 +221,10 @@ def test_ports_of_locators_that_are_told_later_are_those_before() -> None:
 
 
 @pytest.mark.parametrize("ports", [(80,), (RANGE.listen.last + 1,), (*PORTS, 80)])
-def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
+def test_a_participant_with_ports_of_another_range_gets_others_and_rediscovers_all(
     ports: tuple[int, ...],
 ) -> None:
-    """Outside heeds no other locators of whom it knows."""
+    """Outside ignores new locators of a known participant."""
     domain = make_domain(peers=(ROBOT,), lan_relay=None)
     domain.former_ports.note_recorded({A: ports}, domain.inside.by_prefix)
     meet(domain)

@@ -49,7 +49,7 @@ C = b"\x01\x0f" + bytes(9) + b"\x07"
 
 
 def restarted(key: bytes = KEY, peers: tuple[str, ...] = (ROBOT,)) -> Domain:
-    """A proxy that has just started; it counts what it refuses."""
+    """A proxy that has just started, and counts refused datagrams."""
     domain = make_domain(peers=peers, port_store_key=key)
     domain.refused.note = Reasons()
     return domain
@@ -87,7 +87,7 @@ PROOF = proof_of(A, PORTS)
 def come(
     domain: Domain, prefix: bytes, address: str, number: int, now: float, proof: int = 1
 ) -> None:
-    """Have a participant announce itself inside, and answer with the numbers that it has seen."""
+    """Announce a participant inside, and answer with its numbers."""
     domain.heard_inside(spdp(prefix, address), address, now)
     domain.heard_inside(kept_answer(domain, prefix, number), address, now)
     if domain.proxy_participants.port_store.key:
@@ -107,7 +107,7 @@ def ends_of(prefix: bytes, sent: list[Outgoing], host: str) -> list[bytes]:
 FORGED = {
     "none": 1,
     "by another key": proof_of(B, PORTS, b"a guess"),
-    "of the participant that had them": PROOF,
+    "of the rightful participant": PROOF,
 }
 """Proofs for the ports of A that another participant can compute, or may have seen."""
 
@@ -141,7 +141,7 @@ def test_a_participant_with_a_proof_takes_its_port_from_a_liar(proof: str) -> No
 
 
 def test_a_proof_that_another_participant_has_as_well_gets_the_port_for_neither() -> None:
-    """B had the ports in a process before, and A after B; the proxy can't tell who lies."""
+    """B had the ports first, and A later. The proxy cannot tell which participant lies."""
     domain = restarted()
     come(domain, B, OTHER, NUMBER, 0.1, proof_of(B, PORTS))
     come(domain, A, INSIDE, NUMBER, 0.1, PROOF)
@@ -200,7 +200,7 @@ def test_a_peer_decides_between_two_words() -> None:
 
 @pytest.mark.parametrize("source", [OTHER, LAPTOP])
 def test_a_forged_name_at_a_port_decides_nothing(source: str) -> None:
-    """An attacker inside sends to ports of the range, too, from an address that it receives at."""
+    """An attacker inside may send to ports of the range, too, from a proven address."""
     domain = restarted(key=b"")
     prove(domain, OTHER)
     come(domain, B, OTHER, NUMBER, 0.1)
@@ -243,7 +243,7 @@ def test_a_number_without_a_proof_gets_its_ports_where_no_other_claims_them() ->
 
 
 def test_wrong_proofs_from_many_addresses_take_nothing_from_a_proof() -> None:
-    """After wrong proofs from 256 forged addresses no proof counted, and A lost its ports."""
+    """A right proof counts even after wrong proofs from 300 forged addresses."""
     domain = restarted()
     domain.settings.is_inside = everything
     for number in range(1, 301):
@@ -380,7 +380,7 @@ def test_a_participant_inside_that_is_served_keeps_its_prefix(source: str) -> No
 
 
 def test_only_other_networks_are_told_of_the_end_of_a_forged_participant() -> None:
-    """Participants on its own network know the rightful one, and would forget that."""
+    """Participants on its own network know the rightful participant and would forget it."""
     domain = restarted(peers=())
     near = {INSIDE: "172.30.0.2", OTHER: "172.30.0.2", THIRD: "172.30.0.3"}
     domain.settings.proxy_address_for = lambda address: near.get(address, "172.30.0.2")
@@ -400,7 +400,9 @@ def test_what_the_lan_relay_hears_of_itself_is_no_claim() -> None:
 
 
 def test_nothing_is_kept_of_a_participant_inside_that_is_refused() -> None:
-    """It waits, answers the port store, and is refused: a peer's participant has the prefix."""
+    """The participant waits and answers the port store. A peer's participant has the same
+    prefix.
+    """
     domain = restarted()
     domain.heard_outside(carried(ROBOT, spdp(A, ROBOT)), LAN_RELAY.host, SETTLING)
     come(domain, A, INSIDE, 1, SETTLING)

@@ -1,4 +1,4 @@
-"""Locators that serve discovery and users' data, as those of Cyclone DDS."""
+"""Locators for both discovery and user data, as in Cyclone DDS."""
 
 import struct
 
@@ -55,7 +55,7 @@ def announcement(prefix: bytes, address: str) -> bytes:
 
 
 def shared() -> tuple[Domain, int, int]:
-    """A domain, the port that leads to A inside, and the one that stands for B outside."""
+    """A domain, the port that leads to A inside, and the stand-in for B outside."""
     domain = make_domain(both_ways=True)
     domain.heard_inside(message(announcement(A, INSIDE), prefix=A), INSIDE, NOW)
     domain.heard_outside(message(announcement(B, ROBOT), prefix=B), ROBOT, NOW)
@@ -65,8 +65,8 @@ def shared() -> tuple[Domain, int, int]:
     return domain, port, stand_in
 
 
-def test_what_users_send_takes_nothing_of_the_allowance_of_discovery() -> None:
-    """It was charged by its bytes: who sent more than 1.2 MB in a second lost it, and discovery."""
+def test_user_data_takes_nothing_of_the_allowance_of_discovery() -> None:
+    """Otherwise 1.2 MB of user data a second stops user data and discovery."""
     domain, port, stand_in = shared()
     before = allowance_left(domain, INSIDE), allowance_left(domain, ROBOT)
     inwards = message(TIME, TO_A, SAID, prefix=B)
@@ -85,7 +85,7 @@ def test_what_users_send_takes_nothing_of_the_allowance_of_discovery() -> None:
 @pytest.mark.parametrize(
     "in_front", [SAID, TIME + data(bytes(8), writer=USER) * (MOST_OF_USERS + 4)]
 )
-def test_discovery_behind_what_users_send_is_read_and_charged(in_front: bytes) -> None:
+def test_discovery_behind_user_data_is_read_and_charged(in_front: bytes) -> None:
     domain, port, stand_in = shared()
     for kind in (spdp, sedp):
         before = allowance_left(domain, INSIDE), allowance_left(domain, ROBOT)
@@ -96,7 +96,7 @@ def test_discovery_behind_what_users_send_is_read_and_charged(in_front: bytes) -
             domain.at_range_port(port, inwards, ROBOT, NOW),
         ):
             assert len(sent[-1].datagram) in (len(outwards), len(inwards))
-            assert sent[-1].datagram not in (outwards, inwards)  # its locators lead elsewhere
+            assert sent[-1].datagram not in (outwards, inwards)  # the locators are rewritten
         assert allowance_left(domain, INSIDE) == before[0] - 1 - len(outwards) // STEP
         assert allowance_left(domain, ROBOT) == before[1] - 1 - len(inwards) // STEP
 

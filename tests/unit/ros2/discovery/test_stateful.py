@@ -1,8 +1,8 @@
-"""A domain under whatever may come, in any order: what has to hold after each datagram.
+"""A domain under any datagrams in any order: invariants after each datagram.
 
 Hypothesis plays neighbours on both sides that share prefixes, addresses and ports, forge sources,
-and damage datagrams; policy and time change meanwhile. It is short in `make check`. To have it look
-for long, run ``pytest --hypothesis-profile=thorough`` with this file.
+and damage datagrams; policy and time change meanwhile. `make check` runs this test for a short
+time. For a long run, use ``pytest --hypothesis-profile=thorough`` with this file.
 """
 
 import struct
@@ -101,7 +101,7 @@ def datagrams(draw: st.DrawFn) -> bytes:
 
 
 class Neighbours(RuleBasedStateMachine):
-    """Whoever sends something to a domain."""
+    """The senders around a domain."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -226,7 +226,7 @@ class Neighbours(RuleBasedStateMachine):
         self.domain.stand_ins.block(ports[0] if ports and port % 8 == 0 else port, for_good)
 
     def check(self, sent: list[Outgoing]) -> None:
-        """Hold to whom something may go: outside is sent no more than came from there."""
+        """Check all targets: an unproven outside address gets no more than came from there."""
         outsiders = self.domain.outside.by_prefix.values()
         # An address may prove to receive where no participant is known yet.
         self.proven |= {*self.domain.proofs.addresses}

@@ -21,7 +21,7 @@ SECONDS = 20
 
 
 def flooded(sources: LanSources) -> tuple[int, int]:
-    """Have a laptop announce itself each second among forged sources, each of which is new.
+    """Announce a laptop each second among forged sources, which are all new.
 
     Return how many announcements of the laptop are relayed, and how many bytes of all others.
     """
@@ -63,8 +63,8 @@ def test_all_unproven_sources_together_have_one_allowance() -> None:
     assert sources.take(LAPTOP, SIZE, 1.0)
 
 
-def test_a_proven_source_has_an_allowance_of_its_own() -> None:
-    """Its address may be forged as well, by which no other source loses anything."""
+def test_a_proven_source_has_a_separate_allowance() -> None:
+    """If an attacker forges this address, no other source loses anything."""
     sources = LanSources()
     sources.note_proven([LAPTOP, "192.0.2.8"], 0.0)
     assert sum(sources.take(LAPTOP, 0, 0.0) for _ in range(10_000)) == BURST

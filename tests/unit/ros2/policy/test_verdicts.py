@@ -36,7 +36,7 @@ NEIGHBOUR = b"\x01\x0f" + bytes(9) + b"\x09"
 
 
 class Rules:
-    """A policy: what it denies may change; ``asked`` is what it was asked."""
+    """A policy with changeable denials. ``asked`` has all questions."""
 
     def __init__(self, *denied: RuleKind) -> None:
         self.denied = set(denied)
@@ -122,8 +122,8 @@ def test_a_change_has_those_meet_again_whom_it_concerns() -> None:
     assert domain.apply_policy(NOW) == []
 
 
-def test_the_proxy_itself_is_told_of_what_is_denied() -> None:
-    """Its discovery participant would ask for it again and again."""
+def test_the_discovery_participant_gets_denied_topics() -> None:
+    """Otherwise the discovery participant would ask for the samples again and again."""
     domain = met(Rules(RuleKind.PUBLISH))
     told = sedp(A, INSIDE, 7000, to=domain.proxy_participants.discovery_participant.prefix)
     domain.heard_inside(told, INSIDE, NOW)

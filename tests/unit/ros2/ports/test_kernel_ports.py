@@ -1,4 +1,4 @@
-"""Which ports the kernel may forward: those of user data, and what it was told before the start."""
+"""Ports that the kernel may forward: ports of user data, and ports from before the start."""
 
 from rosproxy.forwarding.kernel.decisions import HostForwarding, destination
 from rosproxy.leases.ports import PortPool

@@ -1,4 +1,4 @@
-"""Ports for locators: the same again after a restart, and those first who are meant there."""
+"""Ports for locators: the same after a restart, and first for participants named at a port."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -84,8 +84,10 @@ def test_a_port_for_metatraffic_is_none_for_data() -> None:
 
 
 @given(st.permutations([(bytes(12), 45003), (bytes(range(12)), 45007)]))
-def test_where_several_are_named_their_own_word_decides(had: list[tuple[bytes, int]]) -> None:
-    """Whoever comes first: the last one that was named at a port may not be whose it was."""
+def test_if_several_are_named_their_own_claims_decide(
+    had: list[tuple[bytes, int]],
+) -> None:
+    """The last participant that was named at a port may not be the former user."""
     pool = ports()
     for port in (45003, 45007):
         for prefix, _ in had:
@@ -115,8 +117,8 @@ def test_each_locator_gets_its_own_port_though_outside_names_one_alone() -> None
 
 
 @given(st.permutations([0, 1, 2]))
-def test_each_locator_gets_its_own_port_without_a_word(order: list[int]) -> None:
-    """Where it can be: as long as nobody had the port that it wants."""
+def test_each_locator_gets_its_former_port_without_a_claim(order: list[int]) -> None:
+    """Where it is possible: no other participant had the wanted port."""
     before = ports()
     after = ports()
     prefix = bytes(12)
@@ -152,8 +154,8 @@ def test_a_stranger_names_nobody_where_a_peer_has() -> None:
     assert pool.take(prefix, locator(0), DATA, SETTLING) == 45007
 
 
-def test_where_too_many_are_named_that_tells_nothing() -> None:
-    """Nobody can take a port from whom it was by naming all the world there."""
+def test_too_many_names_at_a_port_count_for_nothing() -> None:
+    """An attacker cannot take a port from its former user by naming many participants there."""
     pool = ports()
     prefix = bytes(12)
     for number in range(1, 100):

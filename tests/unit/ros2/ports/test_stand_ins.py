@@ -9,8 +9,8 @@ from rosproxy.ros2.ports.stand_ins import MOST_SHARING, STAND_INS, stand_in_port
 
 
 @given(st.text(max_size=40))
-def test_a_stand_in_follows_from_what_it_stands_for(key: str) -> None:
-    """Other locators do not matter, as long as they are not too many at one port."""
+def test_the_port_of_a_stand_in_follows_from_its_key(key: str) -> None:
+    """Other locators do not matter, unless too many share a port."""
 
     def chosen(users: Callable[[int], int]) -> int | None:
         return stand_in_port(key, users, lambda _: False)
@@ -25,7 +25,9 @@ def test_a_stand_in_follows_from_what_it_stands_for(key: str) -> None:
 
 @given(st.text(max_size=40), st.integers(0, 2000))
 def test_a_stand_in_is_found_behind_a_long_range_that_is_held(key: str, length: int) -> None:
-    """The proxy's own range may lie where stand-ins do, and be longer than it tries ports."""
+    """The proxy's range may overlap the ports of stand-ins, and be longer than the number
+    of tries.
+    """
     wanted = stand_in_port(key, lambda _: 0, lambda _: False)
     assert wanted is not None
     port = stand_in_port(key, lambda _: 0, lambda candidate: wanted <= candidate < wanted + length)

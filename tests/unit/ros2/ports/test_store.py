@@ -1,4 +1,4 @@
-"""What a participant keeps for the proxy: its ports, in one number with a proof."""
+"""The ports that a participant keeps for the proxy, as a number with a proof."""
 
 from itertools import pairwise
 
@@ -78,9 +78,8 @@ def test_a_port_more_is_a_greater_number(ports: list[int]) -> None:
 
 @given(st.integers(1, 60_000), st.data())
 def test_no_number_keeps_fast_dds_busy(size: int, drawn: st.DataObject) -> None:
-    """Fast DDS counts up to a number one by one: with 1,100 ports a participant counted for days.
-
-    So it did where a container had announced five locators in the name of the participant.
+    """Fast DDS counts up to a number in steps of 1. With 1,100 ports a participant counted for
+    days, and so it did after a container had announced five locators in the participant's name.
     """
     port_store = make_port_store(ports=PortRange(2000, 1999 + size))
     ports = drawn.draw(st.lists(st.integers(2000, 1999 + size), max_size=16, unique=True))
@@ -132,7 +131,7 @@ def test_how_many_ports_fit_into_a_number(size: int, count: int) -> None:
 
 @pytest.mark.parametrize("is_proof", [True, False])
 def test_a_participant_forgets_a_number_that_is_greater(is_proof: bool) -> None:
-    """A reader heeds no smaller one."""
+    """A reader ignores smaller numbers."""
     port_store = make_port_store()
     number = port_store.number([11405])
     proof = port_store.proof(PEER, [11405])
@@ -203,9 +202,8 @@ def count_of(question: bytes) -> int:
 
 
 def test_participants_that_come_and_go_do_not_raise_the_count_of_others() -> None:
-    """A participant heeds only what counts more than the last, also from the next process.
-
-    A container whose participants came and went for an hour had others ignore the next process.
+    """A participant ignores counts that are not greater than the last, also from the next process.
+    Once participants that came and went for an hour made others ignore the next process.
     """
     first = make_port_store(1000.0)
     later = make_port_store(1001.0)
@@ -251,7 +249,7 @@ def test_it_asks_and_reminds_by_heartbeats() -> None:
 
 @pytest.mark.parametrize("is_first", [True, False])
 def test_answers_to_both_in_one_message(is_first: bool) -> None:
-    """Cyclone DDS packs them so. The numbers of the one counted for the other, and it kept none."""
+    """Cyclone DDS packs both answers into a message. The numbers must not be mixed up."""
     port_store = make_port_store()
     ports = [11405]
     answers = [

@@ -1,4 +1,4 @@
-"""RTPS messages made by hand, as tests need them."""
+"""RTPS messages made by hand, for tests."""
 
 import struct
 from collections.abc import Sequence

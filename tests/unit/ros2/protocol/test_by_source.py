@@ -1,4 +1,4 @@
-"""A message in which several participants speak, as one for each of them."""
+"""Split a message of several participants into a message for each participant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which heartbeats say the same, so that only the last one has to be read."""
+"""Heartbeats with the same content, of which only the last has to be read."""
 
 import struct
 
@@ -22,7 +22,7 @@ def heartbeat(writer: int = PUBLICATIONS, last: int = 5, count: int = 1, flags: 
 
 
 def fast_dds(*submessages: bytes, prefix: bytes = HERE) -> bytes:
-    """As Fast DDS ends its messages: with statistics."""
+    """A message that ends with statistics, like messages of Fast DDS."""
     return message(*submessages, submessage(0x80, 0, bytes(40)), prefix=prefix)
 
 

@@ -1,4 +1,4 @@
-"""Parameter lists and the locators in them."""
+"""Parameter lists, and locators in parameter lists."""
 
 import struct
 

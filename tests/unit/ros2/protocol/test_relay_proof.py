@@ -1,4 +1,4 @@
-"""The proof between the proxy and its LAN relay: which datagrams it lets pass, and which not."""
+"""The proof between the proxy and the LAN relay: accepted and refused datagrams."""
 
 import pytest
 from hypothesis import given
@@ -75,8 +75,8 @@ def test_another_secret_is_refused() -> None:
         opened(SEALED, secret="0123456789abcdeg")
 
 
-def test_what_the_proxy_has_sent_is_not_taken_back() -> None:
-    """A process that gets it could send it to where it came from."""
+def test_a_datagram_of_the_proxy_is_not_accepted_from_the_relay() -> None:
+    """A receiver could send the datagram back to the proxy."""
     sent = at(SENT_AT).sealed(Direction.TO_LAN, CONTENT)
     with pytest.raises(ProofError, match="the proof is wrong"):
         opened(sent)

@@ -1,4 +1,4 @@
-"""RTPS messages: what is found in them, what is refused, and that an edit changes nothing else."""
+"""RTPS messages: parsed content, refused messages, and edits that change nothing else."""
 
 import struct
 
@@ -196,8 +196,8 @@ def test_the_prefix_of_a_message() -> None:
     assert Span(1, 2) != Span(1, 3)
 
 
-def test_all_that_a_message_names_are_meant() -> None:
-    """One message of Cyclone DDS may be for several at one address."""
+def test_a_message_is_for_all_participants_that_it_names() -> None:
+    """A message of Cyclone DDS may be for several participants at an address."""
     first = bytes([1] * 12)
     second = bytes([2] * 12)
     to_first, to_second, to_all = (submessage(0x0E, 0, p) for p in (first, second, bytes(12)))

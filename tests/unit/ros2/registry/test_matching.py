@@ -195,7 +195,7 @@ FLOODS: dict[str, tuple[list[Participant], list[Participant]]] = {
 @pytest.mark.parametrize("where", FLOODS)
 @pytest.mark.parametrize("is_turned", [False, True])
 def test_an_address_with_many_pairs_hides_no_other(where: str, is_turned: bool) -> None:
-    """One participant with thousands of readers or writers used up all comparisons."""
+    """A participant with thousands of readers or writers must not use up all comparisons."""
     flooding_inside, flooding_outside = FLOODS[where]
     inside = [*flooding_inside, HONEST]
     outside = [*flooding_outside, LISTENER]
@@ -205,7 +205,7 @@ def test_an_address_with_many_pairs_hides_no_other(where: str, is_turned: bool) 
 
 
 def test_so_many_are_compared_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A participant with 200 readers has 40,000 pairs with 200 writers of one topic."""
+    """A participant with 200 readers has 40,000 pairs with 200 writers of the same topic."""
     compared = list[tuple[DdsEndpoint, DdsEndpoint]]()
     monkeypatch.setattr(matching, "mismatch", lambda *pair: compared.append(pair))
     comparison = compare([many(1, 200, writer)], [many(2, 200, reader), many(5, 7, writer)])

@@ -1,4 +1,4 @@
-"""What a participant's announcement says of itself that may keep others from meeting it."""
+"""Parts of an announcement that may keep other participants from discovering the participant."""
 
 import struct
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Discovery: what participants announce, and their locators led elsewhere."""
+"""Discovery: announcements, and rewritten locators."""
 
 import struct
 
@@ -38,7 +38,7 @@ def nothing(told: Announcement) -> bool:
 
 
 def participant(little: bool = True) -> bytes:
-    """As Fast DDS announces one: two addresses, multicast, shared memory."""
+    """An announcement like that of Fast DDS: two addresses, multicast, shared memory."""
     mark = order(little)
     shared_memory = struct.pack(mark + "iI", 16, 7412) + bytes(16)
     parameters = [
@@ -90,11 +90,11 @@ def test_each_locator_leads_to_a_port_and_what_can_not_be_led_is_gone(little: bo
 
 
 @BOTH
-def test_what_makes_two_machines_look_like_one_is_gone(little: bool) -> None:
-    """Two containers may have the same machine id and MAC address: no message left the machine."""
+def test_parameters_that_make_two_machines_look_alike_are_removed(little: bool) -> None:
+    """Between containers with the same machine id and MAC address, Fast DDS sends no message."""
     told = [(0x8003, b"machine "), (0x8006, bytes([8] * 8)), (0x8007, bytes([7] * 4))]
     datagram = message(data(payload([*told, (0x8010, b"vendor's")], little), little=little))
-    for vendor in (b"\x01\x0f", b"\x00\x00"):  # Fast DDS takes who has none for its own
+    for vendor in (b"\x01\x0f", b"\x00\x00"):  # no vendor means Fast DDS to Fast DDS
         before = datagram[:6] + vendor + datagram[8:]
         after = rewritten(read_discovery(before), lambda *_: None, nothing)
         (announcement,) = read_discovery(after).announcements
@@ -105,7 +105,7 @@ def test_what_makes_two_machines_look_like_one_is_gone(little: bool) -> None:
 
 
 def test_old_locators_are_gone() -> None:
-    """By them a participant inside could have those outside send to anybody."""
+    """By old locators a participant inside could make outside send to any address."""
     datagram = message(data(payload([(pid, bytes([10, 0, 0, 7])) for pid in OLD_LOCATORS])))
     after = rewritten(read_discovery(datagram), lambda *_: None, nothing)
     (announcement,) = read_discovery(after).announcements
@@ -118,7 +118,7 @@ def endpoint(*parameters: tuple[int, bytes]) -> bytes:
 
 
 def test_a_datagram_has_so_many_parameters() -> None:
-    """One with 16,000 took 14 ms, in which the proxy did nothing else."""
+    """A datagram with 16,000 parameters blocked the proxy for 14 ms."""
     parameters = [(0x1234, b"")] * 400
     assert len(read_discovery(message(*[endpoint(*parameters)] * 10)).announcements) == 10
     with pytest.raises(RtpsError, match="more than 4096 parameters"):
@@ -134,7 +134,7 @@ def test_a_datagram_has_so_many_locators(pid: int) -> None:
 
 
 def test_discovery_with_a_checksum_is_refused() -> None:
-    """It would not fit any more, and the receiver would drop the message without a word."""
+    """After a rewrite the checksum is wrong, and the receiver silently drops the message."""
     told = data(payload([(Pid.PARTICIPANT_GUID, bytes(range(16)))]))
     with_checksum = submessage(0x00, 0x20, bytes(8))
     with pytest.raises(RtpsError, match="checksum"):
@@ -142,7 +142,7 @@ def test_discovery_with_a_checksum_is_refused() -> None:
     assert read_discovery(message(submessage(0x00, 0x02, bytes(8)), told)).announcements
     assert not read_discovery(message(with_checksum)).announcements
     crc = message(submessage(0x80, 0, bytes(8)), told)
-    assert read_discovery(crc).announcements  # of Fast DDS that is something else
+    assert read_discovery(crc).announcements  # for Fast DDS this kind has another meaning
     with pytest.raises(RtpsError, match="checksum"):
         read_discovery(crc[:6] + b"\x01\x01" + crc[8:])
 
@@ -188,7 +188,7 @@ LOCATORS = st.tuples(
 def test_nothing_but_locators_changes(
     parameters: list[tuple[Pid, bytes]], writer: BuiltinWriter, little: bool
 ) -> None:
-    """Whatever they hold, all other bytes stay, and no locator leads where it led before."""
+    """All other bytes stay, and all locators are replaced."""
     named = (Pid.TOPIC_NAME, struct.pack(order(little) + "I", 4) + b"rt/\0")
     before = message(data(payload([named, *parameters], little), writer=writer, little=little))
     after = rewritten(read_discovery(before), lambda pid, locator: HostPort(HOST, 45000), nothing)

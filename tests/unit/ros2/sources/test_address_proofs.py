@@ -1,4 +1,4 @@
-"""Addresses prove that they receive; whose sources may be forged gets no one else's place."""
+"""Addresses prove that they receive. A source that may be forged takes no place of others."""
 
 from collections import Counter
 from functools import partial
@@ -63,7 +63,7 @@ NEIGHBOUR = b"\x01\x0f" + bytes([8] * 10)
 LEASE = 300.0
 LONG_RANGE = PortMap(PortRange(45000, 45999), PortRange(46000, 46999))
 PADDING = 200
-"""Bytes by which an announcement is as long as a real one, so that it may be answered."""
+"""Bytes that make an announcement as long as a real announcement, which the proxy may answer."""
 
 
 def named(number: int) -> bytes:
@@ -77,7 +77,7 @@ def hear(domain: Domain, prefix: bytes, address: str, now: float = NOW) -> list[
 
 
 def forge(domain: Domain, first: int, count: int) -> list[Outgoing]:
-    """Announce participants, each at an address of its own."""
+    """Announce participants, each at a different address."""
     sent = list[Outgoing]()
     for number in range(first, first + count):
         sent += hear(domain, named(number), f"10.1.{number // 250}.{number % 250 + 1}")
@@ -85,7 +85,7 @@ def forge(domain: Domain, first: int, count: int) -> list[Outgoing]:
 
 
 def questions(sent: list[Outgoing], address: str) -> list[bytes]:
-    """What asks participants at an address to prove that they receive."""
+    """The questions to participants at an address for a proof that the address receives."""
     return [datagram for datagram in to(sent, address) if destination(datagram) is not None]
 
 
@@ -159,7 +159,7 @@ def test_no_address_takes_the_place_of_another_that_has_fewer() -> None:
 
 
 def test_many_addresses_of_one_machine_take_no_places_of_others() -> None:
-    """A machine has any number of IPv6 addresses: of 20 participants of a laptop one was left."""
+    """A machine may have any number of IPv6 addresses. All 20 participants of the laptop stay."""
     domain = make_domain(peers=())
     addresses = [f"2001:db8::{number:x}" for number in range(1, MOST_OUTSIDE + 11)]
     prove(domain, LAPTOP, STRANGER, *addresses)
@@ -251,7 +251,7 @@ def test_a_question_is_no_longer_than_what_came() -> None:
 
 @pytest.mark.parametrize("known", [True, False])
 def test_a_proxy_answers_for_the_participants_behind_it(known: bool) -> None:
-    """They know nothing of a proxy outside, and can't answer."""
+    """Participants inside know nothing of a proxy outside, and cannot answer."""
     asked = make_domain(peers=())
     asking = make_domain(peers=())
     asking.settings.hosts = (LAPTOP,)
@@ -284,7 +284,7 @@ def exchange(proxies: dict[str, Domain]) -> Counter[str]:
     while sent:
         source, out = sent.pop(0)
         counts[source] += 1
-        assert counts[source] < 100, "they go on and on"
+        assert counts[source] < 100, "the exchange does not end"
         host = out.target.host
         if host in proxies:
             listening = out.target.port - RANGE.advertised(RANGE.listen.first) + RANGE.listen.first
@@ -436,9 +436,8 @@ def test_an_answer_inside_is_not_held_up_either() -> None:
 
 @pytest.mark.parametrize("speaks_another", [False, True])
 def test_an_announcement_beside_an_answer_is_charged(speaks_another: bool) -> None:
-    """Behind an answer an address announced whatever it liked, beyond its allowance.
-
-    Each announcement went to all ports of the peers at once, and no other source had its turn.
+    """Otherwise an address could exceed its allowance with announcements behind an answer. Each
+    announcement goes to all ports of the peers at once, and no other source would have its turn.
     """
     domain = make_domain()
     prove(domain, INSIDE, ROBOT)
@@ -500,7 +499,7 @@ def crowd_at(domain: Domain, address: str, now: float) -> None:
 
 
 def answers_what_it_is_asked(domain: Domain, now: float) -> None:
-    """Have A announce itself, and answer the question that it gets."""
+    """Announce A, and answer the question to A."""
     sent = domain.heard_inside(spdp(A, INSIDE), INSIDE, now)
     for asked in questions(sent, INSIDE):
         if destination(asked) == A and domain.proofs.is_answer(INSIDE, answer(asked, A)):
@@ -521,7 +520,7 @@ def test_forged_participants_at_an_address_keep_no_new_one_from_a_place() -> Non
 
 
 def test_forged_participants_at_an_address_keep_none_from_waiting_after_a_start() -> None:
-    """They did so with each restart, for as long as their source was forged."""
+    """A participant that has answered still waits for its former ports."""
     domain = make_domain(ports=LONG_RANGE)
     crowd_at(domain, INSIDE, 0.1)
     answers_what_it_is_asked(domain, 0.2)
@@ -534,7 +533,7 @@ def test_forged_participants_at_an_address_keep_none_from_waiting_after_a_start(
 
 
 def test_forged_participants_at_proven_addresses_take_three_quarters_of_the_range() -> None:
-    """The last quarter was for proven addresses, and their addresses may be forged."""
+    """The last quarter is only for participants that answer: proven addresses may be forged."""
     domain = make_domain()
     prove(domain, INSIDE, OTHER, prefixes=[B])
     for address in (INSIDE, OTHER):
@@ -555,7 +554,7 @@ def test_a_participant_that_never_answers_pushes_out_none_at_its_address() -> No
 
 
 def test_an_address_with_participants_stays_proven_while_many_others_prove() -> None:
-    """An attacker with 4,096 addresses had all others count as unproven."""
+    """An attacker with 4,096 addresses must not push out the proofs of others."""
     domain = make_domain()
     prove(domain, INSIDE)
     meet(domain)

@@ -1,4 +1,4 @@
-"""Discovery that waits: whose is read next, and whose is lost."""
+"""The queue of discovery: the next datagram, and lost datagrams."""
 
 from collections import Counter
 
@@ -55,7 +55,7 @@ def test_a_datagram_may_take_the_place_of_the_one_that_waits_with_its_key() -> N
     assert queue.replace("key", 3)
     taken_items = [waiting.item for waiting in (queue.pop(), queue.pop()) if waiting]
     assert taken_items == [3, 2]
-    assert not queue.replace("key", 4)  # it waits no longer
+    assert not queue.replace("key", 4)  # no datagram with the key waits any more
     assert queue.pop() is None
 
 
@@ -69,7 +69,7 @@ def test_what_lost_its_place_to_another_source_is_not_replaced() -> None:
 
 
 def test_a_source_that_always_has_one_datagram_is_not_always_next() -> None:
-    """It began where the queue was each time, and no other source was read meanwhile."""
+    """A source that comes back goes to the end of the round."""
     queue = FairQueue[int](most_sources=10)
     for number in range(50):
         queue.put("waits", number, 0)
@@ -136,7 +136,7 @@ def test_a_thousand_forged_sources_get_their_share_alone() -> None:
 
 
 def test_a_stranger_with_many_addresses_keeps_no_peer_from_being_read() -> None:
-    """Peers and strangers shared their places and the reading: a peer found no place."""
+    """Peers and strangers have separate places in the queue."""
     domain = make_domain()
     strangers = [f"2001:db8::{number:x}" for number in range(MOST_KNOWN)]
     prove(domain, INSIDE, *strangers)

@@ -60,7 +60,7 @@ def test_a_long_datagram_is_charged_as_several() -> None:
 
 
 def test_forged_sources_have_one_allowance_together() -> None:
-    """Each had one of its own, and the debt of a source was forgotten after 4,096 others."""
+    """Otherwise an attacker gets a new allowance with each new source."""
     rates = DiscoveryRates()
     assert rates.take("evil", 100, 0.0, Standing.OUTSIDE)
     rates.charge("evil", int(BURST), Standing.OUTSIDE)

@@ -1,4 +1,4 @@
-"""Who inside is let in, and what is held of those who are not."""
+"""Inside sources that the proxy accepts, and the records of other sources."""
 
 import pytest
 
