@@ -1,4 +1,4 @@
-"""Ports are found in a row, as early as can be, where they were if that can be."""
+"""Ranges are the former ports if possible, otherwise the first free ports in a row."""
 
 from dataclasses import replace
 

@@ -51,7 +51,7 @@ def in_jumping_time(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[
 
 
 class Looks:
-    """Notes when there was a look. The first ones fail, one for each of ``errors``."""
+    """Notes the time of each look. The first looks raise ``errors`` in turn."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class Looks:
 @contextlib.asynccontextmanager
 async def looking(*errors: Exception, **more: Any) -> AsyncIterator[Looks]:
     looks = Looks(*errors, **more)
-    looks.loop.wake_threadsafe()  # nobody looks yet
+    looks.loop.wake_threadsafe()  # the loop does not run yet
     assert looks.loop.unready() == "the operator has not looked at the engine yet"
     task = asyncio.create_task(looks.loop.run(looks.look))
     await asyncio.sleep(0)

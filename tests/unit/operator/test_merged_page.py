@@ -1,4 +1,4 @@
-"""The live pages of several proxies as one."""
+"""The live pages of several proxies on a single page."""
 
 import json
 from typing import Any
@@ -238,7 +238,7 @@ def test_no_proxy_hides_what_another_one_has() -> None:
 
 
 def test_no_proxy_has_a_key_of_another_one() -> None:
-    """One in hostile hands put its nodes in place of others', and of proxies without an answer."""
+    """A hostile proxy must not replace nodes of other proxies, or proxies without an answer."""
     stolen = {
         "good /talker": {"lane": "robot", "kind": "participant", "state": "broken"},
         "good rosproxy": {"lane": "host", "kind": "participant", "state": "broken"},

@@ -1,4 +1,4 @@
-"""The administrator's policy, and its way to a proxy."""
+"""The administrator's policy, and the delivery to a proxy."""
 
 import json
 from collections.abc import AsyncIterator
@@ -44,7 +44,7 @@ def test_the_options_make_one_layer_or_none() -> None:
     ],
 )
 def test_a_policy_is_bounded(count: int, glob: str, told: str) -> None:
-    """A program whose variables are too long could not be started."""
+    """Linux starts no program with too long variables."""
     rules = [parse_rules(f"deny publish {glob}")] * count
     if not told:
         assert administrators_policy(rules, "enforce")
@@ -64,7 +64,7 @@ def test_at_its_creation_a_proxy_gets_what_fits_into_a_variable() -> None:
 
 
 class Answers:
-    """A proxy's admin endpoint that answers as it is told, and notes what it hears."""
+    """A proxy's admin endpoint with given answers, which notes all requests."""
 
     def __init__(self) -> None:
         self.status = 200
@@ -93,7 +93,7 @@ async def test_a_proxy_is_told_all_layers() -> None:
     assert answers.told == [("Bearer token", {"layers": layers_as_json([OWN])})]
 
 
-async def test_one_of_a_former_release_has_no_policy_at_all() -> None:
+async def test_a_proxy_of_a_former_release_has_no_policy_at_all() -> None:
     async with proxy() as (client, admin):
         await client.policy(admin, "token", [])
         with pytest.raises(PolicyRefused, match="its image is of a former release"):

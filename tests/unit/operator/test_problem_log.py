@@ -1,4 +1,4 @@
-"""Problems in the log: once when they appear, once when they are solved."""
+"""Problems in the log: a line at the beginning, a line at the end."""
 
 import logging
 

@@ -1,4 +1,4 @@
-"""What operators take from proxies, which somebody may have taken over."""
+"""Answers that operators accept from proxies, which may be hostile."""
 
 import gzip
 from collections.abc import AsyncIterator, Callable
@@ -13,7 +13,7 @@ from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 
 
 class Evil:
-    """Somebody at a proxy's address, who gives one ``answer`` to all."""
+    """A hostile program at a proxy's address, with the same ``answer`` to all requests."""
 
     def __init__(self) -> None:
         self.answer: Callable[[], web.Response] = web.Response
@@ -63,7 +63,7 @@ async def test_nothing_is_inflated(evil: Evil, client: ProxyClient) -> None:
 async def test_a_long_answer_is_not_read(
     evil: Evil, client: ProxyClient, status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was taken for one of another program; it is the proxy that the operator knows."""
+    """The error says that the proxy's answer is too long, not that another program answers."""
     monkeypatch.setattr(proxy_client, "LONGEST_STATUS", 1000)
     evil.answer = lambda: web.Response(status=status, body=b"[" * 1001)
     for asking, path in (
@@ -87,7 +87,7 @@ async def test_what_is_no_text_is_no_answer(evil: Evil, client: ProxyClient) -> 
 
 
 async def test_an_answer_without_a_bottom_is_no_answer(evil: Evil, client: ProxyClient) -> None:
-    """It ended the operator's task for that proxy, and the live page of all proxies."""
+    """The RecursionError must not end the operator's task or the live page of all proxies."""
     deep = "[" * 100_000
     evil.answer = lambda: web.Response(text=f'{{"nodes": {{}}, "links": {{}}, "x": {deep}')
     admin = evil.admin

@@ -1,4 +1,4 @@
-"""What a proxy has confirmed counts for the process that confirmed it."""
+"""A proxy's confirmation counts only for the process that confirmed."""
 
 import asyncio
 from collections.abc import Collection, Mapping, Sequence
@@ -15,7 +15,7 @@ CALLERS = AllowedCallers(("172.18.0.5",))
 
 
 class SlowClient(ProxyClient):
-    """Its proxy answers once ``answers`` is set, with the error if there is one."""
+    """A client whose proxy answers once ``answers`` is set, perhaps with ``error``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -79,7 +79,7 @@ async def test_two_that_want_the_policy_told_tell_it_once() -> None:
 
 
 async def test_a_process_that_came_meanwhile_has_confirmed_nothing() -> None:
-    """The answer may be that of the former one."""
+    """The answer may come from the former process."""
     client = SlowClient()
     session = ProxySession(client, ADMIN, "token")
     telling = [

@@ -32,7 +32,9 @@ def test_the_addresses_of_nodes() -> None:
 
 
 def test_the_proxy_hears_of_each_node_whose_container_is_gone_once() -> None:
-    """Also of one that the proxy has unregistered, since the proxy shows that one as a fault."""
+    """Also of a node that the proxy has unregistered, because the proxy shows this node as
+    a fault.
+    """
     nodes = [
         {"address": "172.18.0.6:4001", "nodes": ["/a"], "state": "silent"},
         {"address": "172.18.0.7:4001", "nodes": ["/b"], "state": "cleaned"},
@@ -47,7 +49,7 @@ def inside(*participants: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_all_may_be_at_one_address() -> None:
-    """For each one the tuple of all before was copied: 40,000 took the operator 12 seconds."""
+    """The time must not grow with the square of the number: 40,000 nodes took 12 seconds."""
     half = MOST_ROWS // 2 - 2
     nodes = [{"address": "172.18.0.6:4001"}] * half
     status = read_status(inside(*[{"address": "172.18.0.7"}] * half) | {"nodes": nodes})
@@ -56,7 +58,7 @@ def test_all_may_be_at_one_address() -> None:
 
 
 def test_ports_that_the_next_proxy_would_refuse_are_not_kept() -> None:
-    """It refused all that it was told with them: who may use it, for as long as it ran."""
+    """The next proxy would refuse the whole update, and get no allowed callers."""
     leased = [{"port": port} for port in (0, 11401, 65536, 2**63 - 1)]
     status = read_status(
         inside(
@@ -73,7 +75,7 @@ def test_ports_that_the_next_proxy_would_refuse_are_not_kept() -> None:
 
 
 def test_ports_are_kept_up_to_a_bound() -> None:
-    """More than a megabyte of them was refused as well."""
+    """A proxy refuses more than a megabyte."""
     prefixes = [number.to_bytes(12, "big").hex(".") for number in range(2000)]
     each = [{"guid_prefix": prefix, "leases": [{"port": 1}] * 20} for prefix in prefixes]
     kept = leases(read_status(inside(*each)))

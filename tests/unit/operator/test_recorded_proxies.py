@@ -1,6 +1,6 @@
 """A running proxy survives the upgrade of its operator: recorded fingerprints and variables.
 
-The operator makes a proxy with another fingerprint anew, and its nodes lose their connections. So a
+The operator recreates a proxy with another fingerprint, which cuts the nodes' connections. So a
 change of ``recorded_proxies.json`` needs a line in CHANGELOG.md. To record:
 
     python -m tests.unit.operator.test_recorded_proxies

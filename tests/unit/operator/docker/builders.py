@@ -58,7 +58,7 @@ def container(
     mode: str = "",
     ports: Iterable[int] = (),
 ) -> Container:
-    """A container, by default one that runs, is labelled and is on the network ``app``."""
+    """A container, by default running, labelled and on the network ``app``."""
     places = tuple(place(n, name) if isinstance(n, str) else n for n in networks)
     return Container(
         id=f"id-{name}",
@@ -82,7 +82,7 @@ def sandbox(
     made: str = "",
     started_at: str = "2026-01-01T10:00:00.5Z",
 ) -> Sandbox:
-    """A sandbox as the operator makes it, by default one that runs on its uplink and ``app``."""
+    """A sandbox of the operator, by default running on the uplink and on ``app``."""
     name = name or sandbox_name(key)
     create = CreateSandbox(name, key, ports)
     made = made or sandbox_fingerprint(create, settings)
@@ -109,7 +109,7 @@ def proxy(
     sandbox_id: str = "",
     started_at: str = "2026-01-01T10:00:00.75Z",
 ) -> Proxy:
-    """A proxy as the operator makes it, by default one that runs in the `sandbox` of its key."""
+    """A proxy of the operator, by default running in the `sandbox` of the same key."""
     name = name or proxy_name(key)
     create = Create(name, key, ports, sandbox_name(key))
     made = made or proxy_fingerprint(create, settings, image, SECRET)
@@ -120,7 +120,7 @@ def proxy(
 
 
 def both(**more: Any) -> dict[str, Any]:
-    """A sandbox and the proxy in it, for `observed`. Words: key, ports, settings."""
+    """A sandbox with a proxy, for `observed`. Words: key, ports, settings."""
     return {"sandboxes": [sandbox(**more)], "proxies": [proxy(**more)]}
 
 
@@ -171,7 +171,7 @@ def inspection(body: Mapping[str, Any], image: str = IMAGE, **more: Any) -> dict
 def planned(
     state: HostState, settings: PlanSettings, memory: DockerMemory, now: float
 ) -> DockerPlan:
-    """The plan for a host, its labels read before."""
+    """The plan for a host, after the labels are read."""
     return plan(state, read_labels(state, settings), settings, memory, now)
 
 

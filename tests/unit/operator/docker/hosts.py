@@ -1,7 +1,4 @@
-"""A host on which everything happens that happens on hosts.
-
-Each event is a method of two numbers, which choose what it happens to.
-"""
+"""A host with random events. Each event is a method of two numbers, which choose the object."""
 
 import contextlib
 from collections.abc import Sequence
@@ -49,12 +46,12 @@ def pick(items: Sequence[T], number: int) -> T:
 
 
 class Hosts(Invariants):
-    """A host with labelled containers, the operator, and people who meddle."""
+    """A host with labelled containers, the operator, and users that interfere."""
 
     # containers of users
 
     def run(self, n: int, m: int) -> None:
-        """A labelled container comes, usually on a network that is there."""
+        """A labelled container comes, usually on an existing network."""
         labels = {
             "rosproxy.enable": "true",
             "rosproxy.master-uri": pick(MASTERS, n),
@@ -110,7 +107,7 @@ class Hosts(Invariants):
                 self.engine.begin(box, state)
 
     def share(self, n: int, m: int) -> None:
-        """A container whose master is given by address comes into the network of another one."""
+        """A container with an address in ROS_MASTER_URI joins the network of another container."""
         homes = [box for box in self.strangers() if not box.mode]
         if not homes or len(self.strangers()) > 6:
             return
@@ -138,7 +135,9 @@ class Hosts(Invariants):
             pick(boxes, n).networks.pop(pick(NETWORKS, m), None)
 
     def rename(self, n: int, m: int) -> None:
-        """Not one with forged labels: its HostConfig gives it away, which is not simulated."""
+        """Not a container with forged labels: the simulation has no HostConfig to detect the
+        forgery.
+        """
         name = pick(STRANGERS, m)
         boxes = [box for box in self.strangers() if read_own(box.labels) is None]
         if boxes and not self.engine.named(name):
@@ -172,7 +171,7 @@ class Hosts(Invariants):
             self.engine.join(box, pick(networks, m))
 
     def fail_redirects(self, n: int, _: int) -> None:
-        """The kernel has no rules for it, for a while."""
+        """Redirects fail for a while, as without support in the kernel."""
         self.engine.redirects_fail = bool(n & 1)
 
     # networks, ports, image
@@ -188,7 +187,7 @@ class Hosts(Invariants):
             del self.engine.networks[name]
 
     def take_port(self, n: int, m: int) -> None:
-        """Another program listens; the operator may be unable to see it."""
+        """Another program takes a port, perhaps invisible to the operator."""
         self.engine.names_ports = bool(m & 1)
         port = 11400 + n % 16
         taken = (box.ports | box.udp for box in self.engine.boxes if box.state in SERVING)
@@ -213,7 +212,7 @@ class Hosts(Invariants):
     # what people and engines do to proxies
 
     def meddle(self, n: int, m: int) -> None:
-        """A sandbox that ends leaves its proxy running in a namespace that nobody reaches."""
+        """A sandbox that ends leaves the proxy running in an unreachable namespace."""
         if boxes := self.boxes("running"):
             pick(boxes, n).state = pick(("exited", "paused", "restarting", "removing"), m)
 
@@ -231,7 +230,7 @@ class Hosts(Invariants):
                 self.start(box)
 
     def engine_restarts(self, n: int, m: int) -> None:
-        """Everything stops; what the engine starts again, it starts in no good order."""
+        """Everything stops. The engine starts containers again, in an unfavourable order."""
         first = pick((ROLE_PROXY, ROLE_SANDBOX), n)
         boxes = sorted(self.boxes("running"), key=lambda box: box.role != first)
         for box in boxes:
@@ -250,13 +249,13 @@ class Hosts(Invariants):
             self.engine.boxes.remove(self.forget(pick(boxes, n)))
 
     def forget(self, box: Box) -> Box:
-        """Of rules whose record somebody removes nobody knows once they are not wanted."""
+        """Without its record, the operator does not know of a rule that is no longer wanted."""
         if box.redirect is not None:
             self.forgotten.add((box.namespace, box.redirect.key))
         return box
 
     def rename_own(self, n: int, m: int) -> None:
-        """Under any other name it would be a stranger, for all that the operator knows."""
+        """Only to names that the operator recognizes as its own."""
         if boxes := [box for box in self.boxes() if box.role != ROLE_REDIRECT]:
             box = pick(boxes, n)
             names = {
@@ -282,7 +281,7 @@ class Hosts(Invariants):
         self.carry_out(self.controller.look())
 
     def look_and_be_killed(self, n: int, _: int) -> None:
-        """The operator is killed after any of its actions and knows nothing any more."""
+        """The operator is killed after any action, and loses its memory."""
         plan = self.controller.look()
         self.carry_out(plan, n % (len(plan.actions) + 1))
         self.lose_memory()
@@ -334,7 +333,7 @@ class Hosts(Invariants):
         return any(port in ports for box in running for port in box.ports | box.udp)
 
     def lose_memory(self) -> None:
-        """Ports are then only known as long as there is a container that has had them."""
+        """From now on the operator knows ports only from existing containers."""
         self.controller.memory = DockerMemory()
         started = {own.key for box, own in self.own(role=ROLE_SANDBOX) if box.state != "created"}
         self.served = {key: ports for key, ports in self.served.items() if key in started}

@@ -1,4 +1,4 @@
-"""A pure engine: what actions do to a host, and what must never be done to it."""
+"""A simulated engine: the effects of actions on a host, and forbidden actions."""
 
 import itertools
 from dataclasses import dataclass, field, replace
@@ -56,15 +56,15 @@ from tests.unit.operator.docker.builders import planned
 
 SERVING = {"running", "paused", "restarting"}
 GATEWAY = "172.30.0.1"
-"""That of the uplink, whenever there is one."""
+"""The gateway of the uplink, if the uplink exists."""
 
 
 class Failed(Exception):
-    """The engine can't do it."""
+    """The engine cannot do an action."""
 
 
 class Refused(Failed):
-    """A container can't be started because of its ports."""
+    """The engine cannot start a container, because a port is taken."""
 
     def __init__(self, port: int | None) -> None:
         super().__init__(f"a port is taken: {port}")
@@ -75,8 +75,8 @@ class Refused(Failed):
 class Box:
     """A container of the engine. ``networks`` holds ids and names by network.
 
-    ``namespace`` is when its network namespace came to be: for a proxy, its sandbox's start.
-    ``redirect`` is what it does to the rules of another's.
+    ``namespace`` is the time of origin of the network namespace: for a proxy, the sandbox's start.
+    ``redirect`` is the change to the rules in another container's namespace.
     """
 
     id: str
@@ -97,7 +97,9 @@ class Box:
 
     @property
     def own(self) -> OwnLabels | None:
-        """What its labels say, if its name agrees: nothing else gives one away here."""
+        """The operator's labels, if the name agrees. The simulation knows no other sign of
+        forgery.
+        """
         labels = read_own(self.labels)
         return labels if labels and has_own_name(labels, self.name) else None
 
@@ -107,7 +109,7 @@ class Box:
 
     @property
     def address(self) -> str:
-        """Its address on all of its networks: another one after each start."""
+        """The address on all networks, which changes with each start."""
         return f"172.30.{self.started // 250}.{2 + self.started % 250}" if self.started else ""
 
     @property
@@ -116,8 +118,8 @@ class Box:
 
 
 class Engine:
-    """A Docker host. ``open`` and ``hidden`` are ports that other programs hold; the operator
-    can't see the hidden ones. ``names_ports``: refusals name the port.
+    """A Docker host. ``open`` and ``hidden`` are ports of other programs. The operator sees only
+    ``open``. ``names_ports``: refusals name the port.
     """
 
     def __init__(self, settings: PlanSettings, ephemeral: PortRange) -> None:
@@ -152,7 +154,7 @@ class Engine:
         box.networks[network] = network_id, frozenset({box.name, *names})
 
     def active(self, network: str) -> bool:
-        """Whether a network can't be removed: something that runs is on it."""
+        """Whether a running container is on a network, so that the network cannot be removed."""
         return any(network in box.networks and box.state in SERVING for box in self.boxes)
 
     def conflicts(self, box: Box) -> set[int]:
@@ -336,13 +338,13 @@ class Engine:
         shares = box.mode.startswith("container:")
         if shares and (home is None or home.state not in STARTED):
             raise Failed("cannot join network of a non running container")
-        box.state = "restarting" if taken else "running"  # a LAN relay takes its port by itself
+        box.state = "restarting" if taken else "running"  # a LAN relay binds the port itself
         box.started = next(self.ids)
         box.namespace = home.namespace if home else box.started
         box.networks = {n: (self.networks[n].id, names) for n, (_, names) in box.networks.items()}
 
     def _run(self, box: Box) -> None:
-        """Do the one thing, in the namespace that there is now, or fail at that."""
+        """Run a container that does a single thing and ends. Raises Failed."""
         if box.role == ROLE_FLUSH:
             box.state = "exited"
             box.started = next(self.ids)
@@ -363,14 +365,14 @@ class Engine:
             del self.rules[place]
 
     def begin(self, box: Box, state: str) -> None:
-        """Give a user's container a state; each start of it makes another namespace."""
+        """Give a user's container a state. Each start makes a new namespace."""
         if state in STARTED and box.state not in STARTED:
             box.started = next(self.ids)
             box.namespace = box.started
         box.state = state
 
     def home(self, box: Box) -> Box | None:
-        """The container whose network namespace another one shares."""
+        """The container whose network namespace `box` shares."""
         return next((owner for owner in self.boxes if box.mode == f"container:{owner.id}"), None)
 
     def _connect(self, box: Box, network: str, aliases: tuple[str, ...]) -> None:

@@ -1,4 +1,4 @@
-"""Names that a label gives a proxy: those of a LAN's hosts, and never those of containers."""
+"""Names that a label gives a proxy: names of hosts on the LAN, never names of containers."""
 
 from dataclasses import replace
 from typing import Any
@@ -176,7 +176,7 @@ def test_a_name_that_is_refused_now_is_taken_back() -> None:
 
 @pytest.mark.parametrize("state", ["created", "running", "exited"])
 def test_a_container_that_comes_later_gets_its_name_from_the_proxy(state: str) -> None:
-    """Its neighbours must not reach the proxy under that name, now or some of the time."""
+    """Neighbours must never reach the proxy under that name."""
     steady = look(hostile(), **both(key=DB))
     assert steady.actions == ()
     for newcomer in (
@@ -190,7 +190,7 @@ def test_a_container_that_comes_later_gets_its_name_from_the_proxy(state: str) -
 
 
 def test_the_name_of_a_container_that_is_gone_stays_its_own() -> None:
-    """``docker compose up`` makes containers anew, one after the other."""
+    """``docker compose up`` recreates containers in turn."""
     before = look(container("x-db-1", {}, [place("app", "x-db-1", "db")]))
     plan = look(hostile(env=DB.master_uri), memory=before.memory)
     assert "db" not in aliases(plan)
@@ -209,7 +209,7 @@ def test_an_option_takes_no_name_from_a_container_that_is_there() -> None:
 
 
 def test_a_name_on_another_network_of_a_neighbour_is_taken() -> None:
-    """The neighbour asks the name servers of all its networks, in an order of the engine's."""
+    """The engine searches a neighbour's networks for a name in any order."""
     web = container("web", {}, ("app", "back"))
     db = container("db", {}, ("back",))
     plan = look(hostile(env=DB.master_uri), web, db)
@@ -231,7 +231,7 @@ def test_a_name_with_the_name_of_a_network_is_that_of_a_container_there() -> Non
 
 
 def test_no_label_of_an_image_takes_a_name_from_a_proxy() -> None:
-    """Compose gives aliases: its labels, which an image can have as well, say nothing."""
+    """An image may have Compose's labels. Only aliases count."""
     forged = container("web", {"com.docker.compose.service": "robot"})
     uri = "http://robot:11311"
     plan = look(container("talker", {"rosproxy.enable": "true"}, env=uri), forged)
@@ -246,7 +246,7 @@ def test_a_proxy_that_only_lingers_leaves_a_container_its_name() -> None:
 
 
 def test_a_proxy_that_can_not_be_made_leaves_a_container_its_name() -> None:
-    """Without the image no proxy is made in its sandbox, which has the name."""
+    """Without the image the operator cannot create the proxy, but the sandbox has the name."""
     plan = look(hostile(), container("db", {}), sandboxes=[sandbox(DB)], image="")
     assert plan.actions == (Disconnect(sandbox(DB).container.name, "app"),)
 

@@ -27,7 +27,7 @@ from tests.unit.operator.docker.builders import (
 def read(
     settings: PlanSettings = SETTINGS, env: str = "http://rosproxy:11311", **labels: str
 ) -> tuple[Member | None, list[Problem]]:
-    """The member of one container with these labels, and what it is told."""
+    """The member for a container with these labels, and the problems."""
     names = {f"rosproxy.{name.replace('_', '-')}": value for name, value in labels.items()}
     talker = container(labels={**ENABLED, **names}, env=env)
     members, problems = read_members(observed(talker), settings)
@@ -35,7 +35,7 @@ def read(
 
 
 def asked(settings: PlanSettings = SETTINGS, **labels: str) -> tuple[Member, str]:
-    """What a container gets, and the one thing that it is told, if any."""
+    """The member for a container with these labels, and the text of its problem, if any."""
     member, problems = read(settings, **labels)
     assert member is not None
     assert all(problem.subject == "container talker" for problem in problems)
@@ -128,7 +128,7 @@ def test_nothing_is_made_and_no_name_taken_for_a_master_that_is_not_allowed() ->
 
 
 def test_a_label_takes_no_name_that_a_neighbour_answers_to() -> None:
-    """Neither its name nor an alias, by which Compose has its services found."""
+    """Neither its name nor an alias, such as the name of a Compose service."""
     labels = {**ENABLED, "rosproxy.master-uri": "http://db:5432"}
     for neighbour in (container("db", {}), container("x-db-1", {}, [place("app", "x-db-1", "DB")])):
         seen = observed(container(labels=labels), neighbour)
@@ -144,7 +144,7 @@ def test_a_label_takes_no_name_that_a_neighbour_answers_to() -> None:
     ("option", "label", "gets"), [(100, 101, 100), (8, 33, 32), (40, 1000, 40)]
 )
 def test_more_ports_than_labels_may_ask_for(option: int, label: int, gets: int) -> None:
-    """It is --ports that an operator gives anyway."""
+    """A proxy gets at least the number of --ports."""
     member, told = asked(replace(SETTINGS, max_ports=option), ports=str(label))
     assert member.ports == gets
     assert told == (
@@ -222,8 +222,8 @@ def test_a_slave_control_that_can_not_be() -> None:
     assert problem.text.startswith("label rosproxy.slave-control='nobody' is none of any, master.")
 
 
-def test_who_has_exited_keeps_the_control_narrow_for_the_grace() -> None:
-    """A container that is restarted does not have its proxy made anew twice."""
+def test_an_exited_container_keeps_slave_control_narrow_for_the_grace() -> None:
+    """Otherwise a container's restart would recreate the proxy twice."""
     narrow = {**ENABLED, "rosproxy.slave-control": "master"}
     seen = observed(container("a"), container("b", narrow, state="exited"))
     first = planned(seen, SETTINGS, DockerMemory(), 0.0)

@@ -1,4 +1,4 @@
-"""The command line of the operator: every mistake is one line that names the option."""
+"""The command line of the operator: each mistake gives a line that names the option."""
 
 from pathlib import Path
 
@@ -136,7 +136,7 @@ def test_no_engine_is_one_line_that_says_what_to_do(words: list[str]) -> None:
 def test_a_misspelt_variable_is_told_with_the_one_that_was_meant(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """By commands at once, and by the operator for as long as it runs."""
+    """Commands print the problem at once. The operator keeps reporting the problem."""
     misspelt = "is not a variable of rosproxy and is ignored; did you mean ROSPROXY_PORT_WINDOW?"
     result = run("docker", "status", ROSPROXY_PORT_WINDO="12000-12999")
     assert f"ROSPROXY_PORT_WINDO {misspelt}" in result.stderr
@@ -160,7 +160,7 @@ def test_uninstall_says_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_uninstall_refuses_beside_an_operator(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where options are given, for which status and plan do not ask it."""
+    """Also with options. With options, `status` and `plan` do not ask the running operator."""
     answer = {"operator": "http://127.0.0.1:11313", "version": "another"}
     monkeypatch.setattr("rosproxy_operator.docker.host_status.ask_operators", lambda _: answer)
     result = run("docker", "--proxy-image", "other", "uninstall")
@@ -198,7 +198,7 @@ def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_policy_can_stand_in_a_variable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blanks in it separate no values, as they do in other variables."""
+    """Unlike in other variables, blanks separate no values."""
     monkeypatch.setenv("ROSPROXY_POLICY", "deny publish /camera/*;\ndeny serve * by /driver")
     monkeypatch.setenv("ROSPROXY_POLICY_MODE", "audit")
     words = ["--policy=deny call *"]

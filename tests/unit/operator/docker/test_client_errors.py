@@ -1,4 +1,4 @@
-"""What the engine says when it refuses, and what the user is told."""
+"""Refusals of the engine, and the messages for the user."""
 
 import errno
 import os
@@ -93,7 +93,7 @@ def test_what_the_engine_itself_forbids_is_told_as_it_is() -> None:
 
 
 def wrapped(error: OSError) -> Exception:
-    """As it comes out of requests over a UNIX socket."""
+    """An error in the form in which requests raises it over a UNIX socket."""
     inner = urllib3.exceptions.ProtocolError("Connection aborted.", error)
     outer = requests.ConnectionError(inner)
     inner.__context__ = error
@@ -116,7 +116,7 @@ def test_an_engine_that_cannot_be_reached(number: int, words: str) -> None:
 
 
 def test_the_mounted_socket_of_a_former_engine_is_told(tmp_path: Path) -> None:
-    """A file that was removed and is still open has no name left, as one that is mounted."""
+    """Like a mounted socket, an open file that was removed has no name."""
     file = tmp_path / "docker.sock"
     file.touch()
     with file.open() as held:

@@ -1,4 +1,4 @@
-"""Looks at an engine that is given by the test, and what the controller makes of them."""
+"""The controller with a fake engine."""
 
 import asyncio
 from dataclasses import replace
@@ -53,7 +53,7 @@ def own(
 
 @pytest.fixture(autouse=True)
 def containers(engine: FakeEngine) -> None:
-    """A labelled container, which is called as its master is, and a proxy in its sandbox."""
+    """A labelled container with the name of its master, and a proxy in a sandbox."""
     engine.knows["/networks"] = [captured.network()]
     state = {"State": {"Status": "running", "StartedAt": "1"}}
     details = captured.inspected() | state
@@ -77,7 +77,7 @@ async def test_a_look_finds_containers_labels_masters_and_proxies() -> None:
     assert [box.container.name for box in state.sandboxes] == [sandbox_name(KEY)]
     assert [(proxy.key, proxy.range) for proxy in state.proxies] == [(KEY, RANGE)]
     assert [request.key.master_uri for request in look.labels.requests] == [KEY.master_uri]
-    assert state.masters == {"robot": "172.29.0.2"}  # no name server has it, but a container
+    assert state.masters == {"robot": "172.29.0.2"}  # the name of a container, not of a name server
     assert not state.busy
     assert state.addresses >= {"172.29.0.2", "172.30.0.2"}
     access = look.access[name]
@@ -112,7 +112,7 @@ def forged(number: str, name: str, **more: Any) -> tuple[dict[str, Any], dict[st
 
 @pytest.mark.parametrize("name", ["evil", BOX.name])
 async def test_a_forged_container_is_told_and_left_alone(engine: FakeEngine, name: str) -> None:
-    """Also by its name alone, without which nobody gets as far."""
+    """Also if only the name is forged."""
     del engine.rows[1:]
     engine.knows[f"/images/{SETTINGS.proxy_image}/json"] = {"Id": IMAGE}
     row, inspected = forged("e" * 64, name)
@@ -135,8 +135,8 @@ async def test_a_forged_container_is_told_and_left_alone(engine: FakeEngine, nam
     assert not any(11400 in ports for ports in planned.memory.planned.values())
 
 
-async def test_a_forged_container_does_not_hold_up_what_is_own(engine: FakeEngine) -> None:
-    """It claims to be another sandbox of the same key, and nobody knows yet how it was made."""
+async def test_a_forged_container_does_not_delay_own_containers(engine: FakeEngine) -> None:
+    """The container claims to be a sandbox of the same key, and is not inspected yet."""
     row, _ = forged("e" * 64, "evil")
     engine.rows.append(row)
     look = await observer().look(5.0)
@@ -153,10 +153,10 @@ async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine)
     assert look.state.masters == {"robot": ""}
 
 
-async def test_who_shares_the_network_of_one_that_is_not_inspected_yet_waits(
+async def test_a_container_in_the_network_of_an_uninspected_container_waits(
     engine: FakeEngine,
 ) -> None:
-    """It is no mistake of its user's: Compose starts both in the same moment."""
+    """This is no fault of the user: Compose starts both at the same moment."""
     talker = engine.rows[0]["Id"]
     inspected = engine.knows.pop(f"/containers/{talker}/json")
     beside = captured.running() | {
@@ -246,7 +246,7 @@ async def test_a_doubt_is_good_for_one_look_however_late(
 
 
 async def test_a_redirect_that_was_run_again_is_inspected_again(engine: FakeEngine) -> None:
-    """The list shows it as ended before and after."""
+    """In the list of containers the redirect has exited, before and after."""
     looking = observer()
     seen = replace((await looking.look(5.0)).state, image_id=IMAGE)
     master = HostPort("192.0.2.7", 11311)
@@ -275,7 +275,7 @@ async def test_the_list_tells_that_a_proxy_has_ended(engine: FakeEngine) -> None
 async def test_a_start_that_no_event_told_is_found(
     engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside the looks; one that finds nothing new brings about no look."""
+    """By a separate check, which causes a look only after a change."""
     monkeypatch.setattr(snapshot, "CHECK", 0.0)
     told: list[bool] = []
     resolver = MasterResolver(lambda: None)
@@ -304,7 +304,7 @@ async def test_a_start_that_no_event_told_is_found(
 async def test_the_page_tells_of_a_proxy_that_has_ended(
     engine: FakeEngine, state: str, is_told: bool
 ) -> None:
-    """One that has not started yet is not broken."""
+    """A proxy that has not started yet is not broken."""
     engine.rows[-1]["State"] = state
     controller = DockerController(SETTINGS, 30.0, DockerMetrics())
     assert await controller.documents() == {}

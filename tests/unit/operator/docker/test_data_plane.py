@@ -1,4 +1,4 @@
-"""How a proxy is told to forward, and what its containers are given for that."""
+"""The data plane of a proxy, and the capabilities of its containers."""
 
 from dataclasses import replace
 
@@ -71,7 +71,7 @@ def made(actions: tuple[Action, ...]) -> tuple[list[bool], list[DataPlane]]:
 
 
 def own(plane: DataPlane) -> tuple[Sandbox, Proxy]:
-    """A sandbox and its proxy, as they were created for a data plane."""
+    """A sandbox and a proxy that were created for a data plane."""
     spec = ProxySpec(data_plane=plane)
     box = sandbox_fingerprint(structs.replace(SANDBOX, spec=spec), SETTINGS)
     process = proxy_fingerprint(structs.replace(PROXY, spec=spec), SETTINGS, IMAGE, SECRET)
@@ -94,7 +94,7 @@ def test_a_label_goes_before_the_option(plane: str) -> None:
         assert plan.problems == ()
 
 
-def test_who_is_outvoted_is_told() -> None:
+def test_a_container_whose_label_is_outvoted_gets_a_problem() -> None:
     plan = look(asking("a", "copy"), asking("b", "kernel"), container("c"), asking("d", "auto"))
     assert given(plan) == "kernel"
     assert [(p.subject, p.fatal) for p in plan.problems] == [
@@ -176,8 +176,8 @@ def test_the_kernel_plane_makes_both_anew() -> None:
 
 
 @pytest.mark.parametrize("plane", ["auto", "splice", "copy"])
-def test_who_gives_the_kernel_plane_up_leaves_no_rules_behind(plane: DataPlane) -> None:
-    """A proxy that was killed has not taken them away, and its successor can't."""
+def test_leaving_the_kernel_plane_leaves_no_rules_behind(plane: DataPlane) -> None:
+    """A killed proxy leaves its rules, and its successor cannot remove these."""
     plan = look(asking("a", plane), existing_pair=own("kernel"))
     assert made(plan.actions) == ([False], [plane])
 

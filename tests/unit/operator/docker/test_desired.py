@@ -59,7 +59,7 @@ def named(
 
 
 def names(*containers: Container, **more: Any) -> tuple[dict[tuple[Key, str], set[str]], list[str]]:
-    """The names that proxies get on networks, and who is told that it won't find its own."""
+    """The names of proxies on networks, and the containers that do not find their proxy."""
     seen = observed(*containers, **more)
     naming = named(seen)
     told = [problem.subject.removeprefix("container ") for problem in naming.problems]
@@ -113,7 +113,7 @@ LATER = [Network("n3", name) for name in ("00", "0-zoo", "Lab", "_x", "1")]
 
 @pytest.mark.parametrize("network", [*EARLY, *LATER, Network("n3", "0-app", internal=True)])
 def test_a_network_that_would_take_the_published_ports_is_not_joined(network: Network) -> None:
-    """Its name would sort first. An internal one takes nothing."""
+    """Its name sorts before the uplink. An internal network takes no ports."""
     talker = container(networks=("app", network.name))
     desired, problems = want(observed(talker, networks=(UPLINK, APP, network)))
     if network not in EARLY:
@@ -129,7 +129,7 @@ def test_an_early_network_that_nobody_asks_for_is_no_problem() -> None:
     assert want(observed(container(), networks=(UPLINK, APP, Network("n3", "0-a"))))[1] == ()
 
 
-# who has exited
+# exited containers
 
 
 def test_networks_of_who_has_exited_stay_joined_for_the_grace() -> None:
@@ -240,19 +240,19 @@ def test_the_one_who_lingers_keeps_it_as_long() -> None:
         ([sandbox(ARM, state="restarting")], False, ["a"]),
         ([sandbox(ARM, state="restarting"), sandbox()], True, ["a"]),
     ],
-    ids=["it leaves", "it can't leave now", "it can't leave now, but the other one has it, too"],
+    ids=["leaves", "can't leave now", "can't leave now, but the other proxy has the name, too"],
 )
-def test_a_proxy_that_nobody_wants_keeps_its_name_until_it_has_left(
+def test_an_unneeded_proxy_keeps_its_name_until_it_has_left(
     sandboxes: list, has_it: bool, told: list[str]
 ) -> None:
-    """One that the engine is restarting answers again in a moment, and then both would."""
+    """A proxy that the engine restarts answers again soon. Then both proxies would answer."""
     given, told_names = names(container("a"), sandboxes=sandboxes)
     assert (("rosproxy" in given[KEY, "app"]), told_names) == (has_it, told)
     assert given[KEY, "app"] >= {"robot", NAME}
 
 
 def test_two_masters_on_one_host() -> None:
-    """Both proxies can't be called robot; the second one's containers are told."""
+    """Only one proxy can have the name robot. The containers of the other get a problem."""
     second = Key("http://robot:11312", HERE)
     labels = {**ENABLED, "rosproxy.master-uri": second.master_uri}
     given, told = names(
@@ -267,7 +267,7 @@ def test_two_masters_on_one_host() -> None:
 
 @pytest.mark.parametrize("mode", [APP.name, APP.id])
 def test_container_that_is_just_being_created_has_its_network_soon(mode: str) -> None:
-    """The engine lists it without any for a moment; that was told as an error."""
+    """For a moment the engine lists the container without a network."""
     seen = observed(container(networks=(), state="created", mode=mode))
     members, problems = read_members(seen, SETTINGS)
     assert [member.networks for member in members] == [{APP.name}]
@@ -278,8 +278,8 @@ WRONG = Key("http://robot:11312", HERE)
 ADVICE = re.compile(r"set ROS_MASTER_URI=(\S+)(?: and the label (\S+)=(\S+))?$")
 
 
-def test_a_wrong_port_that_came_first_is_named_to_those_who_are_right() -> None:
-    """Its proxy has the name of the master's host, which both look for."""
+def test_an_earlier_container_with_a_wrong_port_is_named_in_the_problem() -> None:
+    """The wrong container's proxy has the name of the master's host."""
     bare = {"rosproxy.enable": "true"}
     bad = container("bad", bare, env=WRONG.master_uri)
     seen = observed(bad, container("good", bare, env=KEY.master_uri), sandboxes=[sandbox(WRONG)])

@@ -1,4 +1,4 @@
-"""Whose proxies are to carry the way outwards, too: label, option, internal networks."""
+"""Proxies that carry the way outwards, too: label, option, internal networks."""
 
 from dataclasses import replace
 
@@ -69,7 +69,7 @@ def test_who_asks(containers: list[Container], option: Direction, gets: str) -> 
 
 
 def test_the_network_that_the_label_names_is_what_counts() -> None:
-    """A container on two networks that is to meet its proxy on the one with a route."""
+    """The container is on two networks, and the label names the network with a route."""
     labels = {**ENABLED, "rosproxy.network": "app"}
     on_both = container("a", labels, ["app", "cell"])
     assert direction_of(on_both, memory=DockerMemory()) == "out"
@@ -81,8 +81,8 @@ def test_a_direction_that_can_not_be() -> None:
     assert problem.text.startswith("label rosproxy.direction='inwards' is none of out, both.")
 
 
-def test_who_has_exited_keeps_it_for_the_grace() -> None:
-    """A container that is restarted does not have its proxy made anew twice."""
+def test_an_exited_container_keeps_the_direction_for_the_grace() -> None:
+    """Otherwise a container's restart would recreate the proxy twice."""
     seen = observed(container("a"), labelled("b", "both", state="exited"))
     first = planned(seen, SETTINGS, DockerMemory(), 0.0)
     assert first.desired[0].spec.direction == "both"

@@ -1,4 +1,4 @@
-"""What is called at an engine on loopback, and what is made of its answers."""
+"""Calls to an engine on loopback, and its answers."""
 
 import re
 from pathlib import Path
@@ -220,7 +220,7 @@ async def test_anything_else_is_an_error(engine: FakeEngine, action: Action) -> 
         {"Config": {"Labels": None}},
         {"Config": {"Labels": own_labels(BOX), "User": "root"}, "HostConfig": {}},
     ],
-    ids=["without labels", "with forged ones"],
+    ids=["without labels", "with forged labels"],
 )
 async def test_a_name_that_a_stranger_has(engine: FakeEngine, inspected: dict[str, Any]) -> None:
     engine.refuses["POST /containers/create"] = (409, "in use")

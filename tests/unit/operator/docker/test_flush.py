@@ -46,7 +46,7 @@ EARLIER = "2026-01-01T09:59:59.75Z"
 
 
 def published(ports: PortRange = RANGE, state: str = "running", busy: bool = False) -> HostState:
-    """A host with a labelled container of ROS 2, whose proxy publishes UDP ports."""
+    """A host with a labelled ROS 2 container and a proxy with UDP ports."""
     parts: dict[str, Any] = running_proxy()
     (box,) = parts["sandboxes"]
     udp = frozenset(ports.ports())
@@ -105,8 +105,8 @@ def test_it_runs_again_unless_it_ended_well_after_the_sandboxs_start(old: FlushC
     assert steps(replace(published(), flushes=(old,))) == [Run(NAME)]
 
 
-def test_it_runs_again_once_when_the_engine_has_returned() -> None:
-    """With live-restore it publishes the ports of a sandbox anew that went on."""
+def test_the_flush_runs_again_once_when_the_engine_has_returned() -> None:
+    """With live-restore the engine publishes the ports of a running sandbox again."""
     state = replace(published(), flushes=(record(MADE),))
     memory = DockerMemory(engine_returned=True)
 

@@ -27,7 +27,7 @@ def test_only_listening_sockets_count() -> None:
 
 @pytest.mark.parametrize(("text", "last"), [("32768\t40000\n", 40000), (None, 60999)])
 def test_the_ephemeral_range(text: str | None, last: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or the kernel's default where it is not told."""
+    """Or the kernel's default if the file is missing."""
 
     def read(*_: object, **__: object) -> str:
         if text is None:
@@ -50,7 +50,7 @@ def test_own_addresses() -> None:
 
 @pytest.fixture
 def routes(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """The address that connections to an address come from; far ones from 10.0.0.7."""
+    """The source address of connections to each address; 10.0.0.7 for all others."""
     source_addresses: dict[str, str] = {}
     monkeypatch.setattr(host, "address_towards", lambda to: source_addresses.get(to, "10.0.0.7"))
     return source_addresses

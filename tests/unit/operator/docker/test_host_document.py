@@ -36,7 +36,7 @@ TIGHT = PlanSettings(advertise_host=HERE, ports=2, port_window=PortRange(11400, 
 
 
 def test_a_labelled_container_without_a_proxy_is_listed() -> None:
-    """Its window is too small: that is the problem, and not that nobody has a label."""
+    """The problem is the small port window, not a missing label."""
     state = observed(container(), listening=[11400])
     made = planned(state, TIGHT, DockerMemory(), 0.0)
     assert not made.actions
@@ -58,7 +58,7 @@ def test_a_container_whose_master_is_refused_is_listed() -> None:
 
 @pytest.mark.parametrize(("key", "up"), [(KEY, False), (Key("", HERE, 0), None)])
 def test_only_a_proxy_for_ros_1_has_a_master(key: Key, up: bool | None) -> None:
-    """What a proxy for ROS 2 says of one is nothing that is wrong."""
+    """A proxy for ROS 2 has no master, which is not a fault."""
     running = proxy(KEY)
     own = replace(running.container, name=proxy_name(key))
     state = observed(proxies=[replace(running, key=key, container=own)])
@@ -80,9 +80,8 @@ def told_of_talker(
     age: float = SETTLED,
     uptime: float = SETTLED,
 ) -> list[str]:
-    """What a host's status says of a labelled container of ROS 2.
-
-    ``inside`` are the addresses at which its proxy has heard participants.
+    """The problems of a labelled ROS 2 container in the status of a host. ``inside`` are the
+    addresses of the participants that the proxy has heard.
     """
     labels = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
     talker = container(labels=labels, networks=[TALKER], env="")
@@ -103,7 +102,7 @@ def told_of_talker(
     ("age", "is_told"), [(-3600.0, True), (1.0, False), (STARTING - 0.1, False), (STARTING, True)]
 )
 def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) -> None:
-    """An engine whose clock is ahead hides no silence."""
+    """Even if the engine's clock is ahead, later silence is a problem."""
     running = proxy(KEY)
     own = replace(running.container, name="p", started_at=STARTED_AT)
     state = observed(proxies=[replace(running, container=own)])
@@ -134,8 +133,8 @@ def test_a_variable_is_named_where_no_participant_is_heard(
     assert f"Possible cause: variable {name}={value}. " in text
     assert fix in text
     assert not told_of_talker(variables, inside=[TALKER.address]), "all is well"
-    assert not told_of_talker(variables, age=1.0), "it has just started"
-    assert not told_of_talker(variables, uptime=1.0), "its proxy has just started"
+    assert not told_of_talker(variables, age=1.0), "the container has just started"
+    assert not told_of_talker(variables, uptime=1.0), "the proxy has just started"
 
 
 @pytest.mark.parametrize(
@@ -152,7 +151,7 @@ def test_variables_that_keep_no_participant_apart(variables: dict[str, str]) -> 
 
 
 def test_a_container_in_the_network_of_another_has_its_participants() -> None:
-    """The other one needs no label."""
+    """The other container needs no label."""
     pause = container("pause", labels={}, networks=[TALKER])
     labels = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
     talker = container(labels=labels, networks=(), env="", mode=f"container:{pause.id}")

@@ -61,7 +61,7 @@ VARIABLES = st.sampled_from(
 
 
 def host(labels: dict[str, str], variables: dict[str, str], name: str, alias: str) -> HostState:
-    """A host with such a container, and another one with its ROS_MASTER_URI."""
+    """A host with such a container, and with another container with the same ROS_MASTER_URI."""
     config = {
         "Env": [f"{variable}={value}" for variable, value in variables.items()],
         "User": alias,

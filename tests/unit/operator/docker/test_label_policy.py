@@ -1,4 +1,4 @@
-"""Labels with rules: whose nodes they are for, how long, and how many."""
+"""Labels with rules: affected nodes, duration, limits."""
 
 from dataclasses import replace
 
@@ -103,7 +103,7 @@ def test_a_layer_is_for_the_addresses_of_its_container() -> None:
 
 
 def test_a_proxy_is_made_with_the_layers_of_its_containers() -> None:
-    """Its nodes may register before the operator has told it anything."""
+    """Nodes may register before the operator has sent the policy to the proxy."""
     labels = {**ENABLED, "rosproxy.policy": "deny publish /camera/*"}
     seen = observed(container("talker", labels, [Attachment("app", A)]))
     plan = planned(seen, replace(SETTINGS, policy=COMMON), DockerMemory(), 0.0)
@@ -122,7 +122,7 @@ def test_what_a_container_that_has_gone_hid_stays_hidden_until_its_nodes_are_gon
     assert recent.look([], set(), 1.0) == (layer("a", A),)
     assert recent.look([], set(), OUTLIVES) == ()
     recent.look([layer("a", A)], {A}, 0.0)
-    assert recent.look([], {A}, 1.0) == ()  # another container has it
+    assert recent.look([], {A}, 1.0) == ()  # another container has the address
 
 
 def test_a_container_that_comes_back_elsewhere_has_one_layer() -> None:

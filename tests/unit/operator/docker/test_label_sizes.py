@@ -1,4 +1,4 @@
-"""Labels of any length and number: they cost a container its own proxy at most."""
+"""Labels of any length and number cost a container at most its own proxy."""
 
 import pytest
 

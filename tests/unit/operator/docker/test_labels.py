@@ -1,4 +1,4 @@
-"""What containers ask for, and what they are told if they can't have it."""
+"""The labels of containers, and the problems of wrong labels."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ EXPOSING = replace(SETTINGS, expose_by_default=True)
 def read(
     container: Container, settings: PlanSettings = SETTINGS, *others: Container, **more
 ) -> tuple[Member | None, list[Problem]]:
-    """The member of one container, if any, and its problems."""
+    """The member for a container, if any, and the problems."""
     members, problems = read_members(observed(container, *others, **more), settings)
     mine = [problem for problem in problems if problem.subject == f"container {container.name}"]
     return next((member for member in members if member.container == container), None), mine
@@ -48,7 +48,7 @@ def refusal(container: Container, settings: PlanSettings = SETTINGS, **more) -> 
 
 
 def warning(container: Container) -> str:
-    """What a container is told that has its member nevertheless."""
+    """The problem of a container that gets a member nevertheless."""
     member, problems = read(container)
     assert member is not None
     assert [problem.fatal for problem in problems] == [False]
@@ -261,7 +261,7 @@ def test_a_variable_that_leads_to_the_proxy(env: str) -> None:
 
 
 def test_an_address_is_told_the_variable_and_the_label_at_once() -> None:
-    """Either alone leads to the next mistake: the other one then names no master, or the proxy."""
+    """If the user sets only one, the other names no master, or names the proxy as the master."""
     uri = "http://192.0.2.7:11311"
     settings = replace(SETTINGS, redirect=False)
     _, (problem,) = read(container(labels=ON, env=uri), settings)
@@ -272,7 +272,7 @@ def test_an_address_is_told_the_variable_and_the_label_at_once() -> None:
 
 
 def test_no_variable_leads_to_localhost() -> None:
-    """Nodes that are started with one of their own find the proxy all the same."""
+    """Nodes with a variable of their own still find the proxy."""
     assert warning(container(env="")) == (
         "has no variable ROS_MASTER_URI, so the nodes look for a master on localhost, unless a "
         "script sets the variable. Set ROS_MASTER_URI=http://rosproxy:11311"
@@ -338,7 +338,7 @@ def test_labels_of_others_are_left_alone(label: str) -> None:
 
 
 def test_an_address_that_is_not_known_for_a_moment() -> None:
-    """The proxy that is there stays: of several, the one on the container's network."""
+    """An existing proxy stays, if possible the proxy on the container's network."""
     other = Key(ROBOT, "192.0.2.1")
     seen = [sandbox(other, networks=()), sandbox(KEY)]
     assert good(container(), PlanSettings(), sandboxes=seen).key == KEY

@@ -1,4 +1,4 @@
-"""Proxies for ROS 2, and their LAN relays: how they are made, and when anew."""
+"""Proxies for ROS 2 and their LAN relays: creation and recreation."""
 
 from dataclasses import replace
 from typing import Any
@@ -82,7 +82,7 @@ def own(made: Any, places: tuple[Attachment, ...] = (), mode: str = "host") -> C
 
 
 def running_proxy(near: str = NEAR, lan_relay: CreateLanRelay | None = MADE) -> dict[str, Any]:
-    """A proxy for ROS 2 that runs, with its LAN relay."""
+    """A running proxy for ROS 2, with a LAN relay."""
     box = structs.replace(BOX, fingerprint=sandbox_fingerprint(BOX, SETTINGS))
     made = proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET)
     places = (Attachment(SETTINGS.uplink, near), Attachment("app", "172.18.0.9"))
@@ -268,7 +268,7 @@ def environment(config: dict[str, Any]) -> dict[str, str]:
 
 
 def secrets_of(secret: str, key: Key = KEY) -> tuple[str, str]:
-    """What the proxy of a key holds, and what its LAN relay does."""
+    """The secret of a key's proxy, and the secret of the LAN relay."""
     proxy = container_config(structs.replace(PROXY, key=key), SETTINGS, secret, "")
     relay = lan_relay_config(structs.replace(MADE, key=key), SETTINGS, secret)
     proxy_env = environment(proxy)
@@ -277,12 +277,14 @@ def secrets_of(secret: str, key: Key = KEY) -> tuple[str, str]:
 
 
 def test_a_proxy_and_its_lan_relay_share_a_secret() -> None:
-    """It is computed from the operator's own: the same after each start, another for each proxy."""
+    """The operator computes this secret from its own: always the same, and different for each
+    proxy.
+    """
     of_proxy, of_relay = secrets_of(SECRET)
     assert of_proxy == of_relay == secrets_of(SECRET)[0]
     others = [secrets_of("another"), secrets_of(SECRET, Key("", HERE, 1))]
     assert len({of_proxy, *(secret for pair in others for secret in pair)}) == 3
-    # Who reads it by an inspection of the LAN relay can't call the admin endpoint.
+    # The secret, visible by inspection of the LAN relay, is no token for the admin endpoint.
     assert proxy_token(KEY, SECRET) != of_proxy
     without = container_config(structs.replace(PROXY, lan_relay=None), SETTINGS, SECRET, "")
     assert "ROSPROXY_ROS2_LAN_RELAY_SECRET" not in environment(without)

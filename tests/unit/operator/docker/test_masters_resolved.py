@@ -7,7 +7,7 @@ from rosproxy_operator.common.master_resolver import MasterResolver
 
 
 class Names:
-    """A name server: ``known`` are its names; ``asked`` those that it was asked for."""
+    """A name server with ``addresses`` for names. ``asked`` are the requested names."""
 
     def __init__(self) -> None:
         self.addresses: dict[str, list[str]] = {}
@@ -65,7 +65,7 @@ async def test_the_last_good_address_is_kept(
 async def test_a_change_is_told(masters: MasterResolver, names: Names, changes: list[int]) -> None:
     names.addresses["robot"] = ["192.0.2.7", "192.0.2.8"]
     await masters.learn(["robot"], {}, [])
-    names.addresses["robot"].reverse()  # the one in use is still good
+    names.addresses["robot"].reverse()  # the address in use is still valid
     await masters.refresh()
     assert (masters.address("robot"), changes) == ("192.0.2.7", [])
     names.addresses["robot"] = ["192.0.2.9"]

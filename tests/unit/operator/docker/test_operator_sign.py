@@ -1,4 +1,4 @@
-"""Operators of this machine are found wherever they listen."""
+"""All operators of this machine are found, at any address."""
 
 from contextlib import ExitStack, closing
 

@@ -1,4 +1,4 @@
-"""Which containers are the operator's own, and what gives those away that an image has forged."""
+"""The operator's own containers, and the detection of forged containers."""
 
 from dataclasses import replace
 from typing import Any
@@ -32,14 +32,14 @@ NAMES = {"sandbox": BOX.name, "proxy": PROCESS.name}
 
 
 def wrong(inspected: dict[str, Any], name: str, image: str = IMAGE) -> str:
-    """What gives a container away, read as the operator reads it."""
+    """The operator's reason why a container is forged, or empty."""
     own = read_own(inspected["Config"]["Labels"])
     assert own is not None
     return forgery_reason(own, name, read_making(check_inspection(inspected)), image)
 
 
 def changed(role: str, *path: str, value: object) -> dict[str, Any]:
-    """A container as it is made but for one thing."""
+    """The inspection of an own container with a single changed value."""
     inspected = {key: dict(inner) if isinstance(inner, dict) else inner
                  for key, inner in MADE[role].items()}  # fmt: skip
     at = inspected
@@ -74,7 +74,7 @@ def test_so_is_one_with_ports_for_udp() -> None:
 
 
 def test_what_options_decide_makes_no_stranger() -> None:
-    """What was made by an operator with other ones is made anew, which is for its planner."""
+    """The planner recreates containers of an operator with other options."""
     other = replace(SETTINGS, uplink="0-other", publish_address=("::", "0.0.0.0"), proxy_memory=0,
                     proxy_pids=0, slave_control="master", secret="other")  # fmt: skip
     assert wrong(inspection(sandbox_config(BOX, other)), BOX.name) == ""
@@ -99,7 +99,7 @@ def test_the_process_of_a_former_image_is_known_by_user_and_command() -> None:
 
 @pytest.mark.parametrize("role", MADE)
 def test_an_image_can_have_labels_command_user_and_variables_and_no_more(role: str) -> None:
-    """``docker run --name …`` of it, with everything that it could have put in."""
+    """``docker run --name …`` of an image with every forged value that an image can have."""
     forged = {**MADE[role], "HostConfig": {"NetworkMode": "app", "IpcMode": "private"}}
     assert wrong(forged, "evil") == f"the name is not {NAMES[role]}"
     assert wrong(forged, NAMES[role]).startswith("HostConfig.ReadonlyRootfs")

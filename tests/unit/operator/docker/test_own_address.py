@@ -1,4 +1,4 @@
-"""What a container says of its own address, where that keeps its nodes from working."""
+"""Variables for a container's own address that keep its nodes from working."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What is done in which order, rule by rule. That it always ends well: test_plan_convergence."""
+"""The order of actions, rule by rule. test_plan_convergence checks the end."""
 
 from dataclasses import replace
 from typing import Any
@@ -115,7 +115,7 @@ def test_the_first_container_on_a_host() -> None:
 
 
 def test_another_secret_makes_the_process_anew_in_its_sandbox() -> None:
-    """Its nodes keep their ports, and its master's address and networks stay."""
+    """The sandbox stays, so the nodes keep their ports and networks."""
     plan = look(observed(container(), **both(), secret="another"))
     assert [(type(action), action.name) for action in plan.actions] == [
         (Rename, NAME),
@@ -129,7 +129,7 @@ def test_another_secret_makes_the_process_anew_in_its_sandbox() -> None:
 @pytest.mark.parametrize(
     "seen",
     [observed(container(), **both()), observed(container(labels={}), networks=[APP])],
-    ids=["all is as it ought to be", "nobody wants anything"],
+    ids=["all is in order", "no container has a label"],
 )
 def test_nothing_is_to_be_done(seen: HostState) -> None:
     plan = look(seen)
@@ -162,7 +162,7 @@ def test_networks_are_joined_and_left() -> None:
 
 
 def test_the_last_one_leaves() -> None:
-    """`docker compose down` can then remove the network; the proxy itself has its grace."""
+    """`docker compose down` can then remove the network. The proxy stays for the grace."""
     plan = look(observed(**both()))
     assert list(plan.actions) == [Disconnect(PORTS, "app")]
     assert plan.again_in == 60.0
@@ -193,7 +193,7 @@ def test_a_name_that_another_one_has_now_is_not_taken_again() -> None:
 
 
 def test_a_sandbox_that_has_stopped_is_started_without_networks() -> None:
-    """The engine joins them in any order, and may lay the ports over the wrong one first."""
+    """The engine joins networks in any order, and might publish the ports on the wrong network."""
     seen = observed(container(), sandboxes=[sandbox(state="exited")], proxies=[proxy()])
     assert actions(seen) == [
         Disconnect(PORTS, "app"),
@@ -319,7 +319,7 @@ def test_a_controller_killed_while_replacing_goes_on() -> None:
         ([proxy(name=f"{NAME}-old")], Rename(f"{NAME}-old", NAME)),
         ([proxy(name="other"), proxy()], Remove("other", "left over")),
     ],
-    ids=["an old one that is right after all gets its name back", "of two that run one goes"],
+    ids=["an old proxy that is right gets its name back", "of two that run, the wrong one goes"],
 )
 def test_what_a_controller_that_was_killed_leaves(proxies: list[Proxy], done: Action) -> None:
     assert actions(observed(container(), sandboxes=[sandbox()], proxies=proxies)) == [done]
@@ -331,7 +331,7 @@ def test_other_ports_replace_both() -> None:
 
 
 def test_a_controller_killed_before_the_old_sandbox_went_goes_on() -> None:
-    """The proxy goes first: without its network it could not close its connections."""
+    """The proxy goes first: without a network the proxy cannot close connections."""
     old = sandbox(name=f"{PORTS}-old")
     new = sandbox(ports=LONGER, state="created", networks=())
     lives = proxy(sandbox_id=old.container.id)
@@ -469,8 +469,8 @@ def test_ports_on_which_the_proxy_itself_listens_are_not_in_its_range() -> None:
     assert created(look(observed(container(labels=labels)))).first == 11406
 
 
-def test_two_new_proxies_do_not_get_the_same() -> None:
-    """Who has been promised some keeps them: its container is being created."""
+def test_two_new_proxies_do_not_get_the_same_ports() -> None:
+    """A proxy keeps its promised ports while its container is being created."""
     plan = look(observed(container(), container("b", ON_ARM)))
     assert ranges(plan) == {ARM: RANGE, KEY: WITH_ROOM}
     memory = look(observed(container())).memory
@@ -479,7 +479,7 @@ def test_two_new_proxies_do_not_get_the_same() -> None:
 
 
 def test_a_sandbox_that_the_engine_is_just_starting_keeps_its_ports() -> None:
-    """It is not seen to run yet, but its ports are listened on already."""
+    """The sandbox does not run yet, but the ports are already taken, by the sandbox itself."""
     starting = sandbox(state="created", networks=())
     for memory in (None, look(observed(container())).memory):
         plan = look(
@@ -490,7 +490,7 @@ def test_a_sandbox_that_the_engine_is_just_starting_keeps_its_ports() -> None:
 
 
 def test_ports_are_kept_when_everything_was_removed_by_hand() -> None:
-    """What listens there may be what is left of it."""
+    """The program that listens there may be a remainder of the proxy."""
     memory = look(observed(container(), **both(ports=ELSEWHERE))).memory
     plan = look(observed(container(), listening=ELSEWHERE.ports()), memory=memory)
     assert created(plan) == ELSEWHERE
@@ -499,7 +499,7 @@ def test_ports_are_kept_when_everything_was_removed_by_hand() -> None:
 def test_ports_are_kept_when_one_was_removed_and_nothing_is_remembered() -> None:
     seen = observed(container(), sandboxes=[sandbox(ports=ELSEWHERE)])
     assert actions(seen) == [new_proxy(ELSEWHERE), Start(NAME)]
-    # The proxy, which is of no use without its sandbox, says where it was.
+    # A proxy without its sandbox is useless, but has the range in its labels.
     assert created(look(observed(container(), proxies=[proxy(ports=ELSEWHERE)]))) == ELSEWHERE
 
 
@@ -658,7 +658,7 @@ def test_problems_of_one_key_do_not_touch_another() -> None:
 
 
 def test_what_lets_names_go_comes_first() -> None:
-    """A key's name may be another one's next."""
+    """Another key may need the name next."""
     seen = observed(
         container(),
         networks=[UPLINK, APP],

@@ -1,4 +1,4 @@
-"""Telling proxies their policy and who may use them, whatever else there is to be told."""
+"""Updates to proxies: policy, allowed callers, and everything else."""
 
 import asyncio
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
@@ -34,9 +34,8 @@ SECOND = ProxyAccess(WHERE, "token", "run 2")
 
 
 class Proxies(ProxyClient):
-    """A proxy that notes whom it is told of, and answers nothing else but its ``known_status``.
-
-    ``calls`` are all that came, in order: addresses, or the names of layers.
+    """A proxy that notes updates, and answers only with ``known_status``. ``calls`` are all updates
+    in order: addresses, or names of layers.
     """
 
     def __init__(self) -> None:
@@ -100,9 +99,8 @@ async def tasks() -> AsyncIterator[Tasks]:
 def look(
     *addresses: str, access: ProxyAccess = FIRST, policy: str = "", ports: PortRange = RANGE
 ) -> tuple[DockerSnapshot, list[Member]]:
-    """Containers at these addresses, which a proxy's labels select, on its network.
-
-    ``policy`` is that of each.
+    """Selected containers at these addresses, on the proxy's network. ``policy`` is the label of
+    each container.
     """
     nodes = [
         container(f"node{number}", networks=[Attachment("app", address)])
@@ -237,7 +235,7 @@ async def test_a_policy_is_told_before_who_may_use_it_and_only_when_it_has_chang
         ("", FIRST, [addresses]),
         (RULE, FIRST, [["administrator", label], addresses]),
         (RULE, FIRST, [addresses]),
-        (RULE, SECOND, [["administrator", label], addresses]),  # it was started again
+        (RULE, SECOND, [["administrator", label], addresses]),  # the proxy was restarted
     ):
         proxies.calls.clear()
         sync.update(*look(*addresses, access=access, policy=policy))
@@ -266,7 +264,7 @@ async def test_without_its_policy_nobody_new_is_let_in(
 async def test_what_ends_the_task_of_a_proxy_ends_it_until_the_next_look(
     tasks: Tasks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The proxy was told nothing more, for as long as it ran."""
+    """The next look must start a new task, or the proxy gets no more updates."""
     proxies = Proxies()
     proxies.known_status = ProxyStatus()
     sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)

@@ -1,4 +1,4 @@
-"""What a proxy is told of the containers on its networks."""
+"""Updates to a proxy about the containers on its networks."""
 
 from dataclasses import replace
 from ipaddress import IPv4Network
@@ -101,7 +101,7 @@ def test_the_masters_address_is_only_told_for_a_name() -> None:
 
 
 def test_selected_are_all_that_may_use_it_on_its_networks() -> None:
-    """Also those that are just starting, and those in the network of another container."""
+    """Also starting containers, and containers in the network of another container."""
     starting = Container("s" * 20, "soon", "created", attachments=(at("172.18.0.7"),))
     ended = Container("e" * 20, "ended", "exited", attachments=(at("172.18.0.8"),))
     pod = Container("q" * 20, "pod", "running", attachments=(at("172.18.0.9"),))
@@ -245,7 +245,7 @@ def test_a_move_is_told_until_the_proxy_knows() -> None:
     update = ProxyUpdate()
     update.look(HERE, 0.0)
     update.body({OLD}, 0.0)
-    update.look(replace(THERE, taken=frozenset({NEW})), 1.0)  # nobody has the old one: not gone
+    update.look(replace(THERE, taken=frozenset({NEW})), 1.0)  # the old is free, but moved
     assert update.body({OLD}, 1.0) == {"moved": {OLD: NEW}}
     update.mark_delivered(1.0)
     assert update.next_due(1.0) == 1.0

@@ -1,4 +1,4 @@
-"""A master given by address is led to the proxy, in the network of who gives it."""
+"""Redirect the address in a container's ROS_MASTER_URI to the proxy, in the container's network."""
 
 from dataclasses import replace
 from typing import Any
@@ -59,7 +59,7 @@ def node(name: str = "talker", env: str = MASTER, mode: str = "", **labels: str)
 
 
 def nodes_proxy(near: str = NEAR, proxy: str = "running", key: Key = KEY) -> dict[str, Any]:
-    """The proxy of these nodes, with an address on their network."""
+    """The nodes' proxy, with an address on the same network."""
     pair = both(key=key)
     (box,) = pair["sandboxes"]
     (process,) = pair["proxies"]
@@ -197,7 +197,7 @@ def test_containers_that_share_a_network_have_it_once() -> None:
 
 @pytest.mark.parametrize("address", [ADDRESS, "192.0.2.8"])
 def test_a_masters_name_may_be_known_by_an_address(address: str) -> None:
-    """Also by one that it had: the master has moved, and its nodes go on."""
+    """Also by a former address of the master: the nodes keep the variable."""
     by_name = Key("http://robot:11311", HERE)
     talker = node(master_uri="http://robot:11311")
     state = observed(talker, **nodes_proxy(key=by_name), masters={"robot": address})
@@ -323,7 +323,7 @@ def test_the_end_of_a_container_without_a_network_shows_in_the_list() -> None:
 
 
 class Addressed(Hosts):
-    """A host where all masters are given by address, and the option may be another one."""
+    """A host where every ROS_MASTER_URI has an address, and --redirect may change."""
 
     def come(self, n: int, m: int) -> None:
         if len(self.strangers()) > 4:
@@ -363,7 +363,9 @@ STARTED_ANEW = [
     (Addressed.change, 0, 0),
     (Addressed.start_by_hand, 0, 0),
 ]
-"""A record of the container's former start is started by hand, and sets its rules in this one."""
+"""A record of the container's former start, started by hand: the rules are in the current
+namespace.
+"""
 OUTDATED_STARTED = [
     (Addressed.come, 0, 2),
     (Addressed.meddle, 0, 0),
@@ -371,7 +373,7 @@ OUTDATED_STARTED = [
     (Addressed.look_and_be_killed, 2, 0),
     (Addressed.start_by_hand, 0, 0),
 ]
-"""So does one whose proxy has another address by now, and which was not removed any more."""
+"""The same for a record with a former address of the proxy."""
 
 
 @given(st.lists(EVENTS, min_size=5, max_size=25))

@@ -1,4 +1,4 @@
-"""Which containers are of ROS 2, and what they get and are told."""
+"""ROS 2 containers by label: the proxy that a container gets, and problems."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -41,7 +41,7 @@ def labelled_container(
 def read(
     container: Container, settings: PlanSettings = SETTINGS, **more
 ) -> tuple[list[Member], list[str]]:
-    """What a container gets, and what it is told."""
+    """The members of a container, and the texts of its problems."""
     members, problems = read_members(observed(container, **more), settings)
     return list(members), [problem.text for problem in problems]
 

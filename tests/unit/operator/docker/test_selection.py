@@ -1,4 +1,4 @@
-"""Which of several containers for one thing stays."""
+"""The choice between several own containers for the same purpose."""
 
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,4 +1,4 @@
-"""What containers are made of, when they must be made anew, and what their labels tell."""
+"""Specs of containers, fingerprints, and labels."""
 
 from dataclasses import replace
 
@@ -108,7 +108,7 @@ def test_an_unknown_address_is_not_given() -> None:
 
 
 def test_a_token_is_made_of_the_secret_and_the_key_and_is_nowhere() -> None:
-    """Who inspects a proxy finds the hash of its token, which opens nothing."""
+    """An inspection of a proxy shows only the hash of the token."""
     assert proxy_token(KEY, SECRET) == TOKEN
     assert proxy_token(KEY, "another secret") != TOKEN
     assert proxy_token(Key(KEY.master_uri, "192.0.2.11"), SECRET) != TOKEN

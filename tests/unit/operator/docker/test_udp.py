@@ -1,4 +1,4 @@
-"""Whose proxies publish their ports for UDP as well, for UDPROS: label and option."""
+"""Proxies that publish UDP ports for UDPROS: label and option."""
 
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Nothing of the operator's is left on a host, and nothing of anybody else's is touched."""
+"""Uninstall removes everything of the operator, and nothing else."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def test_after_whatever_happened_nothing_is_left(containers: int, events: list) 
         host.run(number, number)
     for happen, n, m in events:
         happen(host, n, m)
-        host.check()  # which also notes who has which ports
+        host.check()  # check also notes the ports of each key
     host.engine.redirects_fail = False
     host.engine.uninstalls = True
     before = [(box.id, box.name, box.state, dict(box.networks)) for box in host.strangers()]
@@ -63,7 +63,7 @@ def test_after_whatever_happened_nothing_is_left(containers: int, events: list) 
 
 
 def run(host: Hosts) -> set[str]:
-    """Uninstall to the end; whose problems are told then."""
+    """Uninstall to the end. Return the subjects of the remaining problems."""
     uninstall = Uninstall()
     for _ in range(20):
         planned = look(uninstall, host.engine.observe())

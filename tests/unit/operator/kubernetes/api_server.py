@@ -1,6 +1,5 @@
-"""A small API server on loopback: objects in a dictionary, HTTP as Kubernetes speaks it.
-
-What it knows of kinds is what the operator and kopf ask for. `refuse` makes it say no.
+"""A small API server on loopback: objects in a dictionary, and the HTTP of Kubernetes. The server
+has the kinds that the operator and kopf need. `refuse` makes a request fail.
 """
 
 import asyncio
@@ -41,16 +40,16 @@ GROUPS = {
 
 
 class ApiServer:
-    """The server and what it holds. ``requests`` are (method, path, query) as they came."""
+    """The server and its objects. ``requests`` are (method, path, query) in order."""
 
     def __init__(self) -> None:
         self.objects: dict[tuple[str, str, str], Object] = {}
         self.requests: list[tuple[str, str, dict[str, str]]] = []
         self.bodies: list[Any] = []
         self.refusals: dict[tuple[str, str], tuple[int, str]] = {}
-        self.address_refusals = Counter[str]()  # how often each is still to be refused
+        self.address_refusals = Counter[str]()  # remaining refusals for each address
         self.gone_for_watches = False
-        self.granted = False  # what the answer to a SubjectAccessReview says
+        self.granted = False  # the answer to a SubjectAccessReview
         self.retry_after = ""
         self.url = ""
         self._numbers = itertools.count(1)
@@ -58,7 +57,7 @@ class ApiServer:
         self._past: list[tuple[int, str, str, Object]] = []
 
     def put(self, kind: str, obj: Object, namespace: str = "ns") -> Object:
-        """Hold an object, and tell those who watch."""
+        """Store an object, and send an event to all watches."""
         meta = obj.setdefault("metadata", {})
         if kind not in ("nodes", "mutatingwebhookconfigurations"):
             meta.setdefault("namespace", namespace)
@@ -69,12 +68,12 @@ class ApiServer:
         return self._hold(event, key, {"apiVersion": "v1", "kind": PLURALS[kind], **obj})
 
     def drop(self, kind: str, name: str, namespace: str = "ns") -> None:
-        """Lose an object, and tell those who watch."""
+        """Delete an object, and send an event to all watches."""
         key = kind, "" if kind == "nodes" else namespace, name
         self._hold("DELETED", key, self.objects[key])
 
     def forget(self, kind: str, name: str, namespace: str = "ns") -> None:
-        """Lose an object, and tell nobody."""
+        """Delete an object without an event."""
         del self.objects[kind, "" if kind == "nodes" else namespace, name]
 
     def get(self, kind: str, name: str, namespace: str = "ns") -> Object:
@@ -227,7 +226,7 @@ class ApiServer:
         self.end_watches({})
 
     def end_watches(self, event: Object) -> None:
-        """Tell all who watch the same, for example an error."""
+        """Send the same event to all watches, for example an error."""
         for _, _, queue in self._watches:
             queue.put_nowait(event)
 
@@ -242,7 +241,7 @@ async def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
 
 @asynccontextmanager
 async def serving(directory: Path, port: int = 0) -> AsyncIterator[ApiServer]:
-    """An API server, and a kubeconfig in ``directory/config`` that leads to it."""
+    """An API server, and its kubeconfig in ``directory/config``."""
     server = ApiServer()
     async with listening(server, port):
         write_kubeconfig(directory / "config", server.url)
@@ -253,7 +252,7 @@ async def serving(directory: Path, port: int = 0) -> AsyncIterator[ApiServer]:
 async def listening(server: ApiServer, port: int = 0) -> AsyncIterator[None]:
     application = web.Application()
     application.router.add_route("*", "/{path:.*}", server.serve)
-    # A watch ends with its client, as the real server's do; it would be counted for ever otherwise.
+    # A watch ends with its client, as in the real server. Otherwise the count never falls.
     runner = web.AppRunner(application, shutdown_timeout=0.1, handler_cancellation=True)
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.1", port).start()

@@ -1,4 +1,4 @@
-"""Objects as the API server gives them, for tests."""
+"""Objects in the form of the API server, for tests."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ LATER = "2026-11-21T15:00:00Z"
 
 
 def rosproxy_obj(spec: Any = None, name: str = "arm", status: Obj | None = None) -> Obj:
-    """A RosProxy; ``spec`` is put over the least that it needs."""
+    """A RosProxy with the required fields and ``spec``."""
     return {
         "apiVersion": "rosproxy.io/v1alpha1",
         "kind": "RosProxy",
@@ -146,14 +146,14 @@ def stuck_proxy(why: PodFailure, message: str = "because") -> ProxyPod:
 
 
 def answer(*names: str, **more: Any) -> ProxyReport:
-    """The answer of a proxy that master and outside reach, with ROS nodes in one pod."""
+    """The answer of a proxy in order, with ROS nodes in a single pod."""
     nodes = {"10.244.1.5": names} if names else {}
     given = {"answered": True, "master_up": True, "nodes": nodes, "range_probe": REACHED}
     return ProxyReport(**{**given, **more})
 
 
 def state(node: str = "node1", **more: Any) -> RosProxyOnNode:
-    """A node with a pod, a proxy and its answer, unless told otherwise."""
+    """A node, by default with a pod, a proxy and the proxy's answer."""
     fields = {
         "proxy": proxy(node),
         "pods": (pod(),),
@@ -169,7 +169,7 @@ def status(
     more: tuple[ClusterFinding, ...] = (),
     **given: Any,
 ) -> Json:
-    """The status that follows from some nodes; ``more`` problems besides those that they have."""
+    """The status for some nodes, with ``more`` problems besides the problems of the nodes."""
     resource = of or rosproxy()
     problems = (*findings(resource, states, given.get("failures", {})), *more)
     stamp = given.get("stamp", STAMP)

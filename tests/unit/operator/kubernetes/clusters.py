@@ -1,6 +1,5 @@
-"""A cluster in which everything happens that happens in clusters, and what must always hold there.
-
-Each event is a method of two numbers, which choose what it happens to.
+"""A cluster with random events, and its invariants. Each event is a method of two numbers, which
+choose the object.
 """
 
 import contextlib
@@ -57,7 +56,7 @@ T = TypeVar("T")
 
 
 def mended(spec: Object) -> Object:
-    """A spec that the API server takes, whichever version of ROS it is for."""
+    """A spec that the API server accepts, for any version of ROS."""
     ros = str(spec.get("ros", 1))
     if "1" not in ros:
         spec = spec | {"master": None}
@@ -73,7 +72,7 @@ def pick(items: Sequence[T], number: int) -> T:
 
 
 class Clusters(World):
-    """A world with labelled pods, and people who meddle."""
+    """A world with labelled pods, and users that interfere."""
 
     # pods of users
 
@@ -92,7 +91,7 @@ class Clusters(World):
             pick(pods, n)["status"]["phase"] = "Succeeded"
 
     def stranger(self, n: int, m: int) -> None:
-        """A pod that takes a hostPort, if it can have it."""
+        """A pod that takes a hostPort, if this port is free."""
         if self.nodes:
             self.pods += 1
             with contextlib.suppress(Refused):
@@ -108,7 +107,7 @@ class Clusters(World):
             self.cluster.add_pod(id.name, pick(self.nodes, n), {})
 
     def register(self, n: int, _: int) -> None:
-        """ROS nodes of all pods on a node register at its proxies, before anybody knows them."""
+        """ROS nodes of all pods on a node register at the proxies, before the operator looks."""
         if not self.nodes:
             return
         node = pick(self.nodes, n)
@@ -182,14 +181,14 @@ class Clusters(World):
             self.cluster.delete_pod(pick(self.own(), n))
 
     def reject(self, n: int, m: int) -> None:
-        """The kubelet ends a proxy: its ports are taken, or it needs the room."""
+        """The kubelet ends a proxy: the ports are taken, or the node lacks resources."""
         if pods := [pod for pod in self.own() if node_of(pod)]:
             pod = pick(pods, n)
             reason = pick(("NodePorts", "Evicted", "NodePorts"), m)
             pod["status"] = {"phase": "Failed", "reason": reason, "message": "so it is"}
 
     def delete_service(self, n: int, m: int) -> None:
-        """A Service is deleted, and maybe its address is given to another one."""
+        """A Service is deleted. Perhaps another Service gets the address."""
         if services := list(self.cluster.state.services):
             gone = self.cluster.state.services.pop(pick(services, n))
             if m % 3 == 0 and is_own(gone):
@@ -210,7 +209,7 @@ class Clusters(World):
                 policy["spec"]["ingress"] = []
 
     def change_key(self, n: int, _: int) -> None:
-        """Somebody takes the key of the proxies' tokens out of its Secret."""
+        """The key of the proxies' tokens changes, as after its removal from the Secret."""
         self.cluster.key = bytes([n]) * 32
 
     def forbid(self, n: int, _: int) -> None:

@@ -1,4 +1,4 @@
-"""RosProxies, nodes, pods and what the operator makes of them, for tests."""
+"""RosProxies, nodes, pods, and the operator's objects, for tests."""
 
 import copy
 from collections.abc import Iterable, Mapping
@@ -33,7 +33,9 @@ from rosproxy_operator.proxy_spec.spec import WISHES, ProxySpec
 
 BOUNDS = Bounds(data_planes=("auto", "kernel", "splice", "copy"), images=("*",))
 SETTINGS = ClusterSettings(image="rosproxy:1", bounds=BOUNDS, network_policy=False)
-"""Everything is allowed, and nobody gets a NetworkPolicy: those have tests of their own."""
+"""Everything is allowed, without NetworkPolicies. Bounds and NetworkPolicies have separate
+tests.
+"""
 STAMP = "2026-01-01T00:00:00Z"
 RANGE = PortRange(11400, 11403)
 ROBOT = Name("ros", "robot")
@@ -42,7 +44,7 @@ ROBOT = Name("ros", "robot")
 def rosproxy(name: str = "robot", uid: str = "", **changes: Any) -> RosProxy:
     """A RosProxy in namespace ros with four ports per node.
 
-    ``changes`` are of it, its spec or its `ProxySpec`.
+    ``changes`` are for the RosProxy, its spec or its `ProxySpec`.
     """
     defaults: dict[str, Any] = {
         "master": MasterSpec("http://robot:11311"), "ports": 4, "window": PortRange(11400, 11499),
@@ -63,7 +65,7 @@ def node(name: str = "one", **changes: Any) -> ClusterNode:
 
 
 def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **changes: Any) -> Pod:
-    """A pod that runs and asks for a proxy; or, with ``ports``, a stranger that takes those."""
+    """A running pod that asks for a proxy; or, with ``ports``, another pod with these hostPorts."""
     taken = frozenset(ports)
     defaults: dict[str, Any] = {
         "labels": {} if taken else {names.INJECT: "true"},
@@ -77,7 +79,7 @@ def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **chan
 
 
 def site(of: RosProxy, on: ClusterNode, ports: PortRange = RANGE, publish: int = 0) -> ProxySite:
-    """A place for a proxy, of a RosProxy as the planner completes it."""
+    """A site for a proxy of a RosProxy, with the planner's defaults."""
     host = on.advertise_host or on.addresses["InternalIP"]
     (of,) = with_pod_defaults(ClusterSnapshot(rosproxies=(of,)), SETTINGS.pod).rosproxies
     return ProxySite(of, on, host, ports, replace(of.spec.master, publish=publish))
@@ -93,7 +95,7 @@ def proxy(
     settings: ClusterSettings = SETTINGS,
     **changes: Any,
 ) -> ProxyPod:
-    """A proxy's pod, by default one that runs; ``changes`` are of its `Pod`."""
+    """A proxy's pod, by default running. ``changes`` are for its `Pod`."""
     of = of or rosproxy()
     on = on or node()
     body: dict[str, Any] = copy.deepcopy(
@@ -118,7 +120,7 @@ def service(of: RosProxy | None = None, ip: str = "10.96.1.1", **changes: Any) -
 def observed(
     *resources: RosProxy | ClusterNode | Pod | ProxyPod | ProxyService, **more: Any
 ) -> ClusterSnapshot:
-    """A cluster with these. Node one is there unless other nodes are given."""
+    """A cluster with these objects; with node one unless other nodes are given."""
     nodes = [r for r in resources if isinstance(r, ClusterNode)] or [node()]
     services = [r for r in resources if isinstance(r, ProxyService)]
     return ClusterSnapshot(
@@ -138,7 +140,7 @@ def scene(*more: Any, of: Any = None) -> ClusterSnapshot:
 
 
 def complete(**changes: Any) -> ClusterSnapshot:
-    """A pod, its proxy, and the Service."""
+    """A pod, a proxy, and the Service."""
     return replace(observed(rosproxy(), pod(), proxy(), service()), **changes)
 
 
@@ -152,7 +154,7 @@ def look(
 
 
 def written(seen: ClusterSnapshot, plan: ClusterPlan | None = None) -> ClusterSnapshot:
-    """The cluster with the status that a plan, or the first one, writes."""
+    """The cluster with the status that a plan writes, by default the first plan."""
     plan = plan or look(seen)
     new = {action.of: action.status for action in plan.actions if isinstance(action, PatchStatus)}
     rosproxies = (replace(of, status=new.get(of.id, of.status)) for of in seen.rosproxies)

@@ -1,6 +1,6 @@
 """A cluster reduced to what matters: API server, scheduler, kubelets, garbage collector.
 
-Objects are as the API server has them, and are read by the same code as there.
+Objects have the form of the API server, and the operator's code parses them.
 """
 
 import copy
@@ -44,7 +44,7 @@ Object = dict[str, Any]
 
 
 class Refused(Exception):
-    """The API server does not do it."""
+    """The API server refuses a request."""
 
 
 def meta(obj: Object) -> Object:
@@ -81,7 +81,7 @@ def is_own(obj: Object) -> bool:
 
 
 def component_of(obj: Object) -> str:
-    """What an object of the operator's is; empty if another one has made it."""
+    """The component of an object of the operator; empty for other objects."""
     return names.component(meta(obj).get("labels", {})) if is_own(obj) else ""
 
 
@@ -108,8 +108,8 @@ class State:
 class Cluster:
     """The cluster. ``forbidden``: no pod with hostPorts is admitted.
 
-    ``addresses`` are those that pods really have, by uid, before anybody is told; ``ros`` is what
-    a proxy knows: the addresses of ROS nodes by the uid of the proxy's pod.
+    ``addresses`` are the real addresses of pods by uid, before the status has them. ``ros`` are the
+    addresses of the ROS nodes that a proxy knows, by the uid of the proxy's pod.
     """
 
     def __init__(self, namespace: str = NAMESPACE) -> None:
@@ -153,7 +153,7 @@ class Cluster:
         ports: Iterable[int] = (),
         protocol: str = "TCP",
     ) -> None:
-        """A pod of a user, bound to a node at once, or left to the scheduler if it takes ports."""
+        """A user's pod: bound to a node at once, or left to the scheduler if the pod has ports."""
         taken = [{"containerPort": port, "hostPort": port, "protocol": protocol} for port in ports]
         pod: Object = {
             "metadata": {"name": name, "namespace": self.namespace, "labels": labels},
@@ -209,7 +209,7 @@ class Cluster:
     # what goes on by itself
 
     def step(self) -> None:
-        """Everybody does what he has to."""
+        """Run the garbage collector, the scheduler and all kubelets once."""
         self.collect()
         self.schedule()
         for name in list(self.state.nodes):
@@ -275,7 +275,7 @@ class Cluster:
         if uid not in self.addresses:
             network = self.state.nodes[node_of(pod)]["spec"]["podCIDRs"][0]
             self.addresses[uid] = network.replace(".0/24", f".{next(self.numbers)}")
-            return  # its containers run, and nobody has been told yet
+            return  # the containers run, but the status does not say so yet
         state: Object = {"running": {}}
         if container["image"] == BAD_IMAGE:
             state = {"waiting": {"reason": "ImagePullBackOff", "message": "not found"}}
@@ -294,7 +294,7 @@ class Cluster:
     # what the operator sees
 
     def observe(self, old: State | None, failures: dict[Name, dict[Name, str]]) -> ClusterSnapshot:
-        """What is there; pods, nodes and Services as they were before, if ``old`` is given."""
+        """The state of the cluster, with pods, nodes and Services of ``old`` if given."""
         seen = old or self.state
         pods = [parse.pod(pod) for pod in seen.pods.values()]
         own = [proxy for pod in seen.pods.values() if (proxy := parse.proxy_pod(pod))]
@@ -359,7 +359,7 @@ class Cluster:
             case SetImage(id=id, uid=uid, image=image):
                 if pod := self._own(self.state.pods, id, uid):
                     works = pod["status"]["phase"] == "Running"
-                    assert image != BAD_IMAGE or not works, f"{id} loses an image that it can run"
+                    assert image != BAD_IMAGE or not works, f"{id} loses an image that works"
                     pod["spec"]["containers"][0]["image"] = image
             case PatchStatus(of=of, status=status):
                 if of in self.state.rosproxies:
@@ -368,7 +368,7 @@ class Cluster:
                 pass
 
     def _own(self, objects: dict[Name, Object], id: Name, uid: str) -> Object | None:
-        """An object to do something to, if it is still the one that is meant."""
+        """The object for an action, if the uid is still the same."""
         target = objects.get(id)
         if target is None or meta(target)["uid"] != uid:
             return None

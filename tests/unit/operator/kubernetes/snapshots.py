@@ -1,4 +1,4 @@
-"""What is known of a cluster whose watches have told everything."""
+"""The snapshot of a cluster after all watches have delivered."""
 
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.records import READERS, key_of

@@ -1,4 +1,4 @@
-"""Which ports a proxy gets on its node, and when it leaves them."""
+"""The ports of a proxy on a node, and changes of ports."""
 
 from typing import Any
 
@@ -45,7 +45,7 @@ B = pod("b", labels=OURS)
 
 
 def two(*more: Any, arm: Any = None, robot: Any = None) -> ClusterSnapshot:
-    """Two RosProxies, with their Services, and other things."""
+    """Two RosProxies with Services, and more objects."""
     arm = arm or rosproxy("arm")
     robot = robot or rosproxy()
     return observed(arm, robot, service(arm), service(robot), *more)
@@ -76,7 +76,7 @@ def host_ports(action: CreateProxy) -> list[int]:
          "11404-11407"),
         # never the proxy's own
         (rosproxy(window=PortRange(11309, 11330)), [], "11313-11316"),
-        # those in the status, unless somebody holds them
+        # the ports in the status, unless another pod holds them
         (rosproxy(former_ranges=FORMER), [], "11450-11453"),
         (rosproxy(former_ranges=FORMER), [pod("web", ports=[11451])], "11400-11403"),
     ],
@@ -111,7 +111,7 @@ def test_former_ports_of_another_rosproxy_are_left_alone_if_there_are_others(
     assert created(look(two(B, arm=arm, robot=rosproxy(**changes)))) == str(ports)
 
 
-def test_when_there_are_none_it_is_told_who_holds_them_and_what_to_do() -> None:
+def test_without_free_ports_the_finding_names_the_holders_and_the_fix() -> None:
     of = rosproxy(window=PortRange(11400, 11406))
     plan = look(scene(pod("web", ports=[11403]), of=of))
     assert done(plan) == []
@@ -266,7 +266,7 @@ def test_ports_that_another_pod_has_taken_are_left_at_once() -> None:
 
 
 def test_a_proxy_that_has_its_ports_stays_whatever_else_is_seen() -> None:
-    """It can only be a list of former times: the kubelet sees to it that there are not two."""
+    """The list of pods may be old. The kubelet never admits two pods with the same port."""
     assert done(look(scene(proxy(), pod("web", ports=[11401])))) == []
 
 

@@ -62,10 +62,10 @@ async def test_a_list_comes_in_pages(
     assert (names(first.items), names(last.items), last.continue_token) == ({"a", "b"}, {"c"}, "")
 
 
-async def test_who_is_put_off_asks_again_when_told(
+async def test_a_throttled_request_is_repeated_after_the_given_time(
     server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """API Priority and Fairness answers so; who has little time is told at once."""
+    """API Priority and Fairness answers with 429. A call with a short time limit fails at once."""
     slept: list[float] = []
     monkeypatch.setattr("rosproxy_operator.kubernetes.api.api_client.time.sleep", slept.append)
     server.refuse("GET", "nodes", 429, "too many requests")
@@ -169,7 +169,7 @@ async def test_what_does_not_answer_in_json_is_away(
 async def test_a_page_of_large_objects_is_asked_for_in_parts(
     server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """500 pods of a megabyte each were read at once: the operator ended by it, at each start."""
+    """Reading 500 pods of a megabyte each at once would end the operator, at each start."""
     monkeypatch.setattr("rosproxy_operator.kubernetes.api.api_client.LONGEST_PAGE", 30_000)
     large = {f"a{number}": "x" * 60 for number in range(100)}
     for number in range(9):

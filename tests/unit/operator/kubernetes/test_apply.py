@@ -46,7 +46,7 @@ ABOUT = Reference("RosProxy", Name(NAMESPACE, "arm"), "uid-arm")
 
 
 class Carried:
-    """An applier, and what it has counted."""
+    """An applier, and its counts."""
 
     def __init__(self, api: Api) -> None:
         self.counted: list[tuple[str, str]] = []
@@ -109,7 +109,7 @@ async def test_a_policy_is_made_mended_and_deleted(server: ApiServer, carry: Car
     made = {**body("NetworkPolicy", "rosproxy-arm"), "apiVersion": "networking.k8s.io/v1"}
     id = Name(NAMESPACE, "rosproxy-arm")
     await carry.out(CreatePolicy(OF, made))
-    await carry.out(CreatePolicy(OF, made))  # it is there by now
+    await carry.out(CreatePolicy(OF, made))  # the policy exists now
     assert carry.applier.failures == {OF: {}}
     (policy,) = server.all("networkpolicies")
     uid = policy["metadata"]["uid"]
@@ -142,7 +142,7 @@ async def test_somebody_elses_pod_is_left_alone(server: ApiServer, carry: Carrie
 async def test_a_lost_service_gets_its_address_or_another(
     server: ApiServer, carry: Carried, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """That of one just deleted is given back only after its deletion was told."""
+    """The address of a deleted Service is free only some time after the deletion."""
     monkeypatch.setattr("time.sleep", lambda _: None)
     server.address_refusals.update({"10.96.0.5": 2, "10.96.9.9": 1000})
     service = body("Service", "rosproxy-arm", clusterIP="10.96.0.5")
@@ -173,10 +173,10 @@ async def test_nothing_is_deleted_but_what_was_seen(server: ApiServer, carry: Ca
     assert carry.applier.failures == {OF: {}}
 
 
-async def test_what_stays_another_than_it_is_known_is_doubted(
+async def test_an_object_that_stays_different_from_the_snapshot_is_doubted(
     server: ApiServer, carry: Carried
 ) -> None:
-    """Once it is a watch that lags."""
+    """A single difference may be a watch that lags."""
     server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     old = server.put("pods", proxy_obj(), NAMESPACE)
     action = DeleteProxy(
@@ -277,7 +277,7 @@ async def test_failures_of_a_deleted_rosproxy_are_forgotten(
     before = carry.applier.failures
     await carry.out(create_pod())
     assert carry.applier.failures
-    assert not before  # whoever has it compares
+    assert not before  # callers compare the former dictionary
     await carry.out(rosproxies=())
     assert not carry.applier.failures
 
@@ -381,7 +381,7 @@ async def test_a_pod_that_was_wired_meanwhile_is_not_evicted(
 
 
 async def test_a_budget_that_does_not_allow_an_eviction(server: ApiServer, carry: Carried) -> None:
-    """It is asked once, and tried again when it is planned again."""
+    """A single request for each plan."""
     action, observed = evict(server)
     server.retry_after = "10"
     server.refuse("POST", "pods", 429, "Cannot evict pod: disruption budget")

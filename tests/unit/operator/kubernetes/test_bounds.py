@@ -1,4 +1,4 @@
-"""What RosProxies may not ask for, and what becomes of those that do."""
+"""Bounds of RosProxies, and RosProxies that exceed the bounds."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -129,7 +129,7 @@ def test_a_masters_pattern(master: str, pattern: str, allowed: bool) -> None:
         ({"master": MasterSpec("http://robot:11311")}, True),
         ({"master": MasterSpec("http://other:11311")}, False),
         ({"master": MasterSpec("http://other:11311", "192.0.2.7")}, True),
-        # Who says himself where a name leads has not named that name's owner.
+        # With its own address for the name, a RosProxy does not mean the name's owner.
         ({"master": MasterSpec("http://robot:11311", "10.96.0.1")}, False),
         ({"host_aliases": ({"ip": "10.96.0.1", "hostnames": ["robot"]},)}, False),
         ({"host_aliases": ({"ip": "10.96.0.1", "hostnames": ["else"]},)}, True),
@@ -179,8 +179,8 @@ def test_who_asks_for_too_much_gets_nothing_and_is_told() -> None:
     assert told(plan, "NotAllowed")
 
 
-def test_what_it_had_stays_as_it_is() -> None:
-    """An upgrade that forbids what was allowed takes no port from anybody."""
+def test_the_proxies_of_an_unusable_rosproxy_stay() -> None:
+    """An upgrade with narrower bounds takes no ports away."""
     of = rosproxy(image="mine:1", status={"perNode": [{"name": "one", "ports": "11400-11403"}]})
     plan = look(observed(of, service(of), pod(), proxy(of)), settings=OWN)
     assert done(plan) == []

@@ -1,4 +1,4 @@
-"""Which pods may use a proxy as their master."""
+"""The pods that may use a proxy as their master."""
 
 from typing import Any
 
@@ -27,9 +27,9 @@ def test_selected_pods_on_its_node() -> None:
 @pytest.mark.parametrize(
     ("changes", "may"),
     [
-        ({"phase": "Pending"}, True),  # as soon as it has an address
+        ({"phase": "Pending"}, True),  # as soon as the pod has an address
         ({"phase": "Pending", "ip": ""}, False),
-        ({"deleting": True}, True),  # its nodes unregister while they end
+        ({"deleting": True}, True),  # the nodes unregister at their end
         ({"phase": "Succeeded"}, False),
         ({"host_network": True}, False),
         ({"labels": {}}, False),

@@ -36,7 +36,7 @@ NOW = datetime.now(UTC).replace(microsecond=0)
 
 
 class Clock:
-    """A time of day that stands still until it is moved."""
+    """A clock that only tests move."""
 
     def __init__(self) -> None:
         self.time = NOW
@@ -67,7 +67,7 @@ def source(api: Api, clock: Clock) -> SelfSigned:
 
 @contextlib.asynccontextmanager
 async def served(pair: KeyPair) -> AsyncIterator[tuple[int, ssl.SSLContext]]:
-    """A TLS server on loopback; its port and context."""
+    """Run a TLS server on loopback. Yield the port and the context."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     certificates.load(context, pair)
 
@@ -112,7 +112,7 @@ async def test_another_ca_or_name_is_refused() -> None:
 
 
 async def test_renewal_while_serving() -> None:
-    """Whoever trusts both CAs is served without a gap."""
+    """A client that trusts both CAs is served without a gap."""
     old = certificates.make(NAMES, NOW)
     new = certificates.make(NAMES, NOW, before=old.ca)
     async with served(old) as (port, context):
@@ -174,8 +174,10 @@ async def test_a_restart_finds_the_same(server: ApiServer, api: Api) -> None:
     assert len(server.asked("PATCH", "mutatingwebhookconfigurations")) == 1
 
 
-async def test_one_that_cannot_be_written_is_kept(server: ApiServer, api: Api) -> None:
-    """With another one each time, what is served would not always be trusted."""
+async def test_a_certificate_that_cannot_be_written_is_kept(server: ApiServer, api: Api) -> None:
+    """With a new certificate for each try, clients would not always trust the served
+    certificate.
+    """
     put(server)
     clock = Clock()
     self_signed = source(api, clock)
@@ -198,8 +200,8 @@ async def test_one_that_cannot_be_written_is_kept(server: ApiServer, api: Api) -
     assert certificates.read(server.get("secrets", "wh")["data"]) == served[-1]
 
 
-async def test_only_the_operator_that_leads_makes_it(server: ApiServer, api: Api) -> None:
-    """One that waits for it is ready: an upgrade may wait for that before it ends the other."""
+async def test_only_the_leading_operator_makes_the_certificate(server: ApiServer, api: Api) -> None:
+    """A waiting operator is ready, because an upgrade waits for this before ending the leader."""
     put(server)
     leading = False
     self_signed = SelfSigned(api, NAMES, SECRET, "wh", Clock(), leads=lambda: leading)

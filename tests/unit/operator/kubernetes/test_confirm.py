@@ -25,7 +25,7 @@ from tests.unit.operator.kubernetes.snapshots import snapshot_of
 
 OF = Name(NAMESPACE, "arm")
 PROXY = proxy_obj()["metadata"]["name"]
-DELETE = DeleteProxy(OF, Name(NAMESPACE, PROXY), f"uid-{PROXY}", "nobody wants it")
+DELETE = DeleteProxy(OF, Name(NAMESPACE, PROXY), f"uid-{PROXY}", "it is not needed")
 SERVICE = DeleteService(OF, Name(NAMESPACE, "rosproxy-arm"), "uid-service", "made anew")
 NODE = {
     "metadata": {"name": "node1"},
@@ -132,7 +132,9 @@ async def test_a_service_is_its_rosproxys(
 async def test_of_a_rosproxy_that_is_gone_nothing_else_matters(
     server: ApiServer, api: Api, happen: Callable[[ApiServer], None]
 ) -> None:
-    """The garbage collector is at its pods; who waits for them to rest unregisters nobody."""
+    """The garbage collector ends the pods. Waiting for a stable state would leave the nodes
+    registered.
+    """
     put_all(server)
     remove(server)
     seen = snapshot_of(server)
@@ -141,10 +143,10 @@ async def test_of_a_rosproxy_that_is_gone_nothing_else_matters(
     assert await in_thread(confirm, api, DELETE, seen) == ""
 
 
-async def test_one_that_nobody_has_seen_is_stale(server: ApiServer, api: Api) -> None:
+async def test_an_action_on_an_unseen_object_is_stale(server: ApiServer, api: Api) -> None:
     put_all(server)
     seen = snapshot_of(server)
-    other = DeleteProxy(OF, DELETE.id, "another", "nobody wants it")
+    other = DeleteProxy(OF, DELETE.id, "another", "it is not needed")
     with pytest.raises(StateChanged):
         await in_thread(confirm, api, other, seen)
 

@@ -151,7 +151,7 @@ async def test_it_settles(server: ApiServer, running: Running) -> None:
         return len([1 for method, _, _ in server.requests if method != "GET"])
 
     async def look() -> int:
-        """What was written when there has been one more look."""
+        """The number of writes after another look."""
         looks = running.looks()
         running.controller.wake()
         await until(lambda: running.looks() > looks)
@@ -170,8 +170,8 @@ async def test_it_settles(server: ApiServer, running: Running) -> None:
     assert [await look() for _ in range(3)] == [now] * 3
 
 
-async def test_one_that_does_not_lead_looks_on(server: ApiServer, running: Running) -> None:
-    """And begins at once when it does; when it does no more, it ends."""
+async def test_an_operator_without_the_lead_only_looks(server: ApiServer, running: Running) -> None:
+    """It acts at once when it leads, and stops when it leads no more."""
 
     def written() -> list[str]:
         return [method for method, _, _ in server.requests if method != "GET"]
@@ -263,7 +263,7 @@ async def test_what_is_malformed_stops_nobody(server: ApiServer, running: Runnin
 async def test_a_proxy_is_asked_and_told(
     server: ApiServer, running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it answers is in the status; what is gone it is told until it has heard."""
+    """The status has the proxy's answer. The operator repeats "gone" until the proxy confirms."""
     told: list[Any] = []
 
     async def status(_: web.Request) -> web.Response:

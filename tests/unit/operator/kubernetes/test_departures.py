@@ -1,4 +1,4 @@
-"""Which addresses a proxy is told to be gone: never one at which something runs."""
+"""Departed addresses for a proxy: never the address of a running pod."""
 
 from typing import Any
 
@@ -66,7 +66,7 @@ def test_it_is_told_until_the_proxy_does_not_name_them_any_more() -> None:
 
 
 def test_a_node_that_has_registered_just_before_its_pod_went_is_told() -> None:
-    """The answer in which it is named comes after the look that finds the pod gone."""
+    """The proxy's answer with the node comes after the look that finds the pod gone."""
     unnamed = seen(names=())
     second = find_departures(unnamed, KNOWN, 3.0)
     assert list(next_checks(second, 3.0)) == [LOOK_AGAIN_AFTER]

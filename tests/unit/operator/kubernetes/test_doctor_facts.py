@@ -1,4 +1,4 @@
-"""What the doctor finds about the webhook and in Events, and what it is not allowed to look at."""
+"""The doctor's findings about the webhook and from Events, and missing permissions."""
 
 import copy
 import time
@@ -135,7 +135,7 @@ def test_which_pods_show_that_the_api_server_reached_no_operator() -> None:
 
 
 async def test_labelled_pods_in_a_namespace_without_a_rosproxy(server: ApiServer, api: Api) -> None:
-    """Only an admission warning mentioned them, which no user of a Deployment sees."""
+    """Otherwise only an admission warning mentions the pods, which no user of a Deployment sees."""
     for name in ("talker", "listener"):
         server.put("pods", pod_obj(name, {"rosproxy.io/inject": "true"}), NAMESPACE)
     server.put("pods", pod_obj("off", {"rosproxy.io/inject": "false"}), NAMESPACE)
@@ -391,7 +391,7 @@ async def test_of_pods_that_are_gone_nothing_is_told(server: ApiServer, api: Api
 
 
 def test_the_name_in_an_event_is_no_command() -> None:
-    """Who may make Events can write any text there."""
+    """A user that may create Events can write any text there."""
     evil = RecentEvent(
         kind="Pod",
         id=Name("robots;reboot", "talker;reboot"),
@@ -407,7 +407,7 @@ def test_the_name_in_an_event_is_no_command() -> None:
 
 
 def test_only_running_proxies_have_a_doctor() -> None:
-    """A LAN relay has none: its pod was reported as an ERROR, with a cure for Docker."""
+    """A LAN relay has no doctor, and must not become an ERROR."""
     proxy = proxy_obj("robot")
     pods = [proxy, *(copy.deepcopy(proxy) for _ in range(3))]
     for obj, component in zip(pods[1:], (LAN_RELAY, IMAGE_CHECK, PROXY), strict=True):

@@ -105,7 +105,7 @@ def test_many_problems_have_their_turn():
 
 
 def test_a_problem_whose_text_changes_all_the_time_makes_few_events():
-    """A proxy in hostile hands had an Event made each half second, for as long as it liked."""
+    """Otherwise a hostile proxy could cause an Event each half second."""
     told = NewEvents()
     emits = list[Emit]()
     for second in range(10 * int(QUIET)):

@@ -40,7 +40,7 @@ INJECT = "rosproxy.io/inject"
 
 
 def admitted(*containers: Any, **spec: Any) -> dict[str, Any]:
-    """A pod as it comes to the webhook."""
+    """A pod in the form that the webhook receives."""
     return {
         "metadata": {"generateName": "talker-", "labels": {INJECT: "true"}},
         "spec": {"containers": list(containers), **spec},
@@ -52,7 +52,7 @@ def container(*env: Any, name: str = "ros", **more: Any) -> dict[str, Any]:
 
 
 def applied(obj: dict[str, Any], wiring: Wiring) -> dict[str, Any]:
-    """The pod as the API server stores it."""
+    """The pod in the form that the API server stores."""
     notes = {**obj["metadata"].get("annotations", {}), **wiring.annotations}
     meta = {**obj["metadata"], "annotations": notes}
     return {**obj, "metadata": meta, "spec": wiring.spec or obj["spec"]}

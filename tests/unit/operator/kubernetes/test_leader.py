@@ -111,10 +111,10 @@ async def test_another_one_leads_at_once_when_it_is_released(candidates: Candida
     assert not first.leads()
 
 
-async def test_one_that_can_not_renew_ceases(
+async def test_a_leader_that_cannot_renew_stops(
     candidates: Candidates, server: ApiServer, now: list[float], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """And leads again, for another term, when it can."""
+    """It leads again, in a new term, as soon as renewal works."""
     caplog.set_level(logging.INFO)
     election = candidates.join()
     await until(election.leads)

@@ -25,8 +25,8 @@ OTHER = LeaseRecord("7", "b", transitions=3, acquired="then")
 MINE = LeaseRecord("", "a")
 
 
-def test_one_that_is_missing_is_made_and_has_to_run_out() -> None:
-    """Whoever held it before it was taken away may still act."""
+def test_a_missing_lease_is_made_and_has_to_expire_first() -> None:
+    """The former holder may still act."""
     candidate = observe(Candidate("a"), None, 5.0)
     made = next_record(candidate, 5.0)
     assert made == LeaseRecord("", NOBODY)
@@ -97,7 +97,7 @@ def test_terms_are_counted() -> None:
 
 @dataclass
 class Store:
-    """The API server's: one Lease, written only over the version that was read."""
+    """The API server: a single Lease, which is written only over the version that was read."""
 
     record: LeaseRecord | None
     version: int = 0
@@ -114,7 +114,7 @@ class Store:
 
 @dataclass
 class Operator:
-    """One candidate with a clock of its own, and a request that may be under way."""
+    """A candidate with its own clock, and perhaps a pending request."""
 
     candidate: Candidate
     ahead: float
@@ -124,7 +124,7 @@ class Operator:
     step: int = field(default=0)
 
     def go(self, store: Store, now: float, lost: bool) -> None:
-        """Do the next part of a round; between two of them any time may pass."""
+        """Do the next part of a round. Any time may pass between two parts."""
         own = now + self.ahead
         self.step = (self.step + 1) % 4
         if self.step == 1:
@@ -137,7 +137,7 @@ class Operator:
             self.answered = None
             if self.writing is not None:
                 done = store.write(self.writing[0])
-                self.answered = done and not lost  # it was written, and the answer is lost
+                self.answered = done and not lost  # written, but the answer is lost
         elif self.writing is not None and self.answered:
             self.candidate = after_write(self.candidate, *self.writing, own)
 
@@ -147,11 +147,11 @@ class Operator:
             self.go(store, now, lost=False)
 
     def stop(self, store: Store) -> None:
-        """Act no more, then release what it holds."""
+        """Stop acting, then release the Lease."""
         self.candidate = after_resignation(self.candidate)
         if record := released_record(store.record, self.candidate.name):
             store.write(record)
-        # it is started again
+        # the operator starts again
         self.candidate = Candidate(f"{self.candidate.name}'")
         self.step = 0
 
@@ -172,9 +172,8 @@ AHEAD = st.lists(st.floats(-1000.0, 1000.0), min_size=3, max_size=3)
 def test_never_two_at_once(
     steps: list[tuple[int, float, str]], ahead: list[float], made: bool
 ) -> None:
-    """Requests take any time, operators stand still, answers get lost, clocks differ.
-
-    And somebody takes the Lease away.
+    """Requests take any time, operators stand still, answers get lost, clocks differ, and a user
+    deletes the Lease.
     """
     store = Store(LeaseRecord("0") if made else None)
     now = 0.0
@@ -194,7 +193,7 @@ def test_never_two_at_once(
 
 
 def leading(operators: list[Operator], now: float) -> list[str]:
-    """Who leads; never more than one does."""
+    """The leading operators: at most one."""
     leaders = [
         operator.candidate.name
         for operator in operators
@@ -205,8 +204,8 @@ def leading(operators: list[Operator], now: float) -> list[str]:
 
 
 @pytest.mark.parametrize("stopped", [True, False], ids=["stopped", "killed"])
-def test_another_one_takes_over(stopped: bool) -> None:
-    """Of those that look each second, one leads a second after a stop, 12 after a kill."""
+def test_another_operator_takes_over(stopped: bool) -> None:
+    """Candidates look each second: one leads a second after a stop, 12 s after a kill."""
     store = Store(LeaseRecord("0"))
     now = 0.0
     first = Operator(Candidate("a"), 0.0)

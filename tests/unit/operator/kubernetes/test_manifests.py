@@ -1,4 +1,4 @@
-"""What is created: hardened, bound to its node, and recognized when it is seen again."""
+"""Created pods: hardened, bound to a node, and recognized later."""
 
 from typing import Any
 
@@ -58,7 +58,7 @@ def test_the_proxy_understands_all_of_its_variables() -> None:
 
 
 def test_its_policy_is_there_from_the_start_and_makes_no_pod_anew() -> None:
-    """The administrator's layer first; the RosProxy's can only narrow it."""
+    """The administrator's layer comes first. The RosProxy's layer can only narrow the policy."""
     rules = parse_rules("deny publish /camera/*")
     settings = replace(SETTINGS, policy=administrators_policy([rules], "audit"))
     own = PolicyLayer("RosProxy ros/robot", parse_rules("deny serve *"))
@@ -283,7 +283,7 @@ def test_a_service_leads_to_the_proxy_on_the_callers_own_node() -> None:
 
 
 def test_a_rosproxy_chooses_no_name_and_no_address_of_its_service() -> None:
-    """The host of its master is a name for its own proxies, and for pods that ask for it."""
+    """The master's host is a name only for the RosProxy's proxies, and for pods that ask for it."""
     alias = {"ip": "192.0.2.9", "hostnames": ["db"]}
     made = manifests.service(rosproxy(master=MasterSpec("http://db:5432"), host_aliases=(alias,)))
     assert made["metadata"]["name"] == "rosproxy-robot"

@@ -186,7 +186,7 @@ def test_nodes_services_and_rosproxies_are_told_of_at_the_rosproxy():
 
 
 def test_of_many_names_a_bounded_number_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """60,000 labels of one pod took the operator two seconds each time that the pod changed."""
+    """Checking 60,000 labels of a pod took two seconds at each change of the pod."""
     checked = 0
 
     def counted(*_: object) -> str:

@@ -1,4 +1,4 @@
-"""What things are called: always the same, never too long, each its own."""
+"""Names of objects: stable, unique, and short enough."""
 
 import pytest
 from hypothesis import given

@@ -200,7 +200,7 @@ def test_the_window_is_open_for_datagrams_where_they_are_asked_for() -> None:
 
 
 def rosproxy_restricting_egress(**changes: Any) -> RosProxy:
-    """A RosProxy whose pods are kept to their proxies."""
+    """A RosProxy whose pods may send to their proxies only."""
     return rosproxy(direction="both", pod_egress="proxy", **changes)
 
 

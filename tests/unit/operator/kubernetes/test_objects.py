@@ -1,4 +1,4 @@
-"""Nodes, pods, Services and answers as they are read."""
+"""Parsing of nodes, pods, Services and answers."""
 
 from typing import Any
 

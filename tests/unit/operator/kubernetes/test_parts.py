@@ -1,4 +1,4 @@
-"""Planning a cluster part by part decides what planning all of it at once does."""
+"""Planning a cluster part by part gives the same actions as planning all at once."""
 
 import copy
 from typing import Any
@@ -37,7 +37,7 @@ EVENTS = st.tuples(
 
 
 class Together:
-    """Two clusters as one, in namespaces of their own; on the same nodes, or on others."""
+    """Two clusters as one, in separate namespaces, on the same nodes or on different nodes."""
 
     def __init__(self, shared: bool) -> None:
         nodes = ALIKE if shared else APART
@@ -73,7 +73,7 @@ class Together:
 
 
 def by_rosproxy(actions: tuple[Action, ...]) -> dict[Any, list[Action]]:
-    """The actions of each RosProxy, in their order."""
+    """The actions of each RosProxy, in order."""
     grouped: dict[Any, list[Action]] = {}
     for action in actions:
         grouped.setdefault(action.of, []).append(action)
@@ -81,7 +81,7 @@ def by_rosproxy(actions: tuple[Action, ...]) -> dict[Any, list[Action]]:
 
 
 def all_of(observed: ClusterSnapshot) -> Partition:
-    """All parts as one. What is remembered of others is forgotten with the next look at all."""
+    """All parts as one. The next look at all parts forgets the memory of everything else."""
     all_partitions = [*partitions(observed)]
     return Partition(
         frozenset(namespace for partition in all_partitions for namespace in partition.namespaces),
@@ -98,7 +98,7 @@ def check(
     merged: dict[Any, list[Action]] = {}
     for _, part_plan in pieces:
         for of, actions in by_rosproxy(part_plan.actions).items():
-            assert of not in merged, "two parts have it"
+            assert of not in merged, "two parts have the same RosProxy"
             merged[of] = actions
     assert merged == by_rosproxy(whole.actions)
     both = {uid: told for _, part_plan in pieces for uid, told in part_plan.briefings.items()}
@@ -143,7 +143,7 @@ def test_planning_by_parts_is_planning_it_all(shared: bool, events: list) -> Non
 
 @given(st.booleans(), st.lists(EVENTS, min_size=5, max_size=25))
 def test_what_is_not_touched_stays_as_it_is(shared: bool, events: list) -> None:
-    """After a whole plan a part can be planned again, and leaves what others have remembered."""
+    """Planning a part again after a whole plan keeps the memory of the other parts."""
     both = Together(shared)
     for which, happen, n, m in events:
         happen(both.worlds[which], n, m)

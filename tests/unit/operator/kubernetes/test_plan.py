@@ -1,4 +1,4 @@
-"""What is done for RosProxies: their Services, and a proxy on each node that needs one."""
+"""Actions for RosProxies: Services, and a proxy on each node with pods."""
 
 from typing import Any
 
@@ -213,8 +213,8 @@ def test_a_rosproxy_that_is_being_deleted_counts_as_gone() -> None:
     assert [type(action) for action in plan.actions] == [DeleteProxy, DeleteService]
 
 
-def test_one_of_the_same_name_takes_over_once_all_is_gone() -> None:
-    """Its pods were wired to an address: the new Service is to have it again."""
+def test_a_rosproxy_of_the_same_name_takes_over_once_all_is_gone() -> None:
+    """The pods are wired to an address, so the new Service gets the same address."""
     new = rosproxy(uid="uid-new")
     first = look(complete(rosproxies=(new,)))
     assert [(type(action), getattr(action, "retire", None)) for action in done(first)] == [
@@ -325,7 +325,7 @@ def test_pods_on_nodes_that_the_node_selector_leaves_out_are_named() -> None:
 
 
 def test_each_of_two_rosproxies_names_the_pod_that_both_select() -> None:
-    """The status advised the label value true, which is the fault."""
+    """The status must not advise the label value true, which is the fault."""
     plan = look(observed(rosproxy("arm"), rosproxy("leg"), pod()))
     for name in ("arm", "leg"):
         ready = status(plan, Name("ros", name))["conditions"][0]
@@ -341,8 +341,8 @@ def test_a_pod_that_is_not_wired_is_told() -> None:
     assert "kubectl -n ros delete pod talker" in told(plan, "NotWired")[0]
 
 
-def test_a_pod_of_a_former_rosproxy_is_told() -> None:
-    """Its nodes are registered no more; the new Service had got the same address."""
+def test_a_pod_of_a_former_rosproxy_gets_a_finding() -> None:
+    """Its nodes are no longer registered, although the new Service has the same address."""
     of = replace(rosproxy(), created="2026-01-01T00:00:10Z")
     former = pod(created="2026-01-01T00:00:09Z", workload="deployment/talker")
     plan = look(complete(pods=(former,), rosproxies=(of,)))
@@ -404,7 +404,7 @@ def test_one_bad_rosproxy_does_not_stop_another() -> None:
     assert [(type(action), action.of.name) for action in done(plan)] == [(CreateProxy, "robot")]
 
 
-# proxies that are made anew one after the other
+# proxies that are recreated in turn
 
 
 KEY = b"k" * 32

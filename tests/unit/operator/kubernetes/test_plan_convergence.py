@@ -1,7 +1,6 @@
-"""Whatever happens in a cluster, and wherever the operator is killed: it ends as it ought to.
-
-After each event what must always hold is checked, see `Clusters.check`. From time to time nothing
-else happens: then the operator must come to rest, with everything as wished.
+"""Random events in a cluster, and an operator that is killed anywhere, end in the wanted state.
+After each event the test checks the invariants (`Clusters.check`). In pauses without events the
+operator must come to rest, with everything as wished.
 """
 
 from hypothesis import example, given

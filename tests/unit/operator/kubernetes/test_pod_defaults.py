@@ -1,4 +1,4 @@
-"""The defaults for the pods of all proxies: how they are read, and which RosProxies get them."""
+"""Defaults for the pods of all proxies: parsing, and use in RosProxies."""
 
 from typing import Any
 
@@ -60,7 +60,7 @@ VALUES = {
 
 
 def completed(**changes: Any) -> RosProxySpec:
-    """The spec of a RosProxy, as the planner sees it."""
+    """The spec of a RosProxy with the planner's defaults."""
     seen = with_pod_defaults(observed(rosproxy(**changes)), DEFAULTS)
     return seen.rosproxies[0].spec
 

@@ -169,7 +169,9 @@ SHORT = {"startedAt": "2026-11-21T14:00:00Z", "finishedAt": "2026-11-21T14:00:40
     [(0, LONG, None), (0, SHORT, PodFailure.CRASHING), (2, LONG, PodFailure.CRASHING)],
 )
 def test_a_container_that_the_kubelet_has_stopped_does_not_crash(code, ran, why):
-    """A proxy ends with exit code 0 when the kubelet stops it, as for another image."""
+    """A proxy ends with exit code 0 if the kubelet stops the container, for example for a new
+    image.
+    """
     failure, text = stuck(waiting("CrashLoopBackOff", exitCode=code, reason="Completed", **ran))
 
     assert failure is why

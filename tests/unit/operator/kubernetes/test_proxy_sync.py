@@ -29,7 +29,7 @@ DOWN = {"master": {"up": False, "error": "refused"}, "nodes": []}
 
 
 class Told(ProxyClient):
-    """Proxies whose answers are given by the test."""
+    """Proxies with answers of the test."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -141,42 +141,42 @@ async def test_an_answer(talk: Talk) -> None:
     assert talk.changes == 1  # the same answer is no update
 
 
-async def test_one_that_says_too_much_keeps_what_is_known_of_it(talk: Talk) -> None:
-    """It counted as one that does not answer, and was told all anew each time."""
+async def test_a_proxy_with_too_long_an_answer_keeps_its_last_report(talk: Talk) -> None:
+    """The proxy still counts as answering, and gets no repeated updates."""
     node = {"nodes": ["/talker"], "address": "10.244.1.9:40001", "state": "ok"}
     talk.proxies.says = {**UP, "nodes": [node]}
     talk.all.follow([proxy()], KEY)
     talk.all.brief({UID: Briefing(callers=("10.244.1.9",))})
     await talk.asked()
     await until(lambda: bool(talk.proxies.callers))
-    talk.proxies.unreadable = ProxyError("it answers with more", unreadable=True)
+    talk.proxies.unreadable = ProxyError("the answer is too long", unreadable=True)
     told = len(talk.proxies.callers)
     await talk.asked(5)
     report = talk.all.reports[UID]
     assert report.answered
     assert report.nodes == {"10.244.1.9": ("/talker",)}
-    assert report.problems == ("it answers with more",)
+    assert report.problems == ("the answer is too long",)
     assert len(talk.proxies.callers) == told
     talk.proxies.unreadable = None
     await talk.asked(2)
     assert talk.all.reports[UID].problems == ()
 
 
-async def test_one_that_says_too_much_from_the_start_does_not_answer(
+async def test_a_proxy_with_too_long_a_first_answer_does_not_answer(
     talk: Talk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(proxy_sync, "STARTING", 0.0)
-    talk.proxies.unreadable = ProxyError("it answers with more", unreadable=True)
+    talk.proxies.unreadable = ProxyError("the answer is too long", unreadable=True)
     talk.all.follow([proxy()])
     await talk.asked()
     assert not talk.all.reports[UID].answered
-    assert talk.all.reports[UID].error == "it answers with more"
+    assert talk.all.reports[UID].error == "the answer is too long"
 
 
-async def test_one_that_reports_changes_without_an_end_keeps_no_other_waiting(
+async def test_a_proxy_with_endless_changes_keeps_no_other_waiting(
     talk: Talk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was asked again at once, as often as the operator could."""
+    """The operator waits before each further request."""
     waits: list[float] = []
     wait = proxy_sync.ProxyPoller._wait_for_update
 
@@ -200,7 +200,7 @@ async def test_one_that_reports_changes_without_an_end_keeps_no_other_waiting(
 async def test_one_that_is_just_starting_is_not_told(talk: Talk) -> None:
     talk.all.follow([proxy()])
     await talk.asked()
-    talk.proxies.says = DOWN  # it has not asked its master yet
+    talk.proxies.says = DOWN  # the proxy has not asked its master yet
     await talk.asked()
     assert talk.all.reports == {}
     assert talk.changes == 0
@@ -247,7 +247,7 @@ async def test_updates_are_repeated_until_they_are_heard(talk: Talk) -> None:
     count = len(talk.proxies.told)
     await talk.asked()
     assert len(talk.proxies.told) == count
-    assert talk.changes == changes + 1  # one more look whether the nodes are still there
+    assert talk.changes == changes + 1  # another look, whether the nodes are still there
 
 
 async def test_who_is_not_there_any_more_is_forgotten(talk: Talk) -> None:
@@ -278,12 +278,12 @@ async def test_no_address_no_poller(talk: Talk) -> None:
     assert talk.proxies.asked == 0
 
 
-async def test_it_is_told_who_may_call(talk: Talk) -> None:
-    """When that changes, and not over and over again."""
+async def test_the_proxy_gets_the_allowed_callers(talk: Talk) -> None:
+    """Only after changes."""
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await talk.asked()
-    assert talk.proxies.callers == []  # nobody knows yet
+    assert talk.proxies.callers == []  # not known yet
     talk.all.brief({UID: Briefing(callers=("10.244.1.5",)), "nobody": Briefing(callers=())})
     await until(lambda: bool(talk.proxies.callers))
     token = token_of(KEY, proxy().pod.id, "node1")
@@ -296,8 +296,8 @@ async def test_it_is_told_who_may_call(talk: Talk) -> None:
     assert talk.proxies.callers[-1] == (token,)
 
 
-async def test_who_may_call_is_repeated_until_it_is_heard(talk: Talk) -> None:
-    """And what a proxy does not understand keeps nothing else from it."""
+async def test_the_allowed_callers_are_repeated_until_confirmed(talk: Talk) -> None:
+    """Other updates go on meanwhile."""
     talk.proxies.says = UP
     talk.proxies.deaf = True
     talk.all.follow([proxy()], KEY)
@@ -315,7 +315,7 @@ async def test_a_proxy_that_was_started_again_is_told_anew(talk: Talk) -> None:
     await until(lambda: len(talk.proxies.callers) == 1)
     talk.all.follow([replace(proxy(), restarts=1)], KEY)
     await until(lambda: len(talk.proxies.callers) == 2)
-    talk.proxies.failing = 1  # or it did not answer for a moment
+    talk.proxies.failing = 1  # or after a failed answer
     await until(lambda: len(talk.proxies.callers) == 3)
 
 
@@ -326,7 +326,7 @@ async def test_its_policy_is_told_when_it_changes(talk: Talk) -> None:
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await talk.asked()
-    assert talk.proxies.policies == []  # nobody knows yet
+    assert talk.proxies.policies == []  # not known yet
     token = token_of(KEY, proxy().pod.id, "node1")
     for policy, told in (
         ((), [(token,)]),
@@ -346,12 +346,12 @@ async def test_its_policy_is_told_anew_when_it_was_started_again(talk: Talk) -> 
     await until(lambda: len(talk.proxies.policies) == 1)
     talk.all.follow([replace(proxy(), restarts=1)], KEY)
     await until(lambda: len(talk.proxies.policies) == 2)
-    talk.proxies.failing = 1  # or it did not answer for a moment
+    talk.proxies.failing = 1  # or after a failed answer
     await until(lambda: len(talk.proxies.policies) == 3)
 
 
-async def test_without_its_policy_nobody_is_let_in(talk: Talk) -> None:
-    """And the operator can say why; what else it is told and asked goes on."""
+async def test_without_its_policy_a_proxy_gets_no_callers(talk: Talk) -> None:
+    """The report has the reason. Other updates and questions go on."""
     talk.proxies.says = UP
     talk.proxies.refuses = PolicyRefused("knows no policies")
     talk.all.follow([proxy()], KEY)
@@ -423,23 +423,23 @@ async def test_who_is_waited_for_can_be_told(talk: Talk) -> None:
     await until(lambda: len(talk.proxies.callers) == 1)
     talk.all.brief({UID: Briefing(gone=("10.0.0.1",))})
     await until(lambda: talk.proxies.told == [{"gone": ["10.0.0.1"]}])
-    await until(lambda: talk.changes == 2)  # one more look whether the nodes are still there
+    await until(lambda: talk.changes == 2)  # another look, whether the nodes are still there
     await listening(talk)
-    # Once to begin, once to wait, once after it was told, and once more a while later.
+    # Once to begin, once to wait, once after the update, and again later.
     assert [bool(within) for _, within in talk.proxies.waited] == [False, True, False, False]
 
 
-async def test_what_stays_there_is_not_told_over_and_over(
+async def test_an_address_that_stays_is_not_reported_over_and_over(
     talk: Talk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The operator looks again what has become of it after a while, not at once."""
+    """The operator looks at the result after a while, not at once."""
     monkeypatch.setattr(proxy_sync, "EVERY", 3600.0)
     talk.proxies.former = False
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await listening(talk)
     talk.all.brief({UID: Briefing(gone=("10.0.0.1",))})
-    await until(lambda: len(talk.proxies.waited) == 3)  # it is asked after it was told
+    await until(lambda: len(talk.proxies.waited) == 3)  # a request after the update
     assert talk.changes == 1
     talk.all.brief({UID: Briefing(gone=("10.0.0.1",))})
     await until(lambda: len(talk.proxies.waited) == 4)
@@ -525,10 +525,10 @@ async def test_proxies_whose_masters_hang_keep_nobody_waiting(
     await until(lambda: bool(talk.proxies.callers))
 
 
-async def test_one_that_leads_no_more_tells_nothing_more(
+async def test_an_operator_that_lost_the_lead_sends_no_more_updates(
     talk: Talk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also if it lost the lead while it was telling something."""
+    """Also if it loses the lead during an update."""
     leading = True
     asked = asyncio.Event()
     hears = asyncio.Event()

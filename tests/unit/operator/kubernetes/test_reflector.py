@@ -38,7 +38,7 @@ KINDS = ("rosproxies", "nodes", "pods", "services", "networkpolicies")
 
 
 class Seen:
-    """A store with its reflectors."""
+    """A store with reflectors."""
 
     def __init__(self, api: Api) -> None:
         self.woken = self.back = self.lost = self.corrected = 0
@@ -175,7 +175,7 @@ async def test_a_proxy_that_vanishes_while_it_runs_is_noted(server: ApiServer, s
 async def test_a_watch_that_is_too_old_begins_anew(server: ApiServer, seen: Seen) -> None:
     put_all(server)
     await begun(server, seen)
-    server.forget("pods", "talker", NAMESPACE)  # and nobody has told
+    server.forget("pods", "talker", NAMESPACE)  # without an event
     server.end_watches({"type": "ERROR", "object": {"code": 410, "message": "old"}})
     await until(lambda: "talker" not in seen.pods())
     await until(lambda: server.watches("pods") == 1)
@@ -194,8 +194,8 @@ async def test_a_watch_that_is_lost_goes_on(server: ApiServer, seen: Seen) -> No
     await seen.store.check()
 
 
-async def test_a_lost_watch_tells_nothing_twice(server: ApiServer, seen: Seen) -> None:
-    """Else a pod would have no address again for a moment, and be taken for one that went."""
+async def test_after_a_lost_watch_no_event_comes_twice(server: ApiServer, seen: Seen) -> None:
+    """Otherwise a pod would lose its address for a moment, and would count as gone."""
     put_all(server)
     await begun(server, seen)
     server.put("pods", pod_obj("second", INJECT), NAMESPACE)
@@ -221,7 +221,7 @@ async def test_watches_that_end_at_once_are_not_asked_for_in_a_loop(
         await until(lambda: seen.lost == lost)
         await until(lambda: all(server.watches(kind) == left for kind in KINDS))
 
-    await end(len(KINDS), 1)  # the first time it is asked for anew without a pause
+    await end(len(KINDS), 1)  # the first request is without a pause
     await end(2 * len(KINDS), 0)
 
 
@@ -296,7 +296,7 @@ async def test_only_what_concerns_somebody_wakes(server: ApiServer, seen: Seen) 
     assert seen.woken == woken + 1
 
 
-async def test_whom_it_concerns(server: ApiServer, seen: Seen) -> None:
+async def test_changes_touch_their_namespaces_and_nodes(server: ApiServer, seen: Seen) -> None:
     put_all(server)
     server.put("rosproxies", rosproxy_obj({"master": SERVICE}, "leg"), NAMESPACE)
     await begun(server, seen)
@@ -313,7 +313,7 @@ async def test_whom_it_concerns(server: ApiServer, seen: Seen) -> None:
         await until(all_taken)
 
     seen.store.take_changes()
-    server.put("pods", {**pod_obj("talker", {})}, NAMESPACE)  # it has lost its label
+    server.put("pods", {**pod_obj("talker", {})}, NAMESPACE)  # lost the label
     await touches({NAMESPACE}, {"node1"})
     server.put("pods", {**pod_obj("talker", {"rosproxy.io/injekt": "true"})}, NAMESPACE)
     await touches({NAMESPACE}, set())
@@ -387,7 +387,7 @@ async def test_what_only_an_event_tells(
     assert proxy.stuck is PodFailure.PORTS
     assert proxy.message == SANDBOX.format("…")
     assert await failures.read(snapshot) == set()
-    assert len(server.asked("GET", "events")) == 1  # it is not asked for again at once
+    assert len(server.asked("GET", "events")) == 1  # no repeated request at once
 
 
 async def test_the_service_of_a_master(server: ApiServer, seen: Seen) -> None:

@@ -1,4 +1,4 @@
-"""The fixes for what Kubernetes refuses, by its own words."""
+"""Fixes for refusals of Kubernetes, by the text of the refusal."""
 
 import pytest
 

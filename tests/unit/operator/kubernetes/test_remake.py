@@ -1,4 +1,4 @@
-"""Pods that came by unwired are made anew, where their RosProxy asks for that."""
+"""Unwired pods are evicted if the RosProxy asks for that."""
 
 from itertools import pairwise
 from typing import Any
@@ -43,7 +43,7 @@ def evicted(plan: ClusterPlan) -> list[str]:
     return [action.id.name for action in plan.actions if isinstance(action, EvictPod)]
 
 
-def test_one_that_was_not_wired_is_evicted() -> None:
+def test_an_unwired_pod_is_evicted() -> None:
     plan = look(cluster(of_set()))
     (action,) = [a for a in plan.actions if isinstance(a, EvictPod)]
     assert (action.of, action.uid) == (ROBOT, of_set().uid)
@@ -102,8 +102,8 @@ def test_nobody_is_evicted_who_did_not_ask_for_it() -> None:
     assert evicted(look(cluster(of_set(), remakes=False))) == []
 
 
-def test_nobody_is_evicted_while_there_is_no_service() -> None:
-    """The next one could not be wired either."""
+def test_no_pod_is_evicted_without_a_service() -> None:
+    """The webhook could not wire the next pod either."""
     of = replace(rosproxy(), remakes=True)
     assert evicted(look(observed(of, node(), of_set()))) == []
 
@@ -124,7 +124,7 @@ def test_one_goes_at_a_time() -> None:
 
 
 def test_a_webhook_that_does_not_work_costs_a_pod_a_minute() -> None:
-    """And also where nothing is left between one pod and the next."""
+    """Even if no pod exists for a moment between two pods."""
     state = ClusterState()
     gone = list[float]()
     for second in range(3600):

@@ -1,4 +1,4 @@
-"""A change of image or settings: one proxy after the other, and no image that a node can't run."""
+"""A change of image or settings: the proxies in turn, and no image that a node cannot run."""
 
 from typing import Any
 
@@ -46,7 +46,7 @@ NEXT = "rosproxy:2"
 
 
 def running(name: str, **changes: Any) -> ProxyPod:
-    """The proxy of a node, as it was made with the settings of now and the image of before."""
+    """The proxy of a node, with the current settings and the former image."""
     of = rosproxy()
     made = creation(look(observed(of, service(), node(name), pod(on=name))))
     there = proxy(on=node(name), **changes)
@@ -54,14 +54,14 @@ def running(name: str, **changes: Any) -> ProxyPod:
 
 
 def cluster(*proxies: ProxyPod, checks: tuple[HelperPod, ...] = (), **spec: Any) -> ClusterSnapshot:
-    """Three nodes with a pod each, whose RosProxy asks for the next image."""
+    """Three nodes with a pod each. The RosProxy asks for the next image."""
     of = rosproxy(**{"image": NEXT, **spec})
     pods = [pod(name, on=name, ip=f"10.244.{number}.5") for number, name in enumerate(NODES)]
     return observed(of, service(of), *map(node, NODES), *pods, *proxies, image_checks=checks)
 
 
 def check(plan: ClusterPlan, phase: str = "Succeeded", **changes: Any) -> HelperPod:
-    """The image check that a plan makes, as it is later."""
+    """The image check of a plan, in a later phase."""
     (action,) = (a for a in plan.actions if isinstance(a, CreateHelper))
     parsed = objects.helper_pod({**action.body, "status": {"phase": phase}})
     assert parsed is not None
@@ -74,7 +74,7 @@ def all_running() -> list[ProxyPod]:
 
 
 def images(actions: list[Action]) -> list[str]:
-    """The nodes whose proxies get another image."""
+    """The nodes where the proxy gets another image."""
     by_id = {names.proxy_id(ROBOT, name): name for name in NODES}
     return [by_id[action.id] for action in actions if isinstance(action, SetImage)]
 
@@ -113,7 +113,7 @@ def test_one_proxy_gets_the_image_after_the_other() -> None:
         plan = look(cluster(*proxies, checks=checks), plan.state, now)
         turns.append(images(done(plan)))
         proxies[index] = replace(proxies[index], image=NEXT)
-        # The kubelet has not restarted the container yet: its pod is ready as before.
+        # The kubelet has not restarted the container yet, so the pod is still ready.
         plan = look(cluster(*proxies, checks=checks), plan.state, now + 1)
         assert kinds(plan) in ([], [DeleteHelper])
         proxies[index] = replace(proxies[index], restarts=1)
@@ -204,7 +204,7 @@ def test_a_proxy_that_waits_for_ports_stops_nothing() -> None:
 
 
 def test_where_no_master_is_reached_the_rollout_goes_on() -> None:
-    """A proxy is ready once it reaches its master; the robot may be off for the weekend."""
+    """A proxy is ready only with a reachable master, and the robot may be off for the weekend."""
     proxies = [replace(each, ready=False) for each in all_running()]
     assert kinds(look(cluster(*proxies))) == [CreateHelper]
     proxies[1] = replace(proxies[1], ready=True)

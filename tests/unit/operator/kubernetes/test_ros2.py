@@ -63,7 +63,7 @@ GOOD = {"master": {"uri": "http://robot:11311"}}
 
 
 def of2(ros2: Ros2Spec | None = None, **changes: Any) -> RosProxy:
-    """One for ROS 2 alone."""
+    """A RosProxy for ROS 2 alone."""
     spec: dict[str, Any] = {"ros1": False, "ros2": ros2 or Ros2Spec(), "master": MasterSpec()}
     return some.rosproxy(**spec | changes)
 
@@ -242,7 +242,9 @@ def test_an_lan_relay_is_made_once_its_proxy_has_an_address():
 
 
 def test_a_proxy_and_its_lan_relay_share_a_secret():
-    """It is computed from the operator's key: the same after each start, another on each node."""
+    """The operator computes this secret from its key: always the same, and different on
+    each node.
+    """
     of = of2(HEARING, ports=5)
     far = node("two", addresses={"InternalIP": "192.0.2.2"})
 
@@ -256,7 +258,7 @@ def test_a_proxy_and_its_lan_relay_share_a_secret():
     assert of_proxies == secrets(KEY)
     proxy_id = names.proxy_id(of.id, "one")
     assert names.relay_secret_of(KEY, proxy_id, "one") in of_proxies
-    # Who may read pods can't call the admin endpoint by what stands there.
+    # The secret, visible to readers of pods, is no token for the admin endpoint.
     assert names.token_of(KEY, proxy_id, "one") not in of_proxies
     place = replace(site(of, node(), PortRange(11400, 11404)), relay_secret=SECRET)
     assert place.lan_relay is not None
@@ -297,7 +299,7 @@ def test_an_lan_relay_stays_while_its_proxy_is_made_anew():
 
 
 def test_an_lan_relay_stays_until_its_proxy_has_left_its_ports():
-    """It carries to the LAN that the proxy's participants have ended."""
+    """The LAN relay passes the dispose messages of the proxy's participants to the LAN."""
     _, proxy_pod = hearing()
     moved = of2(HEARING, ports=5, window=PortRange(13000, 13099))
     (action,) = done(
@@ -463,7 +465,7 @@ def test_what_users_are_told():
 
 
 def test_a_proxy_made_anew_is_told_the_ports_that_participants_had():
-    """Until it has participants itself; one that was started again in its pod is not told."""
+    """Only until the proxy has participants, and not after a restart in the same pod."""
     of = of2()
     proxy_pod = proxy(of)
     leases = {"01": (11401, 11402)}
@@ -475,7 +477,7 @@ def test_a_proxy_made_anew_is_told_the_ports_that_participants_had():
     retired = replace(
         seen, reports={proxy_pod.pod.uid: replace(report, participants={}, leases={})}
     )
-    state = look(retired, state).state  # it has told outside that they ended, by datagrams
+    state = look(retired, state).state  # the proxy has sent dispose messages
 
     new = replace(proxy_pod, pod=replace(proxy_pod.pod, uid="uid-new"))
     starting = observed(of, service(of), pod(), new, reports={"uid-new": ProxyReport(True, True)})

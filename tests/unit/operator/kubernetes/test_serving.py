@@ -1,4 +1,4 @@
-"""kopf itself, in its thread, against an API server on loopback: it may end, nothing else does."""
+"""kopf in its thread, with an API server on loopback. If kopf ends, everything else goes on."""
 
 import asyncio
 import base64
@@ -43,7 +43,7 @@ OTHER = {**service_obj()["metadata"]["ownerReferences"][0], "uid": "another"}
 
 
 class Woken:
-    """A controller that only counts, and makes the Service once it is woken, if it is to."""
+    """A controller that counts wake-ups, and runs ``makes`` at each."""
 
     def __init__(self) -> None:
         self.makes: Callable[[], object] = lambda: None
@@ -59,7 +59,7 @@ class Woken:
 
 
 class Running:
-    """What a replica serves, the webhook and its liveness, before an API server."""
+    """The webhook and the liveness endpoint of a replica, with an API server."""
 
     def __init__(self, server: ApiServer, api: Api) -> None:
         self.server = server
@@ -265,7 +265,9 @@ async def test_a_service_that_is_somebody_elses_is_told(running: Running) -> Non
 async def test_a_pod_of_a_rosproxy_that_asks_for_too_much_does_not_wait(
     running: Running, monkeypatch: pytest.MonkeyPatch, spec: dict[str, Any], said: str
 ) -> None:
-    """Nobody is going to make its Service; once it is allowed, the pod waits for that."""
+    """The operator makes no Service for such a RosProxy. Once allowed, the pod waits for the
+    Service.
+    """
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 60.0)
     server = running.server
     server.put("rosproxies", rosproxy_obj(spec), NAMESPACE)
@@ -309,7 +311,7 @@ async def test_an_api_server_that_is_just_starting_is_asked_again(running: Runni
 async def test_a_pod_waits_for_a_service_that_is_just_made(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before kube-proxy knows it, a connection would be lost for two minutes."""
+    """Before kube-proxy knows the Service, a connection attempt would hang for two minutes."""
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG", 0.5)
     put_rosproxy(running.server)
     (service,) = running.server.all("services")

@@ -1,4 +1,4 @@
-"""RosProxies as they are read."""
+"""Parsing of RosProxies."""
 
 import re
 from typing import Any
@@ -289,7 +289,7 @@ _json = st.recursive(
 
 
 def _refusal(obj: Any) -> str:
-    """Why it is refused, empty if it is not."""
+    """The reason of a refusal, or empty."""
     try:
         rosproxy(obj)
     except InvalidField as error:

@@ -1,4 +1,4 @@
-"""The status of a RosProxy: what kubectl shows of it."""
+"""The status of a RosProxy, for kubectl."""
 
 import json
 
@@ -342,7 +342,7 @@ def test_ready_means_that_every_node_with_pods_is_served(states):
 
 
 def test_where_no_proxy_runs_nothing_is_said_of_the_master():
-    """It said for minutes that the master is reached, with 0 of 2 proxies."""
+    """With 0 of 2 proxies, the status must not keep MasterReachable for minutes."""
     first = status(state())
     assert judged(first, "MasterReachable") == ("True", "Reached")
     stuck = state(proxy=stuck_proxy(PodFailure.IMAGE), answer=None)

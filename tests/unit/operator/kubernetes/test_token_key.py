@@ -1,4 +1,4 @@
-"""The key of the proxies' tokens: made once, kept, and made anew when somebody takes it away."""
+"""The key of the proxies' tokens: made once, kept, and made again after a deletion."""
 
 import base64
 from typing import Any

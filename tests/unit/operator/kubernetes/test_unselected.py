@@ -1,4 +1,4 @@
-"""Pods that ask for a proxy by their label, and that no RosProxy selects."""
+"""Pods with a label for a proxy that no RosProxy selects."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ def astray(name: str = "astray", label: str = "robott", **changes: Any) -> Pod:
     ],
 )
 def test_a_typo_in_the_label_is_an_event_and_a_line_of_the_status(label: str, fix: str) -> None:
-    """Only the ReplicaSet controller heard of it, at admission, and dropped the warning."""
+    """At admission only the ReplicaSet controller gets the warning, and drops it."""
     seen = complete(unselected_pods=(astray(label=label),))
     first = look(seen)
     assert told(first, "NotWired") == []
@@ -89,7 +89,7 @@ def test_many_pods_make_few_events() -> None:
 
 
 def test_beside_a_rosproxy_that_can_not_be_read_nothing_is_said() -> None:
-    """That RosProxy may be the one that is meant, and has a condition."""
+    """The pod may mean that RosProxy, which has a condition."""
     broken = InvalidRosProxy(Name("ros", "robott"), "uid", 1, "spec.ports: is 0")
     seen = replace(observed(unselected_pods=(astray(),)), unusable={broken.id: broken})
     assert told(look(seen, look(seen).state, now=200.0), "NotWired") == []

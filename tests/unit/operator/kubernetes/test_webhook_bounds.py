@@ -1,4 +1,4 @@
-"""What any pod of a cluster can take of the operator by its webhook."""
+"""Limits on the resources that a pod can take from the operator through the webhook."""
 
 import asyncio
 import gc
@@ -97,7 +97,7 @@ async def status_of(wire: Wire) -> int:
 
 
 async def test_an_address_ends_its_own_oldest_connection(callers: Callers) -> None:
-    """1,000 connections of one pod that sent nothing took 300 MB."""
+    """1,000 idle connections of a pod took 300 MB."""
     with without_garbage_collection():
         other = await callers.connect("127.0.6.2")
         wires = [await callers.connect("127.0.6.1") for _ in range(MOST_OF_SOURCE + 50)]
@@ -118,7 +118,7 @@ async def test_of_many_addresses_the_one_with_most_loses(callers: Callers) -> No
 
 
 async def test_bodies_that_do_not_end_are_bounded(callers: Callers) -> None:
-    """50 bodies of 8 MB, each without its end, took all memory that the operator may have."""
+    """50 unfinished bodies of 8 MB took all memory of the operator."""
     share = webhook_server.MOST_HELD_OF_SOURCE
     part = b"[" + b" " * (webhook_server.MOST - 2)
     wires = [await callers.ask(len(part) + 1, part) for _ in range(share // len(part) + 1)]

@@ -84,7 +84,7 @@ class World:
             yield pod, proxy
 
     def statuses(self) -> dict[str, str]:
-        """The status of each pod, by its uid, and the address that it has already."""
+        """The status and the real address of each pod, by uid."""
         addresses = self.cluster.addresses
         pods = ((meta(pod)["uid"], pod) for pod in self.cluster.state.pods.values())
         return {uid: f"{pod['status']} {addresses.get(uid)}" for uid, pod in pods}
@@ -92,7 +92,7 @@ class World:
     # what the operator does
 
     def observe(self) -> ClusterSnapshot:
-        """As the operator sees it."""
+        """The operator's snapshot."""
         snapshot = self.cluster.observe(self.controller.old, self.controller.failures)
         selected = (
             pod for pod in snapshot.pods if any(selects(of, pod) for of in snapshot.rosproxies)
@@ -151,7 +151,7 @@ class World:
             other_pods = (pod for pod in pods_on_node if not ended(pod) and not is_own(pod))
             of = parse_rosproxy.rosproxy(self.cluster.state.rosproxies[action.of])
             taken = {port for pod in other_pods for port in objects.pod(pod).ports_of(of.spec)}
-            assert not taken.intersection(range(first, last + 1)), "held by others"
+            assert not taken.intersection(range(first, last + 1)), "other pods hold these ports"
         if before is not None and place not in self.may_move:
             count = self.cluster.state.rosproxies[action.of]["spec"]["ports"]
             cut = PortRange(before.first, min(before.last, before.first + count - 1))
@@ -169,7 +169,7 @@ class World:
         return inside and not any(port in ports for port in own)
 
     def note_conflicts(self) -> None:
-        """Who does not get his ports, or whose ports somebody else has, may move."""
+        """A proxy may move if its ports are refused, or if another pod has them."""
         for place, ports in self.served_ranges.items():
             other_pods = [
                 pod
@@ -225,7 +225,7 @@ class World:
             self.controller.now += 1.0 if plan.next_look_in is None else plan.next_look_in
         else:
             raise AssertionError(f"never comes to rest: {plan.actions} {plan.next_look_in}")
-        assert self.cluster.made <= 40, "it is done over and over again"
+        assert self.cluster.made <= 40, "the operator repeats actions for ever"
         self.check_all_is_as_wished(plan)
 
     def check_all_is_as_wished(self, plan: ClusterPlan) -> None:
@@ -258,10 +258,8 @@ class World:
         self.check_lan_relays(plan, unready)
 
     def check_lan_relays(self, plan: ClusterPlan, unready: set[str]) -> None:
-        """Each proxy that hears the LAN has a LAN relay, which knows its address; nobody else has.
-
-        A proxy stays as it was where an obstacle is told of, and gets no LAN relay before that is
-        gone.
+        """Exactly the proxies with multicast have a LAN relay, which knows the proxy's address. If
+        a finding reports an obstacle, the proxy stays, and gets no LAN relay meanwhile.
         """
         lan_relays = {}
         for pod in self.own():
@@ -319,7 +317,7 @@ class World:
                 assert env["ROSPROXY_PUBLISH_MASTER"] == str(publish)
 
     def check_versions(self, place: ProxyPlace, proxy: ProxyPod, env: dict[str, str]) -> None:
-        """It has ports of the protocols that it needs, and is for the versions that are wanted."""
+        """The proxy has the wanted versions of ROS, and ports of the protocols for these."""
         spec = parse_rosproxy.rosproxy(self.cluster.state.rosproxies[place.of]).spec
         assert bool(proxy.pod.host_ports) == spec.ros1
         assert bool(proxy.pod.udp_ports) == (spec.ros2 is not None)
