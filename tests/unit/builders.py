@@ -1,4 +1,4 @@
-"""Documents as rospy and XmlRpc++ write them, and small inside worlds to rewrite them for."""
+"""Documents in the form of rospy and XmlRpc++, and small worlds for rewriting."""
 
 import xmlrpc.client
 from collections.abc import Callable, Sequence
@@ -34,12 +34,12 @@ MASTER = f"{PROXY}:11311"
 
 
 def py_call(method: str, *params: Any) -> bytes:
-    """A call as rospy and the tools send it."""
+    """A call in the form of rospy and the tools."""
     return xmlrpc.client.dumps(params, method).encode()
 
 
 def py_reply(value: Any) -> bytes:
-    """A reply as rosmaster and rospy send it."""
+    """A reply in the form of rosmaster and rospy."""
     return xmlrpc.client.dumps((value,), methodresponse=True).encode()
 
 
@@ -62,7 +62,7 @@ def cpp_value(value: Any) -> str:
 
 
 def cpp_call(method: str, *params: Any) -> bytes:
-    """A call as roscpp sends it (XmlRpcClient::generateRequest)."""
+    """A call in the form of roscpp (XmlRpcClient::generateRequest)."""
     inside = "".join(f"<param>{cpp_value(param)}</param>" for param in params)
     return (
         f'<?xml version="1.0"?>\r\n<methodCall><methodName>{method}</methodName>\r\n'
@@ -71,7 +71,7 @@ def cpp_call(method: str, *params: Any) -> bytes:
 
 
 def cpp_reply(value: Any) -> bytes:
-    """A reply as roscpp sends it (XmlRpcServerConnection::generateResponse)."""
+    """A reply in the form of roscpp (XmlRpcServerConnection::generateResponse)."""
     return (
         '<?xml version="1.0"?>\r\n<methodResponse><params><param>\r\n\t'
         f"{cpp_value(value)}\r\n</param></params></methodResponse>\r\n"
@@ -92,7 +92,7 @@ DIALECTS = {"rospy": (py_call, py_reply), "roscpp": (cpp_call, cpp_reply)}
 
 
 def decoded(body: bytes) -> tuple[Any, str | None]:
-    """What Python's own decoder makes of a document: its values and the method's name."""
+    """The values and the method's name in a document, by Python's own decoder."""
     values, method = xmlrpc.client.loads(body)
     return values, method
 
@@ -128,7 +128,7 @@ def make_addressing(
 
 
 def make_stand_ins(ports: PortMap | None = None, **options: Any) -> StandIns:
-    """The stand-ins of a proxy whose master is ``robot``; none yet."""
+    """The empty stand-ins of a proxy with the master ``robot``."""
     ports = ports or PortMap(PortRange(45000, 45009), PortRange(45000, 45009))
     settings = Settings(
         master_uri="http://robot:11311",
@@ -152,7 +152,7 @@ def add_node(
     named: bool | None = None,
     confirmed: bool = True,
 ) -> Endpoint:
-    """Admit a node; its ``address`` is the host in its URI unless given."""
+    """Admit a node. ``address`` is by default the host in the URI."""
     node = parse_slave_uri(uri)
     assert node
     is_named = named if named is not None else address is None
@@ -236,5 +236,5 @@ def _admit(addressing: Addressing, uri: str | None, caller: Caller, refuse: Refu
 
 
 def own_uri(address: str, port: int = 40001) -> str:
-    """The slave URI of a node that gives its address."""
+    """The slave URI of a node with an address as its host."""
     return slave_uri(HostPort(address, port))

@@ -1,9 +1,9 @@
-"""How hard hypothesis tries: `pytest --hypothesis-profile=thorough tests/unit` for long.
+"""Profiles of hypothesis. For a long run: `pytest --hypothesis-profile=thorough tests/unit`.
 
-`make check`, which is to take less than a minute, uses the profile "brief".
+`make check` uses the profile "brief", and takes less than a minute.
 
-In CI it tries the same examples each time, so that nobody's change fails for a bug that was there
-before; on a developer's machine others each time, and what it finds is tried again first.
+In CI hypothesis tries the same examples each time, so that no change fails for an older bug. On a
+developer's machine the examples differ each time, and failed examples come first.
 """
 
 import os

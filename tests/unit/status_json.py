@@ -1,4 +1,4 @@
-"""What ``/status`` returns, made up for the tests of its table and of the doctor."""
+"""Answers of ``/status`` for the tests of the status table and of the doctor."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ HOST = "robot-host"
 
 
 def make_status(*nodes: dict[str, Any], **parts: Any) -> dict[str, Any]:
-    """A status; ``master``, ``ports`` and ``settings`` are changed by what is given for them."""
+    """A status. ``master``, ``ports`` and ``settings`` update the defaults."""
     status: dict[str, Any] = {
         "version": "0.1.0",
         "pid": 42,

@@ -1,4 +1,4 @@
-"""What is installed: each version pinned, each file known by its hash."""
+"""Pinned requirements: each with a version and hashes."""
 
 import re
 
@@ -32,8 +32,8 @@ def test_images_are_built_on_what_a_digest_names() -> None:
     assert set(re.findall(r"^FROM (\S+)", text, re.M)) - stages == {"${BASE_IMAGE}"}
 
 
-def test_every_pin_is_of_use_to_somebody() -> None:
-    """Those without are left over: make lock."""
+def test_every_pin_is_required() -> None:
+    """Remove pins that are left over: make lock."""
     pinned = re.findall(r"^([\w.-]+)==", (ROOT / "constraints.txt").read_text(), re.M)
     assert len(pinned) == len(pins(EXTRAS))
 

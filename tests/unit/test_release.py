@@ -1,4 +1,4 @@
-"""What a release is made of says one version, and its workflow what the tests were run with."""
+"""All parts of a release have the same version, and the workflow uses the tested versions."""
 
 import re
 from pathlib import Path
@@ -80,13 +80,13 @@ def test_workflows_have_the_tests_helm() -> None:
     assert set(re.findall(r"setup-helm@.*\n +with:\n +version: (\S+)", text)) == {version}
 
 
-def test_what_signs_and_publishes_is_pinned() -> None:
-    """A tag can be moved to other code, which would run with the right to publish."""
+def test_actions_that_sign_and_publish_are_pinned() -> None:
+    """A moved tag could run other code with the right to publish."""
     uses = set(re.findall(r"uses: ([\w./-]+)@(\S+)", RELEASE))
     own = {name for name, _ in uses if name.startswith("actions/") and "attest" not in name}
     others = {at for name, at in uses if name not in own}
     assert len(others) > 5
-    # PyPI's own: it asks for this branch, and runs an image of the same name.
+    # PyPI's action recommends this branch, and runs an image of the same name.
     assert {at for at in others if not re.fullmatch("[0-9a-f]{40}", at)} == {"release/v1"}
 
 

@@ -27,7 +27,7 @@ def lines(node: ast.stmt) -> int:
 
 
 def functions(path: Path) -> dict[str, int]:
-    """The functions of a module, each with its lines of code: no docstring, no decorators."""
+    """The lines of code of each function in a module, without docstrings and decorators."""
     sizes = {}
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -50,7 +50,7 @@ def test_functions_are_short() -> None:
 
 
 def test_no_package_hides_the_standard_library() -> None:
-    """`operator` is a source root: as a package it would hide a module of Python."""
+    """`operator` is a source root. As a package it would hide Python's module."""
     assert not (ROOT / "operator/__init__.py").exists()
 
 
@@ -73,7 +73,7 @@ def test_the_table_of_settings_is_that_of_the_code() -> None:
 
 
 def test_architecture_names_what_exists() -> None:
-    """Ways of data, rooms and proofs are worth as much as the modules and tests that they name."""
+    """The page names modules and tests, which must exist."""
     text = (ROOT / "docs/architecture.md").read_text()
     named = set(re.findall(r"`([\w./]+(?:\.py|/))`", text))
     roots = [ROOT, ROOT / "proxy/rosproxy", ROOT / "operator/rosproxy_operator"]
@@ -110,7 +110,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 def headings(page: Path) -> set[str]:
-    """The anchors of a page, as GitHub and GitLab make them."""
+    """The anchors of a page on GitHub and GitLab."""
     titles = re.findall(r"^#+ (.*)$", page.read_text(), re.M)
     return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
 
@@ -121,7 +121,7 @@ def test_scripts_can_be_run() -> None:
 
 
 def test_images_are_tagged_with_the_version() -> None:
-    """The chart pulls that tag: its appVersion is the same (tests/chart)."""
+    """The chart pulls the tag of its appVersion, which is the same version (tests/chart)."""
     from rosproxy import __version__
 
     make = ["make", "--dry-run", "image", "push", "REGISTRY=registry.example/ros"]
@@ -172,7 +172,7 @@ def test_reference_names_every_metric_of_the_proxy() -> None:
 
 
 def rules() -> dict[str, set[str]]:
-    """What the controller's service account has to be allowed, by resource, as its code says."""
+    """The required verbs of the controller's service account by resource, from the docstring."""
     from rosproxy_operator.kubernetes.api import api_client
 
     lines = re.findall(r"^    ([a-z/]+) {2,}([a-z ]+)$", api_client.__doc__ or "", re.M)
@@ -180,7 +180,7 @@ def rules() -> dict[str, set[str]]:
 
 
 def test_the_chart_gives_users_no_right_to_a_status() -> None:
-    """A Service that is lost is made anew at the address that the status of its RosProxy has."""
+    """The operator recreates a lost Service at the address in the RosProxy's status."""
     text = (ROOT / "charts/rosproxy-operator/templates/rbac.yaml").read_text()
     for_users = text.partition(".Values.rbac.aggregate")[2]
     assert re.findall(r"resources: (.+)", for_users) == ["[rosproxies]", "[rosproxies]"]

@@ -1,4 +1,6 @@
-"""Tests that fail among others and pass alone are shown, and bounded; what fails twice is wrong."""
+"""Tests that fail at first and pass alone are flaky and bounded. Tests that fail twice fail the
+run.
+"""
 
 import subprocess
 from dataclasses import replace

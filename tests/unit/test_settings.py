@@ -1,4 +1,4 @@
-"""Settings: what is accepted, and that each bad value names its option."""
+"""Settings: accepted values, and errors that name the option."""
 
 from ipaddress import ip_network
 from typing import Any
@@ -202,7 +202,7 @@ def test_what_rmw_zenoh_can_not_have(name: str, value: object, complaint: str) -
 
 
 def test_a_lan_relay_needs_a_secret() -> None:
-    """Its address is also that of other programs; the error says what to give."""
+    """Other programs may have the relay's address. The error names the missing option."""
     given = {**GIVEN, "ros": ("2",), "ros2_lan_relay": "172.17.0.1:7500"}
     expected = (
         "--ros2-lan-relay-secret: missing; give this option and rosproxy lan-relay --secret the"

@@ -1,4 +1,4 @@
-"""The policy in force: where its layers come from, and what it tells."""
+"""The policy in force: sources of layers, and the policy in the status."""
 
 from pathlib import Path
 

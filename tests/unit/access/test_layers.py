@@ -1,4 +1,4 @@
-"""Layers: what all of them together allow."""
+"""Layers: a policy allows only what all layers allow."""
 
 import msgspec
 import pytest

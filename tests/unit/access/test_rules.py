@@ -54,7 +54,7 @@ def test_a_hostile_glob_takes_no_time() -> None:
 
 
 def test_a_glob_without_a_question_mark_takes_no_more_steps_than_the_name_has_characters() -> None:
-    """60 globs of one label took 0.1 s for a name: the expression tried each text at each place."""
+    """A regular expression tries each text at each place: 60 globs took 0.1 s for a single name."""
     rules._expression.cache_clear()
     assert not rules.matches("*" + "a" * 254 + "b", "a" * 1024)
     assert not rules.matches("*" + "a" * 253 + "b*", "a" * 1024)

@@ -1,4 +1,4 @@
-"""What may be posted to the admin endpoint, and that each mistake names its field."""
+"""Requests to the admin endpoint: accepted bodies, and errors that name the field."""
 
 import json
 from typing import Any

@@ -1,4 +1,4 @@
-"""Whether outside can reach a proxy as it was set up."""
+"""Settings with which outside cannot reach the proxy."""
 
 import shlex
 

@@ -1,4 +1,4 @@
-"""A costly document: made once for all that wait, seldom, and never before it was asked for."""
+"""A costly document: made once for all waiting callers, seldom, and only on request."""
 
 import asyncio
 
@@ -9,7 +9,7 @@ from tests.clock import PatientLoop
 
 
 class Maker:
-    """Makes a document of the ``state``, in ``took`` seconds of a clock of its own."""
+    """Makes a document of the ``state``, in ``took`` seconds of a separate clock."""
 
     def __init__(self, took: float = 0.0) -> None:
         self.took = took

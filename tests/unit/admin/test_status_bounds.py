@@ -1,4 +1,4 @@
-"""The document at ``/status`` stays small, and no address hides what another one has."""
+"""The document at ``/status`` stays small, and no address hides the rows of another."""
 
 import json
 import re
@@ -253,7 +253,7 @@ def test_shares_are_fair(wanted: list[int], most: int) -> None:
     assert all(0 <= share <= want for share, want in zip(shares, wanted, strict=True))
     assert sum(shares) <= most
     cut = [share for share, want in zip(shares, wanted, strict=True) if share < want]
-    if cut:  # no share is larger than one that was cut, but for what does not divide
+    if cut:  # no share exceeds a cut share by more than the remainder of the division
         assert max(shares) - min(cut) <= 1
         assert most - sum(shares) < len(wanted)
 

@@ -1,4 +1,4 @@
-"""The document at ``/status``: read whatever it holds, and the same after writing."""
+"""The document at ``/status``: any content is read, and writing and reading change nothing."""
 
 import json
 from typing import Any
@@ -77,12 +77,12 @@ def test_what_does_not_fit_leaves_the_rest_alone() -> None:
     "odd", ['{"settings": {"udp": "\\ud800"}}', '{"settings": {"\\ud800": 1}}']
 )
 def test_half_of_a_surrogate_pair_leaves_the_rest_alone(odd: str) -> None:
-    """The operator's task for that proxy ended by it."""
+    """Such a text must not end the operator's task for the proxy."""
     assert parse_status(odd) == ProxyStatus()
 
 
 def test_a_document_of_too_many_rows_is_not_read() -> None:
-    """One in hostile hands had a million in 4 MB, and reading them took the operator minutes."""
+    """A hostile proxy may send a million rows in 4 MB, which would take the operator minutes."""
     full: dict[str, Any] = {"settings": {}, "nodes": [{}] * (MOST_ROWS - 2)}
     assert len(parse_status(json.dumps(full)).nodes) == MOST_ROWS - 2
     full["nodes"] = [{}] * (MOST_ROWS - 1)

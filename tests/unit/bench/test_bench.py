@@ -1,4 +1,4 @@
-"""The arithmetic of the benchmark, and what its pages are made of."""
+"""The arithmetic of the benchmark, and the content of its pages."""
 
 import os
 from pathlib import Path
@@ -12,7 +12,7 @@ from tests.bench.world import processors
 
 
 def filled() -> Book:
-    """Two rounds of a row at two sizes, and one of a row that does not grow."""
+    """A book with two rounds of a row at two sizes, and a single round of another row."""
     book = Book({"machine": "2 cores"})
     book.begin("streams")
     for direct, ours in ((100.0, 50.0), (400.0, 300.0)):
@@ -63,7 +63,7 @@ def test_loss() -> None:
 
 
 def test_cpu_is_by_the_time_between_two_readings() -> None:
-    """However late the second one comes."""
+    """However late the second reading comes."""
     before = Spent(10.0, 3.0, 7.0)
     after = Spent(12.0, 4.0, 10.0)
     assert per_second(before, after) == (0.5, 1.5)

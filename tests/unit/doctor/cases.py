@@ -77,7 +77,7 @@ def without_proxy(**changes: Any) -> DoctorFacts:
 
 
 def by_name(*nodes: NodeFacts) -> dict[str, NodeFacts]:
-    """Nodes by their names."""
+    """Nodes by name."""
     return {node.name: node for node in nodes}
 
 
@@ -98,6 +98,6 @@ def listener(**changes: Any) -> NodeFacts:
 
 
 def only(findings: Iterable[DoctorFinding], severity: Severity = Severity.WARNING) -> DoctorFinding:
-    """The one finding that is at least so bad."""
+    """The only finding of at least this severity."""
     (finding,) = [f for f in findings if f.severity >= severity]
     return finding

@@ -18,7 +18,7 @@ def test_a_sound_system_gives_no_errors() -> None:
     assert not failed(findings)
 
 
-def test_the_worst_stands_last_each_with_what_mends_it() -> None:
+def test_the_worst_finding_stands_last_and_each_has_its_fix() -> None:
     assert render([ERROR, WARNING, NOTE, OK, ERROR], 80).split("\n") == [
         "ok       ports: 100 free",
         "note     nodes: 3 registered",

@@ -52,8 +52,8 @@ def test_sound_nodes_are_counted() -> None:
 
 
 @pytest.mark.parametrize("state", ["refused", "silent", "failing", "cleaned"])
-def test_what_has_ended_is_no_node_that_does_not_answer(state: str) -> None:
-    """A container that was restarted: its node is back, or it took its name back itself."""
+def test_an_ended_node_does_not_count_as_silent(state: str) -> None:
+    """The container was restarted and the node is back, or the node has unregistered its name."""
     former = make_node(uri="http://10.0.0.5:40009/", port=45009, state=state)
     nameless = make_node(nodes=[], uri="http://10.0.0.5:40008/", port=45008, state=state)
     facts = make_facts(status=make_status(former, make_node(), nameless))
@@ -103,7 +103,7 @@ def test_a_proxy_that_has_just_started_misses_no_node_yet() -> None:
 
 @pytest.mark.parametrize(("host", "state"), [("127.0.0.1", "refused"), ("localhost", "ok")])
 def test_a_node_that_listens_on_loopback_only(host: str, state: str) -> None:
-    """A roscpp node answers probes all the same: only its TCPROS server is on loopback."""
+    """A roscpp node still answers probes: only the TCPROS server is on loopback."""
     finding = inside(uri=f"http://{host}:40001/", state=state)
     assert (finding.severity, finding.subject) == (Severity.ERROR, "/talker")
     assert "listens on loopback only" in finding.text

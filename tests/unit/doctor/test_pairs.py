@@ -1,4 +1,4 @@
-"""What the doctor says of the names that it is asked about."""
+"""The doctor's findings about given names."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -49,7 +49,7 @@ def apart(giver: NodeFacts, taker: NodeFacts, **changes: Any) -> DoctorFinding:
 
 
 def silent_talker(**changes: Any) -> NodeFacts:
-    """A publisher that nobody is connected to."""
+    """A publisher without connections."""
     return talker(**{"report": SlaveReport({"/chatter": STRING}), **changes})
 
 
@@ -205,7 +205,7 @@ def test_a_subscriber_outside_that_does_not_come() -> None:
 
 
 def subscriber_inside(**settings: str | bool) -> DoctorFinding:
-    """A publisher outside that serves its topic, and a subscriber behind the proxy."""
+    """The finding for a working publisher outside and a subscriber inside."""
     giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(ReachOutcome.ANSWERED))
     ports = {("/talker", "/chatter"): ("192.168.0.9:5000", Attempt(ReachOutcome.ANSWERED))}
     status = make_status(make_node("/listener"), settings=settings)
@@ -233,7 +233,7 @@ def test_a_subscriber_inside_that_has_the_proxy_as_its_way() -> None:
 
 
 def outside_pair(data_port: tuple[str, Attempt]) -> DoctorFinding:
-    """A publisher outside whose data port was tried."""
+    """The finding for a publisher outside after a connection attempt to its data port."""
     giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(ReachOutcome.ANSWERED))
     ports = {("/talker", "/chatter"): data_port}
     return apart(giver, listener(), data_ports=ports)

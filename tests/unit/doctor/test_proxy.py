@@ -1,4 +1,4 @@
-"""What the doctor says of the proxy, its master and its ports."""
+"""The doctor's findings about the proxy, the master and the ports."""
 
 from typing import Any
 

@@ -34,8 +34,8 @@ def test_words() -> None:
     assert slave_report(None, "x", 3) == SlaveReport()
 
 
-def test_a_connection_that_is_none_is_not_counted() -> None:
-    """A boolean is read as its text."""
+def test_a_row_that_is_not_connected_is_not_counted() -> None:
+    """Nodes may write the boolean as a number or a text."""
     rows = [
         [n, "/x", "o", "TCPROS", f"/{n}", said] for n, said in enumerate((True, 1, "1", 0, "0"))
     ]

@@ -70,14 +70,14 @@ def test_who_hears_nobody_is_told_where_to_look() -> None:
     assert "10.0.0.1:11400" in told["outside", "domain 7"][1]
 
 
-def test_a_peer_of_whom_nobody_is_heard_is_told() -> None:
-    """Cyclone DDS takes ports of its own where it has multicast: announcements miss it."""
+def test_a_peer_without_a_known_participant_gets_a_finding() -> None:
+    """With multicast, Cyclone DDS does not listen on the usual ports, so announcements miss it."""
     peers = ("10.0.0.9", "fd00::9", "10.0.0.7", "10.0.0.6:11400")
     told = diagnose_domain(
         DomainStatus(peers=peers, discovery="10.0.0.1:11400", inside=(INSIDE,), outside=(OUTSIDE,))
     )
     assert ("outside", "peer 10.0.0.9") not in told
-    assert ("outside", "peer fd00::9") not in told  # the same one's other address
+    assert ("outside", "peer fd00::9") not in told  # another address of 10.0.0.9
     for peer in peers[2:]:
         severity, text = told["outside", f"peer {peer}"]
         assert severity is Severity.INFO
@@ -96,7 +96,7 @@ def test_a_range_that_is_too_short_and_a_port_that_is_not_reached() -> None:
     assert told["reached", "01.10.dd"][0] is Severity.WARNING
     assert "10.0.0.1" in told["reached", "01.10.dd"][1]
     alone = DomainStatus(peers=("10.0.0.9",), outside=(unheard,))
-    assert ("reached", "01.10.dd") not in diagnose_domain(alone)  # nobody there to be answered
+    assert ("reached", "01.10.dd") not in diagnose_domain(alone)  # no participant inside
 
 
 TALKER = replace(INSIDE, publishes=("/chatter", "/scan"), services=("/add",))

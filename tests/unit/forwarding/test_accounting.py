@@ -1,4 +1,4 @@
-"""Whose connections the kernel forwards, and how many bytes went through them."""
+"""Connections that the kernel forwards, and their bytes."""
 
 from collections.abc import Iterable
 

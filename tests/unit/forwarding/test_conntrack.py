@@ -1,4 +1,4 @@
-"""What ``conntrack -L`` prints, as conntrack 1.4.7 printed it."""
+"""The output of ``conntrack -L``, recorded with conntrack 1.4.7."""
 
 from hypothesis import given
 from hypothesis import strategies as st

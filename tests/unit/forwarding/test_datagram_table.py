@@ -1,4 +1,4 @@
-"""nftables for datagrams: the documents that nft takes, and what nft prints of them."""
+"""nftables for datagrams: documents for nft, and the output of nft."""
 
 import json
 import re

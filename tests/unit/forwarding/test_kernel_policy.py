@@ -1,4 +1,4 @@
-"""What the kernel forwards, and why it doesn't: plain decisions."""
+"""Decisions: connections that the kernel forwards, and reasons against it."""
 
 from typing import Any
 

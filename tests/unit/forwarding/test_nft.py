@@ -1,4 +1,4 @@
-"""nftables: documents as nft takes them, its JSON output as nft 1.0.6 printed it."""
+"""nftables: documents for nft, and JSON output recorded with nft 1.0.6."""
 
 import contextlib
 import json

@@ -1,4 +1,4 @@
-"""Fast ports: which port goes with which, who gets one, and who loses it."""
+"""Fast ports: the second port of each node, and nodes that get or lose this port."""
 
 from hypothesis import given
 from hypothesis import strategies as st

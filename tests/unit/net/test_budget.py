@@ -1,4 +1,4 @@
-"""What may be held at once, in all and by one source."""
+"""Limits on resources in use: in all, and of a single source."""
 
 import contextlib
 

@@ -1,4 +1,4 @@
-"""Slots: so many in all, and no source has all of them."""
+"""Slots: a limited number, and never all for a single source."""
 
 import pytest
 

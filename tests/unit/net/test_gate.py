@@ -1,4 +1,4 @@
-"""How many connections there may be, and which one goes first."""
+"""Limits on connections, and the connection that is closed first."""
 
 from rosproxy.net import gate
 from rosproxy.net.gate import LEAST_PER_SOURCE, Gate

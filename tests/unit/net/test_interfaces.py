@@ -1,4 +1,4 @@
-"""Which of its own addresses this machine uses, and how long packets may be."""
+"""This machine's source address for a target, and the longest packet."""
 
 from ipaddress import ip_network
 
@@ -23,7 +23,7 @@ def test_a_network_may_be_a_single_address(network: str) -> None:
 def test_the_route_to_an_own_address_begins_there_and_takes_packets_of_loopback() -> None:
     route = route_towards("127.0.0.1")
     assert route.source == "127.0.0.1"
-    # Linux tells at most the longest packet of IP, and loopback's MTU is one byte more.
+    # Linux reports at most the longest IP packet, a byte less than the MTU of loopback.
     assert route.mtu >= 65_535
 
 

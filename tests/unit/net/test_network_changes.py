@@ -11,7 +11,7 @@ from rosproxy.net.network_changes import LOOK_INTERVAL_S, NetworkChanges
 
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch):
-    """The kernel's end of the socket on which it tells of changes."""
+    """The kernel's end of the socket that reports changes."""
     end, told = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     told.setblocking(False)
     monkeypatch.setattr(network_changes, "_route_socket", lambda: told)

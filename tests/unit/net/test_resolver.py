@@ -22,7 +22,7 @@ FOUND = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("192.0.2.7", 0))]
 
 
 class NameServer:
-    """Answers for names that begin with ``good``; all others hang until the test ends."""
+    """Answers for names that begin with ``good``. Other names hang until the test ends."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []

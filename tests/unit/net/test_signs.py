@@ -1,4 +1,4 @@
-"""The signs by which proxies of one machine know each other."""
+"""The signs by which proxies of the same machine find each other."""
 
 from contextlib import ExitStack, closing
 

@@ -1,4 +1,4 @@
-"""What is sent of a document: nothing less than what makes the new one of the old, and no more."""
+"""Changes of a document: exactly the parts that turn the old document into the new."""
 
 import json
 from typing import Any

@@ -52,8 +52,10 @@ def test_participants_and_what_crosses_the_boundary() -> None:
     assert "master" not in document["nodes"]
 
 
-def test_participants_of_one_container_have_labels_of_their_own() -> None:
-    """Fast DDS tells processes by the bytes in the middle; the last ones are 0 for all of them."""
+def test_participants_of_a_container_have_different_labels() -> None:
+    """In Fast DDS the middle bytes differ between processes. The last bytes may be 0 in all
+    prefixes.
+    """
     prefixes = [
         "01.0f.a1.b2.17.00.c3.d4.00.00.00.00",
         "01.0f.a1.b2.18.00.c3.d5.00.00.00.00",
@@ -82,8 +84,8 @@ def test_a_mismatch_is_on_its_link_alone() -> None:
     assert links["topic /chatter 0 01.10.cc 0 01.0f.aa"]["state"] == "ok"
 
 
-def test_a_mismatch_that_is_at_its_link_is_no_finding_as_well() -> None:
-    """Nothing else is taken for it: of what a participant leaves out there is no link."""
+def test_a_mismatch_that_a_link_shows_is_no_finding() -> None:
+    """A mismatch without a link stays a finding."""
     pair = MismatchStatus(
         "topic", "/chatter", "reliability", "BEST_EFFORT", "RELIABLE", "01.10.bb", "01.0f.aa"
     )
@@ -119,7 +121,9 @@ def test_a_mismatch_counts_more_than_a_warning_about_a_participant() -> None:
 
 @pytest.mark.parametrize(("direction", "inwards"), [("out", True), ("out", False), ("both", False)])
 def test_a_participant_of_one_port_gets_its_data_there(direction: str, inwards: bool) -> None:
-    """Cyclone DDS has one for discovery and user data; outside it has a stand-in for discovery."""
+    """Cyclone DDS has the same port for discovery and user data, and outside a stand-in for
+    discovery.
+    """
     port = replace(DATA, kind="metatraffic", plane="copy")
     writes, reads = (
         {"leases": (port,), "publishes": publishes, "subscribes": subscribes}

@@ -1,4 +1,4 @@
-"""The document of a proxy for ROS 1: lanes, ways, measures, and what is wrong where it is wrong."""
+"""The document of a proxy for ROS 1: lanes, ways, measures, and faults at the right object."""
 
 import json
 from typing import Any
@@ -39,7 +39,9 @@ KERNEL = {"plane": "kernel", "port": 45050, "connections": 1, "sent_rate": 10.0}
 
 
 def judged(**changes: Any) -> JudgedFacts:
-    """What the doctor says of a talker inside and a listener outside, asked about their topic."""
+    """The doctor's findings about a talker inside and a listener outside, with the topic as
+    a name.
+    """
     facts = make_facts(names=("/chatter",), **changes)
     return judge(facts, judge(facts))
 
@@ -226,7 +228,7 @@ def test_what_every_node_has_is_quiet() -> None:
         "service /talker/get_loggers /talker ",
         "parameter /rosout_disable_topics_generation master /talker",
     }
-    assert "state" not in links["topic /chatter /talker "], "nobody has looked at it"
+    assert "state" not in links["topic /chatter /talker "], "the topic is not examined"
 
 
 @pytest.mark.parametrize("topic", ["/tf", "/tf_static", "/rosout_agg", "/parameter_events"])
@@ -316,7 +318,7 @@ def test_a_large_graph_is_cut_and_what_is_broken_stays() -> None:
 
 
 def test_of_too_many_nodes_the_broken_ones_stay() -> None:
-    """The last of them had the one broken link, which was not shown."""
+    """Also a node behind the limit, if it has a broken link."""
     nodes = {f"/n{number}": PageNode("robot") for number in range(MOST_NODES + 9)}
     last = f"/n{MOST_NODES + 8}"
     ill = f"/n{MOST_NODES + 7}"
@@ -332,7 +334,9 @@ def test_of_too_many_nodes_the_broken_ones_stay() -> None:
 
 
 def test_a_document_has_few_bytes_whatever_nodes_call_themselves() -> None:
-    """200 names of 100,000 characters made 60 MB of it each second, and the operator read none."""
+    """200 names of 100,000 characters would make 60 MB each second, which the operator does not
+    read.
+    """
     names = [f"/{number}{'é' * 100_000}" for number in range(50)]
     facts = judged().facts
     graph = SystemState({"/chatter": ["/talker"]}, {"/chatter": names})

@@ -1,4 +1,4 @@
-"""Rates, ages, and connections that carry nothing: from counters and their times alone."""
+"""Rates, ages, and connections without traffic, from counters and times alone."""
 
 from typing import Any
 
@@ -106,8 +106,8 @@ def test_what_the_proxy_relays_is_newer_than_what_nodes_are_asked_for() -> None:
     assert link.last(61.0 + FLOWS) == 61.0
 
 
-def test_what_the_proxy_relays_hides_no_connection_that_carries_nothing() -> None:
-    """Its counter grows until the buffers behind it are full."""
+def test_relayed_bytes_hide_no_connection_without_traffic() -> None:
+    """The proxy's counter grows until the buffers behind the proxy are full."""
     measures = read((1.0, 10, 10), (3.0, 20, 20), (9.0, 80, 20))
     measures.read_relays({KEY: 1000}, 8.0)
     measures.read_relays({KEY: 2000}, 9.0)
@@ -127,7 +127,7 @@ def test_where_nodes_alone_count_it_flows_if_it_came_often_between_two_questions
 
 def test_counts_of_a_node_that_answers_no_more_are_not_shown() -> None:
     link = read((1.0, 10, 10), (31.0, 310, 310)).get(KEY)
-    assert link.flows(90.0), "a round may take longer than the one before"
+    assert link.flows(90.0), "a round may take longer than the last round"
     assert not link.flows(95.0)
     assert link.last(95.0) == 31.0
 
@@ -153,10 +153,10 @@ def test_roscpp_knows_a_publisher_without_the_path_of_its_uri() -> None:
     assert measures.get(KEY).hz == 10.0
 
 
-def test_what_a_node_says_is_read_once_however_many_it_hears(
+def test_the_report_of_a_node_is_read_once_for_all_its_publishers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Anybody may register a thousand publishers, and answer as many rows."""
+    """A node may register a thousand publishers, and answer a thousand rows."""
     read = list[str]()
 
     def parse(uri: str) -> HostPort | None:

@@ -1,4 +1,4 @@
-"""Who may look at the page."""
+"""Visitors that may see the page."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Logs: as text and as JSON, harmless whatever they quote, and few whoever floods them."""
+"""Logs: text and JSON, with escaped quotes of foreign texts, and bounded in a flood."""
 
 import json
 import logging
@@ -35,7 +35,7 @@ def record(
 
 
 def line(message: str, *arguments: object, **more: Any) -> dict[str, Any]:
-    """A record as the object of its line."""
+    """The JSON object of a record."""
     text = JsonLines().format(record(message, *arguments, **more))
     assert text.isascii()
     assert "\n" not in text
@@ -114,7 +114,7 @@ def test_the_text_of_an_exception_is_short() -> None:
 
 
 class Clock:
-    """A clock that stands still until it is told."""
+    """A clock that only tests move."""
 
     now = 100.0
 
@@ -147,8 +147,8 @@ def test_the_same_warning_again_and_again_is_written_now_and_then(clock: Clock) 
     assert len(written(floods, (record("%s: gone", "/a") for _ in range(99)))) == SUBJECT_BURST
 
 
-def test_a_node_is_told_of_after_another_one_at_the_same_address(clock: Clock) -> None:
-    """A node registers some five times when it starts, and is refused each time."""
+def test_a_second_node_at_an_address_is_logged_too(clock: Clock) -> None:
+    """A node registers some five times at its start, and the proxy refuses each."""
     floods = LogRateLimit(clock)
     why = "all ports of the range are in use; " * 7
     told = [record("%s: %s: %s", "10.0.0.5", node, why) for node in ("/a", "/b") for _ in range(5)]

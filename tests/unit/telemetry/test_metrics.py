@@ -1,4 +1,4 @@
-"""The metrics of a proxy that has just started, and how many series it may have."""
+"""The metrics of a proxy after the start, and the limit on series."""
 
 import ast
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Problems: the newest are kept, and no text of others makes them large."""
+"""Problems: the newest stay, and texts are bounded."""
 
 from rosproxy.telemetry.problems import LONGEST_SUBJECT, LONGEST_TEXT, MOST, Problems
 

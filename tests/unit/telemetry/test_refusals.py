@@ -69,12 +69,12 @@ def test_a_refusal_that_is_over_is_not_shown() -> None:
     refusals.note("long_body", "10.0.0.5", "x")
     clock[0] = OVER_AFTER
     refusals.end_old()
-    assert problems.all(), "the last one was a while later"
+    assert problems.all(), "the last refusal was later"
     clock[0] = QUIET / 2 + OVER_AFTER
     refusals.end_old()
     assert not problems.all()
     refusals.note("long_body", "10.0.0.5", "x")
-    assert problems.all(), "it is told when it comes again"
+    assert problems.all(), "a new refusal is a problem again"
 
 
 @pytest.mark.parametrize("reason", [*sorted(OF_STARTS), RATE])
@@ -94,7 +94,7 @@ def test_what_a_start_brings_for_a_moment_is_not_told(
 
 
 def test_what_goes_on_after_a_start_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    """Also where each datagram has another source, as forged ones have."""
+    """Also if each datagram has another, perhaps forged, source."""
     problems = Problems()
     clock = [0.0]
     refusals = Refusals(Metrics(), problems, lambda: clock[0])
@@ -107,8 +107,8 @@ def test_what_goes_on_after_a_start_is_told(caplog: pytest.LogCaptureFixture) ->
 
 
 @pytest.mark.parametrize("reason", sorted(OF_STARTS))
-def test_a_node_that_starts_again_and_again_is_not_told(reason: str) -> None:
-    """Its participant is met each time."""
+def test_a_node_that_restarts_again_and_again_is_no_problem(reason: str) -> None:
+    """The proxy admits the node's participant each time."""
     problems = Problems()
     clock = [0.0]
     refusals = Refusals(Metrics(), problems, lambda: clock[0])

@@ -1,4 +1,4 @@
-"""What is wrong with the routers: each fault has its text and its fix, and names its object."""
+"""Faults of the routers: each finding has an object, a text and a fix."""
 
 import pytest
 from msgspec.structs import replace

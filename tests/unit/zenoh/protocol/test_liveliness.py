@@ -1,4 +1,6 @@
-"""Liveliness tokens: what rmw_zenoh writes is read, and nothing else raises or is taken for it."""
+"""Liveliness tokens: the parser reads those of rmw_zenoh, and ignores all other keys without
+errors.
+"""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""Reports of the router process: what they tell, and nothing raises but ValueError."""
+"""Reports of the router process: content, and no error but ValueError."""
 
 import msgspec
 import pytest
