@@ -40,7 +40,7 @@ async def adopt(proxy: Proxy, *containers: dict[str, Any]) -> int:
 
 
 async def register_directly(master: FakeMaster, node: FakeNode) -> None:
-    """One registration of each kind at the real master, around the proxy."""
+    """Make a registration of each kind at the real master directly."""
     real = host_and_port(master.uri)
     for topic in ("/chatter", "/rosout"):
         await node.publish(real, topic)
@@ -61,7 +61,7 @@ def all_of(master: FakeMaster, name: str = "/talker") -> dict[str, list[str]]:
 
 
 def leased(proxy: Proxy, node: FakeNode) -> dict[str, list[str]]:
-    """The same as it must be once the node is behind the proxy."""
+    """The expected registrations once the node is behind the proxy."""
     uri = proxy.uri(node)
     (host, port) = proxy.lease(node)
     names = ("/chatter", "/rosout", "/back", "/rosout_disable_topics_generation")
@@ -128,7 +128,7 @@ async def test_its_own_subscription_goes_on_without_a_gap(
     await inside.publish(proxy.master, "/back")
     await register_directly(master, node)
     await adopt(proxy)
-    await until(lambda: node.updates("/back"), "it is told who publishes")
+    await until(lambda: node.updates("/back"), "the node gets the publishers")
     assert node.updates("/back") == [[outside.uri, inside.uri]]
 
 
@@ -193,7 +193,7 @@ async def test_another_node_at_the_same_port(
 
 
 async def twins(make_node: MakeNode, *topics: str) -> list[FakeNode]:
-    """Two containers whose nodes have the same host name and port."""
+    """Nodes of two containers with the same host name and port."""
     port = free_ports(1)
     first = await make_node("/first", NODE, "twin", port)
     second = await make_node("/second", OTHER_NODE, "twin", port)
@@ -227,7 +227,7 @@ async def test_two_containers_that_can_not_be_told_apart_are_left_alone(
 async def test_several_names_of_one_process(
     proxy: Proxy, master: FakeMaster, node: FakeNode
 ) -> None:
-    """As a nodelet manager has them."""
+    """As in a nodelet manager."""
     await register_directly(master, node)
     await rpc(master.uri, "registerPublisher", "/nodelet", "/points", "std_msgs/String", node.uri)
     node.published["/points"] = "std_msgs/String"
@@ -240,13 +240,17 @@ async def test_several_names_of_one_process(
 async def test_a_node_that_is_subscribed_to_a_parameter_is_left_as_it_was(
     proxy: Proxy, master: FakeMaster, node: FakeNode, key: str
 ) -> None:
-    """The master does not tell of it, and would shut the node down if it stayed."""
+    """The master does not show parameter subscriptions, and would shut the node down for a
+    remaining one.
+    """
     master.params["/robot/name"] = 1
     await register_directly(master, node)
     await node.call(host_and_port(master.uri), "subscribeParam", node.uri, key)
     before = all_of(master)
     assert await adopt(proxy) == 0
-    del before["/rosout_disable_topics_generation"]  # which could not be told apart
+    del before[
+        "/rosout_disable_topics_generation"
+    ]  # lost: this subscription cannot be distinguished
     assert all_of(master) == before
     problems = [p for p in proxy.ros1.context.problems.all() if p.subject == "/talker"]
     assert "Restart the container of the node" in problems[-1].text
@@ -278,10 +282,12 @@ async def test_it_registers_through_the_proxy_before_the_update(
     assert not shutdowns(node)
 
 
-async def test_it_registers_around_the_proxy_again(
+async def test_an_adopted_node_registers_directly_again(
     make_proxy: MakeProxy, master: FakeMaster, node: FakeNode
 ) -> None:
-    """The master drops what it had through the proxy and asks for a shutdown, which is spared."""
+    """The master drops the node's registrations and calls shutdown, which the proxy does not pass
+    on.
+    """
     proxy = await make_proxy(**PATIENT)
     await register_directly(master, node)
     await adopt(proxy)
@@ -291,7 +297,7 @@ async def test_it_registers_around_the_proxy_again(
     assert not shutdowns(node)
 
 
-async def test_it_does_so_through_a_proxy_that_has_forgotten(
+async def test_an_adopted_node_registers_directly_after_a_restart_of_the_proxy(
     make_proxy: MakeProxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
     proxy = await make_proxy(**PATIENT)
@@ -299,26 +305,26 @@ async def test_it_does_so_through_a_proxy_that_has_forgotten(
     await register_directly(master, node)
     await adopt(proxy, container(NODE, "c1.invalid"))
     await proxy.restart()
-    await until(lambda: len(proxy.ros1.context.registry), "it is found at the master")
-    await until(lambda: proxy.endpoint(node).trusted, "it is recovered")
+    await until(lambda: len(proxy.ros1.context.registry), "the proxy finds the node at the master")
+    await until(lambda: proxy.endpoint(node).trusted, "the node is recovered")
     await node.publish(host_and_port(master.uri), "/more")
     uri = proxy.uri(node)
-    await until(lambda: all_of(master).get("/more") == [uri], "the new one is behind the proxy")
-    await until(lambda: all_of(master).get("/chatter") == [uri], "and what it had")
+    await until(lambda: all_of(master).get("/more") == [uri], "the new topic is behind the proxy")
+    await until(lambda: all_of(master).get("/chatter") == [uri], "so is /chatter")
     assert not shutdowns(node)
 
 
-async def test_a_shutdown_that_comes_late_is_spared(
+async def test_a_late_shutdown_is_not_passed_on(
     make_proxy: MakeProxy, master: FakeMaster, node: FakeNode
 ) -> None:
-    """What it was for is over: the master has the node by its own URI of the proxy again."""
+    """The reason is over: the master has the node by the proxy's URI again."""
     proxy = await make_proxy(**PATIENT, probe_interval=60.0)
     await node.publish(proxy.master)
     node.published["/lost"] = "std_msgs/String"
     reason = "[/talker] Reason: new node registered with same name"
     assert await rpc(proxy.uri(node), "shutdown", "/master", reason) == [1, "", 0]
     assert not shutdowns(node)
-    await until(lambda: "/lost" in all_of(master), "what it lacked is registered")
+    await until(lambda: "/lost" in all_of(master), "the missing topic is registered")
     assert not proxy.endpoint(node).has_registered_directly
 
 
@@ -331,7 +337,7 @@ async def test_a_shutdown_that_is_meant_is_passed_on(
     assert len(shutdowns(node)) == 1
     another = await make_node("/talker", OUTSIDE)
     await another.publish(host_and_port(master.uri))
-    await until(lambda: len(shutdowns(node)) == 2, "the older one of the same name is shut down")
+    await until(lambda: len(shutdowns(node)) == 2, "the older node of the name is shut down")
 
 
 async def test_what_it_drops_around_the_proxy_is_dropped(
@@ -345,7 +351,7 @@ async def test_what_it_drops_around_the_proxy_is_dropped(
     assert "/add" in all_of(master)
 
 
-async def test_when_it_has_ended_nothing_is_left_at_once(
+async def test_after_the_end_of_an_adopted_node_nothing_is_left(
     make_proxy: MakeProxy, master: FakeMaster, node: FakeNode
 ) -> None:
     proxy = await make_proxy(**PATIENT)
@@ -353,7 +359,7 @@ async def test_when_it_has_ended_nothing_is_left_at_once(
     await adopt(proxy)
     lease = proxy.lease(node)
     await node.stop()
-    await until(lambda: not all_of(master), "the master knows nothing of it")
+    await until(lambda: not all_of(master), "the master has no registrations")
     assert await refuses(lease)
 
 
@@ -361,7 +367,7 @@ Multicall = Callable[[MasterClient, Sequence[Any]], Awaitable[list[Any]]]
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
-    """The master is away the first time when a multicall has that method in it."""
+    """Let the first multicall with this method find the master away."""
     real: Multicall = MasterClient.multicall
     failures: list[str] = []
 
@@ -375,7 +381,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
 
 
 @pytest.mark.parametrize("method", ["registerPublisher", "registerService"])
-async def test_registering_it_fails_and_is_made_up_for(
+async def test_a_failed_registration_is_made_later(
     make_proxy: MakeProxy,
     master: FakeMaster,
     node: FakeNode,
@@ -389,7 +395,7 @@ async def test_registering_it_fails_and_is_made_up_for(
     assert reply.status == 503
     assert not all_of(master)
     expected = set(leased(proxy, node)) - {"/rosout_disable_topics_generation"}
-    await until(lambda: expected <= set(all_of(master)), "upkeep registers it")
+    await until(lambda: expected <= set(all_of(master)), "upkeep registers the node")
     assert all_of(master)["/chatter"] == [proxy.uri(node)]
     assert not shutdowns(node)
 

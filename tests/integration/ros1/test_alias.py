@@ -1,4 +1,4 @@
-"""Nodes on the master's host, whose name leads to the proxy: reached at the same ports there."""
+"""Nodes on the master's host: inside, the host name leads to the proxy, and the ports stay."""
 
 import asyncio
 import socket
@@ -45,7 +45,7 @@ MOVED = "127.0.1.2"
 
 
 def behind_its_name(master: FakeMaster, **options: Any) -> dict[str, Any]:
-    """Options of a proxy that stands in for the master's host; nodes there have its ports."""
+    """Options of a proxy that stands in for the master's host with the same ports."""
     port = host_and_port(master.uri)[1]
     named = {"master_uri": f"http://robot:{port}", "master_address": MASTER}
     return {**named, "bind": PROXY, "advertise_host": PROXY, **options}
@@ -76,7 +76,7 @@ def service(node: FakeNode, address: str = PROXY) -> Address:
 
 
 def stand_ins(proxy: Proxy) -> dict[int, int]:
-    """The ports that stand in for nodes, with their connections."""
+    """The ports of stand-ins, with the number of connections."""
     return {row["port"]: row["connections"] for row in proxy.app.status()["stand_ins"]}
 
 
@@ -85,7 +85,7 @@ def problems(proxy: Proxy) -> dict[str, str]:
 
 
 async def look_up(proxy: Proxy, node: FakeNode) -> Any:
-    """A node's slave URI as inside is given it."""
+    """A node's slave URI for inside."""
     return (await rpc(proxy.master, "lookupNode", "/tool", node.name, source=NODE))[2]
 
 
@@ -286,7 +286,7 @@ async def test_nodes_with_addresses_or_of_other_hosts_are_left_alone(
 
 
 async def gone(proxy: Proxy, robot: FakeNode) -> None:
-    """End a node whose ports have aliases, and let inside find out."""
+    """End a node with aliases. Connections from inside are reset."""
     await robot.stop()
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
     assert await knock(service(robot), service_header(), NODE) == "reset"
@@ -390,7 +390,7 @@ async def test_the_proxys_own_ports_are_no_aliases_where_it_shares_the_name(
     await node.publish(proxy.master)
     assert await look_up(proxy, node) == node.uri
     assert stand_ins(proxy) == {}
-    assert problems(proxy).keys() == {"advertised host"}  # nobody knows it here
+    assert problems(proxy).keys() == {"advertised host"}  # no name server knows PROXY
 
 
 @pytest.fixture
@@ -518,10 +518,10 @@ async def test_a_proxy_that_stops_ends_connections_and_ports(proxy: Proxy, robot
     assert await refuses(slave(robot), NODE)
 
 
-async def test_an_update_that_the_master_does_not_bear_out_opens_no_port(
+async def test_an_update_without_the_masters_confirmation_opens_no_port(
     proxy: Proxy, robot: FakeNode, node: FakeNode, master: FakeMaster
 ) -> None:
-    """Whoever called publisherUpdate at its own lease had any port of the master's host opened."""
+    """A node must not open ports of the master's host by a publisherUpdate at its own lease."""
     await node.subscribe(proxy.master, "/t")
     secret = await asyncio.start_server(lambda *_: None, MASTER)
     port = secret.sockets[0].getsockname()[1]
@@ -532,7 +532,7 @@ async def test_an_update_that_the_master_does_not_bear_out_opens_no_port(
             assert (await rpc(proxy.uri(node), "publisherUpdate", *params, source=source))[0] == 1
     assert stand_ins(proxy) == {}
     assert await refuses((PROXY, port), NODE)
-    # What the master has of that topic opens its port, whoever tells.
+    # A publisher that the master has opens its port, with any caller.
     await rpc(proxy.uri(node), "publisherUpdate", "/master", "/chatter", [robot.uri, *forged])
     assert set(stand_ins(proxy)) == {slave(robot)[1]}
     secret.close()
@@ -565,13 +565,13 @@ async def test_an_update_is_passed_on_while_the_master_is_away(
 
 
 async def test_only_tcpros_is_relayed(proxy: Proxy, robot: FakeNode) -> None:
-    """A port that speaks something else can't be used, though the master names it."""
+    """Other protocols do not pass, even at a port that the master names."""
     await look_up_service(proxy)
     before = robot.tcpros.connections
     for data in (b"\x00\x01\x02\x03garbage", b"\xff\xff\xff\xff", b"\x04\x00\x00\x00abcd"):
         async with connect(service(robot), NODE) as wire:
             await wire.send(data)
-            await wire.half_close()  # what waits for more has all of it now
+            await wire.half_close()  # ends a wait for more bytes
             assert await wire.outcome() in ("closed", "reset", "answered")
     assert robot.tcpros.connections == before
 
@@ -590,7 +590,7 @@ async def test_an_alias_port_waits_for_an_operator_that_has_told_nothing_yet(
     monkeypatch.setattr(callers, "UPDATE_TIMEOUT", 30.0)
     operated = behind_its_name(master, admin_token_hash=hash_token("the operator's"))
     proxy = await make_proxy(**operated)
-    assert await look_up(proxy, robot) == robot.uri  # by a program on its own machine
+    assert await look_up(proxy, robot) == robot.uri  # a program on the proxy's machine
     ask = post(xml("getPid", "/tool"))
     both = [asyncio.create_task(knock(slave(robot), ask, source)) for source in (NODE, OTHER_NODE)]
     assert (await rpc(proxy.master, "getPid", "/doctor", source="127.0.0.1"))[0] == 1

@@ -98,22 +98,22 @@ async def test_a_subscriber_comes_back_to_the_same_port_after_a_restart(
     node.calls.clear()
     await proxy.restart()
     await until(lambda: len(node.updates()) > 1, "publisherUpdates by the proxy")
-    gone, (again,) = node.updates()[:2]  # who has given up tries again once it is told of both
+    gone, (again,) = node.updates()[:2]  # subscribers that gave up try again after both updates
     assert gone == []
     assert host_and_port(again)[1] == host_and_port(given[0])[1]
-    # Its port is not known yet: it is asked for.
+    # The proxy does not know the topic's port yet, and asks the node.
     async with connect(host_and_port(again), NODE) as wire:
         await wire.send(topic_header(caller="/n"))
         assert (await read_header(wire))["callerid"] == "/robot"
 
 
-async def test_what_comes_back_is_what_the_master_has(
+async def test_uris_from_inside_are_imported_for_the_master(
     proxy: Proxy, robot: FakeNode, master: FakeMaster
 ) -> None:
-    """As `rosnode cleanup` unregisters somebody else's node."""
+    """As `rosnode cleanup` unregisters another node."""
     given = await look_up(proxy, robot)
     api = await look_up_service(proxy)
-    await proxy.restart()  # nothing is remembered; the port is as before
+    await proxy.restart()  # without memory, but with the same port
     assert await look_up(proxy, robot) == given
     ended = await rpc(proxy.master, "unregisterPublisher", "/robot", "/chatter", given, source=NODE)
     assert ended[2] == 1
@@ -170,7 +170,7 @@ async def test_a_node_that_is_gone_refuses_until_it_is_back(proxy: Proxy, robot:
 async def test_a_node_with_a_problem_is_asked_whether_it_lives(
     proxy: Proxy, robot: FakeNode
 ) -> None:
-    """roslisp ends if it is connected to and told nothing."""
+    """A real call, because a roslisp node ends after a connection without data."""
     await look_up(proxy, robot)
     proxy.ros1.context.problems.add(robot.uri, "a topic can't be reached")
     robot.calls.clear()
@@ -211,10 +211,10 @@ async def test_another_node_at_the_address_does_not_lend_its_name(
         assert "error" in await read_header(wire)
 
 
-async def test_nobody_inside_has_the_proxy_connect_to_what_he_names(
+async def test_a_uri_from_inside_makes_the_proxy_connect_nowhere(
     proxy: Proxy, node: FakeNode
 ) -> None:
-    """With no way out but the proxy, an address that one names oneself would be one."""
+    """Otherwise a node without a way out gets one by naming an address."""
     secret = await asyncio.start_server(lambda *_: None, OUTSIDE)
     port = secret.sockets[0].getsockname()[1]
     params = "/node", "/t", "x/Y", f"http://{OUTSIDE}:{port}/"
@@ -238,7 +238,7 @@ async def test_nodes_of_outside_may_run_on_the_proxys_machine(
 async def test_nothing_leads_to_the_proxys_own_ports(
     proxy: Proxy, node: FakeNode, master: FakeMaster, monkeypatch: pytest.MonkeyPatch, port: str
 ) -> None:
-    """Whoever writes to the master chooses an address of the proxy's machine."""
+    """A node may register any address of the proxy's machine at the master."""
     monkeypatch.setattr(
         "rosproxy.ros1.stand_ins.outside_nodes.is_own", lambda address: address == MASTER
     )
@@ -372,7 +372,7 @@ async def test_who_is_gone_was_not_cut_by_a_policy(
 async def test_a_name_that_changes_its_address_leads_nowhere_else(
     proxy: Proxy, master: FakeMaster, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever registers a name may have a name server that answers otherwise the second time."""
+    """An attacker's name server may give another address the second time."""
     robot = await make_node("/robot", MASTER, host="robot.example")
     await robot.publish(host_and_port(master.uri))
     at = host_and_port(await look_up(proxy, robot))

@@ -1,4 +1,4 @@
-"""Who may use the proxy as its master, whom it believes, and who gets a port."""
+"""Callers of the master port, confirmed addresses of nodes, and distribution of ports."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -40,7 +40,7 @@ HIDDEN = "127.0.2.99"
 
 @pytest.fixture
 def _no_source_is_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All addresses of the tests are this machine's own, whose programs are always let in."""
+    """Count no test address as the proxy's machine, whose programs may always call."""
     monkeypatch.setattr("rosproxy.ros1.servers.callers.is_own", lambda address: False)
 
 
@@ -59,7 +59,7 @@ def address_of(proxy: Proxy, name: str) -> str:
     return proxy.ros1.context.registry.by_caller[name].location.address
 
 
-# Who may use the proxy as its master
+# Callers of the master port
 
 
 @pytest.mark.usefixtures("_no_source_is_own")
@@ -77,7 +77,7 @@ async def test_the_master_port_is_for_inside_alone(
         assert phrase in problems(proxy)["master port"]
     assert (
         caplog.text.count("is not in an inside network") == 1
-    )  # it is told in the log now and then only
+    )  # the log has a bounded number of warnings
     assert proxy.metric("strangers_total", standing="outside") == 3
     assert "/stranger" not in master.nodes
     assert (await node.publish(proxy.master))[0] == 1
@@ -118,14 +118,14 @@ async def test_where_an_operator_selects_only_its_containers_are_let_in(
         assert phrase in problems(proxy)["master port"]
     assert proxy.metric("strangers_total", standing="unselected") == 1
     assert (await other.publish(proxy.master))[0] == 1
-    # What it has stays: only the operator's "gone" ends that.
+    # Registrations stay until the operator sends "gone".
     assert await proxy.serves(node)
-    # Other updates leave the selection as it is; an empty one selects no address.
+    # Other updates keep the selection. An empty selection selects no address.
     await update(proxy, gone=[THIRD_NODE])
     assert (await other.publish(proxy.master))[0] == 1
     await update(proxy, selected=[])
     assert (await exchange(proxy.master, request(body), OTHER_NODE)).status == 403
-    # A proxy that is started again knows nothing of it yet, and serves whom it served.
+    # A restarted proxy does not know the selection yet, and serves its former nodes.
     await proxy.restart()
     assert (await node.publish(proxy.master, "/more"))[0] == 1
 
@@ -149,7 +149,7 @@ async def test_a_new_container_waits_for_the_update_and_loses_nothing(
 
 @pytest.fixture
 def _only_localhost_is_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The one address of the tests that is a program on the proxy's own machine."""
+    """Count 127.0.0.1 alone as the proxy's machine."""
     own = "127.0.0.1"
     monkeypatch.setattr("rosproxy.ros1.servers.callers.is_own", lambda address: address == own)
 
@@ -225,14 +225,14 @@ async def test_the_selection_is_taken_in_while_the_master_is_away(
     assert (await exchange(proxy.master, request(xml("getPid", "/n")), NODE)).status == 403
 
 
-# Whom it believes where a node is
+# Confirmed addresses of nodes
 
 
 @pytest.mark.usefixtures("_as_if_not_loopback")
-async def test_a_forged_caller_api_publishes_nobody_else(
+async def test_a_forged_caller_api_publishes_no_other_node(
     proxy: Proxy, make_node: MakeNode, master: FakeMaster
 ) -> None:
-    """A node that never joined was published by somebody who registered its address."""
+    """Not even a node that never called the proxy."""
     evil = await make_node("/evil")
     victim = await make_node("/victim", OTHER_NODE)
     await evil.call(proxy.master, "registerPublisher", "/rosout", "rosgraph_msgs/Log", victim.uri)
@@ -250,19 +250,19 @@ Ask = Callable[[FakeNode, Proxy], Any]
 
 
 def as_rospy(node: FakeNode) -> None:
-    """It tells its name when it is asked for it, and may have no topic yet."""
+    """Make a node like rospy: it answers getName, and may have no topic yet."""
     node.answers["getName"] = value([1, "", node.name])
     node.published.clear()
 
 
 def as_roscpp(node: FakeNode) -> None:
-    """It publishes /rosout first of all, and has no getName; its subscriptions are locked."""
+    """Make a node like roscpp: /rosout first, no getName, and getSubscriptions hangs."""
     node.answers["getName"] = node.answers["x"] = value([-1, "no such method", 0])
     node.answers["getSubscriptions"] = End.HANG
 
 
 def as_roscpp_without_rosout(node: FakeNode) -> None:
-    """Its first registration is a service (init_options::NoRosout)."""
+    """Make a node like roscpp with init_options::NoRosout, which first registers a service."""
     as_roscpp(node)
     node.published.clear()
 
@@ -294,7 +294,7 @@ async def test_a_node_whose_source_is_hidden_bears_out_its_address_by_its_name(
 
 
 @pytest.mark.usefixtures("_as_if_not_loopback")
-async def test_who_comes_first_from_a_hidden_source_keeps_nobody_from_its_uri(
+async def test_an_earlier_forgery_from_a_hidden_source_does_not_take_a_nodes_uri(
     proxy: Proxy, make_node: MakeNode
 ) -> None:
     node = await make_node("/hidden", OTHER_NODE)
@@ -302,7 +302,7 @@ async def test_who_comes_first_from_a_hidden_source_keeps_nobody_from_its_uri(
     await call(proxy.master, "registerPublisher", "/evil", *forged, source=HIDDEN)
     assert address_of(proxy, "/evil") == HIDDEN
     by_caller = proxy.ros1.context.registry.by_caller
-    await until(lambda: by_caller["/evil"].never_found, "it is looked for there")
+    await until(lambda: by_caller["/evil"].never_found, "the proxy looks for /evil there")
     assert (await publish(node, proxy))[0] == 1
     assert address_of(proxy, "/hidden") == OTHER_NODE
     code, text, _ = await call(proxy.master, "registerPublisher", "/evil2", *forged, source=HIDDEN)
@@ -313,7 +313,7 @@ async def test_who_comes_first_from_a_hidden_source_keeps_nobody_from_its_uri(
 async def test_a_node_outside_is_left_to_itself(
     proxy: Proxy, make_node: MakeNode, master: FakeMaster
 ) -> None:
-    """Somebody inside registers it, as a bridge between masters does: no port leads there."""
+    """No port leads to an outside node that a bridge between masters registers from inside."""
     far = await make_node("/far", OUTSIDE)
     assert (await publish(far, proxy))[0] == 1
     assert master.nodes["/far"] == far.uri
@@ -347,11 +347,11 @@ async def test_the_selection_counts_for_addresses_that_others_register_too(
     assert list(proxy.ros1.context.registry) == []
 
 
-# Who gets a port
+# Distribution of ports
 
 
 def dead_uri(number: int, address: str = NODE) -> str:
-    """A URI at which nobody is."""
+    """A URI where no program listens."""
     return f"http://{address}:{number + 1}/"
 
 
@@ -367,10 +367,10 @@ async def test_the_dead_uris_of_one_source_do_not_take_every_port(
     ]
     assert [code for code, *_ in results] == [1, 1] + [-1] * 6
     assert "does not answer" in results[-1][1]
-    # Those of the same source that live get as many as there are.
+    # Live nodes of the same source get all ports.
     crowd = [await make_node(f"/n{i}") for i in range(6)]
     assert [(await node.publish(proxy.master))[0] for node in crowd] == [1] * 6
-    # The range is used up: the next one gets the port of a dead one, which is unregistered.
+    # The range is used up: the next node gets the port of a dead node, which is unregistered.
     late = await make_node("/late", OTHER_NODE)
     assert (await late.publish(proxy.master))[0] == 1
     assert await proxy.serves(late)
@@ -445,14 +445,14 @@ async def test_a_claim_of_a_node_that_lives_is_not_given_away(
         await node.publish(former.master)
     uris = dict(master.nodes)
     await former.stop()
-    nodes[0].delay = 0.1  # it takes its time
+    nodes[0].delay = 0.1  # a slow node
     proxy = await make_proxy(port_range=str(former.settings.ports.listen))
     late = await make_node("/late")
     assert (await late.publish(proxy.master))[0] == -1
     assert master.nodes == uris
-    await until(lambda: proxy.serves(nodes[0]), "the slow one is served")
+    await until(lambda: proxy.serves(nodes[0]), "the slow node is served")
     await nodes[5].stop()
-    await until(lambda: proxy.endpoint(nodes[5]).is_down, "one is found dead")
+    await until(lambda: proxy.endpoint(nodes[5]).is_down, "the proxy finds a node dead")
     assert (await late.publish(proxy.master))[0] == 1
     assert set(master.nodes) == {"/late", *uris} - {"/n5"}
 
@@ -525,10 +525,10 @@ async def test_a_hundred_uris_of_one_node_are_not_all_remembered(
     assert not await refuses((PROXY, proxy.endpoint(node).port))
 
 
-async def test_an_update_that_a_node_is_gone_does_not_close_its_port_to_the_next(
+async def test_a_late_probe_of_a_dead_node_does_not_close_the_port_of_the_next(
     make_proxy: MakeProxy, make_node: MakeNode
 ) -> None:
-    """A probe of a dead node ended after its port had been given to one that lives."""
+    """The probe ends after a live node has got the port."""
     proxy = await make_proxy(ports=1)
     gone = await make_node("/gone")
     late = await make_node("/late")

@@ -1,4 +1,4 @@
-"""Nodes that are well are asked over one connection that is kept; what becomes of it is noticed."""
+"""The proxy asks live nodes over a kept connection, and notices the end of this connection."""
 
 import os
 import socket
@@ -82,7 +82,7 @@ async def test_a_node_that_hangs_is_silent_after_its_time(kept: Kept, node: Fake
     await told(kept, 10.0)
     node.hang = True
     ask(kept, node, 20.0)
-    await until(lambda: len(node.requests) == 2, "it was asked")
+    await until(lambda: len(node.requests) == 2, "the proxy asks the node")
     assert kept.collect(25.0) == {}
     assert kept.collect(25.1) == {NAME: ProbeResult.SILENT}
 
@@ -94,7 +94,7 @@ async def test_a_node_that_hangs_finds_its_caller_when_it_answers(
     monkeypatch.setattr(NodeClient, "close_after_answer", lambda _nodes, sock: left.append(sock))
     node.hang = True
     ask(kept, node, 20.0)
-    await until(lambda: len(node.requests) == 1, "it was asked")
+    await until(lambda: len(node.requests) == 1, "the proxy asks the node")
     assert kept.collect(25.1) == {NAME: ProbeResult.SILENT}
     assert [sock.getpeername() for sock in left] == [node.slave.address]
     assert kept.collect(25.2) == {}
@@ -160,10 +160,10 @@ async def test_there_are_never_too_many_and_those_of_others_are_closed(
 async def test_the_proxy_keeps_a_connection_to_a_node_that_is_well(make_proxy, node):
     proxy = await make_proxy(probe_interval=0.1)
     await node.publish(proxy.master)
-    await until(lambda: asked(node) > 3, "it is asked")
+    await until(lambda: asked(node) > 3, "the proxy asks the node")
     before = asked(node)
     connections = node.slave.connections
-    await until(lambda: asked(node) > before + 3, "it is asked on")
+    await until(lambda: asked(node) > before + 3, "the proxy goes on asking")
     assert node.slave.connections == connections
     node.pid += 1  # as if another process had the address
     await until(lambda: proxy.ros1.context.registry.by_caller[NAME].health.pid == node.pid, "seen")
@@ -175,5 +175,5 @@ async def test_a_node_that_ends_every_connection_is_called_and_stays(make_proxy,
     node.answers["getPid"] = ok(body, "Connection: close")
     await node.publish(proxy.master)
     before = asked(node)
-    await until(lambda: asked(node) > before + 4, "it is asked on")
+    await until(lambda: asked(node) > before + 4, "the proxy goes on asking")
     assert proxy.app.status()["nodes"][0]["state"] == "ok"

@@ -1,4 +1,4 @@
-"""What the proxy has the master remember of its leases: kept up, bounded, and only a claim."""
+"""The parameter at the master with the proxy's leases: maintained, bounded, and only a claim."""
 
 from asyncio import StreamReader, StreamWriter
 from functools import partial
@@ -31,16 +31,16 @@ async def test_it_is_there_before_the_master_knows_the_node(
     assert master.params == {parameter(proxy): f"{line(proxy, node)}\n"}
 
 
-async def test_it_goes_with_the_last_lease(
+async def test_the_parameter_goes_with_the_last_lease(
     proxy: Proxy, master: FakeMaster, node: FakeNode
 ) -> None:
     await node.publish(proxy.master)
     await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
-    await until(lambda: not master.params, "it is deleted")
+    await until(lambda: not master.params, "the parameter is deleted")
 
 
 @pytest.mark.parametrize("written", ["", "nonsense", "1 /127.0.2.99:1/\n", 7, ["x"], None])
-async def test_what_others_do_to_it_is_undone(
+async def test_foreign_changes_of_the_parameter_are_undone(
     proxy: Proxy, master: FakeMaster, node: FakeNode, written: object
 ) -> None:
     await node.publish(proxy.master)
@@ -48,7 +48,7 @@ async def test_what_others_do_to_it_is_undone(
     master.params.clear()
     if written is not None:
         await rpc(master.uri, "setParam", "/somebody", parameter(proxy), written)
-    await until(lambda: master.params == kept, "it is written again")
+    await until(lambda: master.params == kept, "the parameter is restored")
 
 
 @pytest.mark.parametrize("written", ["", "nonsense\n" * 1000, 7, ["x"], {"a": "b"}])
@@ -69,7 +69,7 @@ async def test_a_node_that_nothing_is_remembered_of_registers_again(
 async def test_a_node_is_believed_for_itself_alone(
     proxy: Proxy, master: FakeMaster, node: FakeNode, make_node: MakeNode
 ) -> None:
-    """Somebody has the master remember another node at the port of one."""
+    """A forged parameter has another node at the port of the node."""
     other = await make_node("/other", OTHER_NODE)
     other.published = {"/rosout": "rosgraph_msgs/Log", "/else": "std_msgs/String"}
     await node.publish(proxy.master)
@@ -100,7 +100,7 @@ async def test_a_node_does_not_answer_for_the_one_before_at_its_port(
     uri = proxy.uri(node)
     await leave_behind(master, uri)
     await proxy.restart()
-    await until(lambda: "/former" not in master.nodes, "the other is taken back")
+    await until(lambda: "/former" not in master.nodes, "/former is unregistered")
     assert set(master.nodes) == {node.name}
     assert await proxy.serves(node)
     reason = "[/former] Reason: new node registered with same name"
@@ -117,10 +117,10 @@ async def only_own_services(
     writer.write(encode_header(answer))
 
 
-async def test_rosout_alone_bears_out_no_name_beside_another(
+async def test_rosout_alone_confirms_no_name_beside_another(
     proxy: Proxy, master: FakeMaster, node: FakeNode
 ) -> None:
-    """Every node has it. What the master does not know is then registered for the right one."""
+    """Every node has /rosout. The proxy registers unknown topics under the confirmed name."""
     node.stream = only_own_services
     await node.publish(proxy.master, "/rosout")
     await node.serve(proxy.master, f"{node.name}/get_loggers")
@@ -132,12 +132,12 @@ async def test_rosout_alone_bears_out_no_name_beside_another(
 
     await proxy.restart()
 
-    await until(lambda: "/former" not in master.nodes, "the other is taken back")
-    await until(lambda: master.holds("publishers", "/unknown") == [uri], "it is registered")
+    await until(lambda: "/former" not in master.nodes, "/former is unregistered")
+    await until(lambda: master.holds("publishers", "/unknown") == [uri], "/unknown is registered")
     assert await proxy.serves(node)
 
 
-async def test_what_was_left_at_a_port_is_taken_back_though_another_node_has_it(
+async def test_old_registrations_at_a_port_are_removed_though_another_node_has_the_port(
     make_proxy: MakeProxy, master: FakeMaster, node: FakeNode
 ) -> None:
     proxy = await make_proxy(cleanup_after=0.3)
@@ -152,12 +152,12 @@ async def test_what_was_left_at_a_port_is_taken_back_though_another_node_has_it(
     await proxy.restart(forget)
     await node.publish(proxy.master)
     assert proxy.uri(node) == uri
-    await until(lambda: set(master.nodes) == {node.name}, "it is taken back")
+    await until(lambda: set(master.nodes) == {node.name}, "the old registrations are removed")
     assert master.tables["services"] == {}
     assert await proxy.serves(node)
 
 
-async def test_a_master_that_does_not_keep_it_is_told_of(
+async def test_a_master_that_refuses_the_parameter_is_a_problem(
     proxy: Proxy, master: FakeMaster, node: FakeNode
 ) -> None:
     """Another proxy is in between, with a policy."""
@@ -168,7 +168,7 @@ async def test_a_master_that_does_not_keep_it_is_told_of(
     assert problem["subject"] == parameter(proxy)
     assert "denied" in problem["text"]
     del master.answers["setParam"]
-    await until(lambda: parameter(proxy) in master.params, "it is kept")
+    await until(lambda: parameter(proxy) in master.params, "the master keeps the parameter")
     assert not proxy.app.status()["problems"]
 
 
@@ -190,7 +190,7 @@ async def test_a_former_versions_uris_are_found_and_registered_anew(
 
     await proxy.restart(turn_back)
     await until(
-        lambda: master.nodes.get(node.name) == f"http://{HOST}:{lease[1]}/", "it has no path"
+        lambda: master.nodes.get(node.name) == f"http://{HOST}:{lease[1]}/", "the URI has no path"
     )
     assert proxy.lease(node) == lease
     assert await proxy.serves(node)

@@ -59,7 +59,7 @@ async def test_a_dead_node_is_cleaned_up_and_its_port_given_back(make_proxy, mas
     await node.call(proxy.master, "subscribeParam", node.uri, "/p")
     await node.stop()
     tables = master.tables.values()
-    await until(lambda: not any(tables), "the master forgets it")
+    await until(lambda: not any(tables), "the master forgets the node")
     assert master.nodes == {}
     await until(lambda: not len(proxy.ros1.context.registry), "the lease ends")
     assert proxy.ros1.context.registry.pool.free == len(proxy.settings.ports.listen)
@@ -84,7 +84,7 @@ async def test_clean_up_waits_for_a_master_that_is_down(make_proxy, master, node
     await until(lambda: refuses(proxy.lease(node)), "the port refuses")
     await until(lambda: proxy.app.status()["master"]["error"], "the master is missed")
     await master.start()
-    await until(lambda: not master.nodes, "the master forgets it")
+    await until(lambda: not master.nodes, "the master forgets the node")
 
 
 async def test_a_hanging_node_blocks_nobody(make_proxy, make_node):
@@ -101,7 +101,7 @@ async def test_a_hanging_node_blocks_nobody(make_proxy, make_node):
         started = asyncio.get_running_loop().time()
         assert (await rpc(other, "getPid", "/outside"))[2] == fine.pid
         assert (await greet(other, topic_header()))["callerid"] == "/fine"
-        assert asyncio.get_running_loop().time() - started < 10  # its time-out: 15 s
+        assert asyncio.get_running_loop().time() - started < 10  # the time-out: 15 s
     await until(lambda: refuses(lease), "the port refuses")
     assert proxy.app.status()["nodes"][0]["state"] == "silent"
 
@@ -116,7 +116,7 @@ async def test_probes_of_a_hanging_node_leak_nothing(start_process, make_node):
     threads = process.threads()
     probes = hung.slave.connections
     await until(lambda: hung.slave.connections >= probes + 6, "six more probes")
-    # A call that is under way has one, or whose answer is late: what leaks would stay.
+    # A pending call has a descriptor. Only leaked descriptors would stay.
     await hung.stop()
     await until(lambda: process.descriptors() <= before, "no more is open than before")
     await until(lambda: process.threads() <= threads, "no more threads than before")
@@ -131,8 +131,8 @@ async def test_a_node_that_answers_again_is_served_again(make_proxy, master, nod
     node.hang = False
     await until(lambda: rpc_works(lease), "the port is served again")
     assert (await greet(lease, topic_header()))["callerid"] == "/talker"
-    # Subscribers that were refused meanwhile are told once more, by the master.
-    await until(lambda: len(master.named("registerPublisher")) == 2, "it is registered once more")
+    # Through the master, refused subscribers get the publisher once more.
+    await until(lambda: len(master.named("registerPublisher")) == 2, "a second registration")
 
 
 async def rpc_works(address) -> bool:
@@ -153,7 +153,7 @@ async def test_a_node_that_was_cleaned_up_and_comes_back_is_registered_again(
     uri = proxy.uri(node)
     lease = proxy.lease(node)
     node.hang = True
-    await until(lambda: not master.nodes, "it is cleaned up")
+    await until(lambda: not master.nodes, "the node is cleaned up")
     far = f"http://{OUTSIDE}:4000/"
     await rpc(master.uri, "registerPublisher", "/far", "/update", "std_msgs/String", far)
     await looks(master)
@@ -163,7 +163,7 @@ async def test_a_node_that_was_cleaned_up_and_comes_back_is_registered_again(
     assert master.holds("publishers", "/chatter") == [uri]
     assert master.holds("subscribers", "/update") == [uri]
     assert master.holds("services", "/add") == [f"rosrpc://{HOST}:{lease[1]}"]
-    await until(lambda: node.updates("/update")[-1:] == [[far]], "it learns what it has missed")
+    await until(lambda: node.updates("/update")[-1:] == [[far]], "the missed update arrives")
 
 
 async def test_another_process_at_a_cleaned_uri_gets_only_what_it_has(make_proxy, master, node):
@@ -173,12 +173,12 @@ async def test_another_process_at_a_cleaned_uri_gets_only_what_it_has(make_proxy
     await node.serve(proxy.master)
     lease = proxy.lease(node)
     node.hang = True
-    await until(lambda: not master.nodes, "it is cleaned up")
+    await until(lambda: not master.nodes, "the node is cleaned up")
     del node.published["/gone"]
     node.pid += 1
     node.hang = False
     await until(lambda: rpc_works(lease), "the port is served again")
-    await until(lambda: master.holds("publishers", "/chatter"), "its topic is there again")
+    await until(lambda: master.holds("publishers", "/chatter"), "the topic is registered again")
     assert master.holds("publishers", "/gone") == master.holds("services", "/add") == []
 
 
@@ -189,7 +189,7 @@ async def test_a_new_process_that_registers_at_a_cleaned_uri_keeps_what_it_regis
     await node.publish(proxy.master)
     await node.serve(proxy.master, "/old")
     await node.stop()
-    await until(lambda: not master.nodes, "it is cleaned up")
+    await until(lambda: not master.nodes, "the node is cleaned up")
     node.pid += 1
     await node.start()
     await node.serve(proxy.master, "/new")
@@ -244,7 +244,7 @@ async def test_a_restart_under_the_same_name_elsewhere_ends_the_old_process(
     await old.publish(proxy.master)
     await new.publish(proxy.master)
     assert proxy.uri(old) != proxy.uri(new)
-    await until(lambda: "shutdown" in dict(old.calls), "the old one is told to end")
+    await until(lambda: "shutdown" in dict(old.calls), "the old node gets a shutdown")
     assert "shutdown" not in dict(new.calls)
     calls = [{"methodName": "unregisterPublisher", "params": ["/talker", "/chatter", old.uri]}]
     await rpc(proxy.master, "system.multicall", calls, source=NODE)

@@ -1,4 +1,4 @@
-"""The master at a given address, whatever its name leads to; and that it may change."""
+"""The master at a given address, independent of its name. The address may change."""
 
 import json
 
@@ -74,10 +74,10 @@ async def test_the_master_moves(
     assert master.holds("publishers", "/chatter") == [proxy.uri(node), proxy.uri(late)]
 
 
-async def test_two_masters_and_the_one_that_is_named_is_asked(
+async def test_after_a_change_of_address_the_next_master_gets_the_calls(
     make_proxy: MakeProxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
-    """The connections that are kept to the former one are not used for the next."""
+    """The proxy does not use kept connections to the former master."""
     other = FakeMaster(ELSEWHERE, host_and_port(master.uri)[1])
     await other.start()
     try:
@@ -87,7 +87,7 @@ async def test_two_masters_and_the_one_that_is_named_is_asked(
         await (await make_node("/two")).publish(proxy.master, "/b")
         assert not master.holds("publishers", "/b")
         assert other.holds("publishers", "/b")
-        await until(lambda: other.holds("publishers", "/a"), "what it lacks is registered")
+        await until(lambda: other.holds("publishers", "/a"), "/a is registered, too")
     finally:
         await other.stop()
 
@@ -116,13 +116,15 @@ async def test_only_the_master_may_control_nodes_and_it_is_known_by_its_address(
 async def test_an_outside_subscriber_on_the_masters_host_is_told_at_its_address(
     make_proxy: MakeProxy, master: FakeMaster, node: FakeNode, make_node: MakeNode
 ) -> None:
-    """Its URI names the master's host: as the proxy starts again, it is told of the publisher."""
+    """The subscriber's URI has the name of the master's host. After a restart of the proxy, this
+    subscriber gets updates.
+    """
     listener = await make_node("/listener", MASTER, NAME)
     await listener.subscribe(host_and_port(master.uri))
     proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
     await node.publish(proxy.master)
     await proxy.restart()
-    await until(lambda: [] in listener.updates(), "it is told that the publisher has gone")
+    await until(lambda: [] in listener.updates(), "the subscriber gets an empty update")
 
 
 async def test_the_doctor_asks_the_master_at_its_address(

@@ -44,7 +44,7 @@ async def test_calls_that_wait_for_recovery_fail_together(master, make_proxy, no
         for wire in wires:
             await wire.send(post(xml("registerPublisher", "/talker", "/t", "*", node.uri)))
         assert [await wire.end() for wire in wires] == ["reset"] * 8
-    assert asyncio.get_running_loop().time() - started < 14  # one after another: 16
+    assert asyncio.get_running_loop().time() - started < 14  # in turn: 16
     del master.answers["getSystemState"]
     assert (await node.publish(proxy.master))[0] == 1
 
@@ -70,7 +70,7 @@ async def test_a_master_that_hangs_is_noticed_long_before_its_calls_time_out(
     proxy = await make_proxy(master_interval=0.05)
     await until(lambda: proxy.app.status()["master"]["up"], "the master is up")
     master.answers["getPid"] = End.HANG
-    await until(lambda: not proxy.app.status()["master"]["up"], "the proxy says that it is not")
+    await until(lambda: not proxy.app.status()["master"]["up"], "the master is down")
     assert "no answer in 0.2 s" in proxy.app.status()["master"]["error"]
     del master.answers["getPid"]
     await until(lambda: proxy.app.status()["master"]["up"], "the master is up again")
@@ -84,7 +84,7 @@ async def test_what_the_master_loses_later_is_registered_again(master, make_prox
     await until(lambda: len(master.named("getSystemState")) > often + 2, "nothing is missing")
     for _ in range(2):
         await rpc(master.uri, "unregisterPublisher", node.name, "/chatter", uri)
-        await until(lambda: master.holds("publishers", "/chatter") == [uri], "it is there again")
+        await until(lambda: master.holds("publishers", "/chatter") == [uri], "a new registration")
 
 
 async def test_a_master_port_where_no_program_listens_is_told_in_plain_words(make_proxy):

@@ -1,4 +1,4 @@
-"""Messages by topic, as nodes count them, while somebody reads the metrics."""
+"""Messages by topic, counted by nodes, while a client reads the metrics."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ ROUND = EVERY + 2
 
 
 class Counts:
-    """What a node has counted of its one topic, for its answers."""
+    """The message count of a node, which has a single topic."""
 
     def __init__(self, node: FakeNode) -> None:
         self.messages = 1000
@@ -32,7 +32,7 @@ class Counts:
         )
 
     def asked(self) -> int:
-        """How often it was asked."""
+        """The number of getBusStats calls."""
         return times_asked(self._node)
 
 
@@ -72,7 +72,7 @@ async def test_what_is_added_while_somebody_reads_is_counted(
     assert read(proxy) == 70, "another process begins anew"
 
 
-async def test_nobody_is_asked_when_nobody_reads(
+async def test_without_readers_no_node_is_asked(
     proxy: Proxy, node: FakeNode, counts: Counts
 ) -> None:
     await node.publish(proxy.master)
@@ -87,7 +87,7 @@ async def test_nobody_is_asked_when_nobody_reads(
     assert counts.asked() == asked
     read(proxy)
     await pass_time(ROUND)
-    assert read(proxy) == 0, "nobody knows when those of the meantime were sent"
+    assert read(proxy) == 0, "the times of earlier messages are unknown"
 
 
 async def test_who_does_not_count_is_left_alone(

@@ -1,4 +1,4 @@
-"""The calls of one multicall are judged one after the other, and others are served in between."""
+"""The calls of a multicall are judged in turn, and other callers are served in between."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -14,7 +14,7 @@ CALLS = 100
 
 
 class Rounds:
-    """Counts the rounds of the event loop, and notes in which of them a method is called."""
+    """Counts the rounds of the event loop, and notes the rounds with a call of a method."""
 
     def __init__(self) -> None:
         self.noted = set[int]()
@@ -23,7 +23,7 @@ class Rounds:
         self._turn()
 
     def noting(self, method: Callable[..., Any]) -> Callable[..., Any]:
-        """The same method, whose calls are noted."""
+        """Wrap a method to note each call."""
 
         def called(*values: Any) -> Any:
             self.noted.add(self._current)
@@ -52,7 +52,7 @@ def several(method: str, *params: Any) -> list[dict[str, Any]]:
 
 
 async def test_calls_of_inside(make_proxy, node, rounds, monkeypatch):
-    """20 calls for parameters held all others up for 0.6 s, with rules of a label's length."""
+    """With the longest rules, judging 20 calls at once blocks other callers for 0.6 s."""
     proxy = await make_proxy(policy="deny get-param /secret/*")
     await node.publish(proxy.master)
     monkeypatch.setattr(AccessPolicy, "judge", rounds.noting(AccessPolicy.judge))

@@ -1,4 +1,4 @@
-"""Inside nodes among themselves and with outside: whose address is given to whom."""
+"""Inside nodes among themselves and with outside: the addresses that each caller gets."""
 
 import asyncio
 from ipaddress import ip_network
@@ -30,7 +30,7 @@ from tests.integration.net import (
 
 @pytest.fixture
 async def twins(make_node):
-    """Two nodes in containers of their own that give the very same URI."""
+    """Two nodes in different containers with the same URI."""
     first = await make_node("/first", NODE, host="localhost")
     second = FakeNode("/second", OTHER_NODE, host="localhost")
     second.slave.address = OTHER_NODE, first.slave.address[1]
@@ -132,8 +132,8 @@ async def test_a_parameter_reaches_who_subscribed_to_a_namespace_it_is_in(proxy,
     assert reply == [-1, text, 0]
 
 
-async def test_a_node_is_not_told_of_what_the_one_before_at_its_port_subscribed_to(proxy, node):
-    """The master calls at a URI, and forgets nobody who has subscribed with it."""
+async def test_a_node_gets_no_updates_for_parameters_of_the_former_node_at_its_port(proxy, node):
+    """The master keeps parameter subscriptions by URI, and forgets none."""
     await node.publish(proxy.master)
     assert (await rpc(proxy.uri(node), "paramUpdate", "/master", "/p/", 1))[0] == -1
     assert "paramUpdate" not in [name for name, _ in node.calls]
@@ -143,8 +143,8 @@ async def test_a_recovered_node_is_told_of_parameters(proxy, node):
     await node.publish(proxy.master)
     await node.call(proxy.master, "subscribeParam", node.uri, "/p")
     await proxy.restart()
-    await until(lambda: len(proxy.ros1.context.registry), "it is found at the master")
-    await until(lambda: proxy.endpoint(node).trusted, "it is recovered")
+    await until(lambda: len(proxy.ros1.context.registry), "the proxy finds the node at the master")
+    await until(lambda: proxy.endpoint(node).trusted, "the node is recovered")
     assert (await rpc(proxy.uri(node), "paramUpdate", "/master", "/p/", 1))[0] == 1
     assert node.calls[-1] == ("paramUpdate", ("/master", "/p/", 1))
 
@@ -153,7 +153,7 @@ async def test_an_update_of_a_parameter_does_not_overtake_the_subscription(proxy
     await node.publish(proxy.master)
     master.delay = 0.2
     subscribing = asyncio.create_task(node.call(proxy.master, "subscribeParam", node.uri, "/p"))
-    await until(lambda: proxy.endpoint(node).pending, "the subscription is on its way")
+    await until(lambda: proxy.endpoint(node).pending, "the subscription is pending")
     assert (await rpc(proxy.uri(node), "paramUpdate", "/master", "/p/", 1))[0] == 1
     assert subscribing.done()
     await subscribing
@@ -164,7 +164,7 @@ async def test_an_update_does_not_overtake_the_registration_before_it(proxy, mas
     uri = proxy.uri(node)
     master.delay = 0.2
     registering = asyncio.create_task(node.subscribe(proxy.master))
-    await until(lambda: proxy.endpoint(node).pending, "the registration is on its way")
+    await until(lambda: proxy.endpoint(node).pending, "the registration is pending")
     far = f"http://{OUTSIDE}:4000/"
     await rpc(uri, "publisherUpdate", "/master", "/chatter", [far])
     assert registering.done()
@@ -197,12 +197,12 @@ async def test_a_call_for_a_former_node_of_a_port_does_not_reach_the_next(make_p
 
 
 async def test_outside_nodes_are_never_touched(proxy, master, node, make_node):
-    """What has nothing to do with the proxy passes as it is: URIs, services, other hosts."""
+    """URIs and services of other hosts pass unchanged."""
     stranger = await make_node("/far", OUTSIDE)
     far = stranger.uri
     await rpc(master.uri, "registerPublisher", "/far", "/chatter", "std_msgs/String", far)
     await rpc(master.uri, "registerService", "/far", "/far/add", f"rosrpc://{OUTSIDE}:5", far)
-    near_miss = f"http://{HOST}:{proxy.settings.ports.listen.last}/"  # nobody's
+    near_miss = f"http://{HOST}:{proxy.settings.ports.listen.last}/"  # no endpoint
     await rpc(master.uri, "registerPublisher", "/odd", "/chatter", "std_msgs/String", near_miss)
     assert (await node.subscribe(proxy.master))[2] == [far, near_miss]
     assert (await node.call(proxy.master, "lookupNode", "/far"))[2] == far

@@ -1,8 +1,8 @@
 """Nodes of client libraries that lack calls of the slave API, or have more TCPROS ports than one.
 
-ROS makes no library implement everything. What a node can't say is neither its death nor a forgery:
-it stays registered, and is served again after a restart of the proxy as far as it can show who it
-is.
+ROS requires no library to implement everything. A node that lacks a call is neither dead nor
+forged. The node stays registered. After a restart of the proxy, the node is served if the proxy can
+confirm the name.
 """
 
 import itertools
@@ -34,7 +34,7 @@ LACKING: dict[str, Answer] = {
     "a status": value([-1, "not implemented", 0]),
     "no XML": b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nno",
 }
-"""How a node answers a call that it does not know."""
+"""Answers of nodes to unknown calls."""
 CALLS = ("getPid", "getPublications", "getSubscriptions")
 SOME_CALLS = [calls for count in (1, 2, 3) for calls in itertools.combinations(CALLS, count)]
 
@@ -81,7 +81,7 @@ async def test_a_node_that_lacks_calls_is_served_by_the_next_proxy(proxy, master
     await populate(proxy, node)
     uri = master.nodes[node.name]
     await proxy.restart()
-    await until(partial(answers, uri), "it is served")
+    await until(partial(answers, uri), "the node is served")
     assert (await greet(uri, topic_header("/out")))["callerid"] == node.name
     assert (await greet(uri, service_header("/add")))["callerid"] == node.name
     await pass_time(5)
@@ -92,29 +92,29 @@ async def test_a_node_that_lacks_calls_is_served_by_the_next_proxy(proxy, master
 async def test_a_pid_is_taken_whatever_the_status(proxy, node):
     node.answers["getPid"] = value([0, "", 4242])
     await node.publish(proxy.master)
-    await until(lambda: proxy.endpoint(node).health.pid == 4242, "its pid is known")
+    await until(lambda: proxy.endpoint(node).health.pid == 4242, "the pid is known")
 
 
-async def test_one_that_can_not_show_who_it_is_stays_registered(proxy, master, node):
-    """It publishes nothing: there is no topic that it could be asked for, and no port known."""
+async def test_a_node_that_cannot_be_confirmed_stays_registered(proxy, master, node):
+    """The node publishes nothing, so the proxy cannot ask for a topic, and knows no port."""
     lack(node, "goroslib", *CALLS)
     await node.subscribe(proxy.master, "/update")
     uri = master.nodes[node.name]
     await proxy.restart()
-    await until(lambda: proxy.app.status()["problems"], "it is told")
+    await until(lambda: proxy.app.status()["problems"], "the status has a problem")
     (problem,) = proxy.app.status()["problems"]
     assert "can't tell whether this is the node" in problem["text"]
     await pass_time(10)
     assert master.nodes == {node.name: uri}
     assert await refuses(host_and_port(uri))
-    await node.subscribe(proxy.master, "/more")  # from its own address: that shows it
+    await node.subscribe(proxy.master, "/more")  # a call from its own address confirms the node
     assert master.nodes == {node.name: uri}
-    await until(partial(answers, uri), "it is served")
+    await until(partial(answers, uri), "the node is served")
     assert not proxy.app.status()["problems"]
 
 
-async def test_another_node_is_not_taken_for_it_by_what_it_lacks(proxy, master, node, make_node):
-    """Its name in the TCPROS header is another one."""
+async def test_another_node_without_the_calls_is_not_confirmed(proxy, master, node, make_node):
+    """The TCPROS header of the other node has another name."""
     await populate(proxy, node)
     uri = master.nodes[node.name]
     other = await make_node("/other", OTHER_NODE)
@@ -124,7 +124,7 @@ async def test_another_node_is_not_taken_for_it_by_what_it_lacks(proxy, master, 
         lack(node, "goroslib", "getPublications", "getSubscriptions")
 
     await proxy.restart(replaced)
-    await until(lambda: proxy.app.status()["problems"], "it is told")
+    await until(lambda: proxy.app.status()["problems"], "the status has a problem")
     await pass_time(5)
     assert await refuses(host_and_port(uri))
 
@@ -148,7 +148,7 @@ async def test_each_topic_and_service_has_a_port_of_its_own(proxy, master, node)
         assert (await greeted(proxy, node, service_header("/add")))["callerid"] == node.name
     uri = master.nodes[node.name]
     await proxy.restart()
-    await until(partial(answers, uri), "it is served")
+    await until(partial(answers, uri), "the node is served")
     for topic in ("/too", "/out"):
         assert (await greeted(proxy, node, topic_header(topic)))["callerid"] == node.name
 
@@ -181,7 +181,7 @@ async def test_ports_of_services_survive_a_restart(proxy, master, node):
     uri = master.nodes[node.name]
     for _ in range(2):
         await proxy.restart()
-        await until(partial(answers, uri), "it is served")
+        await until(partial(answers, uri), "the node is served")
         for service in ("/sub", "/add"):
             header = await greeted(proxy, node, service_header(service))
             assert header["callerid"] == node.name
@@ -194,12 +194,12 @@ async def test_a_node_that_only_serves_is_found_by_its_service(proxy, master, no
     await node.serve(proxy.master)
     uri = master.nodes[node.name]
     await proxy.restart()
-    await until(partial(answers, uri), "it is served")
+    await until(partial(answers, uri), "the node is served")
     assert (await greeted(proxy, node, service_header("/add")))["callerid"] == node.name
 
 
 async def test_a_service_of_unknown_port_is_refused_and_leads_nowhere_else(proxy, master, node):
-    """Somebody has deleted what the proxy has the master remember."""
+    """The proxy's parameter at the master has lost the ports of services."""
     await on_own_ports(node, "/rosout", "/out", "/add")
     await populate(proxy, node)
     uri = master.nodes[node.name]
@@ -211,7 +211,7 @@ async def test_a_service_of_unknown_port_is_refused_and_leads_nowhere_else(proxy
         )
 
     await proxy.restart(lose)
-    await until(partial(answers, uri), "it is served")
+    await until(partial(answers, uri), "the node is served")
     with pytest.raises((EOFError, ConnectionResetError)):
         await greeted(proxy, node, service_header("/add"))
     await looks(master)
@@ -221,10 +221,10 @@ async def test_a_service_of_unknown_port_is_refused_and_leads_nowhere_else(proxy
 async def test_a_uri_without_a_slash_at_the_end_is_the_same_after_a_restart(proxy, master, node):
     node.uri_form = "http://{}"
     await populate(proxy, node)
-    assert (await node.subscribe(proxy.master, "/out"))[2] == [node.uri]  # its own, literally
+    assert (await node.subscribe(proxy.master, "/out"))[2] == [node.uri]  # the literal URI
     uri = master.nodes[node.name]
     await proxy.restart()
-    await until(partial(answers, uri), "it is served")
+    await until(partial(answers, uri), "the node is served")
     assert (await node.publish(proxy.master, "/more"))[0] == 1
     assert (await node.subscribe(proxy.master, "/more"))[2] == [node.uri]
     assert master.nodes == {node.name: uri}
@@ -240,7 +240,7 @@ async def test_a_uri_without_a_slash_at_the_end_is_the_same_after_a_restart(prox
 
 
 async def test_a_uri_without_a_host_is_at_the_callers_address(proxy, master, node, make_node):
-    """As roslisp gives it where ROS_HOSTNAME is set to nothing."""
+    """roslisp gives such a URI if ROS_HOSTNAME is empty."""
     node.uri_form = f"http://:{node.slave.address[1]}"
     await populate(proxy, node)
     uri = master.nodes[node.name]
@@ -252,7 +252,7 @@ async def test_a_uri_without_a_host_is_at_the_callers_address(proxy, master, nod
     assert (await node.call(proxy.master, "registerService", "/own", api, node.uri))[0] == 1
     assert (await greet(uri, service_header("/own")))["callerid"] == node.name
     await proxy.restart()
-    await until(partial(answers, uri), "it is served")
+    await until(partial(answers, uri), "the node is served")
     assert (await node.publish(proxy.master, "/more"))[0] == 1
     assert master.nodes[node.name] == uri
     reply = await node.call(proxy.master, "unregisterPublisher", "/out", node.uri)

@@ -1,4 +1,4 @@
-"""Policy: what is denied is hidden outside, unchanged inside, and refused where it is asked for."""
+"""Policy: denied names are hidden outside, unchanged inside, and refused when requested."""
 
 import asyncio
 import json
@@ -74,18 +74,20 @@ async def test_subscribers_inside_hear_of_hidden_publishers_that_come_and_go(
     talker = await make_node("/talker")
     await talker.publish(proxy.master)
     await until(
-        lambda: listener.updates()[-1:] == [[OUTSIDE_PUBLISHER, talker.uri]], "it hears of both"
+        lambda: listener.updates()[-1:] == [[OUTSIDE_PUBLISHER, talker.uri]],
+        "the subscriber gets both publishers",
     )
     shown = await make_node("/shown", THIRD_NODE)
     await shown.publish(proxy.master)
     await until(
         lambda: listener.updates()[-1] == [OUTSIDE_PUBLISHER, shown.uri, talker.uri],
-        "the master's list is completed on its way",
+        "the proxy completes the master's list",
     )
     ended = await talker.call(proxy.master, "unregisterPublisher", "/chatter", talker.uri)
     assert ended == [1, "Unregistered [/talker] as provider of [/chatter]", 1]
     await until(
-        lambda: listener.updates()[-1] == [OUTSIDE_PUBLISHER, shown.uri], "it hears of the end"
+        lambda: listener.updates()[-1] == [OUTSIDE_PUBLISHER, shown.uri],
+        "the subscriber gets the end",
     )
     again = await talker.call(proxy.master, "unregisterPublisher", "/chatter", talker.uri)
     assert again[::2] == [1, 0]
@@ -131,14 +133,14 @@ async def test_tools_inside_see_the_whole_graph(make_proxy, master, make_node):
     assert before[2] == [[], [], []]
 
 
-async def test_a_dead_hidden_publisher_is_told_of(make_proxy, make_node):
+async def test_a_dead_hidden_publisher_disappears_from_updates(make_proxy, make_node):
     proxy = await make_proxy(policy="deny publish /chatter")
     talker = await make_node("/talker")
     listener = await make_node("/listener", OTHER_NODE)
     await talker.publish(proxy.master)
     await listener.subscribe(proxy.master)
     await talker.stop()
-    await until(lambda: listener.updates()[-1:] == [[]], "the subscriber hears of its end")
+    await until(lambda: listener.updates()[-1:] == [[]], "the subscriber gets the end")
 
 
 # 2. What inside takes from outside
@@ -155,7 +157,7 @@ async def test_a_denied_subscription_gets_the_publishers_inside_alone(
     assert master.holds("subscribers", "/chatter") == []
     await talker.publish(proxy.master)
     assert master.holds("publishers", "/chatter") == [OUTSIDE_PUBLISHER, proxy.uri(talker)]
-    await until(lambda: listener.updates()[-1:] == [[talker.uri]], "it hears of the one inside")
+    await until(lambda: listener.updates()[-1:] == [[talker.uri]], "the inside publisher")
     await rpc(proxy.uri(listener), "publisherUpdate", "/master", "/chatter", [OUTSIDE_PUBLISHER])
     assert listener.updates()[-1] == [talker.uri]
 
@@ -175,7 +177,7 @@ async def test_a_denied_service_of_outside_is_not_found(make_proxy, master, make
 
 @pytest.fixture
 async def params(make_proxy, master, node):
-    """A proxy that denies one parameter, and a node that has registered."""
+    """A proxy that denies some parameters."""
     master.params |= {"/secret/key": 1, "/secret": {"key": 1}, "/open": 2, "/other/x": 3}
     rules = "deny get-param /secret/*; deny set-param /secret/*; deny get-param */password"
     return await make_proxy(policy=rules)
@@ -296,7 +298,7 @@ async def test_no_spelling_of_a_header_gets_around_a_rule(make_proxy, make_node,
 
 
 async def test_udpros_is_refused_where_topics_may_be_denied(make_proxy, make_node):
-    """Its offer names a topic of its own, which roscpp believes."""
+    """The UDPROS offer has its own topic field, which roscpp believes."""
     proxy = await make_proxy(policy="deny publish /chatter by /talker")
     talker = await make_node("/talker")
     other = await make_node("/other", OTHER_NODE)
@@ -338,7 +340,7 @@ async def test_the_masters_own_calls_pass(make_proxy, master, make_node):
     listener = await make_node("/listener")
     await listener.subscribe(proxy.master)
     await rpc(master.uri, "registerPublisher", "/far", "/chatter", "*", OUTSIDE_PUBLISHER)
-    await until(lambda: listener.updates() == [[OUTSIDE_PUBLISHER]], "the master tells it")
+    await until(lambda: listener.updates() == [[OUTSIDE_PUBLISHER]], "the master's update arrives")
     assert (await rpc(proxy.uri(listener), "shutdown", "/master", ""))[0] == -1
 
 
@@ -395,7 +397,7 @@ async def test_a_change_while_the_master_is_away_is_made_up_for(make_proxy, mast
     layer = '{"layers": [{"name": "a", "rules": ["deny publish *"]}]}'
     assert (await post(proxy, "/policy", layer)).status == 503
     await master.start()
-    await until(lambda: not master.holds("publishers", "/chatter"), "it is taken back")
+    await until(lambda: not master.holds("publishers", "/chatter"), "the topic is unregistered")
 
 
 async def test_the_file_is_read_again(make_proxy, master, make_node, tmp_path):
@@ -408,10 +410,10 @@ async def test_the_file_is_read_again(make_proxy, master, make_node, tmp_path):
     await until(lambda: not master.holds("publishers", "/chatter"), "the file is read again")
     file.write_text("deny everything\n")
     problems = proxy.ros1.context.problems.all
-    await until(lambda: "--policy-file" in [p.subject for p in problems()], "it is told")
+    await until(lambda: "--policy-file" in [p.subject for p in problems()], "a problem")
     assert master.holds("publishers", "/chatter") == []
     file.write_text("allow publish *\n")
-    await until(lambda: master.holds("publishers", "/chatter"), "it is shown again")
+    await until(lambda: master.holds("publishers", "/chatter"), "registered again")
     assert "--policy-file" not in [p.subject for p in problems()]
 
 
@@ -468,7 +470,7 @@ async def test_nothing_is_registered_before_an_operator_has_told_its_policy(
     master.calls.clear()
     await proxy.restart()
     registering = asyncio.create_task(late.publish(proxy.master))
-    await until(lambda: "getPid" in dict(master.calls), "it has found its master")
+    await until(lambda: "getPid" in dict(master.calls), "the proxy finds the master")
     assert not {"getSystemState", "registerPublisher"} & {*dict(master.calls)}
     assert not registering.done()
     await told(proxy, "deny publish /chatter")

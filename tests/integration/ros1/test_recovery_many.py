@@ -28,12 +28,12 @@ def all_served(proxy: Proxy) -> bool:
     return len(registry) == NODES and all(endpoint.trusted for endpoint in registry)
 
 
-async def test_each_node_is_asked_once_what_it_is(make_proxy, master, nodes):
+async def test_each_node_is_asked_for_its_topics_once(make_proxy, master, nodes):
     proxy = await make_proxy(probe_interval=60, probe_timeout=3)
     await populate(proxy, nodes)
     for node in nodes:
         node.calls.clear()
-        node.delay = 0.6  # the proxy asks them meanwhile
+        node.delay = 0.6  # the proxy asks meanwhile
     await proxy.restart()
     await until(lambda: all_served(proxy), "all are served")
     await looks(master)  # and the prober, more often
@@ -42,7 +42,7 @@ async def test_each_node_is_asked_once_what_it_is(make_proxy, master, nodes):
 
 
 async def test_nodes_that_answer_late_are_announced_together(make_proxy, master, nodes):
-    """The whole graph is read for it: for each node, that would be the square of their number."""
+    """An announcement reads the whole graph. Once for each node would take quadratic time."""
     proxy = await make_proxy(master_interval=60, cleanup_after=60, probe_timeout=0.3)
     await populate(proxy, nodes)
     for node in nodes:

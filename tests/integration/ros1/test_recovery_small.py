@@ -41,7 +41,7 @@ async def answers(uri: str) -> bool:
 
 
 def all_were_told(nodes: list[FakeNode], publisher: str) -> bool:
-    """Whether all know that one publisher, and no other, has update."""
+    """Whether this publisher is the only one in the last update of /update at all nodes."""
     return all(node.updates("/update")[-1:] == [[publisher]] for node in nodes)
 
 
@@ -54,7 +54,7 @@ def everything(master: Any) -> dict[str, Any]:
 
 
 async def populate(proxy: Any, *nodes: FakeNode) -> None:
-    """Register nodes with one of each kind."""
+    """Make a registration of each kind for each node."""
     for node in nodes:
         await node.publish(proxy.master, "/rosout")
         await node.publish(proxy.master, f"{node.name}/out")
@@ -73,7 +73,7 @@ async def nodes(make_node: Any) -> list[FakeNode]:
 
 
 async def restart(process: Process, while_down: Any = None) -> None:
-    """Kill a proxy, do something, start it again and wait until it is ready."""
+    """Kill a proxy, do something, restart the proxy, and wait until ready."""
     await asyncio.to_thread(process.kill)
     if while_down:
         await while_down()
@@ -107,7 +107,7 @@ async def test_publishers_that_came_and_went_meanwhile_are_made_up_for(proxy, ma
         await rpc(master.uri, "registerPublisher", "/new", "/update", "std_msgs/String", near)
 
     await proxy.restart(change)
-    await until(partial(all_were_told, nodes, near), "they are told")
+    await until(partial(all_were_told, nodes, near), "all nodes get the publisher")
 
 
 async def test_outside_subscribers_are_told_again_of_publishers_inside(
@@ -118,8 +118,8 @@ async def test_outside_subscribers_are_told_again_of_publishers_inside(
     await rpc(master.uri, "registerSubscriber", "/far", "/a/out", "std_msgs/String", far.uri)
     uri = uri_of(master, "/a")
     await proxy.restart()
-    # A publisher whose connection broke is tried again only when it is new.
-    await until(lambda: far.updates("/a/out")[-1:] == [[uri]], "the subscriber is told")
+    # After a broken connection, a subscriber tries again only for a new publisher.
+    await until(lambda: far.updates("/a/out")[-1:] == [[uri]], "the subscriber gets the publisher")
     assert [] in far.updates("/a/out")
 
 
@@ -162,17 +162,17 @@ async def test_a_hanging_node_does_not_hold_up_recovery_and_is_served_later(
     await proxy.restart(update)
     await until(lambda: answers(uri_of(master, "/b")), "the others are served")
     assert clock() - started < 8
-    await until(lambda: nodes[1].updates("/update")[-1:] == [[FAR]], "the others are told")
+    await until(lambda: nodes[1].updates("/update")[-1:] == [[FAR]], "/b gets the update")
     assert await refuses(host_and_port(uri_of(master, "/a")))
     nodes[0].hang = False
-    await until(lambda: answers(uri_of(master, "/a")), "it is served again")
-    await until(lambda: nodes[0].updates("/update")[-1:] == [[FAR]], "it is told as well")
+    await until(lambda: answers(uri_of(master, "/a")), "the node is served again")
+    await until(lambda: nodes[0].updates("/update")[-1:] == [[FAR]], "/a gets the update")
 
 
 async def test_a_node_that_ended_meanwhile_is_cleaned_up(proxy, master, nodes):
     await populate(proxy, *nodes)
     await proxy.restart(nodes[0].stop)
-    # Of parameters a master tells nobody who subscribes to them.
+    # A master does not show parameter subscriptions.
     kinds = ("publishers", "subscribers", "services")
     tables = [master.tables[kind] for kind in kinds]
 
@@ -181,7 +181,7 @@ async def test_a_node_that_ended_meanwhile_is_cleaned_up(proxy, master, nodes):
             caller == name for table in tables for row in table.values() for caller, _ in row
         )
 
-    await until(lambda: not left("/a"), "the master forgets it")
+    await until(lambda: not left("/a"), "the master forgets the node")
     assert left("/b")
     assert left("/c")
 
@@ -194,7 +194,7 @@ async def test_recovery_waits_for_a_master_that_is_down(proxy, master, nodes):
     with pytest.raises(ConnectionResetError):
         await nodes[0].publish(proxy.master, "/more")
     await master.start()
-    await until(lambda: answers(uri), "it is served")
+    await until(lambda: answers(uri), "the node is served")
     assert uri_of(master, "/a") == uri
 
 
@@ -210,7 +210,7 @@ async def test_killed_again_and_again(start_process, master, nodes):
         asked = len(master.named("getSystemState"))
         await restart(process)
         await until(partial(asks_again, master, asked), "recovery begins")
-    await until(lambda: answers(uri_of(master, "/a")), "it is served")
+    await until(lambda: answers(uri_of(master, "/a")), "the node is served")
     await looks(master)
     assert everything(master) == before
 
@@ -226,7 +226,7 @@ async def test_registrations_are_made_again_at_a_master_without_memory(proxy, ma
     assert {k: sorted(v) for k, v in after["publishers"].items() if k != "/update"} == {
         k: sorted(v) for k, v in before["publishers"].items()
     }
-    await until(partial(all_were_told, nodes, FAR), "they are told")
+    await until(partial(all_were_told, nodes, FAR), "all nodes get the publisher")
 
 
 async def test_what_a_master_forgot_without_a_restart_is_noticed(make_proxy, master, nodes):
@@ -243,12 +243,12 @@ async def test_a_restarted_master_that_kept_its_memory_is_left_alone(proxy, mast
     await master.stop()
     master.pid += 1
     await master.start()
-    await until(lambda: proxy.app.status()["master"]["pid"] == master.pid, "it is noticed")
+    await until(lambda: proxy.app.status()["master"]["pid"] == master.pid, "a new master")
     await looks(master)
     assert len(master.named("registerPublisher", "registerSubscriber", "registerService")) == calls
 
 
-async def test_a_name_that_somebody_else_took_meanwhile_is_left_to_them(
+async def test_a_name_that_another_node_took_meanwhile_stays_with_that_node(
     proxy, master, nodes, make_node
 ):
     await populate(proxy, *nodes)
@@ -270,7 +270,7 @@ async def test_a_node_that_is_down_is_not_registered_at_a_new_master(make_proxy,
     proxy = await make_proxy(cleanup_after=0)
     await populate(proxy, *nodes)
     await nodes[0].stop()
-    await until(lambda: refuses(proxy.lease(nodes[0])), "its port refuses")
+    await until(lambda: refuses(proxy.lease(nodes[0])), "the port refuses")
     await master.restart()
     await until(lambda: "/c" in master.nodes, "the others are registered again")
     await looks(master)

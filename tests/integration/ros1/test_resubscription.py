@@ -1,4 +1,4 @@
-"""Subscribers outside that have no connection after a restart are told again; no others are."""
+"""After a restart, only outside subscribers without a connection get the publisher again."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -32,7 +32,7 @@ from tests.integration.proxy import Proxy
 LOOKS = (3.0, 3.8)
 """Seconds after which the proxy of these tests looks; long enough to connect before."""
 AFTERWARDS = 22
-"""Looks of the proxy at its master, five a second, after which both are over."""
+"""Looks of the proxy at the master, five a second, until both are over."""
 
 
 @pytest.fixture(autouse=True)
@@ -59,7 +59,7 @@ async def make_listener(
 
 @asynccontextmanager
 async def listening(proxy: Proxy, publisher: FakeNode, name: str) -> AsyncIterator[None]:
-    """A subscriber's connection for /chatter, as roscpp makes it."""
+    """A subscriber's connection for /chatter, like that of roscpp."""
     async with connect(proxy.lease(publisher)) as wire:
         await wire.send(topic_header(caller=name))
         await read_header(wire)
@@ -82,18 +82,20 @@ async def told(node: FakeNode, *uris: str) -> None:
     await until(lambda: [{*some} for some in node.updates()[-1:]] == [{*uris}], f"{uris} are told")
 
 
-async def test_who_has_no_connection_is_told_at_each_look(proxy, talker, master, make_node):
+async def test_a_subscriber_without_connection_gets_updates_at_each_look(
+    proxy, talker, master, make_node
+):
     lost = await make_listener(make_node, master, "/lost")
     await proxy.restart()
     await served(proxy, talker)
     uri = proxy.uri(talker)
     often = [[], [uri]] * (1 + len(LOOKS))
-    await until(lambda: lost.updates() == often, "it is told after the start and at each look")
+    await until(lambda: lost.updates() == often, "updates at each look")
     await looks(master, 5)
     assert lost.updates() == often
 
 
-async def test_who_has_a_connection_is_left_alone(proxy, talker, master, make_node):
+async def test_a_subscriber_with_a_connection_is_left_alone(proxy, talker, master, make_node):
     lost = await make_listener(make_node, master, "/lost")
     kept = await make_listener(make_node, master, "/kept", "127.0.1.8")
     await proxy.restart()
@@ -103,7 +105,7 @@ async def test_who_has_a_connection_is_left_alone(proxy, talker, master, make_no
     async with listening(proxy, talker, "/kept"):
         lost.calls.clear()
         kept.calls.clear()
-        await until(lambda: lost.updates() == [[], [uri]] * len(LOOKS), "the other one is told")
+        await until(lambda: lost.updates() == [[], [uri]] * len(LOOKS), "/lost gets updates")
         assert set(map(tuple, kept.updates())) == {(uri,)}
 
 
@@ -122,11 +124,11 @@ async def test_only_the_publisher_without_connection_is_withdrawn(proxy, talker,
         without = {proxy.uri(talker), far}
 
         def looks() -> int:
-            """At how many looks it was told; the first may still be of the restart."""
+            """The number of looks with an update. The first may still be of the restart."""
             told = [{*some} for some in listener.updates()]
             return sum(pair == (without, uris) for pair in pairwise(told))
 
-        await until(lambda: looks() >= len(LOOKS), "it is told at each look")
+        await until(lambda: looks() >= len(LOOKS), "the subscriber gets updates at each look")
         assert all(proxy.uri(talker) in uris for uris in listener.updates())
 
 
@@ -143,7 +145,7 @@ async def test_who_is_served_by_udpros_is_left_alone(proxy, talker, master, make
 
 
 @pytest.mark.parametrize("hang", [True, False], ids=["hangs", "says nothing of use"])
-async def test_a_publisher_that_does_not_tell_its_connections_hinders_nobody(
+async def test_a_publisher_without_connection_info_hinders_no_subscriber(
     proxy, talker, master, make_node, hang
 ):
     listener = await make_listener(make_node, master, "/listener")
@@ -152,7 +154,7 @@ async def test_a_publisher_that_does_not_tell_its_connections_hinders_nobody(
     await served(proxy, talker)
     await told(listener, proxy.uri(talker))
     listener.calls.clear()
-    await until(lambda: [] in listener.updates(), "it is told at a look")
+    await until(lambda: [] in listener.updates(), "the subscriber gets an update at a look")
 
 
 async def test_neighbours_that_need_no_proxy_are_left_alone(proxy, talker, master, make_node):
@@ -164,7 +166,7 @@ async def test_neighbours_that_need_no_proxy_are_left_alone(proxy, talker, maste
     assert [] not in neighbour.updates()
 
 
-async def test_a_subscriber_that_is_gone_hinders_nobody(proxy, talker, master, make_node):
+async def test_a_subscriber_that_is_gone_hinders_no_other(proxy, talker, master, make_node):
     gone = await make_listener(make_node, master, "/gone")
     listener = await make_listener(make_node, master, "/listener", "127.0.1.8")
     await gone.stop()
@@ -172,17 +174,17 @@ async def test_a_subscriber_that_is_gone_hinders_nobody(proxy, talker, master, m
     await served(proxy, talker)
     await told(listener, proxy.uri(talker))
     listener.calls.clear()
-    await until(lambda: [] in listener.updates(), "it is told at a look")
+    await until(lambda: [] in listener.updates(), "the subscriber gets an update at a look")
     await told(listener, proxy.uri(talker))
 
 
-async def test_who_lost_a_node_that_did_not_answer_for_a_time_is_told(
+async def test_a_subscriber_that_lost_a_silent_node_gets_an_update(
     proxy, talker, master, make_node
 ):
     listener = await make_listener(make_node, master, "/listener")
     lease = proxy.lease(talker)
     await talker.slave.stop()
-    await until(lambda: refuses(lease), "its port refuses")
+    await until(lambda: refuses(lease), "the port refuses")
     await talker.slave.start(talker.address, talker.slave.address[1])
-    await until(lambda: [] in listener.updates(), "it is told at a look")
+    await until(lambda: [] in listener.updates(), "the subscriber gets an update at a look")
     await told(listener, proxy.uri(talker))
