@@ -1,4 +1,4 @@
-"""Telling a proxy of the tests something at its admin endpoint."""
+"""Calls to the admin endpoint of a test's proxy."""
 
 import json
 from typing import Any

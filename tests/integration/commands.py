@@ -1,4 +1,4 @@
-"""Running ``rosproxy`` commands as an operator does: each a process of its own."""
+"""Run ``rosproxy`` commands as separate processes."""
 
 import asyncio
 import sys
@@ -10,7 +10,7 @@ from tests.integration.proxy import Proxy
 
 @dataclass(frozen=True)
 class Result:
-    """How a command ended and what it printed."""
+    """The exit code and the output of a command."""
 
     code: int
     out: str
@@ -18,7 +18,7 @@ class Result:
 
 
 async def run(*words: str, within: float = 60.0, **environment: str) -> Result:
-    """Run ``rosproxy`` with these words to its end."""
+    """Run ``rosproxy`` with these words until the process ends."""
     command = [sys.executable, "-m", "rosproxy", *words]
     process = await asyncio.create_subprocess_exec(
         *command,
@@ -33,5 +33,5 @@ async def run(*words: str, within: float = 60.0, **environment: str) -> Result:
 
 
 def admin_url(proxy: Proxy) -> str:
-    """Where a proxy of a test has its admin endpoint."""
+    """The URL of a proxy's admin endpoint."""
     return f"http://{proxy.settings.admin}"

@@ -38,7 +38,7 @@ def pytest_asyncio_loop_factories(item: pytest.Item) -> dict[str, LoopFactory]:
 
 @pytest.fixture(autouse=True)
 def _no_traceback(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
-    """No test may leave a traceback in the log, whatever it did to the proxy."""
+    """Fail each test that leaves a traceback in the log."""
     yield
     for phase in ("setup", "call", "teardown"):
         for record in caplog.get_records(phase):
@@ -48,10 +48,10 @@ def _no_traceback(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
 
 
 def is_left_out(record: logging.LogRecord) -> bool:
-    """Whether it is of the kind that ``rosproxy run`` leaves out of its log.
+    """Whether ``rosproxy run`` leaves such a record out of its log.
 
-    That is what clients do to an HTTP server: they speak no HTTP, or are gone before the reply, or
-    before the end of a body that was refused; the latter two are RuntimeErrors.
+    These are faults of clients: a client speaks no HTTP, or is gone before the reply or before the
+    end of a refused body. The last two are RuntimeErrors.
     """
     error = record.exc_info[1] if record.exc_info else None
     gone = "the handler is closed", "Connection closed."
@@ -64,7 +64,7 @@ def is_left_out(record: logging.LogRecord) -> bool:
 
 @pytest.fixture
 def machines_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All hosts of a test are on one machine: here none of their addresses is another's."""
+    """Count the hosts of a test as different machines, although all addresses are local."""
     for question in ("is_own", "is_loopback"):
         monkeypatch.setattr(
             f"rosproxy.ros1.stand_ins.outside_nodes.{question}", lambda address: False
@@ -102,9 +102,9 @@ async def make_node() -> AsyncIterator[MakeNode]:
 async def make_proxy(
     master: FakeMaster, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> AsyncIterator[MakeProxy]:
-    """Starts proxies in this process, for the master unless told otherwise.
+    """Starts proxies in this process, by default for ``master``.
 
-    They are stopped before the nodes: a node can't close connections that are just being made.
+    The proxies stop before the nodes: a node cannot close connections that are just being made.
     """
     monkeypatch.setattr("rosproxy.ros1.stack.PROBE_TICK", 0.03)
     made: list[Proxy] = []
@@ -135,7 +135,7 @@ async def node(make_node: MakeNode) -> FakeNode:
 
 @pytest.fixture
 def start_process(master: FakeMaster) -> Iterator[Callable[..., Process]]:
-    """Starts proxies as processes of their own, for the master unless told otherwise."""
+    """Starts proxies as separate processes, by default for ``master``."""
     made: list[Process] = []
 
     def start(**options: Any) -> Process:

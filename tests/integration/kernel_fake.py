@@ -1,4 +1,4 @@
-"""nft and conntrack of a test: they keep one table as the kernel would, and fail when told to."""
+"""Fake nft and conntrack, which keep a table like the kernel, and fail on demand."""
 
 import json
 from collections.abc import Callable
@@ -17,7 +17,7 @@ OWN = "192.0.2.1"
 
 
 def clear_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have a kernel plane find nothing in the way in its network namespace."""
+    """Let the kernel plane find no obstacle in the network namespace."""
 
     async def nothing(mode: str, tools: Tools) -> None:
         return None
@@ -28,11 +28,11 @@ def clear_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class FakeTools(Tools):
-    """A kernel with one table.
+    """A kernel with a single table.
 
-    ``table`` is None where there is none; ``flows`` is what conntrack prints, ``counted`` are the
-    bytes that nft prints for each mark. The next runs of a
-    program fail as often as ``failing`` says. ``lacking`` is an expression that the kernel lacks.
+    ``table`` is None without a table. ``flows`` is the output of conntrack, ``counted`` are the
+    bytes that nft prints for each mark. The next ``failing`` runs of a program fail. ``lacking`` is
+    an expression that the kernel lacks.
     """
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class FakeTools(Tools):
 
     @property
     def forwards(self) -> dict[int, tuple[str, int]]:
-        """The ports with the addresses and ports that they lead to."""
+        """The forwarded ports with their targets."""
         table = self.table or {}
         ports = dict(map(tuple, table.get("ports", [])))
         hosts = [*table.get("hosts4", []), *table.get("hosts6", [])]
@@ -114,7 +114,7 @@ class FakeTools(Tools):
 
 
 def _element(text: str) -> Any:
-    """An element as nft prints it, or nearly so: a number, a network, or a pair."""
+    """An element in the form of nft, simplified: a number, a network, or a pair."""
     key, _, value = text.partition(" : ")
     if not value:
         return int(key) if key.isdigit() else key

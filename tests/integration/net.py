@@ -1,6 +1,6 @@
 """Addresses, raw connections, XML-RPC and TCPROS headers for the tests.
 
-All of 127.0.0.0/8 is loopback on Linux: every host of a test gets an address of its own there.
+All of 127.0.0.0/8 is loopback on Linux: each host of a test has a different address there.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ PATIENCE = 30.0
 async def until(
     condition: Callable[[], Any], expectation: str | Callable[[], str], within: float = PATIENCE
 ) -> None:
-    """Wait until ``condition`` holds; it may be a coroutine function."""
+    """Wait for a condition, which may be a coroutine function."""
     clock = asyncio.get_running_loop().time
     end = clock() + within
     while True:
@@ -47,27 +47,25 @@ async def until(
 
 
 async def looks(master: FakeMaster, count: int = 3) -> None:
-    """Wait until the proxy has looked at its master so often: long enough for it to act."""
+    """Wait for this number of looks at the master, so that the proxy has time to act."""
     so_far = len(master.named("getPid"))
     await until(lambda: len(master.named("getPid")) >= so_far + count, "the proxy looks")
 
 
 async def refuses(address: Address, source: str = OUTSIDE) -> bool:
-    """Whether nobody listens there."""
+    """Whether no program listens there."""
     try:
         async with connect(address, source):
             return False
     except ConnectionResetError:
-        return False  # it stops listening just now
+        return False  # the listener is just closing
     except ConnectionRefusedError:
         return True
 
 
 async def knock(address: Address, data: bytes, source: str = OUTSIDE) -> str:
-    """What becomes of a connection and of what is sent on it, which is waited for.
-
-    ``refused``, ``reset``, ``closed`` or ``answered``. That there is *no* answer is shown by
-    something else that comes after it.
+    """Connect, send, and wait for the outcome: ``refused``, ``reset``, ``closed`` or ``answered``.
+    To prove that there is *no* answer, wait for a later event.
     """
     try:
         async with connect(address, source) as wire:
@@ -76,7 +74,7 @@ async def knock(address: Address, data: bytes, source: str = OUTSIDE) -> str:
     except ConnectionRefusedError:
         return "refused"
     except ConnectionResetError:
-        return "reset"  # it stops listening just now
+        return "reset"  # the listener is just closing
 
 
 @dataclass
@@ -111,12 +109,12 @@ class Wire:
 
     @property
     def sock(self) -> socket.socket:
-        """Its socket, for options."""
+        """The socket, for options."""
         sock: socket.socket = self.writer.get_extra_info("socket")
         return sock
 
     async def send(self, data: bytes, slices: int = 0) -> None:
-        """Send, in slices of so many bytes, each in a segment of its own."""
+        """Send in slices of this size, each in a separate segment."""
         if not slices:
             self.writer.write(data)
             await self.writer.drain()
@@ -133,7 +131,9 @@ class Wire:
             return await self.reader.readexactly(size)
 
     async def reply(self, head: bool = False) -> Reply:
-        """The next HTTP response, which must have a Content-Length; ``head``: it has no body."""
+        """The next HTTP response, which must have a Content-Length. With ``head`` no body
+        follows.
+        """
         async with asyncio.timeout(PATIENCE):
             raw = await self.reader.readuntil(b"\r\n\r\n")
             reply = _parse_head(raw)
@@ -142,7 +142,7 @@ class Wire:
         return reply
 
     async def end(self) -> str:
-        """How the peer ends it, with nothing sent before: ``closed`` or ``reset``."""
+        """How the peer ends the connection, without data before: ``closed`` or ``reset``."""
         try:
             async with asyncio.timeout(PATIENCE):
                 rest = await self.reader.read()
@@ -210,7 +210,7 @@ def xml(method: str, *params: Any) -> bytes:
 
 
 def post(body: bytes, *headers: str, path: str = "/", version: str = "1.1") -> bytes:
-    """An HTTP POST; ``headers`` are whole lines, Content-Length is added where it is missing."""
+    """An HTTP POST. ``headers`` are whole lines. A missing Content-Length is added."""
     lines = [f"POST {path} HTTP/{version}", "Host: somewhere", "Content-Type: text/xml", *headers]
     if not any(line.lower().startswith(("content-length:", "transfer-enc")) for line in headers):
         lines.append(f"Content-Length: {len(body)}")
@@ -220,7 +220,7 @@ def post(body: bytes, *headers: str, path: str = "/", version: str = "1.1") -> b
 async def exchange(
     address: Address, request: bytes, source: str = OUTSIDE, slices: int = 0
 ) -> Reply:
-    """The response to one raw request."""
+    """The response to a raw request."""
     async with connect(address, source) as wire:
         await wire.send(request, slices)
         return await wire.reply()
@@ -231,7 +231,7 @@ async def rpc(
 ) -> Any:
     """The value of an XML-RPC call. Raises Fault, OSError, EOFError.
 
-    ``host`` is what the caller calls the peer, for one that it reaches through NAT.
+    ``host`` is the caller's name for the peer, for example behind NAT.
     """
     return await call(address, method, *params, source=source, host=host)
 

@@ -1,7 +1,7 @@
-"""A domain of DDS for the tests of one process.
+"""A DDS domain for the tests of a process.
 
-The ports of a domain follow from its number, and all programs of a machine hear the domain's group.
-So tests that run in two processes at once heard each other, or found a port taken.
+The ports of a domain follow from its number, and all programs of a machine receive the domain's
+multicast. With the same domain, tests in two processes disturb each other.
 """
 
 import socket
@@ -9,9 +9,9 @@ import socket
 from rosproxy.ros2.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST
 
 _DOMAINS = range(29, 0, -1)
-"""Their ports are below those that tests draw (`PortDraws`)."""
+"""Domains with ports below the ports that tests draw (`PortDraws`)."""
 _SIGN = 240
-"""A domain has 250 ports; no program of the tests uses this one."""
+"""The offset of a port of the domain that no program of the tests uses."""
 _held = list[socket.socket]()
 
 

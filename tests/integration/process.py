@@ -1,4 +1,4 @@
-"""The proxy of a test as a process of its own, for what can be seen only from outside of it."""
+"""The proxy of a test as a separate process, for observations from outside."""
 
 import os
 import signal
@@ -29,8 +29,8 @@ def command_line(options: dict[str, Any]) -> list[str]:
 class Process:
     """A running ``rosproxy run``.
 
-    ``log`` is what it has written to standard error so far. The option ``prefix`` is a command
-    that runs it.
+    ``log`` are the lines on standard error so far. The option ``prefix`` is a command that runs the
+    proxy.
     """
 
     def __init__(self, options: dict[str, Any]) -> None:
@@ -41,7 +41,7 @@ class Process:
         self.start()
 
     def start(self) -> None:
-        """Start it, the first time or again with the same options, and wait until it is ready."""
+        """Start or restart the proxy with the same options, and wait until ready."""
         self._before = len(self.log)
         command = [*self.prefix, *command_line(self.options)]
         self._process = subprocess.Popen(
@@ -53,7 +53,7 @@ class Process:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """The process id."""
         return self._process.pid
 
     @property
@@ -70,21 +70,21 @@ class Process:
             sleep(0.01)
 
     def resident(self) -> int:
-        """Its memory in bytes: what it holds now, without what is shared with others."""
+        """The private memory in bytes."""
         lines = Path(f"/proc/{self.pid}/smaps_rollup").read_text().splitlines()
         return 1024 * sum(int(line.split()[1]) for line in lines if line.startswith("Private_"))
 
     def most_memory(self) -> int:
-        """The most memory in bytes that it has had resident at any time."""
+        """The peak of resident memory in bytes."""
         lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
         return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
 
     def descriptors(self) -> int:
-        """How many file descriptors it has open."""
+        """The number of open file descriptors."""
         return len(os.listdir(f"/proc/{self.pid}/fd"))
 
     def threads(self) -> int:
-        """How many threads it has."""
+        """The number of threads."""
         return len(os.listdir(f"/proc/{self.pid}/task"))
 
     def terminate(self, number: int = signal.SIGTERM) -> int:
@@ -99,7 +99,7 @@ class Process:
         self.terminate(signal.SIGKILL)
 
     def close(self) -> None:
-        """End it if it still runs; a traceback in its log fails the test."""
+        """Kill the process if necessary. A traceback in the log fails the test."""
         if self._process.poll() is None:
             self.kill()
         assert "Traceback" not in "".join(self.log), "".join(self.log)

@@ -56,7 +56,7 @@ def settings_for(**options: Any) -> Settings:
 
 
 class Proxy:
-    """A running proxy and where to reach it."""
+    """A running proxy and its addresses."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -66,7 +66,7 @@ class Proxy:
 
     @property
     def ros1(self) -> Ros1:
-        """Its part for ROS 1."""
+        """The stack for ROS 1."""
         return next(stack for stack in self.app.stacks if isinstance(stack, Ros1))
 
     async def start(self) -> None:
@@ -112,5 +112,5 @@ class Proxy:
         return host_and_port(self.ros1.context.addressing.advertised_uri(endpoint))
 
     def uri(self, node: FakeNode) -> str:
-        """A node's slave URI as outside sees it."""
+        """A node's advertised slave URI."""
         return self.ros1.context.addressing.advertised_uri(self.endpoint(node))

@@ -132,7 +132,7 @@ async def test_a_long_call_with_an_odd_head_is_bounded(proxy):
 
 
 def parameters(count: int, param_value: Any) -> list[dict[str, Any]]:
-    """What roslaunch sends for its parameters."""
+    """The calls of roslaunch for parameters."""
     return [
         {"methodName": "setParam", "params": ["/n", f"/p{i}", param_value]} for i in range(count)
     ]
@@ -252,7 +252,7 @@ async def test_over_the_byte_budget_is_503_and_told(make_proxy, node):
     await until(lambda: not proxy.ros1.context.buffered.used, "all is given back")
 
 
-async def test_who_does_not_read_is_cut_and_who_reads_slowly_is_not(proxy, master, monkeypatch):
+async def test_an_idle_reader_is_cut_and_a_slow_reader_is_not(proxy, master, monkeypatch):
     def cut_soon(sock: socket.socket) -> None:
         idles = sock.getpeername()[0] == NODE
         sockets.end_if_stalled(sock, 1.0 if idles else sockets.WRITE_TIMEOUT)
@@ -274,17 +274,17 @@ async def test_who_does_not_read_is_cut_and_who_reads_slowly_is_not(proxy, maste
     slow = await open_reader(OTHER_NODE)
     loop = asyncio.get_running_loop()
     passes = proxy.ros1.context.unread_calls
-    await until(lambda: passes.used == 2, "both replies are under way")
-    await until(lambda: passes.used == 1, "the idle one is cut by the kernel")
+    await until(lambda: passes.used == 2, "both replies are pending")
+    await until(lambda: passes.used == 1, "the kernel cuts the idle reader")
     taken = len(await loop.sock_recv(slow, 100_000))
     if isinstance(loop, PatientLoop):
         for _ in range(13):
-            await pass_time(5)  # no timer of the proxy's minds how long a reply takes
-            # The kernel has a clock of its own, and the proxy may need long for this time to pass.
+            await pass_time(5)  # the proxy has no time limit for a reply
+            # The kernel's clock is real, and this time may take the proxy long.
             taken += len(await loop.sock_recv(slow, 100_000))
     while taken < 20_000_000:
         chunk = await loop.sock_recv(slow, 1_000_000)
-        assert chunk, f"the slow one was cut after {taken} bytes"
+        assert chunk, f"the slow reader was cut after {taken} bytes"
         taken += len(chunk)
     idle.close()
     slow.close()
@@ -323,7 +323,7 @@ async def test_connections_to_one_port_are_bounded(make_proxy, make_node):
         assert (await greet(proxy.lease(other), topic_header()))["callerid"] == "/other"
 
 
-async def test_the_silent_one_that_waited_longest_goes_first(proxy, node, monkeypatch):
+async def test_the_longest_silent_connection_goes_first(proxy, node, monkeypatch):
     monkeypatch.setattr(gate, "MOST_WAITING", 4)
     await node.publish(proxy.master)
     lease = proxy.lease(node)
@@ -344,12 +344,12 @@ async def test_the_silent_one_that_waited_longest_goes_first(proxy, node, monkey
         wires.append(await wait_in_line(stack))
         last = newest()
         await wires[3].send(b"POST / HTTP/1.1\r\n")
-        await until(lambda: newest() > last, "it waits with the rest of its request, from now on")
+        await until(lambda: newest() > last, "the connection waits for the rest of a request")
         assert (await exchange(lease, pid(), OTHER_NODE)).value[0] == 1
         for wire in wires:
             assert (await exchange(lease, pid())).value[0] == 1
             assert await wire.outcome() in ("closed", "reset", "answered")
-            await wait_in_line(stack)  # another one takes its place
+            await wait_in_line(stack)  # another connection takes the place
 
 
 async def test_a_compressed_reply_is_not_inflated(proxy, master):

@@ -1,4 +1,4 @@
-"""Calls over kept connections, against peers that end them in every way."""
+"""Calls over kept connections, with peers that end connections in every way."""
 
 import asyncio
 import gzip
@@ -20,7 +20,7 @@ Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 
 class Peer:
-    """A server; ``serve`` handles its connections, ``accepted`` counts them."""
+    """A server. ``serve`` handles a connection, ``accepted`` counts connections."""
 
     def __init__(self) -> None:
         self.serve: Serve = self.answer_always
@@ -64,7 +64,7 @@ async def peer() -> AsyncIterator[Peer]:
     await made.start()
     yield made
     made.stop()
-    await until(lambda: made.open == 0, "the client has closed its connections")
+    await until(lambda: made.open == 0, "the client closes all connections")
 
 
 @pytest.fixture
@@ -106,7 +106,7 @@ async def test_no_more_calls_are_under_way_than_allowed(client, peer):
 
 @pytest.fixture
 def answer(peer: Peer) -> asyncio.Event:
-    """When the peer answers what it was asked; then it waits for the end of the connection."""
+    """Set this event to make the peer answer. The peer then waits for the end of the connection."""
     event = asyncio.Event()
 
     async def late(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -131,7 +131,7 @@ async def test_a_peer_that_answers_late_finds_its_caller_on_the_connection(clien
     await give_up(client, peer)
     assert (peer.open, len(client.late)) == (1, 1)
     answer.set()
-    await until(lambda: not peer.open, "the connection is closed once it has its answer")
+    await until(lambda: not peer.open, "the connection closes after the answer")
     assert len(client.late) == 0
 
 
@@ -148,7 +148,7 @@ async def test_no_more_answers_are_waited_for_than_allowed(client, peer, answer,
     monkeypatch.setattr("rosproxy.net.late_answers.MOST_LATE", 2)
     await asyncio.gather(*(give_up(client, peer) for _ in range(4)))
     assert len(client.late) == 2
-    await until(lambda: peer.open == 2, "the others are closed")
+    await until(lambda: peer.open == 2, "the other connections are closed")
     await client.close()
     assert len(client.late) == 0
 
@@ -346,9 +346,9 @@ async def test_nothing_else_than_a_path_gets_into_a_header(client, peer, bad):
     assert peer.accepted == 0
 
 
-async def test_a_closed_client_calls_nobody(client, peer):
+async def test_a_closed_client_makes_no_calls(client, peer):
     await post(client, peer)
     await client.close()
-    await until(lambda: peer.open == 0, "its connections are closed")
+    await until(lambda: peer.open == 0, "all connections are closed")
     with pytest.raises(ConnectionAbortedError):
         await post(client, peer)

@@ -1,4 +1,4 @@
-"""IPv6 and dual stack, as far as this machine has them."""
+"""IPv6 and dual stack, if this machine has both."""
 
 import os
 import socket
@@ -124,5 +124,5 @@ async def test_recovery_over_ipv6(
         port_range=str(proxy6.settings.ports.listen),
     )
     await until(lambda: len(fresh.ros1.context.registry), "the node is found")
-    await until(lambda: fresh.serves(node6), "it is served")
+    await until(lambda: fresh.serves(node6), "the node is served")
     assert (await rpc(uri, "getPid", "/outside"))[2] == node6.pid

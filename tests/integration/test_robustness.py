@@ -27,14 +27,14 @@ NAMES = ["constructor", "__proto__", "__class__", "_dispatch", "toString", "a" *
 
 @dataclass
 class Door:
-    """A port that speaks XML-RPC, the pid that answers behind it, and the longest body."""
+    """A port with XML-RPC, the pid that answers, and the longest body."""
 
     address: Address
     pid: int
     longest: int = master_call(4).size
 
     async def works(self) -> bool:
-        """Whether it still answers as it should."""
+        """Whether the port still answers correctly."""
         return await rpc(self.address, "getPid", "/n", source=NODE) == [1, "", self.pid]
 
 
@@ -359,7 +359,7 @@ async def test_length_bytes_of_a_tcpros_header_are_no_http(proxy):
 
 
 async def test_a_name_server_that_hangs_does_not_hold_up_a_call_to_a_node(proxy, monkeypatch):
-    """aiohttp's own resolver would wait for it, and leave its failure to nobody."""
+    """aiohttp's resolver would wait for the server, and no task would get the error."""
     answer = threading.Event()
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_args, **_more: answer.wait(20) and [])
     try:

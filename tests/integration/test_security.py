@@ -27,7 +27,7 @@ SECRET = b"<html>the other host's secret</html>"
 
 
 class Victim:
-    """An inside host's ordinary service, which nobody outside may reach."""
+    """An ordinary service of an inside host, which outside must not reach."""
 
     def __init__(self) -> None:
         self.answer: Answer = ok(SECRET)
@@ -106,24 +106,22 @@ async def test_a_forged_caller_api_does_not_open_a_door_to_an_ordinary_service(
 
 
 @pytest.mark.usefixtures("_as_if_not_loopback")
-async def test_somebody_elses_registration_opens_no_further_port_of_a_node(
-    proxy, make_node, victim
-):
+async def test_a_foreign_registration_opens_no_further_port_of_a_node(proxy, make_node, victim):
     evil = await make_node("/evil")
     other = await make_node("/other", OTHER_NODE)
     forged = f"rosrpc://{OTHER_NODE}:{victim.port}"
     door = "registerService", "/door", forged, other.uri
-    # In the node's own name: first as the only one who registers it, then next to the node itself.
+    # In the node's name: first as the only registration, then beside the node's own.
     for _ in range(2):
         await call(proxy.master, door[0], "/other", *door[1:], source=NODE)
         await knock(proxy.lease(other), service_header("/door"))
         await other.publish(proxy.master)
-    # In another name, it is not the node's registration at all.
+    # In another name, the registration is not the node's.
     code, text, _ = await evil.call(proxy.master, *door)
     assert (code, "has the name /other" in text) == (-1, True)
     assert proxy.endpoint(other).caller_ids == ["/other"]
     assert victim.http.connections == 0
-    # The node's own word is believed.
+    # A registration by the node itself counts.
     own = f"rosrpc://{OTHER_NODE}:{other.tcpros_port}"
     await other.call(proxy.master, "registerService", "/add", own, other.uri)
     assert (await greet(proxy.lease(other), service_header()))["callerid"] == "/other"

@@ -1,4 +1,4 @@
-"""What nodes and strangers call things: bounded wherever it is kept, shown or logged."""
+"""Names from nodes and strangers: bounded in memory, in the status and in the log."""
 
 import gzip
 import json
@@ -142,7 +142,7 @@ async def test_a_master_that_says_a_lot_is_quoted_in_short(make_proxy, master):
 
 
 async def test_a_small_request_makes_no_large_log(start_process):
-    """8 KB once made 16 MB of log and of /status: a packed body, most of it one URI."""
+    """Packed, 8 KB may contain a URI of 8 MB, which must not enter the log or /status."""
     process = start_process(log_format="text")
     uri = f"http://{NODE}:5000/" + "x" * 8_000_000
     packed = gzip.compress(xml("registerPublisher", "/a", "/t", "*", uri))
@@ -160,7 +160,7 @@ async def test_a_small_request_makes_no_large_log(start_process):
 
 
 async def test_reading_status_stays_small_whatever_was_registered(proxy, node):
-    """Names as long as they may be, and forged ones, are shown as they are, in JSON."""
+    """The JSON has names unchanged, also hostile and long names."""
     await node.publish(proxy.master, FORGED)
     assert proxy.app.status()["nodes"][0]["publishes"] == (FORGED,)
     async with connect((proxy.settings.admin.host, proxy.settings.admin.port), OUTSIDE) as wire:

@@ -154,7 +154,7 @@ async def test_metrics_of_a_proxy_at_work(
     assert any(name.startswith("rosproxy_build_info{version=") for name in samples)
 
 
-async def test_who_does_not_answer_is_named(
+async def test_a_silent_node_is_named_in_the_metrics(
     make_proxy: MakeProxy, make_node: MakeNode, node: FakeNode
 ) -> None:
     proxy = await make_proxy(cleanup_after=60.0)
@@ -163,7 +163,7 @@ async def test_who_does_not_answer_is_named(
         await publisher.publish(proxy.master)
     assert not [name for name in await metrics(proxy) if "nodes_down{" in name]
     await dead.stop()
-    await until(lambda: proxy.metric("nodes_down", node="/dead"), "it is missed")
+    await until(lambda: proxy.metric("nodes_down", node="/dead"), "the node counts as down")
     assert [name for name in await metrics(proxy) if "nodes_down{" in name] == [
         "rosproxy_nodes_down{node=/dead}"
     ]

@@ -1,4 +1,4 @@
-"""Who may change something at the admin endpoint, what is refused, and what a controller tells."""
+"""Changes at the admin endpoint: allowed callers, refusals, and updates of an operator."""
 
 import asyncio
 import json
@@ -33,12 +33,12 @@ from tests.integration.proxy import Proxy
 
 TOKEN = "0123456789abcdef"
 PATIENT = {"cleanup_after": 0.0, "linger": 60.0}
-"""Nothing is unregistered, nor a port given up, unless a test asks for it."""
+"""The proxy unregisters no node and frees no port, unless a test asks for that."""
 
 
 @pytest.fixture
 def from_afar(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No caller counts as one on loopback; in these tests all are."""
+    """Count no caller as local, although all callers in these tests are on loopback."""
     monkeypatch.setattr("rosproxy.admin.admin_server.is_loopback", lambda _: False)
 
 
@@ -161,7 +161,7 @@ async def test_no_update(proxy: Proxy) -> None:
 
 
 async def populate(proxy: Proxy, node: FakeNode) -> None:
-    """One of each kind."""
+    """Make a registration of each kind."""
     await node.publish(proxy.master)
     await node.publish(proxy.master, "/rosout")
     await node.subscribe(proxy.master, "/back")
@@ -195,7 +195,7 @@ async def test_a_container_that_is_gone(
 async def test_a_node_whose_container_is_gone_is_no_fault(
     was_unregistered: bool, make_proxy: MakeProxy, node: FakeNode
 ) -> None:
-    """Also one that has hung for so long before that the proxy has unregistered it."""
+    """Also a node that hung for so long that the proxy has unregistered the node."""
     hasty = {"cleanup_after": 0.05, "probe_interval": 0.05, "probe_timeout": 0.05, "linger": 60.0}
     proxy = await make_proxy(**(hasty if was_unregistered else PATIENT))
     await node.publish(proxy.master)
@@ -205,9 +205,9 @@ async def test_a_node_whose_container_is_gone_is_no_fault(
         await until(lambda: endpoint.state == "cleaned", "the proxy unregisters it")
     else:
         await node.stop()
-    await until(lambda: proxy.metric("nodes_down", node=node.name), "it is missed")
+    await until(lambda: proxy.metric("nodes_down", node=node.name), "the node counts as down")
     await update(proxy, gone=[NODE])
-    await until(lambda: endpoint.state == "ended", "it is known to have ended")
+    await until(lambda: endpoint.state == "ended", "the node counts as ended")
     assert not proxy.metric("nodes_down", node=node.name)
 
 
@@ -216,16 +216,16 @@ async def test_a_node_that_hangs_is_not_waited_for(
 ) -> None:
     monkeypatch.setattr(
         "rosproxy.ros1.upkeep.containers.YOUNG_NODE_AGE", -1.0
-    )  # it is none that is just starting
+    )  # the node is not young
     proxy = await make_proxy(**PATIENT, probe_timeout=10.0)
     await node.publish(proxy.master)
     node.hang = True
     before = proxy.ros1.context.now()
     assert await update(proxy, gone=[NODE]) == (1, 0, 0)
-    assert proxy.ros1.context.now() - before < 9  # less than its probe may take
+    assert proxy.ros1.context.now() - before < 9  # less than the time limit of a probe
     assert not everything(master)
     node.hang = False  # the update was wrong
-    await until(lambda: master.holds("publishers", "/chatter"), "it is registered again")
+    await until(lambda: master.holds("publishers", "/chatter"), "the node is registered again")
 
 
 async def test_a_node_that_has_just_registered_may_take_its_time(
@@ -239,7 +239,7 @@ async def test_a_node_that_has_just_registered_may_take_its_time(
     assert await update(proxy, gone=[NODE]) == (0, 0, 0)
     assert not await refuses(proxy.lease(node))
     assert everything(master)
-    await until(lambda: not everything(master), "it had its chance")
+    await until(lambda: not everything(master), "the second chance is over")
 
 
 async def test_its_open_connections_end(make_proxy: MakeProxy, node: FakeNode) -> None:
@@ -256,7 +256,7 @@ async def test_its_open_connections_end(make_proxy: MakeProxy, node: FakeNode) -
 async def test_a_port_that_a_living_node_got_meanwhile_keeps_its_connections(
     make_proxy: MakeProxy, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While the dead node was asked, its port went to another: the last one of the range."""
+    """During the probe of a dead node, the only port of the range goes to another node."""
     port = free_ports(1)
     proxy = await make_proxy(port_range=f"{port}-{port}", probe_interval=0.05, linger=60.0)
     dead = await make_node()
@@ -269,7 +269,7 @@ async def test_a_port_that_a_living_node_got_meanwhile_keeps_its_connections(
     probe = proxy.ros1.context.nodes.probe
 
     async def slow_probe(slave: HostPort, *timeout: float) -> ProbeAnswer:
-        if timeout:  # on the word of the operator
+        if timeout:  # a probe because of the operator's update
             asked.set()
             await answered.wait()
         return await probe(slave, *timeout)
@@ -291,14 +291,14 @@ async def test_a_port_that_a_living_node_got_meanwhile_keeps_its_connections(
 async def test_another_process_at_an_address_that_is_gone(
     make_proxy: MakeProxy, node: FakeNode, master: FakeMaster
 ) -> None:
-    """It answers, but has none of the former one's topics."""
+    """The process answers, but has none of the former node's topics."""
     proxy = await make_proxy(**PATIENT, probe_interval=60.0)
     await node.publish(proxy.master)
-    await until(lambda: proxy.endpoint(node).health.pid, "it was probed")
+    await until(lambda: proxy.endpoint(node).health.pid, "the node is probed")
     node.pid += 1
     node.published.clear()
     assert await update(proxy, gone=[NODE]) == (0, 0, 0)
-    await until(lambda: not everything(master), "what the former had is taken back")
+    await until(lambda: not everything(master), "the former registrations are removed")
 
 
 async def test_a_port_is_given_up_after_linger_though_the_address_is_silent(
@@ -311,7 +311,7 @@ async def test_a_port_is_given_up_after_linger_though_the_address_is_silent(
     await until(lambda: not len(proxy.ros1.context.registry), "the port is free again")
 
 
-async def test_a_master_that_is_away_hears_of_it_later(
+async def test_a_master_that_is_away_gets_the_unregistrations_later(
     make_proxy: MakeProxy, node: FakeNode, master: FakeMaster
 ) -> None:
     proxy = await make_proxy(linger=60.0, cleanup_after=60.0)
@@ -324,7 +324,7 @@ async def test_a_master_that_is_away_hears_of_it_later(
     assert reply.body.endswith(b"try again\n")
     assert await refuses(lease)
     await master.start()
-    await until(lambda: not everything(master), "it is unregistered by itself")
+    await until(lambda: not everything(master), "the proxy unregisters the node")
     assert await update(proxy, gone=[NODE]) == (0, 0, 0)
 
 
@@ -337,7 +337,7 @@ class Container:
         self.uri = node.uri
 
     async def move(self, address: str) -> None:
-        """The same process at another address; it calls itself what it did."""
+        """Move the process to another address, with the same URI."""
         await self.node.stop()
         self.node.host = self.node.host
         self.node.address = address
@@ -351,12 +351,12 @@ class Container:
 
 @pytest.fixture
 async def container(make_proxy: MakeProxy, make_node: MakeNode) -> Container:
-    """A node with one registration of each kind, known by its pid."""
+    """A node with a registration of each kind. The proxy knows the pid."""
     node = await make_node(port=free_ports(1))
     proxy = await make_proxy(**PATIENT, probe_interval=60.0)
     await populate(proxy, node)
     moved = Container(node, proxy)
-    await until(lambda: moved.endpoint.health.pid, "it was probed")
+    await until(lambda: moved.endpoint.health.pid, "the node is probed")
     return moved
 
 
@@ -375,7 +375,7 @@ async def test_a_container_that_has_moved(
     for kind, name in [("publishers", "/chatter"), ("subscribers", "/back"), ("params", "/rate")]:
         assert master.holds(kind, name) == [uri]
     # rospy and roscpp connect to a URI again only if it was gone meanwhile.
-    await until(lambda: robot.updates()[-2:] == [[], [uri]], "outside is told to connect anew")
+    await until(lambda: robot.updates()[-2:] == [[], [uri]], "outside subscribers connect anew")
     assert master.holds("services", "/add") == [f"rosrpc://{lease[0]}:{lease[1]}"]
     assert (await greet(lease, topic_header()))["callerid"] == "/talker"
     assert (await greet(lease, service_header()))["callerid"] == "/talker"
@@ -422,10 +422,10 @@ async def test_a_new_address_outside_of_all_inside_networks(container: Container
     assert await update(container.proxy, moved={NODE: OUTSIDE}) == (0, 0, 0)
 
 
-async def test_it_has_registered_from_its_new_address_already(
+async def test_a_moved_container_that_has_already_registered_at_its_new_address(
     container: Container, master: FakeMaster
 ) -> None:
-    """So it holds another port, under the same name; its topics are all registered there."""
+    """The node has another port under the same name. All topics are registered there."""
     proxy = container.proxy
     node = container.node
     await container.move(OTHER_NODE)
@@ -438,7 +438,7 @@ async def test_it_has_registered_from_its_new_address_already(
     assert master.holds("subscribers", "/back") == [uri]
 
 
-async def test_a_master_that_is_away_is_told_of_the_move_later(
+async def test_a_master_that_is_away_gets_the_move_later(
     container: Container, master: FakeMaster
 ) -> None:
     proxy = container.proxy
@@ -448,12 +448,12 @@ async def test_a_master_that_is_away_is_told_of_the_move_later(
     reply = await post(proxy, "/containers", json.dumps({"moved": {NODE: OTHER_NODE}}))
     assert reply.status == 503
     await master.start()
-    await until(lambda: not container.endpoint.unsettled, "it is settled")
+    await until(lambda: not container.endpoint.unsettled, "the endpoint is settled")
     assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
 
 
 async def test_a_container_that_is_back_elsewhere(container: Container, master: FakeMaster) -> None:
-    """Gone at first, as one that is taken off its network, and then at another address."""
+    """First gone, like a container that leaves its network, then back at another address."""
     proxy = container.proxy
     node = container.node
     await node.stop()
@@ -500,7 +500,7 @@ async def test_retiring_waits_for_registrations_under_way(
     await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
     master.delay = 0.3
     registering = asyncio.create_task(node.publish(proxy.master))
-    await until(lambda: len(proxy.ros1.context.registry), "it is admitted")
+    await until(lambda: len(proxy.ros1.context.registry), "the node is admitted")
     await tell(proxy, "/retire")
     await registering
     assert not everything(master)

@@ -43,7 +43,9 @@ async def ask(
 
 @pytest.mark.parametrize("path", [*GETS, "/healthz", "/readyz", "/nothing"])
 async def test_a_strangers_name_is_refused_at_every_path(proxy: Proxy, path: str) -> None:
-    """A web page whose name leads here read /status and /metrics."""
+    """A web page with a name for the proxy's address must not read /status and /metrics (DNS
+    rebinding).
+    """
     refused = await ask(proxy, path, host=STRANGE)
     assert refused.status == 403
     assert refused.body.startswith(b"rosproxy: evil.example:11312: the admin endpoint does not")
@@ -110,7 +112,7 @@ async def test_a_reader_sees_what_was_done_before_it_asked(proxy: Proxy, node: F
 
 @pytest.fixture
 def large(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> Proxy:
-    """A proxy whose status is as large as it may be."""
+    """A proxy with the largest possible status."""
     state = proxy.app._admin._status
     problems = (ProblemStatus(text="x" * 1000),) * 1000
     monkeypatch.setattr(proxy.app._admin, "_status", lambda: replace(state(), problems=problems))
@@ -119,7 +121,7 @@ def large(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> Proxy:
 
 @asynccontextmanager
 async def stalled(proxy: Proxy, count: int, source: str = OUTSIDE) -> AsyncIterator[list[Wire]]:
-    """Readers that ask for the status and take nothing of it."""
+    """Readers that ask for the status and read nothing."""
     address = (proxy.settings.admin.host, proxy.settings.admin.port)
     async with AsyncExitStack() as stack:
         wires = []
@@ -132,7 +134,7 @@ async def stalled(proxy: Proxy, count: int, source: str = OUTSIDE) -> AsyncItera
 
 
 def buffered(proxy: Proxy) -> list[int]:
-    """The bytes that the proxy keeps for each connection to its admin endpoint."""
+    """The buffered bytes of each connection to the admin endpoint."""
     runner = proxy.app._admin._runner
     assert runner
     assert runner.server
@@ -140,25 +142,25 @@ def buffered(proxy: Proxy) -> list[int]:
     return [transport.get_write_buffer_size() for transport in transports if transport]
 
 
-async def test_a_reader_that_takes_nothing_has_no_copy_of_its_own(large: Proxy) -> None:
-    """Each had one: 32 readers of a status of 20 MB took 1.4 GB."""
+async def test_readers_that_take_nothing_share_the_document(large: Proxy) -> None:
+    """With a copy each, 32 readers of a status of 20 MB take 1.4 GB."""
     replies = large.app._admin._replies
     async with stalled(large, MOST_REPLIES_EACH) as wires:
-        await until(lambda: replies.taken == MOST_REPLIES_EACH, "they are served")
-        await until(lambda: all(buffered(large)), "they stall")
+        await until(lambda: replies.taken == MOST_REPLIES_EACH, "the readers are served")
+        await until(lambda: all(buffered(large)), "the readers stall")
         assert max(buffered(large)) <= 3 * PIECE
         for wire in wires:
             wire.reader._transport.resume_reading()  # type: ignore[attr-defined]
             body = (await wire.reply()).body
             assert len(body) > 0.9 * MOST_BYTES
             assert len(json.loads(body)["problems"]) == 1000
-    await until(lambda: not replies.taken, "they have been served")
+    await until(lambda: not replies.taken, "all replies end")
 
 
 async def test_one_address_keeps_nothing_from_others(large: Proxy) -> None:
     replies = large.app._admin._replies
     async with stalled(large, MOST_REPLIES_EACH):
-        await until(lambda: replies.taken == MOST_REPLIES_EACH, "they are served")
+        await until(lambda: replies.taken == MOST_REPLIES_EACH, "the readers are served")
         for path in ("/status", "/metrics"):
             refused = await ask(large, path)
             assert (refused.status, refused.headers["retry-after"]) == (503, "10")
@@ -175,7 +177,7 @@ async def test_there_is_a_bound_for_all_addresses_together(large: Proxy) -> None
         for number in range(MOST_REPLIES // MOST_REPLIES_EACH):
             source = f"127.0.5.{number}"
             await stack.enter_async_context(stalled(large, MOST_REPLIES_EACH, source))
-        await until(lambda: replies.taken == MOST_REPLIES, "they are served")
+        await until(lambda: replies.taken == MOST_REPLIES, "the readers are served")
         assert (await ask(large, "/status")).status == 503
         assert (await ask(large, "/healthz")).status == 200
 
@@ -183,9 +185,9 @@ async def test_there_is_a_bound_for_all_addresses_together(large: Proxy) -> None
 async def test_a_reader_that_takes_nothing_is_cut_off(large: Proxy) -> None:
     replies = large.app._admin._replies
     async with stalled(large, 2) as wires:
-        await until(lambda: replies.taken == 2, "they are served")
+        await until(lambda: replies.taken == 2, "the readers are served")
         await pass_time(REPLY_TIMEOUT + 1)
-        await until(lambda: not replies.taken, "they are given up")
+        await until(lambda: not replies.taken, "the proxy ends the replies")
         wires[0].reader._transport.resume_reading()  # type: ignore[attr-defined]
         with pytest.raises((ConnectionResetError, asyncio.IncompleteReadError)):
             await wires[0].reply()
@@ -194,15 +196,15 @@ async def test_a_reader_that_takes_nothing_is_cut_off(large: Proxy) -> None:
 async def test_a_connection_too_many_ends_the_oldest_with_what_it_has_not_taken(
     large: Proxy,
 ) -> None:
-    """It was closed in order: what was written for it stayed until the kernel gave it up."""
+    """An orderly close would keep the written bytes until the kernel gives up."""
     replies = large.app._admin._replies
     address = (large.settings.admin.host, large.settings.admin.port)
     async with stalled(large, 1), AsyncExitStack() as stack:
-        await until(lambda: any(buffered(large)), "it stalls")
+        await until(lambda: any(buffered(large)), "the reader stalls")
         for _ in range(MOST_CONNECTIONS):
             await stack.enter_async_context(connect(address))
-        await until(lambda: not any(buffered(large)), "nothing is kept for it")
-        await until(lambda: not replies.taken, "it has been given up")
+        await until(lambda: not any(buffered(large)), "no bytes are buffered")
+        await until(lambda: not replies.taken, "the reply ends")
 
 
 async def test_a_head_has_no_body(proxy: Proxy) -> None:
@@ -213,10 +215,10 @@ async def test_a_head_has_no_body(proxy: Proxy) -> None:
             assert (await wire.reply(head=True)).status == 200
 
 
-async def test_our_own_commands_may_name_the_proxy_as_they_like(
+async def test_the_proxys_own_commands_may_use_any_name_of_the_proxy(
     proxy: Proxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They send the address: ``rosproxy status --admin robot.example:11312`` goes on working."""
+    """Commands send the address as Host: ``rosproxy status --admin robot.example:11312`` works."""
     host = proxy.settings.admin.host
     port = proxy.settings.admin.port
 

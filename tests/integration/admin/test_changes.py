@@ -44,7 +44,9 @@ async def test_a_change_is_told(
     await node.publish(proxy.master, "/chatter")
     another, status = await waiting
     assert another != version
-    while status["nodes"][0]["nodes"] != ["/talker"]:  # it has a port before it has a name
+    while status["nodes"][0]["nodes"] != [
+        "/talker"
+    ]:  # the endpoint has a port before it has a name
         another, status = await changes(proxy, another)
     assert (await changes(proxy, version))[1]["nodes"]  # it has changed by then
 

@@ -1,4 +1,4 @@
-"""The status that a running operator tells, and who asks it."""
+"""The status of a running operator, and allowed callers."""
 
 import asyncio
 import json
@@ -30,7 +30,7 @@ DOCUMENT = {"version": __version__, "uplink": "0-rosproxy", "actions": ["start c
 
 
 class RunningOperator:
-    """The endpoint of an operator that tells ``document``, or why it can't."""
+    """The endpoint of an operator with ``document``, or with an error."""
 
     def __init__(self) -> None:
         self.document: dict[str, Any] = DOCUMENT
@@ -121,7 +121,9 @@ async def test_it_is_json(operator: RunningOperator) -> None:
 
 
 async def test_a_strangers_name_is_refused_at_every_path(operator: RunningOperator) -> None:
-    """A web page whose name leads here read /metrics and /readyz."""
+    """A web page with a name for this address must not read /metrics and /readyz (DNS
+    rebinding).
+    """
     url = f"http://{operator.address}"
     async with aiohttp.ClientSession() as session:
         for path in ("/healthz", "/readyz", "/metrics", "/status", "/", "/page.js"):

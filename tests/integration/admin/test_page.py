@@ -1,4 +1,4 @@
-"""The live page: its routes, who is let in, and the stream of changes with its bounds."""
+"""The live page: routes, allowed visitors, and the bounded stream of changes."""
 
 import asyncio
 import json
@@ -36,7 +36,7 @@ LINK = "topic /chatter /talker /outside"
 
 @pytest.fixture
 def from_afar(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No caller counts as one on loopback; in these tests all are."""
+    """Count no caller as local, although all callers in these tests are on loopback."""
     for module in ("rosproxy.admin.admin_server", "rosproxy.page.visitors"):
         monkeypatch.setattr(f"{module}.is_loopback", lambda _: False)
 
@@ -57,7 +57,7 @@ async def get(proxy: Proxy, path: str, *headers: str, host: str = "localhost") -
 
 
 class Stream:
-    """A page that is open: the document as it follows from the events that came."""
+    """An open page, with the document after all events so far."""
 
     def __init__(self, reply: aiohttp.ClientResponse) -> None:
         self._reply = reply
@@ -76,7 +76,7 @@ class Stream:
                 return kind, json.loads(line.removeprefix("data: "))
 
     async def follow(self) -> None:
-        """Take in one event."""
+        """Process the next event."""
         from rosproxy.page.changes import changed
 
         kind, update = await self.event()
@@ -87,7 +87,7 @@ class Stream:
             self.document = changed(self.document, update)
 
     async def link(self, key: str, **wanted: Any) -> dict[str, Any]:
-        """A link, once it is so."""
+        """Wait until a link has these values."""
         async with asyncio.timeout(PATIENCE):
             while True:
                 link: dict[str, Any] = self.document.get("links", {}).get(key, {})
@@ -200,7 +200,7 @@ async def test_a_pair_that_is_apart_is_broken_until_it_meets(
         assert not {"text", "fix"} & link.keys()
 
 
-async def test_nobody_is_asked_while_nobody_looks(proxy: Proxy, node: FakeNode) -> None:
+async def test_without_an_open_page_no_node_is_asked(proxy: Proxy, node: FakeNode) -> None:
     await node.publish(proxy.master)
     assert json.loads((await get(proxy, "/graph")).body)["nodes"]["/talker"]
 
@@ -210,7 +210,7 @@ async def test_nobody_is_asked_while_nobody_looks(proxy: Proxy, node: FakeNode) 
     async with opened(proxy):
         before = asked()
         await until(lambda: asked() > before + 1, "nodes are asked again and again")
-    await until(lambda: proxy.app.page.feed.idle, "it ends after the last page")
+    await until(lambda: proxy.app.page.feed.idle, "the feed ends after the last page")
     before = asked()
     await until(lambda: sum(method == "getPid" for method, _ in node.calls) > 3, "time passes")
     assert asked() == before
@@ -225,13 +225,13 @@ async def test_so_many_pages_and_no_more(proxy: Proxy) -> None:
         assert b"1 pages are open already" in refused.body
         assert (await get(proxy, "/graph")).status == 503
     watchers = proxy.app.page.feed.watchers
-    await until(lambda: not watchers.taken, "it is noticed that the page has gone")
+    await until(lambda: not watchers.taken, "the proxy notices the end of the page")
     async with opened(proxy) as page:
         await page.follow()
 
 
 async def test_one_address_does_not_have_all_pages(proxy: Proxy) -> None:
-    """One address held all sixteen, so that a person elsewhere saw none."""
+    """Otherwise an address could hold all sixteen, and other people would see none."""
     address = (proxy.settings.admin.host, proxy.settings.admin.port)
     watchers = proxy.app.page.feed.watchers
     async with AsyncExitStack() as stack:
@@ -248,7 +248,7 @@ async def test_one_address_does_not_have_all_pages(proxy: Proxy) -> None:
 async def test_a_page_that_reads_nothing_misses_documents_and_holds_few(
     proxy: Proxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Documents of 8 MB, and nobody who reads: no more are encoded than buffers can take."""
+    """With documents of 8 MB, the proxy encodes no more than the buffers can take."""
     made = 0
     encoded = 0
     page = proxy.app.page

@@ -175,7 +175,7 @@ async def test_a_terminal_without_unicode(proxy: Proxy, node: FakeNode) -> None:
 
 
 class Terminal:
-    """A command that runs in a terminal of 80 columns; ``text`` is what it has written."""
+    """A command in a terminal of 80 columns. ``text`` is the output so far."""
 
     def __init__(self, *words: str) -> None:
         self.text = ""
@@ -192,22 +192,22 @@ class Terminal:
         os.close(its)
 
     def read(self) -> str:
-        """What it has written until now."""
+        """The output so far."""
         try:
             while chunk := os.read(self._mine, 65536):
                 self.text += chunk.decode()
-        except OSError:  # nothing yet, or it has ended
+        except OSError:  # no output yet, or the command has ended
             pass
         return self.text
 
     async def interrupt(self) -> int:
-        """Ctrl-C; the exit code."""
+        """Press Ctrl-C. Return the exit code."""
         self._process.send_signal(signal.SIGINT)
-        await until(lambda: self.read() and self._process.poll() is not None, "it has ended")
+        await until(lambda: self.read() and self._process.poll() is not None, "the command ends")
         return self._process.wait()
 
     def close(self) -> None:
-        """Kill it if it still runs."""
+        """Kill the command if necessary."""
         self._process.kill()
         self._process.wait()
         os.close(self._mine)
@@ -231,7 +231,7 @@ async def test_watch_draws_until_interrupted(proxy: Proxy, node: FakeNode) -> No
         await proxy.stop()
         await until(lambda: "no rosproxy answers" in screen.read(), "the proxy was missed")
         assert await screen.interrupt() == 0
-    assert "\x1b[?1049h" in screen.text  # a screen of its own, which is left again
+    assert "\x1b[?1049h" in screen.text  # enters and leaves the alternate screen
     assert "\x1b[?1049l" in screen.text
     assert "Traceback" not in screen.text
 
@@ -262,7 +262,7 @@ async def test_help_names_the_exit_codes_and_variables() -> None:
 
 
 async def test_health_starts_fast() -> None:
-    """Docker runs it every few seconds: it must not load the proxy's own machinery."""
+    """Docker runs ``rosproxy health`` every few seconds, so this command must load few modules."""
     code = (
         "import sys; sys.argv = ['rosproxy', 'health', '--admin', '127.0.0.1:1']\n"
         "from rosproxy.cli.main import main\n"

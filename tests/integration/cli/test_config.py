@@ -1,4 +1,4 @@
-"""The file of ``--config``, variables that nobody reads, help, colours and completion."""
+"""The file of ``--config``, unknown variables, help, colours and completion."""
 
 import fcntl
 import os
@@ -45,7 +45,7 @@ def file(tmp_path: Path) -> Path:
 
 
 async def test_a_file_has_what_neither_the_command_line_nor_a_variable_gives(file: Path):
-    """The master's port clashes with the range of whoever wins, and the message tells which."""
+    """The message shows which source of the range wins: the master's port lies in this range."""
     port = ("--master-port", "11405")
     code, text = await check("--config", str(file), *port)
     assert (code, "lies in --port-range 11400-11409" in text) == (2, True)
@@ -221,7 +221,7 @@ async def test_status_waits_until_the_proxy_is_ready(start_process, master):
 
 
 def on_a_terminal(*words: str, **environment: str) -> str:
-    """What a command writes to a terminal of its own."""
+    """The output of a command in a separate terminal."""
     controller, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 120, 0, 0))
     clean = clean_environment(**{"TERM": "xterm-256color", **environment})
@@ -279,7 +279,7 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
     ],
 )
 def test_bash_completes(words: str, expected: set[str]):
-    """As the documentation has it: eval "$(_ROSPROXY_COMPLETE=bash_source rosproxy)"."""
+    """As documented: eval "$(_ROSPROXY_COMPLETE=bash_source rosproxy)"."""
     bash = shutil.which("bash")
     assert bash
     program, *rest = words.split()
@@ -308,7 +308,9 @@ async def test_both_variables_of_an_option_are_read_and_known():
 
 
 async def test_a_variable_that_is_not_read_is_called_unknown():
-    """Where an option has others than that of its name, which click would read besides."""
+    """Some options have another variable. click would also read the variable of the
+    option's name.
+    """
     code, said = await check(*GOOD, ROSPROXY_INSIDE_NETWORK="no network")
     assert code == 0
     assert "ROSPROXY_INSIDE_NETWORK is not a variable of rosproxy" in said

@@ -1,4 +1,4 @@
-"""What ``rosproxy run`` finds out about itself at its start, and before that ``--check --deep``."""
+"""Self-checks of ``rosproxy run`` at its start, and of ``--check --deep``."""
 
 import asyncio
 import json
@@ -51,7 +51,7 @@ async def problems(process: Process) -> list[str]:
 
 
 async def test_a_second_proxy_on_the_range_of_the_first_ends_and_names_it(start_process, node):
-    """Both started before, and nodes got now the one's port, now the other's."""
+    """If both ran, nodes would get ports of either proxy."""
     first: Process = start_process()
     assert (await node.publish(first.master))[0] == 1
     second = options_for(master_uri=first.options["master_uri"])
@@ -68,7 +68,7 @@ async def test_a_second_proxy_on_the_range_of_the_first_ends_and_names_it(start_
 
 @pytest.mark.parametrize("ros", [{}, {"ros": "2", "ros2_domain": 203, "ros2_peer": "127.0.0.1"}])
 async def test_a_proxy_that_is_started_twice_names_itself(start_process, ros):
-    """With the same admin endpoint it took the other's sign for its own."""
+    """Even with the same admin endpoint."""
     first: Process = start_process(**ros)
     ended = await asyncio.to_thread(started, first.options)
     assert ended.returncode == 2
@@ -89,12 +89,12 @@ async def test_a_second_proxy_on_a_part_of_the_range_names_the_first(start_proce
     assert "set another --port-range" in text
     first.kill()
     first.start()
-    assert (await status(first))["ports"]["blocked"] == 0, "it gets the same ports again"
+    assert (await status(first))["ports"]["blocked"] == 0, "the same ports again"
 
 
 @pytest.mark.parametrize("domain", [201, 202])
 async def test_a_second_proxy_of_ros2_on_the_range_names_the_first(start_process, domain):
-    """Of one domain there can be one proxy on a machine anyway."""
+    """A machine can have only one proxy for a domain anyway."""
     first: Process = start_process(ros="2", ros2_domain=201, ros2_peer="127.0.0.1")
     options = options_for(ros="2", ros2_domain=domain, ros2_peer="127.0.0.1")
     options["port_range"] = first.options["port_range"]
@@ -106,7 +106,7 @@ async def test_a_second_proxy_of_ros2_on_the_range_names_the_first(start_process
 async def test_doctor_takes_no_living_node_of_another_proxy_for_dead(
     make_proxy: MakeProxy, proxy: Proxy, node, master
 ) -> None:
-    """The other one has the same host and range, as outside sees them; the fix was a clean-up."""
+    """Both proxies have the same advertised host and range. A clean-up would be the wrong fix."""
     await node.publish(proxy.master)
     port = proxy.settings.ports.listen.last
     uri = f"http://{proxy.settings.advertise_host}:{port}/{node.address}:{node.slave.address[1]}/"
@@ -151,7 +151,7 @@ async def test_loopback_is_fine_where_all_is_on_one_machine(start_process):
 
 
 async def test_a_range_that_outside_does_not_reach_is_told_once_it_was_tried(start_process):
-    """192.0.2.1 is nobody's; the master does not get there either."""
+    """Neither the proxy nor the master reaches 192.0.2.1."""
     process: Process = start_process(advertise_host="192.0.2.1")
     await until(lambda: "published range: " in process.text, "the range was tried", 60)
     (told,) = [
@@ -200,7 +200,7 @@ async def test_the_range_is_tried_until_outside_gets_in(
 
 
 @pytest.mark.parametrize("change", ["the master was away", "its address", "the host's name"])
-async def test_what_was_proven_is_tried_again_when_it_may_have_changed(
+async def test_a_proven_range_is_tried_again_after_changes(
     change: str, make_proxy: MakeProxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Outside got in, and then does not any more."""
@@ -229,7 +229,7 @@ async def test_what_was_proven_is_tried_again_when_it_may_have_changed(
     if change == "the master was away":
         await master.stop()
         await pass_time(5)
-        assert tries == [1], "not while it is away"
+        assert tries == [1], "no try while the master is away"
         await master.start()
     elif change == "its address":
         await tell(proxy, "/master-address", address="127.0.0.2")
@@ -247,7 +247,7 @@ def findings(text: str) -> list[DoctorFinding]:
 
 
 async def deep(options: dict[str, Any]) -> tuple[int, str]:
-    """The exit code of ``run --check --deep``, and what it printed."""
+    """The exit code and the output of ``run --check --deep``."""
     ended = await asyncio.to_thread(started, {**options, "check": True, "deep": True})
     assert "Traceback" not in ended.stderr
     return ended.returncode, ended.stdout + ended.stderr
@@ -326,14 +326,14 @@ async def test_check_reads_the_policys_file(tmp_path):
     assert ended.stderr.startswith("rosproxy: --policy-file: ")
 
 
-async def test_a_node_gets_the_port_that_is_being_tried(
+async def test_a_node_gets_a_port_during_its_trial(
     make_proxy: MakeProxy,
     make_node: MakeNode,
     master: FakeMaster,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The proxy tries its range by itself, just when nodes start; roscpp never asks again."""
-    monkeypatch.setattr(master, "_notify", lambda *_: None)  # it does not get through
+    """The proxy tries its range just when nodes start, and roscpp never registers again."""
+    monkeypatch.setattr(master, "_notify", lambda *_: None)  # its call does not arrive
     monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 1.0)
     proxy = await make_proxy(ports=1)
     leases = proxy.ros1.leases

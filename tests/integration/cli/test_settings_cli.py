@@ -1,4 +1,4 @@
-"""``rosproxy run``: its options, their environment variables, how it starts and how it ends."""
+"""``rosproxy run``: options, environment variables, start and end."""
 
 import asyncio
 import json
@@ -68,7 +68,7 @@ def variable(option: str) -> str:
 
 
 def run(options: dict[str, Any], **environment: str) -> "subprocess.CompletedProcess[str]":
-    """Run ``rosproxy run`` to its end."""
+    """Run ``rosproxy run`` until the process ends."""
     return subprocess.run(
         command_line(options),
         capture_output=True,
@@ -214,23 +214,23 @@ def test_python_m_runs_the_same_command():
     assert ended.stdout.startswith("rosproxy")
 
 
-async def test_it_starts_without_a_master_says_so_and_works_once_it_is_up(
+async def test_the_proxy_starts_without_a_master_and_works_once_the_master_is_up(
     start_process, master, node
 ):
     await master.stop()
     process: Process = start_process()
-    await until(lambda: "The proxy waits for the master" in process.text, "it says so")
+    await until(lambda: "The proxy waits for the master" in process.text, "the proxy waits")
     assert process.text.count("The proxy waits for the master") == 1
     with pytest.raises(ConnectionResetError):
         await node.publish(process.master)
     await master.start()
-    await until(lambda: "answers" in process.text, "it finds the master")
+    await until(lambda: "answers" in process.text, "the proxy finds the master")
     assert (await node.publish(process.master))[0] == 1
 
 
 async def test_the_log_can_be_json(start_process):
     process: Process = start_process(log_format="json", log_level="debug")
-    await until(lambda: "answers" in process.text, "it finds the master")
+    await until(lambda: "answers" in process.text, "the proxy finds the master")
     lines = [json.loads(line) for line in list(process.log)]
     assert all(line.keys() >= {"time", "level", "message"} for line in lines)
 
@@ -240,8 +240,10 @@ def admin_of(process: Process) -> Address:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-async def test_a_signal_ends_it_with_connections_open(start_process, master, make_node, number):
-    """At once: it waits for no call that is under way; no long time-out ever comes here."""
+async def test_a_signal_ends_the_proxy_with_open_connections(
+    start_process, master, make_node, number
+):
+    """At once, without waiting for pending calls: here long time-outs never end."""
     forever = (
         "import asyncio, sys; real = asyncio.timeout\n"
         "asyncio.timeout = lambda seconds: real(seconds if seconds < 15 else None)\n"

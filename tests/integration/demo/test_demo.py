@@ -1,4 +1,4 @@
-"""The complete demonstration, in a short form, and how it ends when something goes wrong."""
+"""The complete demonstration in a short form, and its end after a fault."""
 
 import asyncio
 import io
@@ -71,7 +71,7 @@ async def test_a_proxy_that_does_not_start_is_named(monkeypatch):
     ],
 )
 async def test_a_proxy_that_comes_back_as_another_is_noticed(monkeypatch, changed, missed):
-    """With other ports it has lost its nodes: nothing that was promised works any more."""
+    """With other ports the proxy has lost all nodes, and no promise is kept."""
     before, after = changed
     start = ProxyProcess.start
 
@@ -118,13 +118,13 @@ def test_an_interrupted_demo_leaves_no_process(stop):
 
 
 def _commands():
-    """The command lines of all processes; that of the demo's proxy has its master's address."""
+    """The command lines of all processes. The demo's proxy has the master's address."""
     command_lines = []
     for process in filter(str.isdecimal, os.listdir("/proc")):
         try:
             command_lines.append(Path(f"/proc/{process}/cmdline").read_text())
         except OSError:
-            continue  # it has ended
+            continue  # the process has ended
     return " ".join(command_lines)
 
 
@@ -192,7 +192,7 @@ async def test_the_frame_has_the_act_the_nodes_and_the_events(scenario):
 
 
 async def test_80_columns_show_all_addresses_whole(scenario):
-    scenario.listener.problem = "it has a long reason " * 9
+    scenario.listener.problem = "a rather long reason " * 9
     scenario.seen = {node.name: "127.0.1.1:30001" for node in scenario.nodes}
     for node in (*scenario.nodes, *scenario.ros2.nodes):
         await node.start()

@@ -21,7 +21,7 @@ async def test_a_second_node_of_the_same_name_shuts_the_first_one_down(master, n
     await rpc(master.uri, "registerPublisher", "/twin", "/t", TYPE, node.uri)
     await rpc(master.uri, "registerService", "/twin", "/s", "rosrpc://old:1", node.uri)
     await rpc(master.uri, "registerSubscriber", "/twin", "/u", TYPE, B)
-    await until(lambda: node.calls, "it is told")
+    await until(lambda: node.calls, "the node gets the calls")
     assert node.calls == [("shutdown", ("/master", NEW_NODE))]
     assert await state(master) == [[], [["/u", ["/twin"]]], []]
     assert (await rpc(master.uri, "lookupNode", "/x", "/twin"))[2] == B
@@ -33,7 +33,7 @@ async def test_subscribers_hear_of_every_change_of_publishers_in_order(master, n
     for name, uri in (("/a", A), ("/b", B)):
         await rpc(master.uri, "registerPublisher", name, "/t", TYPE, uri)
     await rpc(master.uri, "unregisterPublisher", "/a", "/t", A)
-    await until(lambda: len(node.calls) == 3, "it is told")
+    await until(lambda: len(node.calls) == 3, "the node gets the calls")
     assert node.updates("/t") == [[A], [A, B], [B]]
 
 
@@ -73,7 +73,7 @@ async def test_subscribers_of_a_parameter_hear_of_it_unless_they_set_it(master, 
     await rpc(master.uri, "setParam", "/sub", "/p", 1)
     await rpc(master.uri, "setParam", "/other", "/p", 2)
     await rpc(master.uri, "deleteParam", "/other", "/p")
-    await until(lambda: len(node.calls) == 2, "it is told")
+    await until(lambda: len(node.calls) == 2, "the node gets the calls")
     assert [params[2] for _, params in node.calls] == [2, {}]
 
 
@@ -96,9 +96,9 @@ async def test_a_listener_comes_back_when_its_connection_breaks(pair):
     await until(lambda: listener.received, "it hears")
     for writer in talker.subscribers:
         writer.transport.abort()
-    await until(lambda: not listener.connected, "it notices")
+    await until(lambda: not listener.connected, "the listener loses the connection")
     heard = len(listener.received)
-    await until(lambda: len(listener.received) > heard, "it hears again")
+    await until(lambda: len(listener.received) > heard, "messages arrive again")
 
 
 async def test_a_listener_follows_the_masters_list(master, pair):

@@ -1,4 +1,4 @@
-"""The demonstration's nodes of ROS 2 among themselves: discovery, and that nothing is lost."""
+"""The demonstration's ROS 2 nodes among themselves: discovery, and no lost messages."""
 
 import socket
 from contextlib import AsyncExitStack
@@ -32,7 +32,7 @@ LISTENER = A + bytes([0, 0, 1, 4])
 
 @pytest.fixture
 async def met():
-    """Starts nodes, all of which announce themselves to the first one."""
+    """Starts nodes that announce themselves to the first node."""
     async with AsyncExitStack() as ending:
         first = []
 
@@ -64,21 +64,21 @@ async def test_messages_arrive_once_and_in_order_though_datagrams_are_lost(met):
     dice = Random(7)
     for node in (talker, listener):
         node.admits = lambda _: dice.random() < 0.7
-    await until(lambda: talker.connected and listener.connected, "they have met")
+    await until(lambda: talker.connected and listener.connected, "both are connected")
     publish(talker, 100)
-    await until(lambda: len(listener.received) == 100, "all has come")
-    await until(lambda: not talker.writers[WRITER].samples, "nothing is kept any more")
+    await until(lambda: len(listener.received) == 100, "all messages arrive")
+    await until(lambda: not talker.writers[WRITER].samples, "the writer keeps no samples")
     assert heard(listener) == list(range(1, 101))
     assert talker.turned_away > 0 < listener.turned_away
 
 
-async def test_who_comes_late_hears_what_is_published_from_then_on(met):
+async def test_a_late_listener_gets_only_later_messages(met):
     (talker,) = await met(Ros2Talker("/t", "127.0.0.1", "/x"))
     publish(talker, 3)
     (listener,) = await met(Ros2Listener("/l", "127.0.0.1", "/x"))
-    await until(lambda: talker.connected, "they have met")
+    await until(lambda: talker.connected, "both are connected")
     publish(talker, 2)
-    await until(lambda: len(listener.received) == 2, "both have come")
+    await until(lambda: len(listener.received) == 2, "both messages arrive")
     assert heard(listener) == [4, 5]
 
 
@@ -88,8 +88,8 @@ async def test_nodes_of_other_topics_do_not_connect(met):
         Ros2Listener("/o", "127.0.0.1", "/y"),
         Ros2Listener("/l", "127.0.0.1", "/x"),
     )
-    await until(lambda: listener.connected and talker.connected, "they have met")
-    await until(lambda: len(talker.peers) == 2, "it knows both")
+    await until(lambda: listener.connected and talker.connected, "both are connected")
+    await until(lambda: len(talker.peers) == 2, "the talker knows both")
     assert not other.connected
 
 
@@ -99,7 +99,7 @@ async def test_what_is_no_message_is_ignored(met, noise):
         Ros2Talker("/t", "127.0.0.1", "/x"), Ros2Listener("/l", "127.0.0.1", "/x")
     )
     listener.datagram_received(noise, ("127.0.0.1", 1))
-    await until(lambda: talker.connected and listener.connected, "they have met")
+    await until(lambda: talker.connected and listener.connected, "both are connected")
     publish(talker, 1)
     await until(lambda: listener.received, "a message")
 

@@ -1,4 +1,4 @@
-"""``rosproxy doctor`` at running proxies: what it gathers, and what it says of faults made here."""
+"""``rosproxy doctor`` at running proxies: facts, and findings about faults that the tests make."""
 
 import asyncio
 import json
@@ -61,7 +61,7 @@ async def faults(proxy: Proxy | None, *names: str, master_uri: str = "") -> list
 
 
 async def only(proxy: Proxy | None, *names: str, master_uri: str = "") -> DoctorFinding:
-    """The one fault."""
+    """The only fault."""
     (finding,) = await faults(proxy, *names, master_uri=master_uri)
     return finding
 
@@ -116,7 +116,7 @@ async def test_an_outside_node_that_is_gone(
 ) -> None:
     await node.publish(proxy.master)
     await listener.stop()
-    # The master of the tests is on loopback, as all here: so its nodes may be, if they answer.
+    # The master of the tests is on loopback, so nodes on loopback are no fault if they answer.
     assert (await only(proxy)).subject == "/listener"
 
 
@@ -234,7 +234,7 @@ async def outside_publisher(master: FakeMaster, make_node: MakeNode) -> FakeNode
 async def refuse(
     node: FakeNode, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, header: Header
 ) -> None:
-    """Answer a subscriber as a publisher does whose message definition is another."""
+    """Answer a subscriber like a publisher with another message definition."""
     writer.write(encode_header({"error": "md5sums do not match"}))
 
 
@@ -346,7 +346,7 @@ async def test_many_nodes_are_looked_at_together(
     findings = await faults(proxy)
     await silent.stop()
     assert len([f for f in findings if f.subject.startswith("/n")]) == 100
-    assert asyncio.get_running_loop().time() - started < 25  # one after another: 50
+    assert asyncio.get_running_loop().time() - started < 25  # in turn: 50
 
 
 async def hang(_request: FakeRequest) -> End:

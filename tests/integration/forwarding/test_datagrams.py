@@ -1,4 +1,4 @@
-"""Datagrams that are passed on, one way."""
+"""The relay of datagrams, in a single direction."""
 
 import asyncio
 import socket
@@ -31,7 +31,7 @@ async def received(sock: socket.socket) -> bytes:
 
 
 def relay_to(target: socket.socket, *sources: str) -> tuple[DatagramRelay, list[bool]]:
-    """A relay, and what it tells of its end."""
+    """A relay, and the list of its reported ends."""
     ends: list[bool] = []
     address = HostPort(*target.getsockname())
     return DatagramRelay(bind(PROXY, 0), sources, address, lambda: ends.append(True)), ends
@@ -47,24 +47,24 @@ async def test_datagrams_arrive_as_they_were_sent(target: socket.socket) -> None
     relay.close()
 
 
-async def test_those_of_others_are_dropped(target: socket.socket) -> None:
+async def test_datagrams_of_other_sources_are_dropped(target: socket.socket) -> None:
     relay, _ = relay_to(target, OUTSIDE)
     with sender(OTHER_NODE) as stranger, sender(OUTSIDE) as out:
         stranger.sendto(b"forged", (PROXY, relay.port))
-        await until(lambda: relay.dropped, "it was dropped")
+        await until(lambda: relay.dropped, "the datagram is dropped")
         out.sendto(b"real", (PROXY, relay.port))
         assert await received(target) == b"real"
     relay.close()
 
 
-async def test_a_target_that_is_gone_ends_it_and_the_sender_learns_of_it() -> None:
+async def test_the_end_of_the_target_ends_the_relay_and_the_sender_gets_an_error() -> None:
     gone = bind(NODE, 0)
     relay, ends = relay_to(gone, OUTSIDE)
     gone.close()
     with sender(OUTSIDE) as out:
         out.connect((PROXY, relay.port))
         out.send(b"one")
-        await until(lambda: ends, "it has ended")
+        await until(lambda: ends, "the relay ends")
         relay.close()
         out.send(b"two")
         with pytest.raises(ConnectionRefusedError):

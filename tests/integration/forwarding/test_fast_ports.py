@@ -1,4 +1,4 @@
-"""Fast ports as nodes and subscribers see them; the kernel is made up and forwards nothing."""
+"""Fast ports for nodes and subscribers, with a fake kernel that forwards nothing."""
 
 from typing import Any
 
@@ -123,7 +123,7 @@ async def test_fast_ports_go_before_a_node_is_refused(make_proxy, make_node, ker
 async def test_a_range_full_of_fast_ports_is_probed_through_one_of_them(
     make_proxy, make_node, kernel, monkeypatch
 ):
-    """They counted as taken: nothing was tried."""
+    """Fast ports count as free for the probe."""
     monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 0.3)
     proxy = await make_proxy(data_plane="auto", ports=4)
     nodes = [await make_node("/a"), await make_node("/b", OTHER_NODE)]
@@ -177,7 +177,7 @@ async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
     assert (await greet((host, lease + 2), topic_header()))["callerid"] != "/a"
 
 
-async def test_what_a_rule_may_deny_goes_through_the_proxy(make_proxy, make_node, kernel):
+async def test_topics_that_a_rule_may_deny_go_through_the_proxy(make_proxy, make_node, kernel):
     rules = "deny publish /other by /b*; deny serve /x by /c*"
     proxy = await make_proxy(data_plane="kernel", policy=rules, linger=60.0)
     nodes = [await make_node(name) for name in ("/a", "/b", "/c")]
@@ -190,12 +190,12 @@ async def test_what_a_rule_may_deny_goes_through_the_proxy(make_proxy, make_node
         True,
     ]
     fast = proxy.endpoint(nodes[0]).fast_port
-    await until(lambda: fast in kernel.forwards, "the kernel forwards it")
+    await until(lambda: fast in kernel.forwards, "the kernel forwards the port")
     layer = {"name": "more", "rules": ["deny publish /other"]}
     assert (await tell(proxy, "/policy", layers=[layer]))["hidden"] == 0
     assert proxy.endpoint(nodes[0]).fast_port is None
-    await until(lambda: fast not in kernel.forwards, "the kernel forwards it no longer")
-    await until(lambda: kernel.forgotten, "its connections are cut")
+    await until(lambda: fast not in kernel.forwards, "the kernel forwards the port no longer")
+    await until(lambda: kernel.forgotten, "connections are cut")
     assert (await ask(proxy, nodes[0]))[1] == proxy.endpoint(nodes[0]).port
     await proxy.restart()
     await until(lambda: len(proxy.ros1.context.registry) == 3, "the nodes are found again")

@@ -1,4 +1,4 @@
-"""The kernel plane with a kernel made up: what it does when things go wrong."""
+"""The kernel plane with a fake kernel: behaviour after faults."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable

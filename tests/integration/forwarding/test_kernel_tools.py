@@ -1,4 +1,4 @@
-"""What the kernel plane needs: conditions as files and firewalls tell them, and its programs."""
+"""Requirements of the kernel plane: conditions in files and firewalls, and programs."""
 
 import asyncio
 import shutil
@@ -93,7 +93,7 @@ def program(folder: Path, name: str, script: str, mode: int = 0o755) -> None:
 
 @pytest.fixture
 def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder for made-up programs, which are found before all others."""
+    """A folder for fake programs, first in the search path."""
     monkeypatch.setattr(kernel_tools, "IMAGE_FOLDER", tmp_path)
     return tmp_path
 
@@ -147,7 +147,7 @@ async def test_a_long_list_keeps_the_loop_for_one_piece_at_a_time(programs: Path
     assert text.count("\n") == count
     assert max(map(len, pieces)) < kernel_tools.PIECE + 100
     assert all(piece.endswith("\n") for piece in pieces)
-    assert len(set(turns_before)) == len(turns_before), "others have a turn between two pieces"
+    assert len(set(turns_before)) == len(turns_before), "other tasks have a turn between two pieces"
 
 
 async def test_a_list_without_end_is_read_in_part(

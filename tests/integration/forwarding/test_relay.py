@@ -126,7 +126,7 @@ async def test_a_reader_that_stalls_and_leaves_ends_the_writer(proxy, node, leas
 
 
 def slices(data: bytes, seed: int) -> list[bytes]:
-    """The same bytes in pieces of random sizes, most near where the relay changes its ways."""
+    """The same bytes in pieces of random sizes, mostly near the thresholds of the relay."""
     chooser = random.Random(seed)
     parts = []
     start = 0
@@ -288,7 +288,7 @@ async def test_stopping_the_proxy_ends_its_connections(make_proxy, node):
     async with AsyncExitStack() as stack:
         both = [await stack.enter_async_context(relayed(node, proxy.lease(node))) for _ in range(3)]
         flood = asyncio.create_task(both[0].inside.send(b"x" * 50_000_000))
-        await proxy.stop()  # does not wait until somebody reads the flood: nobody does
+        await proxy.stop()  # does not wait for a reader of the flood
         for ends in both[1:]:
             assert await ends.outside.end() == "closed"
             assert await ends.inside.end() == "closed"
@@ -390,7 +390,9 @@ FLOOD = 100_000_000
 
 
 async def flood(ends: Ends, read_on: asyncio.Event) -> int:
-    """Many bytes from inside; how many arrive outside, where nobody reads before it is told."""
+    """Send many bytes from inside, and read outside after ``read_on``. Return the number of
+    bytes.
+    """
     sending = asyncio.create_task(ends.inside.send(bytes(FLOOD)))
     await read_on.wait()
     size = len(await ends.outside.exactly(FLOOD))
@@ -421,7 +423,7 @@ def peer_option(wire: Wire, option: int) -> int:
 
 
 async def test_without_large_pipes_bulk_is_copied(proxy, node, lease, monkeypatch):
-    """An unprivileged user's pipes shrink to two pages; splicing through them would crawl."""
+    """An unprivileged user's pipes may shrink to two pages, and splicing would be slow."""
     monkeypatch.setattr(relay, "LEAST_PIPE", 2 * relay.PIPE_SIZE)
     payload = random.Random(7).randbytes(3 * relay.BLOCK_SIZE + 17)
     async with relayed(node, lease) as ends:

@@ -1,4 +1,4 @@
-"""The relay under load, in a process of its own: memory, fairness, descriptors, threads.
+"""The relay under load, in a separate process: memory, fairness, descriptors, threads.
 
 ROSPROXY_TEST_STALL is the time in seconds for which a reader stalls; 60 for a thorough run.
 """
@@ -62,7 +62,7 @@ class BlockingNode:
                 conn.sendall(WELCOME)
                 self._serve(conn)
             except OSError:
-                return  # the peer ended it
+                return  # the peer ended the connection
 
 
 def receive(conn: socket.socket, size: int) -> bytes:
@@ -149,7 +149,7 @@ async def test_a_stalled_node_does_not_move_the_proxys_memory(start_process, mas
 
 
 class Streams:
-    """Many connections written to, or read from, in turns by one thread: nobody is favoured."""
+    """A thread that writes to, or reads from, many connections in fair turns."""
 
     def __init__(self, conns: list[socket.socket], event: int, turn: Any) -> None:
         self.moved = dict.fromkeys(conns, 0)
@@ -203,7 +203,7 @@ async def test_a_hundred_streams_all_make_progress(start_process, master, node):
         def moved() -> list[int]:
             return [reading.moved[conn] - before[conn] for conn in outside]
 
-        await until(lambda: min(moved()) > MIB, "all of them go on")
+        await until(lambda: min(moved()) > MIB, "all streams go on")
         moved_by_then = moved()
     average = sum(moved_by_then) / len(moved_by_then)
     assert min(moved_by_then) > average / 10, sorted(moved_by_then)

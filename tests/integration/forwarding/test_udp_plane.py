@@ -30,7 +30,7 @@ OTHER = HostPort("192.0.2.6", 7411)
 
 
 class Bench:
-    """A plane for UDP over a made-up kernel, and the ports of one domain; nothing listens."""
+    """A UDP plane with a fake kernel, and the ports of a domain. No program listens."""
 
     def __init__(self, tools: FakeTools | None = None) -> None:
         told = {"ros": ("2",), "advertise_host": "192.0.2.1", "port_range": str(RANGE)}
@@ -114,7 +114,7 @@ async def test_a_lease_is_forwarded_while_it_is_there(bench: Bench) -> None:
     participant = bench.map()
     await bench.forwarding({45001: LOCATOR})
     (mapping,) = bench.kernel_ports
-    await until(lambda: bench.plane.status_of(mapping)["plane"] == "kernel", "it is told")
+    await until(lambda: bench.plane.status_of(mapping)["plane"] == "kernel", "kernel plane")
     assert bench.sources == {(LOCATOR.host, LOCATOR.port): OWN}
     bench.end(participant)
     await bench.forwarding({})

@@ -71,7 +71,7 @@ async def test_short_datagrams_share_a_round() -> None:
 
 
 async def test_a_round_is_longer_after_much_has_come() -> None:
-    """With rounds of one length, receiving from a crowd took all the time, and all was late."""
+    """With rounds of the same length, receiving from a crowd takes all the time."""
     reader = DiscoveryScheduler()
     names = list[str]()
     count = ROUND // OVERHEAD
@@ -118,7 +118,7 @@ async def test_what_comes_behind_a_datagram_that_waits_waits_as_well() -> None:
     assert names == ["first", "second"]
 
 
-async def test_a_datagram_that_breaks_the_reading_does_not_end_it() -> None:
+async def test_a_datagram_that_raises_an_error_does_not_end_the_scheduler() -> None:
     reader = DiscoveryScheduler()
     names = list[str]()
     failures = list[str]()
@@ -127,13 +127,13 @@ async def test_a_datagram_that_breaks_the_reading_does_not_end_it() -> None:
     )
 
     def fail() -> Sequence[Outgoing]:
-        raise RuntimeError("evil broke it")
+        raise RuntimeError("evil datagram")
 
     reader.put("evil", Standing.PROVEN, 0, fail)
     reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
     await until_read(names, 1)
-    assert failures == ["evil broke it"]
-    with pytest.raises(RuntimeError, match="evil broke it"):
+    assert failures == ["evil datagram"]
+    with pytest.raises(RuntimeError, match="evil datagram"):
         reader.read("evil", Standing.PROVEN, 0, fail)
     reader.read("robot", Standing.PROVEN, 0, reading(names, "robot"))
     assert names == ["robot", "robot"]

@@ -1,4 +1,4 @@
-"""The sockets of a domain, on loopback: what they hear goes to it, what follows is sent."""
+"""The sockets of a domain, on loopback: received datagrams go to the domain, results are sent."""
 
 import asyncio
 import socket
@@ -58,7 +58,7 @@ def settings_of(count: int = 16) -> DomainSettings:
 
 @pytest.fixture
 async def server() -> AsyncIterator[DomainServer]:
-    """One that has long been running."""
+    """A server that has been running for a long time."""
     times = chain([0.0], repeat(REMEMBERED + 1))
     started = DomainServer(
         settings_of(), PROXY, times.__next__, lambda address: address == INSIDE, lambda: None
@@ -70,7 +70,7 @@ async def server() -> AsyncIterator[DomainServer]:
 
 @pytest.fixture
 def well_known(server: DomainServer) -> tuple[str, int]:
-    """Where those inside announce themselves."""
+    """The well-known port for announcements from inside."""
     return PROXY, server.domain.settings.unicast_port
 
 
@@ -91,7 +91,7 @@ async def announcement(sock: socket.socket, prefix: bytes) -> bytes:
 
 @contextmanager
 def outsider_without_a_port(server: DomainServer) -> Iterator[tuple[socket.socket, int]]:
-    """A participant outside, and the port that would stand for it, which another program has."""
+    """A participant outside, and the port of its stand-in, which another program holds."""
     domain = server.domain
     with ExitStack() as stack:
         while True:
@@ -99,7 +99,7 @@ def outsider_without_a_port(server: DomainServer) -> Iterator[tuple[socket.socke
             locator = HostPort(OUTSIDE, sock.getsockname()[1])
             wanted = stand_in_port(f"{B.hex()} {locator}", lambda _: 0, domain.stand_ins._is_taken)
             assert wanted is not None
-            with suppress(OSError):  # another program has that already
+            with suppress(OSError):  # another program already holds this port
                 stack.enter_context(bind(PROXY, wanted))
                 break
         domain.settings.peers = (locator,)
@@ -115,8 +115,8 @@ async def test_no_stand_in_is_announced_that_can_not_be_opened(
         inside_port, outside_port = (s.getsockname()[1] for s in (insider, outsider))
         outsider.sendto(spdp(B, OUTSIDE, outside_port), discovery)
         insider.sendto(spdp(A, INSIDE, inside_port), well_known)
-        await announcement(outsider, A)  # what names no such port goes on
-        await until(lambda: wanted in server.domain.stand_ins.blocked, "it can't be opened")
+        await announcement(outsider, A)  # announcements without such a port pass
+        await until(lambda: wanted in server.domain.stand_ins.blocked, "the port is blocked")
         outsider.sendto(spdp(B, OUTSIDE, outside_port), discovery)
 
         told, *_ = reached_at(await announcement(insider, B))
@@ -126,10 +126,10 @@ async def test_no_stand_in_is_announced_that_can_not_be_opened(
         assert opened != wanted
 
 
-async def test_who_is_not_selected_has_an_allowance_of_discovery(
+async def test_an_unselected_source_has_an_allowance_of_discovery(
     server: DomainServer, well_known: tuple[str, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is held back of it has to be read, too, which takes long."""
+    """The proxy parses held announcements, too, which takes time."""
     server.select([])
     held = server._selected.held_announcements
     with participant(INSIDE) as insider:
@@ -146,12 +146,12 @@ async def test_who_is_not_selected_has_an_allowance_of_discovery(
             async with asyncio.timeout(PATIENCE):
                 await asked.wait()
         insider.sendto(spdp(B, INSIDE, port), well_known)
-        await until(lambda: held, "one is held")
+        await until(lambda: held, "an announcement is held")
     assert held[INSIDE].keys() == {B}
 
 
-async def test_participants_that_have_waited_are_let_in_one_after_the_other() -> None:
-    """They were let in at once: 64 with claims for ports held up the loop for 0.6 s."""
+async def test_participants_that_have_waited_are_admitted_in_turn() -> None:
+    """Admitting 64 participants with claims at once blocks the event loop for 0.6 s."""
     times = chain([0.0], repeat(SETTLING + ANSWER_TIME))
     server = DomainServer(
         settings_of(64), PROXY, times.__next__, lambda address: address == INSIDE, lambda: None
@@ -172,12 +172,12 @@ async def test_participants_that_have_waited_are_let_in_one_after_the_other() ->
     assert max(after - before for before, after in pairwise([0, *counts])) == 1
     await server.expire()
     await asyncio.sleep(0)
-    assert prefixes[-1] not in table  # it had ended before its turn
+    assert prefixes[-1] not in table  # ended before its turn
     server.close()
 
 
 async def test_a_participant_whose_turn_is_lost_gets_another_one() -> None:
-    """The longest queue loses its last items while others flood."""
+    """In a flood the longest queue loses its last items."""
     now = 0.0
     server = DomainServer(
         settings_of(), PROXY, lambda: now, lambda address: address == INSIDE, lambda: None
@@ -201,7 +201,7 @@ async def test_a_participant_whose_turn_is_lost_gets_another_one() -> None:
 async def test_of_heartbeats_that_wait_only_the_last_one_of_a_stream_is_read(
     server: DomainServer,
 ) -> None:
-    """Fast DDS repeats them 25 times a second: they would fill the queue of a slow proxy."""
+    """Fast DDS repeats heartbeats 25 times a second, which would fill the queue of a slow proxy."""
     read = list[bytes]()
 
     def take(datagram: bytes, _source: str, _now: float) -> list[Outgoing]:

@@ -32,7 +32,7 @@ from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import A, B, spdp
 
 PROXY = "127.0.0.1"
-"""The address from which it sends to others on loopback."""
+"""The proxy's source address on loopback."""
 INSIDE = "127.0.7.32"
 RELAY = "127.0.7.33"
 LAN = "127.0.7.34"
@@ -163,7 +163,7 @@ async def test_both_may_start_again_in_any_order(boundary: Boundary, order: str)
 
 
 async def test_a_process_at_the_relays_address_is_refused(boundary: Boundary) -> None:
-    """It has the address of the relay, and was taken for it."""
+    """The address alone does not make a process the relay."""
     server = boundary.start_proxy()
     discovery = PROXY, boundary.ports.first
     forged = RelayProof("another secret", time.time).sealed(Direction.TO_PROXY, spdp(B, LAPTOP))
@@ -171,7 +171,7 @@ async def test_a_process_at_the_relays_address_is_refused(boundary: Boundary) ->
         process.sendto(forged, discovery)
         await until(lambda: boundary.reasons == ["relay_proof"], "the forged proof is refused")
         process.sendto(spdp(B, RELAY), discovery)
-        await until(lambda: "not_a_peer" in boundary.reasons, "so is what has none")
+        await until(lambda: "not_a_peer" in boundary.reasons, "no proof: refused")
     assert not server.domain.outside.by_prefix
     assert not server.domain.rediscovery.lan_relay_heard
 
@@ -190,7 +190,7 @@ async def test_a_process_at_the_proxys_address_announces_nothing(
     with closing(bind(PROXY, 0)) as process, on_lan() as listening:
         for datagram in refused:
             process.sendto(datagram, target)
-        # What comes after them is announced: so they were taken in before.
+        # The relay announces this later datagram, so all earlier datagrams have been processed.
         process.sendto(good.sealed(Direction.TO_LAN, spdp(A, PROXY)), target)
         async with asyncio.timeout(PATIENCE):
             datagram = await asyncio.get_running_loop().sock_recv(listening, 65536)
@@ -214,10 +214,10 @@ async def test_refused_datagrams_cost_the_proxy_none_of_its_allowance(boundary: 
     assert PROXY in relay._proxy_rates._by_source
 
 
-async def test_secrets_that_differ_are_told(
+async def test_different_secrets_are_reported(
     boundary: Boundary, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """By the proxy, which counts it, and in the log of the relay."""
+    """By the proxy's counter, and in the log of the relay."""
     server = boundary.start_proxy()
     boundary.start_relay("another secret")
     with closing(bind(LAPTOP, 0)) as laptop:
@@ -239,13 +239,13 @@ async def test_secrets_that_differ_are_told(
 async def test_unproven_sources_share_one_allowance(
     boundary: Boundary, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each forged source had an allowance of its own, and the proxy got all announcements."""
+    """With an allowance for each forged source, the proxy would get all announcements."""
     monkeypatch.setattr(sources, "UNPROVEN_PER_SECOND", 0.0)
     monkeypatch.setattr(sources, "UNPROVEN_BURST", float(SHARED))
     relay = boundary.start_relay()
     for number in range(FORGED):
         announce(f"127.0.8.{number + 1}", bytes([number]) * 12)
-    await until(lambda: relay.from_lan + relay.dropped == FORGED, "the relay has read them all")
+    await until(lambda: relay.from_lan + relay.dropped == FORGED, "the relay has read all")
     assert relay.from_lan == SHARED
     (listed,) = address_lists([LAPTOP])
     sealed = RelayProof(SECRET, time.time).sealed(Direction.TO_LAN, listed)

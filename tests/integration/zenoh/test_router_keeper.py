@@ -1,4 +1,4 @@
-"""The router process: started again after its end, killed if it hangs, with the reason told.
+"""The router process: restarted after its end, killed if hanging, with a reported reason.
 
 Small programs stand in for the router process, which needs the zenoh library.
 """
@@ -34,7 +34,7 @@ ENDS = "import sys; sys.stderr.write('thread panicked\\n'); sys.exit(3)"
 
 
 class Kept:
-    """A keeper with a small program as its process."""
+    """A keeper with a small program as the router process."""
 
     def __init__(self, tasks: Tasks, program: str) -> None:
         self.reports: list[Report] = []

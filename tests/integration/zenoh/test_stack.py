@@ -1,4 +1,4 @@
-"""The part for rmw_zenoh: what keeps it from starting, and how faults are told.
+"""The stack for rmw_zenoh: obstacles to its start, and reported faults.
 
 A small program stands in for the process of the routers, which needs the zenoh library.
 """
@@ -39,7 +39,7 @@ Make = Callable[..., Zenoh]
 
 @pytest.fixture
 async def make(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> AsyncIterator[Make]:
-    """Makes parts whose hub has a session with the peer while the file `linked` exists."""
+    """Makes stacks whose hub has a session with the peer while the file `linked` exists."""
     made: list[Zenoh] = []
     monkeypatch.setattr(stack, "_check_package", lambda: None)
     monkeypatch.setattr(stack, "LINK_INTERVAL_S", 0.05)
