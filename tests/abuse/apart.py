@@ -1,9 +1,9 @@
-"""A network namespace for a proxy that is to take the tests' addresses for other machines'.
+"""A network namespace for a proxy, in which the tests' addresses belong to other machines.
 
-On loopback every address is the proxy's own machine's, whose programs are always let in, and a
-node's word for where it is counts for less. Here the proxy is a machine of its own with two
-interfaces' worth of addresses on one cable; the other end of it is this machine, where all nodes,
-the master and the neighbours have addresses in either network.
+On loopback every address belongs to the proxy's machine, whose programs may always call, and a
+node's claim about its address counts for less. Here the proxy is on a separate machine, with
+addresses of two networks on a single cable. The other end of the cable is this machine, where all
+nodes, the master and the neighbours have addresses in both networks.
 """
 
 import os
@@ -14,10 +14,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-# 198.18.0.0/15 is for tests of networks (RFC 2544): nothing else on this machine has it.
+# 198.18.0.0/15 is for tests of networks (RFC 2544): nothing else on this machine uses this network.
 APART = "198.18.2.1"
 INSIDE = "198.18.2.0/24"
-"""The proxy's address inside, and its inside network."""
+"""The proxy's inside address and inside network."""
 APART_HOST = "198.18.1.254"
 APART_MASTER = "198.18.1.1"
 """What outside knows the proxy's machine by, and the master's address."""
@@ -31,12 +31,14 @@ FAR = "abuse-far"
 """The ends of the cable: on this machine, and in the namespace."""
 NAME = f"abuse-{os.getpid()}"
 NAMES = Path("/etc/netns") / NAME
-"""Whose files stand in for those of /etc in the namespace (ip-netns(8))."""
+"""The folder whose files replace files of /etc in the namespace (ip-netns(8))."""
 
 
 @contextmanager
 def a_silent_name_server(hosts: Mapping[str, str]) -> Iterator[None]:
-    """Have a proxy that is started meanwhile know these hosts; it waits in vain for all others."""
+    """A proxy that starts meanwhile knows only these hosts, and waits in vain for all other
+    names.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind((APART_MASTER, 53))
         NAMES.mkdir(parents=True)
@@ -50,7 +52,7 @@ def a_silent_name_server(hosts: Mapping[str, str]) -> Iterator[None]:
 
 
 class Apart:
-    """The namespace; root makes and removes it."""
+    """The namespace, which requires root."""
 
     def __init__(self) -> None:
         _ip("netns", "add", NAME)
@@ -65,7 +67,7 @@ class Apart:
 
     @property
     def prefix(self) -> list[str]:
-        """A command that runs another one, which follows it, in this namespace."""
+        """The words to put before a command to run the command in this namespace."""
         return ["ip", "netns", "exec", NAME]
 
     def remove(self) -> None:

@@ -1,6 +1,6 @@
 """Bounds on the memory and the threads of processes: a cgroup, of version 1 or 2.
 
-Whichever the machine has; in version 1 each is a group of its own.
+The machine's version decides. In version 1 memory and threads have separate groups.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ V1_PIDS = ROOT / "pids"
 
 
 class Cgroup:
-    """A cgroup with so many bytes of memory and no swap; root makes and removes it."""
+    """A cgroup with a limit on memory in bytes and without swap, which requires root."""
 
     def __init__(self, name: str, most: int) -> None:
         if (V1_MEMORY / "memory.limit_in_bytes").exists():
@@ -25,12 +25,12 @@ class Cgroup:
             folder.mkdir()
         (self._dirs[0] / files[0]).write_text(str(most))
         swap = self._dirs[0] / files[1]
-        if swap.exists():  # not where the kernel does not count it
+        if swap.exists():  # missing if the kernel does not count swap
             swap.write_text("0" if files[1] == "memory.swap.max" else str(most))
 
     @property
     def prefix(self) -> list[str]:
-        """A command that runs another one, which follows it, in this group."""
+        """The words to put before a command to run the command in this group."""
         enter = "; ".join(f"echo $$ > {folder}/cgroup.procs" for folder in self._dirs)
         return ["sh", "-ec", f'{enter}; exec "$@"', "sh"]
 
@@ -41,6 +41,6 @@ class Cgroup:
         (folder / "pids.max").write_text("max" if more is None else str(now + more))
 
     def remove(self) -> None:
-        """Remove it; nothing may be left in it."""
+        """Remove the group, which must be empty."""
         for folder in self._dirs:
             folder.rmdir()

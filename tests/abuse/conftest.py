@@ -1,21 +1,20 @@
-"""The layer abuse: a real proxy with bad neighbours, of whom nobody else may notice anything.
+"""The layer abuse: a real proxy with hostile neighbours, which no other program may notice.
 
-How it works. Each test gets `abused`, a `rosproxy run` as a process of its own in a cgroup of
-256 MB, so that a test which makes it take more kills it. Its master and its nodes are the fakes of
-examples/demo, in the test's own process and outside of the cgroup, on addresses of 127.0.0.0/8 as
-in tests/integration, whose helpers are used: the neighbour's calls and raw connections come from
-`tests.integration.net`. Where it matters that these are other machines' addresses, `apart` is the
-same in a network namespace of its own (:mod:`tests.abuse.apart`). What a test does happens within
-``with abused.watched():``, which holds for all of them what nobody may lose:
+Each test gets `abused`, a separate process of `rosproxy run` in a cgroup of 256 MB. If the proxy
+takes more memory, the kernel kills the proxy. The master and the nodes are the fakes of
+examples/demo, in the process of the test and outside of the cgroup, on addresses of 127.0.0.0/8.
+The neighbour's calls and raw connections come from `tests.integration.net`. If the addresses have
+to belong to other machines, a test gets `apart`, the same in a network namespace
+(:mod:`tests.abuse.apart`). The attack is in the body of ``with abused.watched():``, which checks:
 
-  - /healthz answers within 0.3 s throughout, asked by another process; the time for which the two
-    waited for a processor does not count (:mod:`tests.abuse.health`);
-  - memory grows by 16 MiB at most, or by what a test gives, which says for what;
+  - /healthz answers within 0.3 s throughout, to another process. Time in which the two wait for a
+    processor does not count (:mod:`tests.abuse.health`);
+  - memory grows by 16 MiB at most, or by the bytes that a test gives with a reason;
   - the log grows by 64 KiB at most, and has no traceback; /status has 1 MiB at most.
 
-Tests say themselves that a good neighbour is served meanwhile. It needs root, for the cgroup, the
-namespace (`ip`, of iproute2), and to go before whatever else this machine does, which is no
-neighbour of the proxy's. Tests of one subject are in one file.
+Each test checks that the proxy serves a good neighbour meanwhile. The layer needs root for the
+cgroup, for the namespace (`ip` of iproute2), and for a priority over all other programs of this
+machine, which are no neighbours of the proxy.
 """
 
 import json
@@ -47,11 +46,11 @@ GROWTH = 16 * MEBIBYTE
 LONGEST_ANSWER = 0.3
 """Seconds that an answer of /healthz may take."""
 PATIENT = {"probe_interval": 5, "probe_timeout": 20, "cleanup_after": 0, "linger": 600}
-"""The fakes answer late: they live in the process that makes the neighbours' huge documents."""
+"""The fakes answer late, because the same process makes the neighbours' huge documents."""
 LOG = 64 * 1024
 STATUS = MEBIBYTE
 PRIORITY = -15
-"""Of the test, and of all that it starts, among the processes of this machine (nice)."""
+"""The priority (nice) of the test and of all processes that the test starts."""
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -71,7 +70,7 @@ class Abused(Process):
 
     @property
     def admin(self) -> Address:
-        """Its admin endpoint."""
+        """The admin endpoint."""
         host, port = self.options["admin_bind"].split(":")
         return host, int(port)
 
@@ -82,18 +81,18 @@ class Abused(Process):
             return str(reply.read().decode())
 
     def status(self) -> dict[str, Any]:
-        """What it tells of itself."""
+        """The answer of /status."""
         document: dict[str, Any] = json.loads(self.get("/status"))
         return document
 
     def refused(self) -> set[str]:
-        """The reasons for which it has refused something."""
+        """The reasons of refusals so far."""
         lines = self.get("/metrics").splitlines()
         told = [line for line in lines if line.startswith("rosproxy_refused_total{")]
         return {line.split('"')[1] for line in told if float(line.split()[-1])}
 
     def metric(self, name: str) -> float:
-        """The value of a metric, by its name with its labels."""
+        """The value of a metric, by name and labels."""
         (line,) = (line for line in self.get("/metrics").splitlines() if line.startswith(name))
         return float(line.split()[-1])
 
@@ -103,14 +102,14 @@ class Abused(Process):
         return self.options["advertise_host"], lease["port"]
 
     async def publish(self, of: FakeNode) -> Address:
-        """Have a node register, and find out where outside reaches it."""
+        """Register a node. Return the address for outside."""
         await until(lambda: self.status()["master"]["up"], "the master is found")
         await of.publish(self.master)
         return self.lease(of)
 
     @contextmanager
     def watched(self, growth: int = GROWTH) -> Iterator[None]:
-        """Hold what nobody may lose; memory may grow by ``growth`` bytes."""
+        """Check health, memory, log and status. Memory may grow by ``growth`` bytes."""
         before = self.most_memory()
         written = len("".join(self.log))
         with Health(*self.admin, self.pid) as health:
@@ -163,7 +162,7 @@ async def apart_master(_apart: Apart) -> AsyncIterator[FakeMaster]:
 
 @pytest.fixture
 def start_apart(_apart: Apart, start_abused: StartAbused, apart_master: FakeMaster) -> StartAbused:
-    """Starts proxies that are machines of their own; see `tests.abuse.apart`."""
+    """Starts proxies on a separate machine; see `tests.abuse.apart`."""
 
     def start(**options: Any) -> Abused:
         own = {
@@ -182,5 +181,5 @@ def start_apart(_apart: Apart, start_abused: StartAbused, apart_master: FakeMast
 
 @pytest.fixture
 def apart(start_apart: StartAbused) -> Abused:
-    """A proxy that is a machine of its own."""
+    """A proxy on a separate machine."""
     return start_apart()

@@ -1,11 +1,11 @@
-"""Asks /healthz over and over, in a process of its own, which the tests can't hold up.
+"""Asks /healthz over and over, in a separate process, which the tests cannot hold up.
 
     python -m tests.abuse.health HOST PORT PID
 
-When its standard input ends, it prints how long the longest answer took, in seconds. The time in
-which the event loop of the proxy, process PID, or the asker itself waited for a processor does not
-count: other programs of this machine cause it. All else does, also where the event loop stands
-still in a system call.
+At the end of standard input, the process prints the time of the longest answer in seconds. Time in
+which the proxy's event loop (process PID) or the asker waits for a processor does not count,
+because other programs of this machine cause these waits. All other time counts, also system calls
+that block the event loop.
 """
 
 import http.client
@@ -28,7 +28,7 @@ def waited(pid: str) -> float:
 
 
 def ask(host: str, port: int, pid: str) -> float:
-    """How long an answer takes, on a connection of its own."""
+    """The time of an answer on a new connection."""
     began = time.monotonic() - waited(pid) - waited(str(os.getpid()))
     connection = http.client.HTTPConnection(host, port, timeout=PATIENCE)
     try:
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 class Health:
-    """Runs this module as long as the context lasts; ``longest`` is what it then has found."""
+    """Runs this module as long as the context lasts. Then ``longest`` has the result."""
 
     longest = 0.0
 

@@ -1,10 +1,10 @@
-"""A healthy pair, of which one sends 100 messages a second to the other while others attack.
+"""A healthy pair: a participant sends 100 messages a second to another during attacks.
 
     python -m tests.abuse.pair PREFIX INSIDE OUTSIDE TARGET TARGET_PORT PROXY
 
-The process is of its own, so that the test can't hold it up. It receives at the socket that it is
-given as its standard input, and announces its participant from there. When it gets a SIGTERM, it
-prints how many messages were sent and lost, and the longest time without a message, in seconds.
+A separate process, so that the test cannot hold up the pair. Standard input is the socket that
+receives, and that announces the participant. On SIGTERM the process prints the number of sent and
+lost messages, and the longest time without a message in seconds.
 """
 
 import json
@@ -47,7 +47,7 @@ class Stream:
         self._sent = 0
 
     def send(self) -> None:
-        """Send the next message, and receive until it is time for another one."""
+        """Send the next message, and receive until the time of another message."""
         self._sender.sendto(b"message %d" % self._sent, self._target)
         self._sent += 1
         self._receive(INTERVAL)
@@ -76,7 +76,7 @@ class Stream:
 
 
 class Pair:
-    """Runs this module as long as the context lasts; ``figures`` is what it then has found."""
+    """Runs this module as long as the context lasts. Then ``figures`` has the result."""
 
     figures: Figures
 

@@ -1,7 +1,7 @@
-"""Neighbours of a ROS 2 proxy, made of sockets: one that is to be served, and those that flood.
+"""Neighbours of a ROS 2 proxy, made of sockets: honest participants, and floods.
 
-A `Participant` announces itself as DDS does, and gets what is sent to it. A `Flood` sends from a
-thread as fast as it may, from addresses that it has or, in packets made by hand, from any.
+A `Participant` announces itself like DDS, and receives. A `Flood` sends from a thread as fast as
+allowed, from own addresses, or from any address in packets made by hand.
 """
 
 import itertools
@@ -25,11 +25,11 @@ AGAIN = 0.1
 """Seconds after which an announcement is repeated that may be lost."""
 PATIENCE = 60.0
 SHORTEST_PAUSE = 0.005
-"""Seconds by which a flood is ahead of its rate before it waits."""
+"""Seconds that a flood may be ahead of its rate."""
 PADDING = 200
-"""Bytes by which an announcement is as long as a real one: no address is sent more than came."""
+"""Bytes that make an announcement as long as a real announcement: an answer is never longer."""
 _SO_RCVBUFFORCE = 33
-"""Option of a socket for more bytes than rmem_max allows (socket(7)); Python's module lacks it."""
+"""Socket option for more bytes than rmem_max allows (socket(7)), missing in Python's module."""
 
 Address = tuple[str, int]
 
@@ -44,7 +44,7 @@ def udp(address: str, port: int = 0) -> socket.socket:
 
 
 class Participant:
-    """A participant at an address, with a socket for metatraffic and one for data.
+    """A participant at an address, with sockets for metatraffic and for data.
 
     ``vendor`` is the id of the implementation.
     """
@@ -119,7 +119,7 @@ class Participant:
                     break
                 if wanted(datagram):
                     return datagram
-        raise AssertionError(f"{self.address} did not get what it waited for")
+        raise AssertionError(f"{self.address} did not get the expected datagram")
 
 
 def _announces(datagram: bytes, prefix: bytes) -> bool:
@@ -147,11 +147,11 @@ def forge(source: str, to: Address, datagram: bytes) -> None:
 
 
 class Flood:
-    """Sends datagrams over and over while the context lasts; ``sent`` counts them.
+    """Sends datagrams over and over while the context lasts. ``sent`` counts the datagrams.
 
-    Each comes with where it is from, an address of this machine's, and where it goes. ``via`` is
-    the address on whose network forged ones go to a group; ``per_second`` is how many are sent.
-    ``make_packet`` makes a forged packet of those three.
+    Each datagram has a source, which is an address of this machine, and a target. ``via`` is the
+    address on the network for forged datagrams to a group. ``per_second`` is the rate.
+    ``make_packet`` makes a forged packet from source, target and datagram.
     """
 
     def __init__(
@@ -223,7 +223,7 @@ class Counted:
         self._sock.setblocking(False)
 
     def bytes_from(self, sources: Sequence[str]) -> int:
-        """Those that have come from some addresses since it was asked last."""
+        """The bytes from these addresses since the last call."""
         total = 0
         while True:
             try:

@@ -1,4 +1,4 @@
-"""The admin endpoint: however much there is to tell, and whoever reads it or does not."""
+"""The admin endpoint: with large documents, and with readers that do not read."""
 
 import socket
 import struct
@@ -22,14 +22,14 @@ from tests.unit.ros2.discovery.domains import SEDP_WRITERS, spdp
 from tests.unit.ros2.protocol.messages import data, message, payload
 
 NAMES_OF_WRITERS = 64 * 1024 * 1024
-"""Bytes that writers of five addresses may take, and a status of them while it is made."""
+"""Bytes for the writers of five addresses, and for making their status."""
 GOOD = bytes([1, 15, 1]) + bytes(9)
 EVIL = NODES[1:6]
 PORTS = 64
 ANNOUNCED = APART, WELL_KNOWN
 PARTICIPANTS = 4
 WRITERS = 2048
-"""Participants at one address, and writers of each: more than the proxy remembers."""
+"""Participants at an address, and writers of each: more than the proxy remembers."""
 WRITER_BYTES = 1200
 """Bytes that such a writer takes at most."""
 PER_SECOND = 1000
@@ -41,7 +41,7 @@ MORE = 16 * 1024 * 1024
 
 @pytest.fixture
 def abused(start_abused, _apart) -> Abused:
-    """A proxy for ROS 2 that is a machine of its own."""
+    """A proxy for ROS 2 on a separate machine."""
     first = free_ports(PORTS)
     return start_abused(
         ros=2,
@@ -64,7 +64,7 @@ def prefix(address: str, number: int) -> bytes:
 
 
 def writers(address: str, number: int) -> Iterator[tuple[str, Address, bytes]]:
-    """The announcements of a participant and of its writers, whose names are long."""
+    """The announcements of a participant and of its writers with long names."""
     own = prefix(address, number)
     yield address, ANNOUNCED, spdp(own, address, 9000 + number)
     described = [
@@ -72,7 +72,7 @@ def writers(address: str, number: int) -> Iterator[tuple[str, Address, bytes]]:
             [
                 (Pid.ENDPOINT_GUID, own + writer.to_bytes(3, "big") + b"\3"),
                 (Pid.TOPIC_NAME, text(b"rt/" + b"x" * 240 + b"%d_%d" % (number, writer))),
-                # Both are as long as the proxy keeps them.
+                # Both names have the longest length that the proxy keeps.
                 (Pid.TYPE_NAME, text(b"std_msgs::msg::dds_::" + b"Y" * 200 + b"_")),
             ]
         )
@@ -97,7 +97,7 @@ def told_writers(abused: Abused) -> int:
 
 
 async def announce_many(abused: Abused) -> None:
-    """Have the proxy remember as many writers as it does of five addresses that all answer it."""
+    """Fill the proxy's memory for the writers of five addresses, which all answer the proxy."""
     for address in EVIL:
         with closing(Participant(prefix(address, 0), address, 9000)) as evil:
             evil.proves_to_receive(partial(evil.announce, ANNOUNCED))
@@ -113,7 +113,7 @@ async def announce_many(abused: Abused) -> None:
 
 
 async def test_a_status_of_many_writers_with_long_names(abused: Abused) -> None:
-    """It had 20 MB, and the operator took its proxy for another program."""
+    """With 20 MB, the operator would take the proxy for another program."""
     client = ProxyClient()
     with closing(Participant(GOOD, NODES[0], WELL_KNOWN)) as good:
         good.announce(ANNOUNCED)
@@ -135,14 +135,14 @@ async def test_a_status_of_many_writers_with_long_names(abused: Abused) -> None:
 
 
 def is_refused(abused: Abused, source: str) -> bool:
-    """Whether an address has as many replies under way as it may."""
+    """Whether an address has the maximum of pending replies."""
     with socket.create_connection(abused.admin, 10, (source, 0)) as asking:
         asking.sendall(b"GET /status HTTP/1.0\r\n\r\n")
         return asking.recv(64).startswith(b"HTTP/1.0 503")
 
 
 async def test_readers_that_take_nothing(abused: Abused) -> None:
-    """32 took 681 MB in 14 s, and those that they replaced were kept."""
+    """32 readers once took 681 MB in 14 s, because replaced readers were kept."""
     await announce_many(abused)
     len(abused.get("/status"))
     with abused.watched(), ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""Ports of the master's host: only those that the master names are opened, however it is asked."""
+"""Ports of the master's host: the proxy opens only ports that the master names."""
 
 import asyncio
 from contextlib import AsyncExitStack, closing
@@ -13,7 +13,7 @@ from tests.integration.net import connect, exchange, post, refuses, rpc, xml
 UPDATES = 64 * 1024 * 1024
 """Bytes that the updates may take, of which the option --max-buffered lets 32 MiB in."""
 PER_UPDATE = 1000
-"""URIs in one call from outside; all ports of a host are named by 63 calls."""
+"""URIs in a call from outside. 63 calls name all ports of a host."""
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def updates(topic: str, first: int, but_not: str = "") -> bytes:
 
 
 async def test_updates_that_name_every_port_of_the_masters_host(aliased, apart_master, make_node):
-    """Whoever called publisherUpdate at a lease had any port there opened to inside."""
+    """A publisherUpdate at a lease must not open a port of the master's host to inside."""
     node = await make_node(address=NODES[0])
     robot = await make_node("/robot", APART_MASTER, host="robot")
     secret = await asyncio.start_server(lambda *_: None, APART_MASTER)
@@ -61,7 +61,7 @@ async def test_updates_that_name_every_port_of_the_masters_host(aliased, apart_m
 async def test_more_nodes_on_the_masters_host_than_there_are_stand_ins(
     aliased, apart_master, make_node
 ):
-    """Whoever may register at the master has any ports named: they are bounded in all."""
+    """A node may register any port at the master. The total of stand-ins is bounded."""
     node = await make_node(address=NODES[0])
     robot = await make_node("/robot", APART_MASTER, host="robot")
     await robot.publish(host_and_port(apart_master.uri), "/map")

@@ -1,4 +1,4 @@
-"""What is too large, too much or never ends: it is refused, and everybody else is served."""
+"""Requests that are too large, too many or endless are refused, and other callers are served."""
 
 import asyncio
 import gzip
@@ -9,7 +9,7 @@ from rosproxy.ros1.protocol.xmlrpc.document import INVALID_PARAMS, PARSE_ERROR
 from tests.integration.net import NODE, OTHER_NODE, OUTSIDE, connect, exchange, post, rpc, xml
 
 DOCUMENTS = 48 * 1024 * 1024
-"""Bytes of documents: 32 MiB by --max-buffered, and what is made of one at a time."""
+"""Bytes of documents: 32 MiB by --max-buffered, and a single parsed document."""
 SLOW_CALLS = 32 * 1024 * 1024
 """Bytes that may be under way of 20 calls that pass, each with a connection to the master."""
 UPLOADS = 96 * 1024 * 1024
@@ -60,7 +60,7 @@ def with_a_long_tag(body: bytes, content: bytes) -> bytes:
 
 
 async def test_documents_with_tags_of_megabytes(abused, node):
-    """One document of 4 MiB took 460 MB, and one of 11 MB that passed took 370 MB and 1.1 s."""
+    """Once a document of 4 MiB took 460 MB, and a document of 11 MB took 370 MB and 1.1 s."""
     lease = await abused.publish(node)
     attributes = b"".join(b" a%x=''" % number for number in range(90_000))
     call = xml("registerPublisher", node.name, "/t", "x/Y", node.uri)

@@ -1,4 +1,4 @@
-"""Who may not use the proxy, claims to be another, or takes every port: others are served."""
+"""Unselected callers, forged identities, and used-up ranges: other nodes are served."""
 
 import asyncio
 import json
@@ -63,10 +63,9 @@ async def test_strangers_flood_the_master_port(apart, apart_master, make_node):
     assert set(apart_master.nodes) == {node.name}
 
 
-async def test_who_is_not_selected_floods_the_master_port(start_apart, make_node):
-    """Where an operator runs: a new container waits for the update as long as they do.
-
-    Some call before the operator has told for the first time after the start.
+async def test_unselected_callers_flood_the_master_port(start_apart, make_node):
+    """With an operator, a new container waits for the update as long as unselected callers. Some
+    callers come before the operator's first update after the start.
     """
     apart = start_apart(admin_token_hash=hash_token(TOKEN))
     node = await make_node(address=NODES[0])
@@ -133,7 +132,7 @@ async def test_dead_uris_of_many_sources(abused, make_node):
 
 
 async def test_forged_addresses_of_others(apart, apart_master, make_node):
-    """Neither a node that never joined nor one outside is published by somebody else."""
+    """A forged registration publishes neither an unknown node nor an outside node."""
     evil = await make_node("/evil", NODES[0])
     node = await make_node("/good", NODES[1])
     victims = [await make_node("/victim", NODES[2]), await make_node("/robot", STRANGERS[0])]
@@ -151,7 +150,7 @@ async def test_forged_addresses_of_others(apart, apart_master, make_node):
             if address != lease:
                 assert await knock(address, topic_header("/rosout"), STRANGERS[1]) != "answered"
     asked = {header["callerid"] for victim in victims for header in victim.headers}
-    assert asked <= {"/rosproxy"}  # it only asks them who they are
+    assert asked <= {"/rosproxy"}  # the proxy only asks for the name
     assert apart_master.nodes[node.name].startswith(f"http://{APART_HOST}:{lease[1]}/")
     assert not [
         uri for uri in apart_master.nodes.values() for victim in victims if uri == victim.uri
@@ -160,7 +159,7 @@ async def test_forged_addresses_of_others(apart, apart_master, make_node):
 
 @pytest.mark.parametrize("kind", ["refusing", "silent"])
 async def test_a_range_full_of_stale_claims(start_abused, master, make_node, kind):
-    """Former proxies left eight dead nodes; the next one registers in the first second."""
+    """Former proxies left eight dead nodes. A new node registers in the first second."""
     first = free_ports(PORTS)
     node = await make_node()
     async with silent_servers(OTHER_NODE, PORTS) as silent:

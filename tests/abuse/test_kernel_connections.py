@@ -1,4 +1,4 @@
-"""ROS 1 on the kernel plane: forged SYNs at a fast port keep no subscriber from its topic."""
+"""ROS 1 on the kernel plane: forged SYNs at a fast port do not disturb subscribers."""
 
 import struct
 import subprocess
@@ -48,13 +48,13 @@ def forwarding(_apart: Apart) -> Iterator[Apart]:
 
 @pytest.fixture
 def abused(start_apart, forwarding) -> Abused:
-    """A proxy for ROS 1 whose kernel forwards topics."""
+    """A proxy for ROS 1 with the kernel plane."""
     made: Abused = start_apart(data_plane="kernel")
     return made
 
 
 def syn(source: str, to: Address, port: bytes) -> bytes:
-    """An IPv4 packet that opens a TCP connection; the kernel adds what is zero in its head."""
+    """An IPv4 packet that opens a TCP connection. The kernel fills in zero fields of the head."""
     head = struct.pack(">BBHHHBBH", 0x45, 0, 40, 0, 0, 64, IPPROTO_TCP, 0)
     addresses = inet_aton(source) + inet_aton(to[0])
     segment = port + struct.pack(">HIIBBH", to[1], 1, 0, 0x50, 0x02, 65535)
@@ -79,7 +79,7 @@ async def follow(wire: Wire) -> None:
 
 
 async def echo(wire: Wire, content: bytes) -> None:
-    """Have the node send back what it gets, and nothing else."""
+    """Check that the node echoes these bytes, and nothing else."""
     await wire.send(content)
     assert await wire.exactly(len(content)) == content
 

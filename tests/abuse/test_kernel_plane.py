@@ -16,7 +16,7 @@ from tests.abuse.test_ros2 import PORTS, first, good, robot, served  # noqa: F40
 from tests.integration.net import until
 
 FORGED = IPv4Address("198.19.0.0")
-"""The first of the forged sources, each of which sends one datagram."""
+"""The first of the forged sources. Each source sends a single datagram."""
 ROUNDS = 720
 FORGED_A_ROUND = 100
 """With masquerade, a port of the proxy's address for each source: there are some 64,500."""
@@ -37,7 +37,7 @@ def forwarding(_apart: Apart) -> Iterator[Apart]:
 
 @pytest.fixture
 def abused(start_abused, forwarding, first) -> Abused:  # noqa: F811 - the fixture
-    """A proxy for ROS 2 whose kernel forwards user data."""
+    """A proxy for ROS 2 with the kernel plane."""
     return start_abused(
         ros=2,
         prefix=forwarding.prefix,

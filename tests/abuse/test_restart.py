@@ -1,7 +1,7 @@
-"""ROS 2: the proxy is killed and starts again, and attackers claim what is another participant's.
+"""ROS 2: the proxy is killed and restarts, and attackers claim other participants' ports.
 
-Participants answer the proxy as readers of DDS do, and remember the numbers that the proxy tells
-them. The proxy relays user data itself, and outside is silent until the attacker has had its turn.
+Participants answer the proxy like DDS readers, and remember the proxy's numbers. The proxy relays
+user data in user space, and outside is silent until the attacker has had a turn.
 """
 
 import time
@@ -38,9 +38,8 @@ MESSAGES = 20
 
 
 class Reader(Participant):
-    """A participant that answers the proxy, and remembers which number each writer expects.
-
-    It tells the number in ``claimed`` instead, if there is one for the writer.
+    """A participant that answers the proxy, and remembers the expected number of each writer. A
+    number in ``claimed`` replaces the true number.
     """
 
     def __init__(self, prefix: bytes, address: str, port: int) -> None:
@@ -50,7 +49,7 @@ class Reader(Participant):
         self.claimed: dict[tuple[bytes, int], int] = {}
 
     def live(self) -> None:
-        """Announce itself, and answer all that has come."""
+        """Announce the participant, and answer all received datagrams."""
         self.announce(ANNOUNCED)
         with suppress(BlockingIOError):
             while True:
@@ -77,7 +76,9 @@ def first() -> int:
 
 @pytest.fixture
 def abused(start_abused, _apart, first) -> Abused:
-    """A proxy for ROS 2 that is a machine of its own, has a secret, and relays user data itself."""
+    """A proxy for ROS 2 on a separate machine, with a secret, that relays user data in user
+    space.
+    """
     return start_abused(
         ros=2,
         prefix=_apart.prefix,
@@ -101,7 +102,7 @@ def good(abused) -> Iterator[Reader]:
 
 @pytest.fixture
 def thief(abused) -> Iterator[Reader]:
-    """A participant inside that claims what another one had."""
+    """A participant inside that claims another participant's ports."""
     with closing(Reader(THIEF, EVIL, WELL_KNOWN)) as made:
         yield made
 
@@ -126,7 +127,7 @@ def ports(abused: Abused, participant: Participant) -> list[int]:
 
 
 async def serve_and_restart(abused: Abused, good: Reader, robot: Participant) -> list[int]:
-    """Have a pair served until its ports are kept, and kill the proxy; the ports."""
+    """Serve a pair until its ports are kept, then kill the proxy. Return the ports."""
     good.meta.settimeout(0.1)
     meta, user = served(good, robot, b"before")
     good.meta.setblocking(False)
@@ -143,7 +144,7 @@ async def serve_and_restart(abused: Abused, good: Reader, robot: Participant) ->
 
 
 async def has_its_ports(abused: Abused, good: Reader, before: list[int]) -> None:
-    """Wait until a participant has the ports that it had before."""
+    """Wait until a participant has its former ports."""
 
     def is_served() -> bool:
         good.live()
@@ -153,7 +154,7 @@ async def has_its_ports(abused: Abused, good: Reader, before: list[int]) -> None
 
 
 def gets_all(good: Participant, robot: Participant, port: int, others: Participant) -> None:
-    """Hold that what outside sends to a port arrives at one participant alone."""
+    """Check that datagrams from outside to a port arrive at a single participant."""
     good.data.settimeout(5)
     others.data.setblocking(False)
     for number in range(MESSAGES):
@@ -167,7 +168,7 @@ def gets_all(good: Participant, robot: Participant, port: int, others: Participa
 
 @pytest.mark.parametrize("has_proof", [True, False])
 @pytest.mark.parametrize("is_alone", [True, False])
-async def test_a_claimed_port_goes_to_the_participant_that_had_it(
+async def test_a_claimed_port_goes_to_its_former_participant(
     abused, good, robot, thief, first, has_proof, is_alone
 ):
     """The attacker got the ports, and the messages, in 20 of 20 restarts."""
@@ -196,7 +197,7 @@ async def test_a_claimed_port_goes_to_the_participant_that_had_it(
         assert ports(abused, good) == before
 
 
-async def test_a_prefix_of_inside_goes_to_the_participant_that_had_it(abused, good, robot, first):
+async def test_a_prefix_of_inside_goes_to_its_former_participant(abused, good, robot, first):
     """A host on the LAN that used the prefix kept the participant from being served."""
     before = await serve_and_restart(abused, good, robot)
     proof = RelayProof(SECRET, time.time)

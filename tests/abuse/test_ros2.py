@@ -1,4 +1,4 @@
-"""ROS 2: whoever sends datagrams, and however many; others are served, and nobody is flooded."""
+"""ROS 2: floods of datagrams from any source. Others are served, and no victim is flooded."""
 
 import itertools
 import struct
@@ -52,7 +52,7 @@ EVIL = NODES[1]
 LAN_RELAY = NODES[19]
 VICTIM = STRANGERS[9]
 SECRET = "0123456789abcdef"
-"""What the proxy and its LAN relay share."""
+"""The shared secret of the proxy and its LAN relay."""
 PORTS = 64
 MORE = 20_000_000
 """Bytes that a second flood may take more than the first."""
@@ -65,11 +65,11 @@ HEARD = 40
 FORGED_NETWORK = ip_network("198.19.0.0/18")
 """Forged sources."""
 AMONG = 20_000
-"""Datagrams of a flood in which everybody else is served."""
+"""Datagrams of a flood in which all others are served."""
 ANNOUNCED = APART, WELL_KNOWN
-"""Where those inside announce themselves."""
+"""The target of announcements from inside."""
 GROUP = "239.255.0.1", 7400
-"""Where those on the LAN do."""
+"""The target of announcements on the LAN."""
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def first() -> int:
 
 @pytest.fixture
 def abused(start_abused, _apart, first) -> Abused:
-    """A proxy for ROS 2 that is a machine of its own."""
+    """A proxy for ROS 2 on a separate machine."""
     return start_abused(
         ros=2,
         prefix=_apart.prefix,
@@ -109,7 +109,7 @@ def robot(abused) -> Iterator[Participant]:
 
 
 def served(good: Participant, robot: Participant, marker: bytes) -> list[Address]:
-    """Hold that both find each other, and that data comes in; where the one inside is reached."""
+    """Check that both discover each other, and that data arrives. Return the inside's locators."""
     locators = robot.hears(GOOD, lambda: good.announce(ANNOUNCED))
     assert [locator.host for locator in locators] == [APART_HOST] * 2
     meta, user = ((locator.host, locator.port) for locator in locators)
@@ -121,7 +121,7 @@ def served(good: Participant, robot: Participant, marker: bytes) -> list[Address
 
 
 def carried(source: str, datagram: bytes, secret: str = SECRET) -> bytes:
-    """What the LAN relay sends of a datagram that it has heard from an address."""
+    """The LAN relay's message for a datagram from an address."""
     proof = RelayProof(secret, time.time)
     return proof.sealed(Direction.TO_PROXY, wrapped(source, datagram))
 
@@ -191,10 +191,10 @@ async def test_one_address_inside_floods(abused, good, robot):
             (EVIL, ANNOUNCED, spdp(prefix(number), EVIL, 9000 + number)) for number in range(60)
         ]
         with Flood(arrived, is_forged=False):
-            await until(lambda: evil_count() >= 20, "they have been taken in")
+            await until(lambda: evil_count() >= 20, "the participants are admitted")
         with Flood(announced(), is_forged=False) as flood:
             served(good, robot, b"amid")
-            await until(lambda: "rate" in abused.refused(), "it makes more than it may")
+            await until(lambda: "rate" in abused.refused(), "the address exceeds its rate")
             flood.wait(AMONG)
         served(good, robot, b"after")
         most = abused.most_memory()
@@ -205,12 +205,12 @@ async def test_one_address_inside_floods(abused, good, robot):
             (EVIL, ANNOUNCED, dispose_message(prefix(number))) for number in range(400)
         ]
         with Flood(dispose_messages, is_forged=False):
-            await until(lambda: evil_count() == 0, "they have gone")
+            await until(lambda: evil_count() == 0, "the participants have gone")
     assert abused.most_memory() - most < MORE
 
 
 def test_strangers_flood(abused, good, robot, first):
-    """At all ports, from addresses of their own and from forged ones."""
+    """At all ports, from own and from forged addresses."""
     leases = served(good, robot, b"before")
     ports = [(APART, port) for port in range(first, first + PORTS)]
     said = [spdp(prefix(1), STRANGERS[3]), *heavy(1), dispose_message(GOOD), b"\0" * 999]
@@ -234,8 +234,8 @@ def test_strangers_flood(abused, good, robot, first):
     assert [participant["address"] for participant in domain["outside"]] == [robot.address]
 
 
-def test_nobody_takes_or_ends_what_is_anothers(abused, good, robot, first):
-    """By its prefix, from inside and outside; nor gets a way to where it is not itself."""
+def test_no_attacker_takes_or_ends_another_participant(abused, good, robot, first):
+    """By its prefix, from inside and outside. Nor does an attacker get a port to another host."""
     leases = served(good, robot, b"before")
     for number, source in enumerate((EVIL, STRANGERS[3])):
         said = [
@@ -261,8 +261,8 @@ def test_nobody_takes_or_ends_what_is_anothers(abused, good, robot, first):
     assert {participant["address"] for participant in domain["outside"]} == {robot.address}
 
 
-def test_nobody_is_sent_more_than_came_from_him(abused, good, robot, first):
-    """A victim is named by a forger, and inside has much to say to all that it hears of."""
+def test_no_victim_gets_more_than_came_in_its_name(abused, good, robot, first):
+    """A forger names a victim, and participants inside send much to each new participant."""
     served(good, robot, b"before")
     heard = [spdp(prefix(number), VICTIM, 4000 + number) for number in range(MOST_PER_UNPROVEN)]
     with closing(Counted(VICTIM)) as counted, abused.watched():
@@ -282,8 +282,9 @@ def test_nobody_is_sent_more_than_came_from_him(abused, good, robot, first):
 
 
 def test_a_process_at_the_relays_address_is_not_the_relay(abused, good, robot, first):
-    """Behind Docker's port proxy each client has that address: inside hosts became participants
-    outside, and a datagram was led to port 9999 of one."""
+    """Behind Docker's port proxy each client has the relay's address. Forged claims must not make
+    inside hosts participants outside.
+    """
     served(good, robot, b"before")
     host = NODES[5]
     claims = [(host, 9999), (APART, first), (APART_HOST, first + 3), ("127.0.0.1", 9999)]
@@ -300,7 +301,7 @@ def test_a_process_at_the_relays_address_is_not_the_relay(abused, good, robot, f
             served(good, robot, b"amid")
         assert {"not_a_peer", "relay_proof"} <= abused.refused()
         assert not {"claimed_address", "own_port"} & abused.refused()
-        # Nor does the relay itself lead there, if a machine on the LAN forges its source.
+        # Nor may the relay lead there if a machine on the LAN forges its source.
         for number, claim in enumerate(claims):
             forge(LAN_RELAY, (APART, first), carried(claim[0], spdp(prefix(20 + number), *claim)))
         served(good, robot, b"after")
@@ -324,8 +325,8 @@ def lan_relay(abused, first) -> Iterator[Popen[str]]:
         assert "Traceback" not in made.stderr.read()
 
 
-async def test_somebody_floods_the_lan(abused, good, lan_relay):
-    """Others are heard meanwhile, and the LAN hears of inside."""
+async def test_a_flood_on_the_lan(abused, good, lan_relay):
+    """Discovery goes on in both directions."""
     said = [message(prefix=prefix(1)), *heavy(1), *(spdp(prefix(n), EVIL) for n in range(30))]
     laptop = Participant(ROBOT, STRANGERS[2], WELL_KNOWN)
     listening = group_socket(HostPort(*GROUP))
@@ -350,7 +351,7 @@ async def test_somebody_floods_the_lan(abused, good, lan_relay):
     with closing(laptop), closing(listening), abused.watched(), flood:
         flood.wait(AMONG // 10)
         await until(is_known, "a participant on the LAN is met")
-        await until(is_announced, "the LAN hears of the one inside")
+        await until(is_announced, "the LAN gets the inside announcement")
         flood.wait(AMONG)
     assert lan_relay.poll() is None
 
@@ -398,7 +399,7 @@ async def test_forged_sources_on_the_lan_take_nobodys_place(abused, good, robot,
 async def test_forged_sources_on_the_lan_take_no_more_than_their_share(
     abused, good, robot, lan_relay
 ):
-    """The relay handed the proxy all that it could read, and lost honest announcements."""
+    """Without shares, the relay would lose honest announcements in a flood."""
     served(good, robot, b"before")
     said = [
         (str(source), GROUP, spdp(prefix(number), str(source), padding=PADDING))

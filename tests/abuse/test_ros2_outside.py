@@ -1,7 +1,7 @@
-"""ROS 2: what an address outside can do that has proved to receive, or that is a peer's.
+"""ROS 2: attacks from an outside address that is proven, or that is a peer's.
 
-A participant outside sends 100 messages a second to one inside meanwhile, through a port that the
-proxy itself relays. A crowd of participants is inside, all of which are told of each announcement.
+Meanwhile a participant outside sends 100 messages a second inside, through a port that the proxy
+relays in user space. A crowd of participants inside gets each announcement.
 """
 
 import struct
@@ -34,7 +34,7 @@ EVIL_PREFIX = bytes([1, 15, 7]) + bytes(9)
 PORTS = 256
 CROWD = 50
 AT_ONE_ADDRESS = 16
-"""Participants of the crowd at one address."""
+"""Participants of the crowd at an address."""
 AMONG = 30_000
 """Datagrams of a flood."""
 PER_SECOND = 5000
@@ -54,7 +54,7 @@ def first() -> int:
 
 @pytest.fixture
 def abused(start_abused, _apart, first) -> Abused:
-    """A proxy for ROS 2 that is a machine of its own, and relays user data itself."""
+    """A proxy for ROS 2 on a separate machine that relays user data in user space."""
     return start_abused(
         ros=2,
         prefix=_apart.prefix,
@@ -131,7 +131,7 @@ def ports_for_discovery(abused: Abused) -> list[int]:
 
 
 def named(number: int) -> bytes:
-    """What announces a writer of a topic with a name that takes four times its bytes."""
+    """The announcement of a writer, with a topic name that takes four times its bytes."""
     name = b"rt/" + f"\U0001f600{number:05d}".encode() + b"x" * 1000 + b"\0" * 4
     parameters = [
         (Pid.ENDPOINT_GUID, EVIL_PREFIX + number.to_bytes(3, "big") + b"\3"),
@@ -143,9 +143,9 @@ def named(number: int) -> bytes:
 
 
 async def test_a_peer_makes_up_names(abused, robot, crowd, pair, first):  # noqa: F811
-    """The proxy remembered 1,024 names for each participant inside: 86 MB for 20 of these."""
+    """With 1,024 names for each of 20 participants inside, the proxy once took 86 MB."""
     robot.meta.sendto(spdp(EVIL_PREFIX, PEER, 9000), (APART_HOST, first))
-    await until(lambda: EVIL_PREFIX.hex() in known_outside(abused), "the hostile one is known")
+    await until(lambda: EVIL_PREFIX.hex() in known_outside(abused), "the attacker is known")
     ports = ports_for_discovery(abused)[:NAMED_TO]
     datagrams = [
         (PEER, (APART_HOST, port), named(number)) for number in range(1024) for port in ports

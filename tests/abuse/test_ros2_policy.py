@@ -1,4 +1,4 @@
-"""ROS 2: one address inside has the proxy apply a change of the policy to many participants."""
+"""ROS 2: a change of the policy for many participants at an inside address."""
 
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -49,7 +49,7 @@ def policy(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def abused(start_abused, _apart, first, policy) -> Abused:
-    """A proxy for ROS 2 that is a machine of its own, and relays user data itself."""
+    """A proxy for ROS 2 on a separate machine that relays user data in user space."""
     return start_abused(
         ros=2,
         prefix=_apart.prefix,
@@ -80,7 +80,7 @@ def known(abused: Abused) -> set[bytes]:
 
 
 def met_anew(participant: Participant) -> set[bytes]:
-    """The participants at the peer that are announced to one inside now."""
+    """The peer's participants that the proxy now announces to a participant inside."""
     prefixes = set()
     with suppress(BlockingIOError):
         while True:
@@ -124,7 +124,7 @@ async def crowd(
         publishers = [p for p in domain["inside"] if p["address"] == EVIL and p["publishes"]]
         return len(publishers) == MOST_PER_ADDRESS
 
-    await until(are_publishers, "each of them has told of a publisher")
+    await until(are_publishers, "each participant has a publisher")
 
 
 async def test_a_change_of_the_policy_for_many_participants(
@@ -135,7 +135,7 @@ async def test_a_change_of_the_policy_for_many_participants(
     policy,
     first,
 ):
-    """64 at one address that met 256 held all others up for three seconds."""
+    """Rediscovery of 64 participants with 256 must not block others, once for three seconds."""
     met = set[bytes]()
 
     def is_complete() -> bool:

@@ -1,7 +1,7 @@
-"""ROS 2: one neighbour takes no more than its share, and a healthy pair notices nothing.
+"""ROS 2: no neighbour takes more than its share, and a healthy pair notices nothing.
 
-A participant outside sends 100 messages a second to one inside meanwhile, through a port that the
-proxy itself relays.
+Meanwhile a participant outside sends 100 messages a second inside, through a port that the proxy
+relays in user space.
 """
 
 import socket
@@ -40,7 +40,7 @@ def first() -> int:
 
 @pytest.fixture
 def abused(start_abused, _apart, first) -> Abused:
-    """A proxy for ROS 2 that is a machine of its own, and relays user data itself."""
+    """A proxy for ROS 2 on a separate machine that relays user data in user space."""
     return start_abused(
         ros=2,
         prefix=_apart.prefix,
@@ -62,7 +62,7 @@ def robot(abused) -> Iterator[Participant]:
 
 @pytest.fixture
 def pair(abused, robot) -> Iterator[Pair]:
-    """A healthy pair; the test begins and ends its exchange."""
+    """A healthy pair. The test starts and stops the messages."""
     with closing(Participant(STEADY, NODES[0], WELL_KNOWN)) as inside:
         _, user = robot.hears(STEADY, lambda: inside.announce(ANNOUNCED))
         yield Pair(inside, PEER, (user.host, user.port), APART)
@@ -74,7 +74,7 @@ def evil(number: int) -> bytes:
 
 
 def stand_ins(abused: Abused, robot: Participant, first: int, count: int) -> list[Address]:
-    """Have so many participants at the peer; the ports that stand for them inside."""
+    """Announce this number of participants at the peer. Return their stand-ins inside."""
     for number in range(count):
         prefix = bytes([1, 15, 8, number]) + bytes(8)
         robot.meta.sendto(spdp(prefix, PEER, 9000 + number), (APART, first))
@@ -84,9 +84,10 @@ def stand_ins(abused: Abused, robot: Participant, first: int, count: int) -> lis
 
 
 def is_met(abused: Abused, sock: socket.socket, number: int) -> bool:
-    """Whether a participant is met that a socket announces now.
+    """Announce a participant from a socket, and return whether the proxy admits the participant.
 
-    The proxy reads the datagrams of a source in their order: so it has read all that came before.
+    The proxy reads the datagrams of a source in order, so all earlier datagrams have been read
+    then.
     """
     address, _ = sock.getsockname()
     prefix = evil(number)
@@ -116,7 +117,7 @@ async def test_one_address_sends_long_discovery_to_all_stand_ins(abused, robot, 
         for datagram in (described(31, 500), described(32, 120), described(31, 500)):
             for port in ports:
                 sock.sendto(datagram, port)
-        await until(lambda: is_met(abused, sock, 2), "all that waited has been read")
+        await until(lambda: is_met(abused, sock, 2), "all waiting datagrams are read")
     assert pair.figures.lost == 0
     assert pair.figures.longest_gap < LONGEST_GAP
 
@@ -141,8 +142,8 @@ async def test_a_message_in_which_many_speak_is_not_multiplied(abused, robot, pa
             arrived += counted.bytes_from([APART, APART_HOST])
             return arrived > len(datagram)
 
-        await until(has_arrived, "the peer gets some of it")
-        await until(lambda: is_met(abused, sock, 2), "all that waited has been read")
+        await until(has_arrived, "the peer gets a part")
+        await until(lambda: is_met(abused, sock, 2), "all waiting datagrams are read")
         has_arrived()
     assert arrived <= 3 * 10 * len(datagram)
     assert pair.figures.lost == 0
@@ -158,7 +159,7 @@ def forged_crowd(address: str) -> list[tuple[str, Address, bytes]]:
 
 
 async def test_forged_participants_at_an_address_keep_no_new_one_out(abused, robot, pair):
-    """A neighbour announced participants at a container's address, and no new one was met."""
+    """A neighbour announces participants at a container's address."""
     flood = Flood(forged_crowd(NODES[0]), is_forged=True, per_second=500)
     with abused.watched(), pair, flood, closing(Participant(evil(200), NODES[0], 8000)) as new:
         flood.wait(200)

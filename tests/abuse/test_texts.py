@@ -26,7 +26,7 @@ REGISTRATIONS = 72 * 1024 * 1024
 """Bytes of multicalls of 400 registrations, of all that are noted, and of the status of these."""
 MB = 1000 * 1000
 FILLED = "é" * (LONGEST_NAME - 10)
-"""Most of the longest name there may be; in JSON each of its letters takes six characters."""
+"""Most of the longest allowed name. In JSON each letter takes six characters."""
 
 
 def register(name: str, topic: str, uri: str) -> dict[str, object]:
@@ -34,7 +34,7 @@ def register(name: str, topic: str, uri: str) -> dict[str, object]:
 
 
 async def test_uris_of_a_megabyte_for_one_node(abused, node):
-    """A hundred of them took 196 MB for as long as the node lived."""
+    """A hundred such URIs once took 196 MB for the node's lifetime."""
     lease = await abused.publish(node)
     with abused.watched():
         for number in range(100):
@@ -49,7 +49,7 @@ async def test_uris_of_a_megabyte_for_one_node(abused, node):
 
 
 async def test_a_node_that_registers_as_much_as_it_may(abused, make_node):
-    """With the longest names, until it is refused: 2 MB of names, which JSON makes more of."""
+    """With the longest names, until the proxy refuses: 2 MB of names, and more in JSON."""
     evil = await make_node("/evil", OTHER_NODE)
     node = await make_node()
     lease = await abused.publish(node)
@@ -69,7 +69,7 @@ async def test_a_node_that_registers_as_much_as_it_may(abused, make_node):
 
 
 async def test_subscribers_with_long_names(abused, make_node):
-    """From outside, as many as a port takes of one address."""
+    """From outside, as many as a port accepts from an address."""
     node = await make_node()
     other = await make_node("/other", OTHER_NODE)
     lease = await abused.publish(node)
