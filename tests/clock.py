@@ -1,13 +1,12 @@
-"""An event loop whose clock stands still while the process does.
+"""An event loop with a clock that stands still while the process does not run.
 
-A test judges by time what its nodes do: one that does not answer within a second is dead. Where
-other programs take the processors, the test's own process comes to a halt for as long now and
-then, proxy and nodes alike, and a node that is well would be dead by the wall's clock. By this one
-it is not: a turn of the loop takes no longer than `WORK` where there was something to do, and no
-longer than `WAIT` where there was nothing. So all that happens in one process happens in the order
-and at the times that it would on a quiet machine. Threads and other processes have the real time.
+The proxy judges nodes by time: a node that does not answer within a second is dead. If other
+programs take the processors, the test's process stands still for as long now and then, with proxy
+and nodes. By the wall clock a healthy node would then be dead. By this clock a turn of the loop
+takes at most `WORK` with events, and at most `WAIT` without. So events in a single process have the
+order and the times of a quiet machine. Threads and other processes have the real time.
 
-`pass_time` lets it run ahead, for what is due in minutes.
+`pass_time` lets the clock run ahead, for events that are due in minutes.
 """
 
 import asyncio
@@ -17,7 +16,7 @@ from time import monotonic
 WAIT = 0.02
 """Seconds by which the clock moves at most while the loop waits for something to happen."""
 WORK = 0.002
-"""Seconds by which it moves at most while the loop does what has happened."""
+"""Seconds by which the clock moves at most while the loop handles events."""
 GLANCE = 0.001
 """Real seconds in which nothing may have happened for `WAIT` to be over, in haste."""
 
@@ -25,7 +24,7 @@ _Ready = list[tuple[selectors.SelectorKey, int]]
 
 
 class PatientSelector(selectors.DefaultSelector):
-    """Moves ``now``, in seconds, by what a wait took, or a turn of the loop between two of them."""
+    """Moves ``now`` by the seconds of a wait, or of a turn of the loop between two waits."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,7 +32,7 @@ class PatientSelector(selectors.DefaultSelector):
         self.in_haste = False
 
     def select(self, timeout: float | None = None) -> _Ready:
-        """What has become ready; after `WAIT` at the latest, though it be nothing."""
+        """The ready files, perhaps none after `WAIT`."""
         self._move(WORK)
         wait = WAIT if timeout is None else min(timeout, WAIT)
         ready = super().select(min(wait, GLANCE) if self.in_haste else wait)
@@ -61,7 +60,7 @@ class PatientLoop(asyncio.SelectorEventLoop):
 
 
 async def pass_time(seconds: float) -> None:
-    """Let so many seconds pass as fast as what is due in them is done. In a `PatientLoop` only."""
+    """Let these seconds pass as fast as the due events are handled. In a `PatientLoop` only."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, PatientLoop)
     loop.patient.in_haste = True

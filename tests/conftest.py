@@ -9,7 +9,7 @@ from examples.demo.fake_http import PORTS
 
 @pytest.fixture(autouse=True, scope="session")
 def _ports_of_this_worker() -> None:
-    """Tests that run side by side draw their ports from ranges of their own."""
+    """Tests that run side by side draw ports from separate ranges."""
     number = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     count = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     size = len(PORTS.ports) // count

@@ -1,4 +1,4 @@
-"""Settings of a proxy by way of its real command line."""
+"""Settings of a proxy from the real command line."""
 
 import os
 from collections.abc import Iterator, Mapping

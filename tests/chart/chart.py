@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "charts/rosproxy-operator"
 NAMESPACE = "rosproxy-system"
 KUBERNETES = "1.30.0"
-"""A helm that was not built by its own makefile takes each cluster for an ancient one."""
+"""Without this version, a helm that its makefile did not build assumes an ancient cluster."""
 
 Json = dict[str, Any]
 Values = Mapping[str, Any]
@@ -165,7 +165,7 @@ def helm(*arguments: str | Path, values: Values | None = None) -> subprocess.Com
 
 
 def program() -> Path:
-    """Where helm is: `scripts/install-kubernetes.sh` puts it there."""
+    """The path of helm, which `scripts/install-kubernetes.sh` installs."""
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(os.environ.get("CLUSTER_BIN") or Path(cache) / "rosproxy/cluster") / "helm"
 
@@ -181,7 +181,7 @@ def render(
 
 
 def objects(values: Values | None = None, *options: str, **more: Any) -> list[Json]:
-    """The objects that the chart makes; more are those of `render`."""
+    """The objects of the chart. ``more`` goes to `render`."""
     return parse(render(values, *options, **more))
 
 
@@ -194,10 +194,7 @@ def of_kind(manifests: list[Json], kind: str) -> list[Json]:
 
 
 def combinations(most: int) -> Iterator[tuple[str, Values]]:
-    """Combinations of choices, as few as it takes for any ``most`` of them to meet.
-
-    Their names, and the values.
-    """
+    """Few combinations in which any ``most`` choices meet, as pairs of a name and values."""
     return map(_combined, _covering(most))
 
 
@@ -220,7 +217,7 @@ def _covering(most: int) -> Iterator[tuple[str, ...]]:
 
 
 def merged(*layers: Values) -> Values:
-    """Values on top of each other, as helm lays them."""
+    """Merge values like helm."""
     whole: Json = {}
     for layer in layers:
         for key, value in layer.items():

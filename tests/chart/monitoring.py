@@ -1,4 +1,4 @@
-"""The dashboard and the alerts, as people and other tests read them."""
+"""The queries of the dashboard and of the alerts, for tests."""
 
 import json
 import re
@@ -33,7 +33,7 @@ def panels() -> list[Json]:
 def expressions() -> Iterator[tuple[str, str]]:
     """Each panel's title with each of its queries, for all proxies and over half a minute.
 
-    Without the zero that is shown where there is nothing: with it each query would have data.
+    Without the zero for missing data, with which each query would have data.
     """
     for panel in panels():
         for target in panel["targets"]:
@@ -57,7 +57,7 @@ def of_docker(query: str) -> bool:
 
 
 def _families(metrics: CommonMetrics) -> set[str]:
-    """The names of its metrics in queries."""
+    """The names of the metrics in queries."""
     described = metrics.registry.collect()
     return {
         f"{family.name}_total" if family.type == "counter" else family.name for family in described
@@ -65,9 +65,8 @@ def _families(metrics: CommonMetrics) -> set[str]:
 
 
 def relabel_configs(endpoint: Json) -> list[Json]:
-    """The relabelings of a monitor's endpoint, in the names of Prometheus' own file.
-
-    The Prometheus operator hands them on as they are.
+    """The relabelings of a monitor's endpoint, with the names of Prometheus' own file. The
+    Prometheus operator passes relabelings on unchanged.
     """
     names = {"sourceLabels": "source_labels", "targetLabel": "target_label"}
     return [

@@ -62,7 +62,7 @@ def test_described(path: str) -> None:
 
 @pytest.mark.parametrize("path", SPEC)
 def test_bounded(path: str) -> None:
-    """The cost of a validation rule is estimated from the largest value that a field can have."""
+    """The API server estimates the cost of a validation rule from the largest value of a field."""
     field = SPEC[path]
     if "x-kubernetes-int-or-string" in field:
         return
@@ -91,7 +91,7 @@ def test_columns_show_fields() -> None:
 
 
 def with_defaults(value: Any, schema: Json) -> Any:
-    """An object as the API server completes it."""
+    """An object with the defaults of the API server."""
     if not isinstance(value, dict):
         return value
     value = dict(value)
@@ -117,7 +117,7 @@ def with_defaults(value: Any, schema: Json) -> Any:
     ],
 )
 def test_defaults_are_the_operators(spec: Json) -> None:
-    """The operator reads an object the same, whether or not the API server has completed it."""
+    """The operator reads an object without the API server's defaults in the same way."""
     bare = {"metadata": {"name": "a", "namespace": "b", "uid": "c", "generation": 1}, "spec": spec}
     completed = with_defaults(bare, SCHEMA)
     assert completed != bare

@@ -1,4 +1,4 @@
-"""What is made from the chart is as the chart would make it now."""
+"""Generated files are up to date with the chart."""
 
 import itertools
 import re
@@ -118,7 +118,7 @@ def test_example_labels_its_pods() -> None:
 
 @pytest.mark.parametrize("values", [{}, {"namespaces": ["a"]}])
 def test_page_lists_the_rights(values: Json) -> None:
-    """docs/reference/permissions.md has the rules of the roles, each of them and no other."""
+    """docs/reference/permissions.md has exactly the rules of the roles."""
     manifests = objects(values)
     roles = [*of_kind(manifests, "ClusterRole"), *of_kind(manifests, "Role")]
     granted = {
@@ -170,6 +170,6 @@ def test_every_rule_has_a_comment() -> None:
         for before, line in itertools.pairwise(lines):
             if line.strip().startswith("- apiGroups:"):
                 rules += 1
-                # The view of users is explained with their edit.
+                # The comment for users' edit is also for users' view.
                 assert before.strip().startswith("#") or "rules:" in before, (path.name, line)
     assert rules == 17

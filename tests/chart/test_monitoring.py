@@ -1,4 +1,4 @@
-"""Dashboard and alerts: one source, in the chart and beside it; what they name exists."""
+"""Dashboard and alerts: the same source for all places, and all metrics exist."""
 
 import itertools
 import json
@@ -75,7 +75,9 @@ def test_proxies_of_all_namespaces_are_scraped(namespaces: list[str], selector: 
 
 @pytest.mark.parametrize("address", ["127.0.0.7", "::1"])
 def test_a_proxys_targets_all_become_its_admin_endpoint(address: str, tmp_path: Path) -> None:
-    """Its pod declares its hostPorts alone, of which each makes a target: asked of Prometheus."""
+    """A pod declares only its hostPorts, and each gives a target. Prometheus itself
+    relabels here.
+    """
     (monitor,) = of_kind(objects(ALL), "PodMonitor")
     (endpoint,) = monitor["spec"]["podMetricsEndpoints"]
     assert not {"port", "portNumber", "targetPort"} & endpoint.keys()
@@ -196,7 +198,7 @@ FIRING: dict[str, tuple[dict[str, str], str]] = {
         {"rosproxy_operator_certificate_expiry_seconds": "86400x80"}, "61m",
     ),
 }  # fmt: skip
-"""What makes each alert fire, one value a minute, and after which time it does."""
+"""For each alert: series that make the alert fire, with a value a minute, and the time."""
 WELL = {
     'up{job="rosproxy"}': "1x20",
     'up{job="rosproxy-operator"}': "1x20",
@@ -234,7 +236,7 @@ def rule_test(series: dict[str, str], at: str, expected: list[Json]) -> Json:
 
 
 def test_each_alert_fires_when_what_it_names_is_broken(tmp_path: Path) -> None:
-    """And no other one with it; none at all when all is well."""
+    """And no other alert. No alert fires if all is well."""
     assert list(FIRING) == [alert["alert"] for alert in alerts()]
     tests: list[Any] = [rule_test(WELL, "20m", [])]
     for name, (series, at) in FIRING.items():

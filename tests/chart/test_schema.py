@@ -1,4 +1,4 @@
-"""Values that can't be meant are refused, with a message that names them."""
+"""The schema refuses wrong values, with a message that names the value."""
 
 import json
 from collections.abc import Iterable
@@ -143,12 +143,12 @@ def test_values_about_the_options_of_a_proxy_are_the_operators() -> None:
 
 
 def capitalized(words: Iterable[str]) -> list[str]:
-    """Words as Kubernetes writes them."""
+    """Words in the form of Kubernetes."""
     return [word.capitalize() for word in words]
 
 
 def test_every_value_is_in_the_schema() -> None:
-    """And each group refuses what it does not list."""
+    """And each group refuses other keys."""
     schema = json.loads((CHART / "values.schema.json").read_text())
     values = yaml.safe_load((CHART / "values.yaml").read_text())
     assert missing(values, schema) == [".global"]  # shared with the other charts of a parent

@@ -1,4 +1,4 @@
-"""What the chart makes of its values, alone and in combination."""
+"""The objects of the chart for single values and combinations."""
 
 import json
 import re
@@ -60,7 +60,7 @@ def test_lint(option: str, choice: str) -> None:
 
 @pytest.mark.parametrize("combination", THREE)
 def test_objects(combination: str) -> None:
-    """Each combination makes objects that are whole, and none of them twice."""
+    """Each combination makes complete and unique objects."""
     manifests = objects(THREE[combination])
     ids = [(manifest["kind"], manifest["metadata"].get("namespace"), manifest["metadata"]["name"])
            for manifest in manifests]  # fmt: skip
@@ -74,7 +74,7 @@ def test_objects(combination: str) -> None:
 
 
 def check_references(manifests: list[Json], values: Any) -> None:
-    """What names another object names one that is there."""
+    """Check that all references lead to existing objects."""
     (deployment,) = [
         manifest
         for manifest in of_kind(manifests, "Deployment")
@@ -105,7 +105,7 @@ def check_references(manifests: list[Json], values: Any) -> None:
 
 @pytest.mark.parametrize("combination", TWO)
 def test_arguments(combination: str) -> None:
-    """The operator can use its arguments, and they mean what the values say."""
+    """The operator accepts the arguments, which have the meaning of the values."""
     (pod,) = operator(rendered(combination))
     command, *words = pod["containers"][0]["args"]
     context = main.commands[command].make_context(command, words)
@@ -123,7 +123,7 @@ def test_arguments(combination: str) -> None:
 
 
 def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
-    """What RosProxies may ask for, and who may reach their proxies."""
+    """Check bounds of RosProxies, and access to proxies."""
     allow = values.get("allow", {})
     (args,) = (container["args"] for container in pod["containers"])
     tested = [arg.partition("=")[2] for arg in args if re.search("--allow-master=.*-test[.]", arg)]
@@ -251,7 +251,7 @@ def test_operators_have_a_right_to_their_lease_alone() -> None:
     manifests = objects()
     (lease,) = of_kind(manifests, "Lease")
     (pod,) = operator(manifests)
-    assert "spec" not in lease  # so that upgrades leave alone who holds it
+    assert "spec" not in lease  # so that upgrades keep the holder
     name = lease["metadata"]["name"]
     assert f"--lease={NAMESPACE}/{name}" in pod["containers"][0]["args"]
     rules = [rule for role in (*of_kind(manifests, "Role"), *of_kind(manifests, "ClusterRole"))
@@ -340,7 +340,9 @@ def test_the_operator_in_the_network_of_its_node() -> None:
 
 
 def test_secrets_are_empty() -> None:
-    """Helm leaves alone what it has never set: upgrades keep the certificate and the key."""
+    """Helm never changes fields that it did not set, so upgrades keep the certificate and
+    the key.
+    """
     secrets = of_kind(objects(), "Secret")
     assert len(secrets) == 2
     assert not [secret for secret in secrets if {"data", "stringData"} & secret.keys()]
@@ -522,7 +524,7 @@ def test_the_test_runs_where_the_operator_may(values: Json, namespace: str) -> N
 
 
 def test_the_test_without_a_webhook() -> None:
-    """Nobody wires its pod then, so it is wired in its template."""
+    """Without a webhook the template wires the test's pod."""
     manifests = objects(merged(OPTIONS["webhook"]["off"]))
     (echo,) = [manifest for manifest in of_kind(manifests, "Deployment")
                if manifest["metadata"]["name"] == "rosproxy-operator-test-echo"]  # fmt: skip
@@ -535,7 +537,7 @@ def test_the_test_without_a_webhook() -> None:
 
 @pytest.fixture(scope="session")
 def chart_with_notes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The chart with its notes as an object, since helm shows notes only where a cluster is."""
+    """The chart with its notes as an object, because helm shows notes only with a cluster."""
     copy = tmp_path_factory.mktemp("charts") / "rosproxy"
     shutil.copytree(CHART, copy)
     (copy / "templates/NOTES.txt").rename(copy / "notes.txt")

@@ -38,7 +38,9 @@ def pytest_runtest_makereport(
 
 @pytest.fixture(scope="session")
 def make_lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MakeLab]:
-    """Builds the network of a plan, with a master and, but for the direct one, a proxy."""
+    """Builds the network of a plan with a master and a proxy; for the direct plan without a
+    proxy.
+    """
     problem = missing()
     if problem:
         pytest.fail(problem, pytrace=False)

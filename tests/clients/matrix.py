@@ -1,6 +1,6 @@
-"""Which client libraries there are, what each can't do without a proxy either, and the cases.
+"""The client libraries, their limits without a proxy, and the cases.
 
-What LIMITS has is left out of the matrix; test_limits.py shows it without a proxy.
+The matrix leaves out LIMITS. test_limits.py shows each limit without a proxy.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import pytest
 LIBRARIES = ("goroslib", "rosrust", "roslibrust", "rosnodejs", "foxglove", "roslisp")
 PEERS = ("rospy", "roscpp")
 SIDES = {"inside": ("c1", "out"), "outside": ("out", "c1")}
-"""Where the library's node runs, and where its peers do."""
+"""The machine of the library's node, and the machine of its peers."""
 
 SERVE = "serve"
 SERVE_ON = "serve persistently"

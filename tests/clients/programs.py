@@ -1,6 +1,6 @@
-"""The test nodes of other client libraries, as `scripts/install-clients.sh` has built them.
+"""The test nodes of other client libraries, built by `scripts/install-clients.sh`.
 
-All take the arguments of tests/ros/nodes/node.py, and print the same lines.
+All programs take the arguments of tests/ros/nodes/node.py, and print the same lines.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ ROSNODEJS = (
     "CMAKE_PREFIX_PATH=/usr",
     f"ROS_PACKAGE_PATH={':'.join(f'/usr/share/{name}' for name in _PACKAGES)}",
 )
-"""It makes its messages when it starts, of what it finds there."""
+"""rosnodejs generates messages at its start from these definitions."""
 
 
 def programs() -> dict[str, tuple[str, ...]]:
@@ -33,7 +33,7 @@ def programs() -> dict[str, tuple[str, ...]]:
 
 
 def missing() -> str | None:
-    """What stops this layer from running and the command that mends it, or nothing."""
+    """The obstacle for this layer with the command against it, or None."""
     gone = [name for name, words in programs().items() if not Path(words[-1]).exists()]
     if gone:
         return f"no nodes of {', '.join(gone)}: run `scripts/install-clients.sh` as root"

@@ -1,4 +1,4 @@
-"""Nodes of each library, and their peers, end, are killed and come back, as without the proxy."""
+"""Nodes of each library and their peers end, are killed and come back, as without a proxy."""
 
 from __future__ import annotations
 

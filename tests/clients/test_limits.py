@@ -14,7 +14,7 @@ NO_SUCH_CALL = [
 ]
 """The library has nothing by which a program could do this."""
 ONE_CALL_FOR_EACH_CONNECTION = ["rosrust", "roslisp"]
-"""Their servers don't heed that a client asks for a persistent connection."""
+"""Servers of these libraries ignore a request for a persistent connection."""
 
 
 @pytest.mark.parametrize(("library", "role"), NO_SUCH_CALL)

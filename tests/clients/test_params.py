@@ -1,4 +1,4 @@
-"""Parameters keep their values between each library and the other side."""
+"""Parameters keep values between each library and the other side."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tests.clients.matrix import PARAMETERS, each_client
 from tests.ros.lab import Lab
 
 VALUES = (-42, 0.5, True, "two words")
-"""Of the types that all of them have. goroslib does not escape what XML has to have escaped."""
+"""Values of types that all libraries have. goroslib does not escape special characters of XML."""
 
 
 @each_client(PARAMETERS)

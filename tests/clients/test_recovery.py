@@ -22,9 +22,8 @@ def is_new(node: EndpointStatus) -> bool:
 
 
 def restart_proxy(lab: Lab) -> None:
-    """Kill the proxy and start it again, once it has asked all nodes what they are.
-
-    A roslisp node ends if its caller dies before the node has answered, and a new node is asked.
+    """Kill and restart the proxy, once the proxy has asked all nodes. A roslisp node ends if its
+    caller dies before the node has answered, and the proxy asks each new node.
     """
     assert lab.proxy is not None
     wait_until("all nodes have answered", lambda: not any(is_new(node) for node in nodes_of(lab)))
@@ -41,7 +40,7 @@ def wait_until_a_dead_node_is_unregistered(lab: Lab) -> None:
 
 
 def test_nodes_that_live_stay_registered(lab: Lab) -> None:
-    """The proxy asks each of them again and again what it has, and they differ in what they say."""
+    """The proxy asks each node again and again, and the libraries answer differently."""
     kinds = {"pub": LIBRARIES, "sub": LIBRARIES, "serve": able(SERVE)}
     names = {f"{kind}_{library}": (kind, library) for kind in kinds for library in kinds[kind]}
     for name, (kind, library) in names.items():
@@ -49,7 +48,7 @@ def test_nodes_that_live_stay_registered(lab: Lab) -> None:
         lab.node(library, "c1", kind, name=name, **endpoint).wait_for("^ready")
 
     def state() -> set[str]:
-        """What is registered of each node, apart from what all have."""
+        """The registrations of each node, without the registrations of all nodes."""
         return {item for table in lab.ask_master("getSystemState") for item, _ in table} & wanted
 
     wanted = {f"/{name}/{kind}" for name, (kind, _) in names.items()}
@@ -63,7 +62,7 @@ def test_nodes_that_live_stay_registered(lab: Lab) -> None:
 
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_a_node_that_was_paused_goes_on(lab: Lab, library: str) -> None:
-    """It finds what it was asked meanwhile; roslisp ends if whoever asked has gone."""
+    """The node finds the calls of the meantime. A roslisp node ends if the caller has gone."""
     topic = f"/{lab.unique('paused')}"
     node = lab.node(library, "c1", "pub", topic=topic)
     receivers = [lab.node(peer, "out", "sub", topic=topic) for peer in PEERS]

@@ -11,7 +11,7 @@ PERSISTENT = CALLS | {"persistent": 1}
 
 
 def check(caller: Process, server: Process) -> None:
-    """Every call has reached this server, and got its answer."""
+    """Check that each call has reached this server, and got the answer."""
     for reply in caller.wait_for_count(r"^reply (ask \d+ size \d+ crc \w+)", 5):
         server.wait_for(f"^request {reply[1]} ")
 

@@ -1,6 +1,6 @@
-"""The images by themselves, and as people start them by hand: without an operator.
+"""The images alone, and started by hand, without an operator.
 
-Engine, images and robots are those of `tests.docker`; both layers may run at the same time.
+Engine, images and robots come from `tests.docker`. Both layers may run at the same time.
 """
 
 from tests.docker.conftest import (

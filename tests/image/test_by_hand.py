@@ -1,7 +1,5 @@
-"""The examples with a proxy declared by hand, started as their READMEs say, with real nodes.
-
-The robot cannot reach any container: whatever crosses goes through the proxy's
-published ports.
+"""The examples with a proxy declared by hand, started as in the READMEs, with real nodes. The robot
+cannot reach any container, so all traffic goes through the proxy's published ports.
 """
 
 import json
@@ -65,7 +63,7 @@ def inside(robot: Robot, proxy_image: str, ros_image: str) -> Iterator[Inside]:
 
 
 def nodes(robot: Robot) -> dict[str, str]:
-    """Every node that the master knows, with the address it is known by."""
+    """The URI of each node at the master."""
     lines = robot.run("rosnode", "list", "--all").splitlines()
     return {name.strip(): uri.strip() for uri, name in (line.split("\t") for line in lines)}
 
@@ -131,7 +129,7 @@ def test_stopping_the_example_leaves_no_entry_behind(robot: Robot, inside: Insid
 
 
 def test_example_with_the_kernel(robot: Robot, proxy_image: str, ros_image: str) -> None:
-    """After all others: it has the same ports."""
+    """The last test, because this example has the same ports as the others."""
     with example(Inside(KERNEL, proxy_image, ros_image)) as inside:
         assert robot.run("rostopic", "echo", "-n", "3", "/chatter").count("from inside") == 3
         assert counted(inside) > 0

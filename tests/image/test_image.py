@@ -1,4 +1,4 @@
-"""The proxy's image by itself: its user, its rights, its health, its size."""
+"""The proxy's image alone: user, rights, health, size."""
 
 import re
 
@@ -7,7 +7,7 @@ import pytest
 from tests.docker.engine import docker, inspect, logs, wait_until
 
 HARDENED = ("--read-only", "--cap-drop", "ALL", "--security-opt", "no-new-privileges")
-# Nothing listens there: a proxy is healthy and waits while its master is away.
+# No master listens there. A proxy without a master is healthy and waits.
 SETTINGS = ("--env", "ROS_MASTER_URI=http://127.0.0.1:9", "--env", "ROSPROXY_ADVERTISE_HOST=host")
 
 
@@ -77,9 +77,9 @@ def test_writes_no_file(proxy_image: str, container_name: str) -> None:
 
 def test_stops_at_once_and_cleanly(proxy_image: str, container_name: str) -> None:
     start(proxy_image, container_name)
-    wait_until(lambda: "listening: " in logs(container_name), 60, "it logs that it is ready")
+    wait_until(lambda: "listening: " in logs(container_name), 60, "the proxy is ready")
 
-    docker("stop", "--time", "50", container_name)  # afterwards it would be killed: 137
+    docker("stop", "--time", "50", container_name)  # after 50 s: killed, code 137
 
     assert inspect(container_name)["State"]["ExitCode"] == 0, logs(container_name)
 

@@ -20,7 +20,7 @@ from tests.zenoh.lab import ENVIRONMENTS, PLAN, VERSIONS, Lab  # noqa: E402
 
 
 def missing() -> str | None:
-    """What stops this layer from running and the command that mends it, or nothing."""
+    """The obstacle for this layer with the command against it, or None."""
     gone = [name for name in ("ip", "nft", "unshare", "sysctl") if shutil.which(name) is None]
     gone += [version for version in VERSIONS if not (ENVIRONMENTS / version / "pins").exists()]
     if gone:
@@ -50,7 +50,7 @@ def pytest_runtest_makereport(
 
 @pytest.fixture(scope="module")
 def topology() -> Iterator[Topology]:
-    """The machines of a module; they go at its end."""
+    """The machines of a module, removed at the end."""
     remove_leftovers()
     topology = Topology(PLAN)
     try:

@@ -52,7 +52,7 @@ class Lab:
         return f"{stem}_{next(self._numbers)}"
 
     def start_proxy(self, *options: str, with_robot: bool = True) -> None:
-        """Start the proxy and wait until it listens."""
+        """Start the proxy and wait until ready."""
         argv = [sys.executable, "-m", "rosproxy", "run", "--ros", "zenoh"]
         argv += ["--zenoh-ports", f"{min(PORTS.values())}-{max(PORTS.values())}"]
         argv += ["--zenoh-peer", self.topology.plan.robot] if with_robot else []
@@ -78,7 +78,9 @@ class Lab:
     def node(
         self, version: str, role: str, kind: str, topic: str = "chatter", **environment: str
     ) -> Process:
-        """Start a node, whose name is the title; in a container without a redirect a client."""
+        """Start a node with its name as the title. In a container without a redirect, the node is a
+        client.
+        """
         name = self.unique(kind)
         if not environment and role != "out" and not self.is_redirected(role):
             environment = self.as_client()
@@ -121,7 +123,7 @@ class Lab:
                 return parse_status(asking.getresponse().read())
 
     def zenoh(self) -> ZenohStatus:
-        """What the proxy tells of its routers."""
+        """The status of the proxy's routers."""
         zenoh = self.status().zenoh
         assert zenoh is not None
         return zenoh

@@ -43,7 +43,7 @@ class Watched:
         wait_until("the graph is complete", lambda: self.sees(self.server), timeout)
 
     def sees(self, node: Process) -> bool:
-        """Whether the last change of a node in the graph is that it is there."""
+        """Whether the node has appeared in its last change in the graph."""
         lines = [line for line in self.graph.output().splitlines() if line.endswith(node.title)]
         return bool(lines) and lines[-1].startswith("seen ")
 

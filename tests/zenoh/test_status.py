@@ -31,7 +31,7 @@ def test_nodes_outside_are_told_with_their_topics(lab: Lab) -> None:
     lab.wait_for_link()
     publisher = lab.node(VERSION, "out", "pub")
     wait_until("the node is known", lambda: lab.zenoh().nodes, 30)
-    wait_until("its topic is known", lambda: lab.zenoh().nodes[0].publishes, 30)
+    wait_until("the topic is known", lambda: lab.zenoh().nodes[0].publishes, 30)
     (node,) = lab.zenoh().nodes
     assert (node.name, node.address) == (f"/{publisher.title}", "")
     assert node.publishes == ("/chatter",)

@@ -1,7 +1,7 @@
-"""A stand-in for a node of rmw_zenoh: its session, its keys and its liveliness tokens.
+"""A replacement for a node of rmw_zenoh: session, keys and liveliness tokens.
 
 `python node.py KIND NAME TOPIC`, where KIND is pub, sub, serve, call or graph. Prints a line for
-each thing that happens, and runs until it is ended.
+each event, and runs until killed.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Sessions with the defaults of rmw_zenoh 0.6: those of its nodes, and that of its router.
+"""Sessions with the defaults of rmw_zenoh 0.6, for nodes and for the router.
 
 The values are of DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5 and DEFAULT_RMW_ZENOH_ROUTER_CONFIG.json5.
 ZENOH_CONFIG_OVERRIDE has the syntax of rmw_zenoh.
@@ -39,7 +39,7 @@ ROUTER = {
 
 
 def open_session(own: dict[str, str]) -> Any:
-    """A session with these values, and those of ZENOH_CONFIG_OVERRIDE."""
+    """Open a session with these values and the values of ZENOH_CONFIG_OVERRIDE."""
     # The library's threads may hold up the end of Python.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     zenoh.init_log_from_env_or("error")
