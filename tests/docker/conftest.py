@@ -19,7 +19,7 @@ from tests.docker.ros2 import Inside2, Outside, machine_on_lan
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Show with a failure what the proxies have logged and what they know."""
+    """Add the logs and the status of all proxies to a failure."""
     report = yield
     if report.failed and report.when == "call":
         for proxy in proxies(check=False):
@@ -90,7 +90,7 @@ def robot(ros_image: str) -> Iterator[Robot]:
 
 @pytest.fixture(scope="session")
 def named(ros_image: str) -> Iterator[Robot]:
-    """The same, but it calls itself ``robot``: nobody inside can resolve that by himself."""
+    """A robot with the host name ``robot``, which inside cannot resolve without the proxy."""
     with named_robot(ros_image) as robot:
         robot.start_master()
         yield robot
@@ -111,14 +111,14 @@ def lan(ros2_image: str) -> Iterator[Outside]:
 
 @pytest.fixture
 def inside2(ros2_image: str) -> Iterator[Inside2]:
-    """Where the nodes of ROS 2 inside live; all that a test makes there is removed after it."""
+    """Networks and containers for ROS 2 nodes inside, removed after the test."""
     with inside(ros2_image, "") as made:
         yield Inside2(made)
 
 
 @pytest.fixture(scope="session")
 def _no_other_controller(_engine: None) -> None:
-    """Where all proxies have the tests' image, a killed run has left them: they are taken away."""
+    """If all proxies have the tests' image, remove these remainders of a killed run."""
     if {proxy.image for proxy in proxies()} == {images.PROXY}:
         remove_proxies()
     proxy_names = [proxy.name for proxy in proxies()]
@@ -131,7 +131,7 @@ def _no_other_controller(_engine: None) -> None:
 def start_controller(
     controller_image: str, proxy_image: str, named: Robot, _no_other_controller: None
 ) -> Iterator[Callable[..., Controller]]:
-    """Starts a controller with options of its own; it and its proxies are removed afterwards."""
+    """Starts a controller with its own options. Controller and proxies are removed afterwards."""
     with ExitStack() as stack:
         stack.callback(remove_proxies)
         names = {named.name: named.address}
@@ -152,7 +152,7 @@ def controller(
     controller_image: str, proxy_image: str, named: Robot, _no_other_controller: None,
     request: pytest.FixtureRequest,
 ) -> Iterator[Controller]:  # fmt: skip
-    """A controller for all tests of a module: the usual options, and those in its `OPTIONS`."""
+    """A controller for all tests of a module, with the usual options and the module's `OPTIONS`."""
     names = {named.name: named.address}
     options = getattr(request.module, "OPTIONS", ())
     try:
@@ -166,21 +166,21 @@ def controller(
 
 @pytest.fixture
 def net(ros_image: str, named: Robot) -> Iterator[Inside]:
-    """Where the nodes inside live; all that a test makes there is removed after it."""
+    """Networks and containers for nodes inside, removed after the test."""
     with inside(ros_image, named.master_uri) as made:
         yield made
 
 
 @pytest.fixture
 def near(ros_image: str, robot: Robot) -> Iterator[Inside]:
-    """Where nodes live whose ROS_MASTER_URI has the robot's address."""
+    """Networks and containers for nodes with the robot's address in ROS_MASTER_URI."""
     with inside(ros_image, robot.master_uri) as made:
         yield made
 
 
 @pytest.fixture
 def container_name() -> Iterator[str]:
-    """A name for one container, which is removed afterwards."""
+    """A name for a container, which is removed afterwards."""
     name = f"rosproxy-test-{os.getpid()}"
     yield name
     docker("rm", "--force", name, check=False)

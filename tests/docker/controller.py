@@ -1,4 +1,4 @@
-"""The controller: as a container, as users run it, or as a process that can be killed at will."""
+"""The controller, in a container like users run it, or as a process that tests can kill."""
 
 import json
 import os
@@ -26,7 +26,7 @@ HARDENED = ("--read-only", "--cap-drop", "ALL", "--security-opt", "no-new-privil
 
 @dataclass(frozen=True)
 class Proxy:
-    """A proxy that a controller has made: a container, and another that holds its network."""
+    """A proxy of a controller: the proxy's container, and a sandbox."""
 
     name: str
 
@@ -36,17 +36,17 @@ class Proxy:
 
     @property
     def lan_relay(self) -> str:
-        """The container that hears the LAN for it, if it is for ROS 2."""
+        """The container of the LAN relay, for ROS 2."""
         return f"{self.name}-lan-relay"
 
     @property
     def id(self) -> str:
-        """Its id; empty while there is none."""
+        """The id of the container; empty if missing."""
         return str(inspect(self.name, check=False).get("Id", ""))
 
     @property
     def image(self) -> str:
-        """The image it was made of, as it was named."""
+        """The name of the image."""
         inspection = inspect(self.name, check=False) or inspect(self.sandbox, check=False)
         return str(inspection["Config"]["Image"]) if inspection else ""
 
@@ -57,7 +57,7 @@ class Proxy:
 
     @property
     def running(self) -> bool:
-        """Whether both run, the one in the network of the other."""
+        """Whether both containers run, and the proxy is in the sandbox's network."""
         inspections = [inspect(name, check=False) for name in (self.name, self.sandbox)]
         if not all(
             inspection and inspection["State"]["Running"] and not inspection["State"]["Paused"]
@@ -80,7 +80,7 @@ class Proxy:
         }
 
     def flowing(self) -> set[str]:
-        """Of which topics and services something has gone out through it, on connections it has."""
+        """Topics and services with sent bytes on open connections of the proxy."""
         status = json.loads(docker("exec", self.name, "rosproxy", "status", "--json", check=False))
         links = [link for node in status["nodes"] for link in node["connections"]]
         return {link["name"] for link in links if link["sent"]}
@@ -98,14 +98,16 @@ def managed(role: str, *, check: bool = True) -> list[str]:
 
 
 def proxies(*, check: bool = True) -> list[Proxy]:
-    """All proxies on this engine, also those of which only one container is there."""
+    """All proxies on this engine, also with a missing container."""
     boxes = (name.removesuffix("-ports") for name in managed("ports", check=check))
     names = {*managed("proxy", check=check), *boxes}
     return [Proxy(name) for name in sorted(names)]
 
 
 def published_ranges() -> list[range]:
-    """The ranges of all proxies in one look: one that is being replaced can't be inspected."""
+    """The ranges of all proxies by a single call: a proxy that is being replaced cannot be
+    inspected.
+    """
     listed = containers(MANAGED, "io.rosproxy.role=ports")
     ranges = (container["Labels"]["io.rosproxy.range"] for container in listed)
     ends = [tuple(map(int, text.split("-"))) for text in ranges]
@@ -113,7 +115,7 @@ def published_ranges() -> list[range]:
 
 
 def the_proxy(seconds: float = 30) -> Proxy:
-    """Wait for a single proxy that runs, and return it."""
+    """Wait until a single proxy runs. Return the proxy."""
     wait_until(
         lambda: [proxy.running for proxy in proxies()] == [True],
         seconds, lambda: docker("ps", "--all"),
@@ -141,7 +143,9 @@ class Controller:
         return logs(self.container)
 
     def command(self, *words: str, check: bool = True) -> str:
-        """Have another command in its container ask the controller, which has the options."""
+        """Run a command in the container. The command asks the controller, which has the
+        options.
+        """
         return docker("exec", self.container, "rosproxy-operator", "docker", *words, check=check)
 
     def status(self) -> dict[str, Any]:
@@ -164,9 +168,8 @@ class Controller:
 def running_controller(
     image: str, *options: str, names: Mapping[str, str], container: str = ""
 ) -> Iterator[Controller]:
-    """A controller as examples/docker/compose.yaml has it; later options win.
-
-    ``names`` are entries of its hosts file.
+    """A controller as in examples/docker/compose.yaml. Later options win. ``names`` are entries of
+    the hosts file.
     """
     container = container or f"rosproxy-test-controller-{os.getpid()}"
     every = (*OPTIONS, *options)
@@ -186,7 +189,7 @@ def running_controller(
 
 
 class Process:
-    """A controller that runs outside any container, with names of its own."""
+    """A controller outside of containers, with its own hosts file."""
 
     def __init__(
         self, directory: Path, *options: str, names: Mapping[str, str] | None = None,
@@ -217,7 +220,7 @@ class Process:
             )
 
     def once(self, *words: str, check: bool = True, seconds: float = 120) -> str:
-        """Run it to its end: --once, plan or status."""
+        """Run until the end: --once, plan or status."""
         environment = {**os.environ, **self.environment}
         self.process = subprocess.Popen(
             self._command(*words), stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -229,12 +232,12 @@ class Process:
         return text
 
     def send(self, number: int) -> None:
-        """Send it a signal."""
+        """Send a signal to the process."""
         assert self.process is not None
         self.process.send_signal(number)
 
     def kill(self, number: int = signal.SIGKILL) -> int:
-        """Send it a signal and wait for its end; return its exit status."""
+        """Send a signal and wait for the end. Return the exit status."""
         self.send(number)
         assert self.process is not None
         return self.process.wait(30)

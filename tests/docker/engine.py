@@ -1,4 +1,4 @@
-"""The Docker engine that the tests use: by its command line, and what is asked often by its API."""
+"""The Docker engine of the tests: by command line, and by API for frequent questions."""
 
 import contextlib
 import fcntl
@@ -22,12 +22,12 @@ ROOT = Path(__file__).resolve().parents[2]
 _USERS = Path("/run/lock/rosproxy-tests-engine")
 _DOOR = Path("/run/lock/rosproxy-tests-engine-door")
 _STARTED = Path("/run/lock/rosproxy-tests-engine-started")
-"""The process of the engine that was started here, and the policy for forwarding before it."""
+"""The process of an engine that the tests started, and the former policy for forwarding."""
 _PID = Path("/run/docker.pid")
 
 
 def run(*command: str | Path, check: bool = True, seconds: float = 60, **options: Any) -> str:
-    """Run a command, return what it prints, show all of it when it fails."""
+    """Run a command and return the output. A failure shows the whole output."""
     done = subprocess.run(
         [str(argument) for argument in command],
         stdout=subprocess.PIPE,
@@ -54,9 +54,8 @@ def docker(
 def pause(container: str) -> None:
     """Pause a container.
 
-    With version 1 of control groups runc tries to freeze a container for a moment and then gives
-    up, "a game of chances" in its authors' words (opencontainers/runc#2791): on a busy machine it
-    takes several calls.
+    With version 1 of control groups runc tries to freeze a container only for a moment, "a game of
+    chances" (opencontainers/runc#2791). So pausing may take several calls on a busy machine.
     """
 
     def paused() -> bool:
@@ -79,7 +78,7 @@ def _api(url: str) -> APIClient:
 
 
 def inspect(name: str, *, check: bool = True) -> dict[str, Any]:
-    """Everything that the engine knows about a container or an image; empty if it knows none."""
+    """The engine's inspection of a container or an image; empty if unknown."""
     try:
         api = _api(engine_url())
         try:
@@ -94,7 +93,7 @@ def inspect(name: str, *, check: bool = True) -> dict[str, Any]:
 
 
 def containers(*labels: str, check: bool = True) -> list[dict[str, Any]]:
-    """All containers with these labels, in whatever state, as the engine lists them."""
+    """The engine's list of all containers with these labels, in any state."""
     try:
         listed = _api(engine_url()).containers(all=True, filters={"label": list(labels)})
     except (DockerException, RequestException) as error:
@@ -105,7 +104,7 @@ def containers(*labels: str, check: bool = True) -> list[dict[str, Any]]:
 
 
 def logs(name: str) -> str:
-    """What a container has printed; why it can't be said if the engine does not tell."""
+    """The output of a container, or the engine's error."""
     try:
         return bytes(_api(engine_url()).logs(name)).decode(errors="replace").strip()
     except (DockerException, RequestException) as error:
@@ -115,9 +114,8 @@ def logs(name: str) -> str:
 def wait_until(
     condition: Callable[[], bool], seconds: float, message: str | Callable[[], str]
 ) -> float:
-    """Wait for something to come true; return the seconds it took.
-
-    Who has waited long is asked less often: many questions are a program to start.
+    """Wait for a condition. Return the seconds. The intervals grow, because many conditions start a
+    program.
     """
     started = time.monotonic()
     while not condition():
@@ -136,11 +134,11 @@ def answers() -> bool:
 
 @contextmanager
 def running_engine(log: Path) -> Iterator[None]:
-    """Use the engine that runs; start one where none does.
+    """Use the running engine, or start an engine.
 
-    Several processes may be in here at the same time: each holds a shared lock as long as it uses
-    the engine. The last one to leave stops it, if it is one that was started here; who comes
-    meanwhile waits at the door, and starts one of its own.
+    Several processes may use the engine at the same time, each with a shared lock. The last process
+    stops the engine if the tests started this engine. A process that comes meanwhile waits at the
+    door, and starts a new engine.
     """
     with _DOOR.open("w") as door, _USERS.open("w") as users:
         fcntl.flock(door, fcntl.LOCK_EX)
@@ -153,22 +151,22 @@ def running_engine(log: Path) -> Iterator[None]:
         finally:
             fcntl.flock(users, fcntl.LOCK_UN)
             fcntl.flock(door, fcntl.LOCK_EX)
-            with contextlib.suppress(BlockingIOError):  # others use it
+            with contextlib.suppress(BlockingIOError):  # other users
                 fcntl.flock(users, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 _stop_engine()
 
 
 def _start_engine(log: Path) -> None:
-    """Start an engine that outlives this process, and wait until it answers."""
+    """Start an engine that outlives this process, and wait for answers."""
     policy = forward_policy()
-    # Memory for time: fewer garbage collections, in its containerd as well.
+    # Memory for time: fewer garbage collections, in containerd as well.
     run("setsid", "--fork", "sh", "-c", 'exec env GOGC=400 dockerd >"$0" 2>&1', log)
     wait_until(answers, 60, log.read_text)
     _STARTED.write_text(f"{_PID.read_text().strip()} {policy}")
 
 
 def _stop_engine() -> None:
-    """Stop the engine, if it is one that was started here."""
+    """Stop the engine if the tests started this engine."""
     if not _STARTED.exists():
         return
     number, policy = _STARTED.read_text().split()
@@ -181,7 +179,7 @@ def _stop_engine() -> None:
 
 
 def _runs(process: str) -> bool:
-    """Whether a process is there, and has not ended without anybody asking how."""
+    """Whether a process runs and is no zombie."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -201,7 +199,7 @@ def build(tag: str, *arguments: str | Path) -> str:
 
 
 def compose_command() -> list[str]:
-    """Compose as this machine has it: the plug-in, or the program of its first version."""
+    """The command of Compose on this machine: the plug-in, or the program of version 1."""
     if subprocess.run(
         ["docker", "compose", "version"], capture_output=True, check=False
     ).returncode:
@@ -210,6 +208,6 @@ def compose_command() -> list[str]:
 
 
 def compose(project: Path, *arguments: str, variables: dict[str, str]) -> str:
-    """Run Compose on the example in a directory, with these variables in its environment."""
+    """Run Compose on the example in a directory, with these environment variables."""
     command = [*compose_command(), "--project-name", "rosproxy-test", *arguments]
     return run(*command, cwd=project, env={**os.environ, **variables}, seconds=120)

@@ -2,8 +2,8 @@
 
     python -m tests.docker.images
 
-builds those that nearly all tests need, while other things go on. Tests build them anew: Docker
-knows what has not changed.
+builds the images of nearly all tests in advance. Tests build again, from Docker's cache if nothing
+has changed.
 """
 
 import hashlib
@@ -38,14 +38,14 @@ def base_image() -> str:
 
 
 def build_image(name: str) -> str:
-    """Build one of the images above; its name."""
+    """Build an image by name. Return the name."""
     recipes: dict[str, tuple[str | Path, ...]] = {
-        # As a user builds them, on the base that is at hand.
+        # Like a user's build, on the base of this machine.
         PROXY: ("--target", "proxy", ROOT),
         OPERATOR: ("--target", "operator", ROOT),
-        # A machine with ROS 1 on it.
+        # A machine with ROS 1.
         ROS: ("--file", _HERE / "ros.Dockerfile", ROOT / "tests/ros/nodes"),
-        # One with ROS 2, of two distributions, and with Cyclone DDS.
+        # A machine with two distributions of ROS 2 and Cyclone DDS.
         ROS2: ("--file", _HERE / "ros2.Dockerfile", ROOT / "tests/ros2"),
         # One with sessions of zenoh, as rmw_zenoh has them.
         ZENOH: ("--file", _HERE / "zenoh.Dockerfile", ROOT / "tests/zenoh"),
@@ -69,7 +69,7 @@ def main() -> None:
     with running_engine(log), ThreadPoolExecutor() as pool:
         base_image()
         robots = [pool.submit(build_image, name) for name in (ROS, ROS2)]
-        for name in (PROXY, OPERATOR):  # which have their first steps in common
+        for name in (PROXY, OPERATOR):  # these share the first steps
             build_image(name)
         for robot in robots:
             robot.result()

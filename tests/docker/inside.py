@@ -24,7 +24,7 @@ def unique(kind: str) -> str:
 
 @dataclass
 class Inside:
-    """Makes networks and containers, and removes them in the end."""
+    """Makes networks and containers, removed at the end."""
 
     image: str
     master_uri: str
@@ -51,7 +51,7 @@ class Inside:
         return Container(name)
 
     def node(self, network: str, library: str, role: str, *words: str, **more: Any) -> "Container":
-        """Start one of the test nodes in a container; both have the same name."""
+        """Start a test node in a container. Both have the same name."""
         name = more.setdefault("name", unique(role))
         return self.run(
             network, *node_command(library, role, *words, f"__name:={Container(name).node}"), **more
@@ -68,7 +68,7 @@ class Container:
 
     @property
     def node(self) -> str:
-        """The ROS name of the test node in it."""
+        """The ROS name of the test node in this container."""
         return self.name.replace("-", "_")
 
     @property
@@ -101,7 +101,7 @@ class Container:
 
 @contextmanager
 def inside(image: str, master_uri: str) -> Iterator[Inside]:
-    """What is made in it is gone afterwards."""
+    """An `Inside`. Everything made there is removed afterwards."""
     made = Inside(image, master_uri)
     try:
         yield made
@@ -121,7 +121,7 @@ def remove_marked(mark: str = MARK) -> None:
 
 
 def remove_leftovers() -> None:
-    """Remove what runs have made whose process is gone, killed before it could."""
+    """Remove containers and networks of killed test runs."""
     labels = docker("ps", "--all", "--format", f'{{{{.Label "{_LABEL}"}}}}').split()
     labels += docker("network", "ls", "--format", f'{{{{.Label "{_LABEL}"}}}}').split()
     for pid in set(labels):

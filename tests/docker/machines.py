@@ -1,7 +1,7 @@
-"""Machines outside: each in a network namespace of its own, one cable away from this host.
+"""Machines outside: each in a separate network namespace, with a cable to this host.
 
-Each is a container without any network, which then gets one end of a veth pair. Its only
-route is the cable: this host's published ports are in reach, container networks are not.
+Each machine is a container without a network, which then gets an end of a veth pair. The cable is
+the only route: the machine reaches this host's published ports, but no container networks.
 """
 
 import os
@@ -16,10 +16,9 @@ from tests.docker.nodes import Log, node_command
 
 @dataclass(frozen=True)
 class Machine:
-    """``address`` is its own, ``host_address`` this host's at the other end of the cable.
-
-    ``engine`` is where it runs, which need not be where the nodes inside do; ``root`` leads to its
-    files from here.
+    """A machine at ``address``. ``host_address`` is this host at the other end of the cable.
+    ``engine`` runs the machine, and may differ from the engine of the nodes inside. ``root`` is the
+    path to the machine's files from here.
     """
 
     container: str
@@ -29,7 +28,7 @@ class Machine:
     root: Path
 
     def run(self, *command: str, seconds: float = 30, check: bool = True) -> str:
-        """Run a program; one that hangs is stopped and fails the test."""
+        """Run a program. A hanging program is stopped and fails the test."""
         return docker(
             "exec", self.container, "timeout", str(seconds), *command,
             check=check, seconds=seconds + 10, engine=self.engine,
@@ -39,9 +38,9 @@ class Machine:
         docker("exec", "--detach", self.container, *command, engine=self.engine)
 
     def node(self, name: str, library: str, role: str, *options: str) -> Log:
-        """Start a test node; what it prints goes to a file."""
+        """Start a test node with its output in a file."""
         file = f"/tmp/{name}.log"
-        # What a node of that name in another test has printed must not be taken for this one's.
+        # Remove the output of a node with this name in another test.
         (self.root / file.lstrip("/")).unlink(missing_ok=True)
         command = node_command(library, role, *options, f"__name:={name}")
         self.start("sh", "-c", f"echo $$ >/tmp/{name}.pid; exec {' '.join(command)} >{file} 2>&1")
@@ -63,7 +62,7 @@ class Machine:
 def machine(
     image: str, name: str, number: int, *options: str, namespace: str = ""
 ) -> Iterator[Machine]:
-    """A machine whose addresses are made of a number, beside this host or a network namespace."""
+    """A machine with addresses from a number, beside this host or a network namespace."""
     container = f"rosproxy-test-{name}-{os.getpid()}"
     host_address, address = addresses(number)
     engine = engine_url()
@@ -107,7 +106,7 @@ def plug(container: str, number: int, namespace: str = "") -> None:
 
 
 def join(first: Machine, second: Machine) -> None:
-    """Lay a cable between two machines, so that they reach each other by their addresses."""
+    """Lay a cable between two machines, so that each reaches the other's address."""
     pids = [str(inspect(machine.container)["State"]["Pid"]) for machine in (first, second)]
     ends = [("nsenter", "--target", pid, "--net") for pid in pids]
     run(*ends[0], "ip", "link", "add", "eth1", "type", "veth", "peer", "name", "eth1",
@@ -118,7 +117,7 @@ def join(first: Machine, second: Machine) -> None:
 
 
 def reach(source: Machine, address: str) -> None:
-    """Let a machine reach another of this host's addresses by its cable."""
+    """Add a route from a machine to another address of this host, over the cable."""
     pid = str(inspect(source.container)["State"]["Pid"])
     run("nsenter", "--target", pid, "--net", "ip", "route", "add", address, "via",
         source.host_address)  # fmt: skip

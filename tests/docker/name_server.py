@@ -1,4 +1,4 @@
-"""A name server that knows a few names, as a home or company network has one."""
+"""A name server that knows a few names, like that of a home or company network."""
 
 import contextlib
 import socket
@@ -34,7 +34,7 @@ def _serve(server: socket.socket, names: Mapping[str, str], done: threading.Even
 
 
 def reply(query: bytes, names: Mapping[str, str]) -> bytes:
-    """The answer to a query for one name."""
+    """The answer to a query for a name."""
     name, end = question(query)
     kind = struct.unpack(">H", query[end : end + 2])[0]
     address = names.get(name.lower(), "")
@@ -46,7 +46,7 @@ def reply(query: bytes, names: Mapping[str, str]) -> bytes:
 
 
 def question(query: bytes) -> tuple[str, int]:
-    """The name asked for, and where it ends."""
+    """The name in a query, and the offset of its end."""
     labels = []
     at = 12
     while length := query[at]:

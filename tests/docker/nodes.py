@@ -1,4 +1,4 @@
-"""The test nodes of tests/ros and tests/ros2, in containers and on machines, what they print."""
+"""The test nodes of tests/ros and tests/ros2, in containers and on machines, and their output."""
 
 import itertools
 import re
@@ -34,7 +34,7 @@ class Log:
     read: Callable[[], str]
 
     def got(self, text: str = "", verb: str = "got") -> list[Got]:
-        """The messages with that word that it has received, or sent."""
+        """The received, or sent, messages with this word."""
         messages = (Got(m[2], int(m[3]), float(m[4])) for m in _GOT.finditer(self.read())
                  if m[1] == verb)  # fmt: skip
         return [got for got in messages if not text or got.text == text]
@@ -42,7 +42,9 @@ class Log:
     def wait_for(
         self, text: str, count: int = 3, seconds: float = 60, since: float = 0, verb: str = "got"
     ) -> float:
-        """Wait until it has received that many with a word; return when the first came."""
+        """Wait until the node has received ``count`` messages with a word. Return the time of the
+        first.
+        """
 
         def fresh() -> list[Got]:
             return [got for got in self.got(text, verb) if got.at >= since]
@@ -54,7 +56,7 @@ class Log:
         return fresh()[0].at
 
     def lost(self, text: str, since: float) -> int:
-        """How many messages are missing between those received since then."""
+        """The number of missing messages between the received messages since then."""
         numbers = {got.number for got in self.got(text) if got.at >= since}
         return max(numbers) - min(numbers) + 1 - len(numbers)
 

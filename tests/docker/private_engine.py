@@ -1,4 +1,4 @@
-"""An engine of the tests' own, in a network namespace of its own, that may be restarted."""
+"""A private engine in a separate network namespace, which tests may restart."""
 
 import contextlib
 import os
@@ -12,7 +12,7 @@ from tests.docker.engine import docker, run, wait_until
 
 
 class PrivateEngine:
-    """Its containers and networks are apart from those of this machine's engine."""
+    """An engine with separate containers and networks."""
 
     def __init__(self, directory: Path) -> None:
         self.name = f"rpx-engine-{os.getpid()}"
@@ -32,16 +32,16 @@ class PrivateEngine:
         wait_until(self._answers, 60, self.log.read_text)
 
     def end(self, number: int = signal.SIGTERM) -> None:
-        """End the engine; it ends its containers unless it was started with --live-restore."""
+        """End the engine, and its containers unless started with --live-restore."""
         assert self._daemon is not None
         self._daemon.send_signal(number)
         self._daemon.wait(60)
-        # Of a killed engine both stay, and where nobody reaps zombies both processes seem alive.
+        # A killed engine leaves both files, and unreaped zombies make both processes seem alive.
         for left in ("pid", "run/containerd/containerd.pid"):
             (self._directory / left).unlink(missing_ok=True)
 
     def load(self, *images: str) -> None:
-        """Give it images of this machine's engine."""
+        """Load images of this machine's engine."""
         archive = self._directory / "images.tar"
         docker("save", "--output", archive, *images, seconds=120)
         docker("load", "--input", archive, seconds=120, engine=self.url)
@@ -57,7 +57,7 @@ class PrivateEngine:
         return "Server Version" in docker("info", check=False, engine=self.url)
 
     def clear(self) -> None:
-        """Remove all containers, end the engine and delete what it has stored."""
+        """Remove all containers, end the engine and delete its data."""
         container_ids = docker("ps", "--all", "--quiet", engine=self.url, check=False).split()
         if container_ids:
             docker("rm", "--force", *container_ids, engine=self.url, check=False, seconds=120)

@@ -20,13 +20,13 @@ from tests.docker.engine import engine_url, wait_until
 
 @dataclass(frozen=True)
 class Prometheus:
-    """One that runs; ``url`` is where it answers, ``since`` when it began, in Unix time."""
+    """A running Prometheus at ``url``. ``since`` is the start in Unix time."""
 
     url: str
     since: float
 
     def ask(self, path: str, **words: str) -> Any:
-        """What its API answers."""
+        """The answer of the API."""
         query = urllib.parse.urlencode(words)
         with urllib.request.urlopen(f"{self.url}/api/v1/{path}?{query}", timeout=10) as reply:
             return json.load(reply)["data"]
@@ -41,7 +41,7 @@ class Prometheus:
         return [series["metric"] for series in answer["result"]]
 
     def wait_for_data(self, panels: list[tuple[str, str]]) -> None:
-        """Wait until each query, given with its title, has had something since the beginning."""
+        """Wait until each query, given with its title, has had data since the start."""
 
         def empty() -> list[tuple[str, str]]:
             return [panel for panel in panels if not self.series(panel[1])]
@@ -53,7 +53,7 @@ class Prometheus:
         return [alert for alert in self.ask("alerts")["alerts"] if alert["state"] == "firing"]
 
     def wait_for_alert(self, name: str, seconds: float = 60, **labels: str) -> dict[str, Any]:
-        """Wait until an alert with these labels fires, and return it."""
+        """Wait until an alert with these labels fires. Return the alert."""
         wanted = {"alertname": name, **labels}.items()
 
         def matching_alerts() -> list[dict[str, Any]]:
@@ -63,7 +63,7 @@ class Prometheus:
         return matching_alerts()[0]
 
     def targets(self) -> list[dict[str, Any]]:
-        """All targets that are scraped, whether they answer or not."""
+        """All scraped targets, also without an answer."""
         active: list[dict[str, Any]] = self.ask("targets", state="active")["activeTargets"]
         return active
 
@@ -85,9 +85,9 @@ def guides_configuration(directory: Path, operator: str) -> Any:
 
 
 def hurried(directory: Path, rules: Any) -> Any:
-    """What makes Prometheus look each second; and the rules' file, by which they fire at once.
+    """A configuration to scrape each second, and a file of the rules without delays.
 
-    How long what they name has to last is tested in tests/chart.
+    tests/chart tests the delays.
     """
     for rule in rules["groups"][0]["rules"]:
         rule.pop("for", None)
@@ -97,7 +97,7 @@ def hurried(directory: Path, rules: Any) -> Any:
 
 @contextmanager
 def running_prometheus(directory: Path, config: Any) -> Iterator[Prometheus]:
-    """Prometheus as a program of this host, with its files in a directory."""
+    """Run Prometheus as a program of this host, with all files in a directory."""
     path = directory / "prometheus.yml"
     path.write_text(yaml.safe_dump(config))
     address = f"127.0.0.1:{free_ports(1)}"

@@ -1,4 +1,4 @@
-"""What leads containers to their proxy whose master is given by address, and who they are."""
+"""Redirects of containers with an address in ROS_MASTER_URI."""
 
 from tests.docker.controller import the_proxy
 from tests.docker.engine import inspect, run, wait_until
@@ -24,7 +24,7 @@ def leads_to_the_proxy(container: Container, network: str) -> bool:
 
 
 def redirected(container: Container, network: str) -> None:
-    """Wait until its master's address leads to the proxy."""
+    """Wait until the master's address leads the container to the proxy."""
     wait_until(lambda: leads_to_the_proxy(container, network), 30, lambda: rules(container))
 
 

@@ -28,9 +28,8 @@ print(json.dumps({name: master.lookupNode("/test", name)[2] for name in names}))
 
 @dataclass(frozen=True)
 class Robot(Machine):
-    """A machine with a master, which ``name`` stands for in URIs.
-
-    ``hidden``: it is beside another network namespace, and this host does not reach it.
+    """A machine with a master. ``name`` is the host in URIs. A ``hidden`` robot is beside another
+    network namespace, and this host does not reach the robot.
     """
 
     name: str
@@ -45,7 +44,7 @@ class Robot(Machine):
         wait_until(lambda: "/rosout" in self.nodes(port), 60, "roscore is up")
 
     def nodes(self, port: int = 11311) -> dict[str, str]:
-        """Every node that the master knows, with its URI."""
+        """The URI of each node at the master."""
         if not self.hidden:
             return nodes_at(f"http://{self.address}:{port}")
         text = self.run("python3", "-c", _NODES, f"http://{self.address}:{port}", check=False)
@@ -66,7 +65,7 @@ class Robot(Machine):
 
 
 def nodes_at(master_uri: str) -> dict[str, str]:
-    """Every node that a master knows, with its URI; none if it does not answer."""
+    """The URI of each node at a master; empty if the master does not answer."""
     master: Any = xmlrpc.client.ServerProxy(master_uri, _Transport())
     try:
         with master:
@@ -85,7 +84,7 @@ def publishers_at(master_uri: str, topic: str) -> set[str]:
 
 
 class _Transport(xmlrpc.client.Transport):
-    """One that waits for five seconds at most."""
+    """A transport that waits for at most five seconds."""
 
     def make_connection(self, host: Any) -> HTTPConnection:
         connection = super().make_connection(host)
@@ -95,7 +94,7 @@ class _Transport(xmlrpc.client.Transport):
 
 @contextmanager
 def robot_outside(image: str) -> Iterator[Robot]:
-    """A robot that calls itself by its address."""
+    """A robot whose nodes use its address."""
     settings = ("--env", f"ROS_MASTER_URI={MASTER_URI}", "--env", f"ROS_IP={ROBOT_ADDRESS}")
     with machine(image, "addressed", ADDRESSED, *settings) as own_machine:
         yield _robot(own_machine, own_machine.address)
@@ -105,14 +104,14 @@ def robot_outside(image: str) -> Iterator[Robot]:
 def named_robot(
     image: str, name: str = "robot", number: int = NAMED, namespace: str = ""
 ) -> Iterator[Robot]:
-    """A robot as most are: it calls itself by its name, in URIs too."""
+    """A usual robot, whose nodes use its host name."""
     with machine(image, name, number, *_names(name, number), namespace=namespace) as own_machine:
         yield _robot(own_machine, name, hidden=bool(namespace))
 
 
 @contextmanager
 def laptop(image: str, robot: Robot) -> Iterator[Machine]:
-    """A second machine outside, beside the robot. Inside, nobody can resolve its name."""
+    """A second machine outside, beside the robot. Inside, its name does not resolve."""
     own = addresses(LAPTOP)[1]
     settings = ("--env", f"ROS_MASTER_URI={robot.master_uri}", "--env", f"ROS_IP={own}",
                 "--add-host", f"{robot.name}:{robot.address}")  # fmt: skip

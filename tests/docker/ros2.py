@@ -37,7 +37,7 @@ class Outside:
     machine: Machine
 
     def node(self, vendor: str, kind: str, topic: str, *options: str) -> "OutsideNode":
-        """Start a node; what it prints goes to a file."""
+        """Start a node with its output in a file."""
         name = f"outside_{kind}_{next(_numbers)}"
         words = command(vendor, kind, topic, *options, "--name", name)
         file = f"/tmp/{name}.log"
@@ -62,7 +62,7 @@ class OutsideNode:
 def machine_on_lan(
     image: str, name: str = "lan", number: int = NUMBER, namespace: str = ""
 ) -> Iterator[Outside]:
-    """A machine one cable away, which sends multicast into it."""
+    """A machine that sends multicast into its cable."""
     with machine(image, name, number, namespace=namespace) as lan_machine:
         process = str(inspect(lan_machine.container)["State"]["Pid"])
         run("nsenter", "--target", process, "--net",
@@ -79,7 +79,7 @@ class Inside2:
     def node(
         self, network: str, vendor: str, kind: str, topic: str, *options: str, **more: Any
     ) -> Container:
-        """Start a labelled container, which says by its environment which ROS it is."""
+        """Start a labelled container with the version of ROS in its environment."""
         name = unique(kind)
         env = ("--env", f"ROS_DISTRO={vendor}", *more.pop("options", ()))
         words = command(vendor, kind, topic, *options, "--name", Container(name).node)
@@ -88,7 +88,7 @@ class Inside2:
 
 
 def domain(proxy: Proxy) -> DomainStatus:
-    """What a proxy tells of its domain; nothing while it does not answer."""
+    """The status of a proxy's domain; empty while the proxy does not answer."""
     text = docker("exec", proxy.name, "rosproxy", "status", "--json", check=False)
     try:
         (status,) = parse_status(text).domains
@@ -98,7 +98,7 @@ def domain(proxy: Proxy) -> DomainStatus:
 
 
 def ports(proxy: Proxy) -> dict[str, list[tuple[int, str]]]:
-    """The ports of the range with their locators, by participant inside."""
+    """The ports of the range and the locators of each participant inside."""
     return {
         participant.guid_prefix: sorted((lease.port, lease.where) for lease in participant.leases)
         for participant in domain(proxy).inside
@@ -119,7 +119,7 @@ def ros2_proxies() -> list[Proxy]:
 
 
 def ports_are_kept(proxy: Proxy) -> bool:
-    """Whether all participants inside keep their ports for the next process."""
+    """Whether both participants inside keep their ports for the next process."""
     participants = domain(proxy).inside
     return len(participants) == 2 and all(participant.kept for participant in participants)
 

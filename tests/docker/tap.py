@@ -1,4 +1,4 @@
-"""A wire between a controller and the engine that tells when it is about to change something."""
+"""A tap between a controller and the engine, which acts when the controller changes something."""
 
 import contextlib
 import re
@@ -12,10 +12,9 @@ ENGINE = "/var/run/docker.sock"
 
 
 class EngineTap:
-    """Passes on what a controller says to the engine, and counts what changes anything there.
-
-    ``arm`` has something done at one of these requests: before it gets to the engine, or while
-    the engine carries it out.
+    """Relays a controller's requests to the engine, and counts the requests that change something.
+    ``arm`` sets an action for such a request: before the engine gets the request, or during its
+    execution.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -71,7 +70,7 @@ class EngineTap:
                 self._act("during")
 
     def _replies(self, engine: socket.socket, client: socket.socket) -> None:
-        # A controller that is killed in the middle of a reply leaves nobody to send it to.
+        # A controller killed in the middle of a reply no longer receives.
         with contextlib.suppress(OSError):
             for data in chunks(engine, client):
                 client.sendall(data)
@@ -82,7 +81,7 @@ class EngineTap:
 
 
 def body_to_come(request: bytes) -> int:
-    """How many bytes of a request's body are not in the packet that it begins with."""
+    """The number of body bytes that are not in the first packet of a request."""
     head, _, body = request.partition(b"\r\n\r\n")
     match = re.search(rb"\r\ncontent-length: *(\d+)", head, re.IGNORECASE)
     return int(match[1]) - len(body) if match else 0
@@ -95,7 +94,7 @@ def accepted(listener: socket.socket) -> Iterator[socket.socket]:
 
 
 def chunks(source: socket.socket, target: socket.socket) -> Iterator[bytes]:
-    """What comes from one side; closes both when it ends."""
+    """The data from a side. Closes both sides at the end."""
     with contextlib.suppress(OSError), source, target:
         while data := source.recv(65536):
             yield data

@@ -1,4 +1,4 @@
-"""What the controller's commands and its HTTP endpoint tell."""
+"""The output of the controller's commands and of its HTTP endpoint."""
 
 import urllib.request
 from urllib.error import HTTPError
@@ -86,7 +86,7 @@ def test_controller_stops_at_once(controller_image: str, container_name: str) ->
            "--volume", "/var/run/docker.sock:/var/run/docker.sock", "--user", "0:0",
            controller_image, "docker", "--admin-bind", "127.0.0.1:21314",
 )  # fmt: skip
-    wait_until(lambda: "21314" in logs(container_name), 60, "it logs where its health is")
+    wait_until(lambda: "21314" in logs(container_name), 60, "the admin endpoint is logged")
 
     docker("stop", "--time", "10", container_name)
 

@@ -1,7 +1,7 @@
-"""What becomes of a labelled container's nodes when something happens to the container.
+"""The nodes of a labelled container after an event of the container.
 
-That a node was unregistered at once is shown by the controller's log: it told the proxy, which had
-that still to do. The proxy alone does it some 30 seconds later, and then it had not.
+The controller's log proves that a node was unregistered at once: the controller's update came
+before the proxy's own clean-up, which takes some 30 seconds.
 """
 
 import json
@@ -25,7 +25,7 @@ def talker(net: Inside, network: str, robot: Robot, library: str = "roscpp") -> 
 
 
 def old_talker(net: Inside, network: str, robot: Robot) -> Container:
-    """One that has been there for four seconds: younger ones get another chance to answer."""
+    """A talker that has run for four seconds: younger nodes get a second chance to answer."""
     node = talker(net, network, robot)
     node.log.wait_for("inside", count=80, verb="sent")
     return node
@@ -124,8 +124,8 @@ def test_container_moves_to_another_network(
     listener = named.node("listener", library, "sub", "--topic", "/out")
     try:
         listener.wait_for("inside")
-        # rospy's one thread that accepts connections reads each one's header, without a time-out:
-        # a connection cut before its header came leaves the node deaf for good.
+        # rospy's accepting thread reads each connection's header without a time-out. A connection
+        # that is cut before the header blocks this thread for ever.
         wait_until(lambda: proxy.flowing() == {"/out", "/rosout"}, 60, "both topics flow")
 
         docker("network", "disconnect", old, node.name)
@@ -152,7 +152,7 @@ def test_nodes_of_two_networks_hear_each_other(
 
 
 def test_container_of_two_networks(controller: Controller, net: Inside, named: Robot) -> None:
-    """It is served on both; leaving one of them cuts nothing."""
+    """The proxy serves the container on both. Leaving a network cuts nothing."""
     first = net.network()
     second = net.network()
     node = net.node(first, "roscpp", "pub", "--topic", "/out", "--word", "inside", verb="create")
@@ -201,7 +201,7 @@ def test_network_can_be_removed_when_its_containers_are_gone(
 def test_proxy_goes_with_its_last_container(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
-    """After the grace, which is 3 seconds here; and nothing of it is left at the master."""
+    """After the grace, here 3 seconds. The master has no registrations left."""
     node = talker(net, net.network(), named)
     assert proxies()
 

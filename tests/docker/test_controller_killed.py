@@ -1,4 +1,4 @@
-"""A controller that is killed, at any step of what it does, and started again."""
+"""A controller that is killed at any step, and restarted."""
 
 import signal
 import threading
@@ -26,7 +26,7 @@ from tests.docker.tap import EngineTap
 from tests.docker.traffic import traffic
 
 MASTER = "http://robot:11311"
-NAMES = {"robot": "198.51.100.7"}  # nobody is there: these tests are about the engine
+NAMES = {"robot": "198.51.100.7"}  # no master there: these tests are about the engine
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def start_process(
 
 
 def good(network: str) -> Proxy:
-    """The one proxy, of which nothing is missing and nothing is left over."""
+    """The only proxy, complete and without remainders."""
     (proxy,) = proxies()
     assert [managed("proxy"), managed("ports")] == [[proxy.name], [proxy.sandbox]]
     assert proxy.running
@@ -90,9 +90,9 @@ def test_killed_before_each_step_of_a_first_proxy(
 def test_killed_during_each_step_of_a_replacement(
     tap: EngineTap, idle: Inside, start_process: Callable[..., Process]
 ) -> None:
-    """Both containers are made anew, since more ports are wanted each time.
+    """The controller recreates both containers, because each label asks for more ports.
 
-    The engine carries out what it was asked for, or part of it, and nobody hears of that.
+    The engine executes a request, or a part, and the answer is lost.
     """
     network = idle.network()
     idle.idle(network)
@@ -114,7 +114,7 @@ def test_killed_during_each_step_of_a_replacement(
 
 
 def killed_at(step: int, when: str, tap: EngineTap, process: Process) -> bool:
-    """Have a controller killed at one step of what it does; tell whether it got there."""
+    """Kill a controller at a step. Return whether the controller reached this step."""
     reached = threading.Event()
 
     def kill() -> None:
@@ -151,7 +151,7 @@ def test_traffic_goes_on_without_the_controller(
 def test_what_happened_while_the_controller_was_away(
     start_controller: Callable[..., Controller], net: Inside, named: Robot
 ) -> None:
-    """A container died and another one came, in a network that is new."""
+    """A container is gone, and another comes on a new network."""
     controller = start_controller()
     network = net.network()
     node = net.node(network, "roscpp", "pub", "--topic", "/out")

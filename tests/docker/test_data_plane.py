@@ -1,4 +1,4 @@
-"""Topics that the kernel forwards: what the containers get for it, and that messages flow."""
+"""Topics on the kernel plane: capabilities of the containers, and flowing messages."""
 
 import json
 import time
@@ -16,7 +16,7 @@ from tests.docker.test_proxy_lost import recovered
 from tests.docker.traffic import Traffic, crash, traffic
 
 KERNEL = (ENABLE, "rosproxy.data-plane=kernel", "rosproxy.ports=40")
-"""Nodes of the test before hold their ports for a while, and each node is to have two."""
+"""Nodes of former tests hold ports for a while, and each node needs two."""
 OPTIONS = ("--allow-data-plane", "kernel")
 
 
@@ -37,7 +37,7 @@ def plane_of(node: str) -> dict[str, Any]:
 
 
 def wait_forwarded(flow: Traffic) -> dict[str, Any]:
-    """Wait until the kernel forwards the talker's topic, and return what the proxy says of it."""
+    """Wait until the kernel forwards the talker's topic. Return the topic's status."""
     talker = flow.talker.node
     wait_until(
         lambda: plane_of(talker)["plane"] == "kernel" and plane_of(talker)["connections"] > 0,
@@ -45,7 +45,7 @@ def wait_forwarded(flow: Traffic) -> dict[str, Any]:
     )  # fmt: skip
     before = plane_of(talker)
     assert before["port"] in the_proxy().ports
-    wait_until(lambda: plane_of(talker)["sent"] > before["sent"], 60, "its bytes are counted")
+    wait_until(lambda: plane_of(talker)["sent"] > before["sent"], 60, "bytes are counted")
     return before
 
 

@@ -1,4 +1,4 @@
-"""Containers whose only way out is their proxy: an internal network, or a label that says so."""
+"""Containers whose only way out is the proxy: on an internal network, or by label."""
 
 import json
 import time
@@ -32,7 +32,7 @@ def test_containers_on_an_internal_network_hear_and_are_heard(
         flow.wait()
         assert told_direction() == "both"
         route = flow.listener.run("python3", "-c", CONNECT, named.address, "11311", check=False)
-        assert "Error" in route  # it has no other way
+        assert "Error" in route  # no other way out
         named.node("far", library, "serve", "--service", service)
         try:
             caller = net.node(network, library, "call", "--service", service)

@@ -1,4 +1,4 @@
-"""What is wrong on a host, told to whoever asks: the first cause, and what mends it."""
+"""Faults on a host in the doctor's report: the first cause, and the fix."""
 
 import json
 import urllib.request
@@ -24,7 +24,7 @@ def process(tmp_path: Path, proxy_image: str, named: Robot, _no_other_controller
 
 
 def asked(process: Process, *words: str) -> tuple[int, dict[str, Any]]:
-    """The exit code of a command, and what it prints as JSON."""
+    """The exit code and the JSON output of a command."""
     text = process.once(*words, "--json", check=False)
     assert process.process is not None
     document: dict[str, Any] = json.loads(text[text.index("{") :])
@@ -32,7 +32,7 @@ def asked(process: Process, *words: str) -> tuple[int, dict[str, Any]]:
 
 
 def wrong(process: Process) -> tuple[int, list[dict[str, Any]]]:
-    """The exit code of ``doctor``, and all that it finds wrong."""
+    """The exit code of ``doctor``, and all errors and warnings."""
     code, report = asked(process, "doctor")
     severe = [
         finding for finding in report["findings"] if finding["severity"] in ("error", "warning")
@@ -49,7 +49,7 @@ def page() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def named(ros_image: str) -> Iterator[Robot]:
-    """One with a master that knows nothing of nodes of other tests, long gone."""
+    """A robot with a new master, without nodes of other tests."""
     with named_robot(ros_image, "scout", SCOUT) as robot:
         robot.start_master()
         yield robot
@@ -100,8 +100,8 @@ def test_from_a_plan_to_a_host_that_is_well(process: Process, net: Inside, named
         remove_proxies()
 
 
-def test_what_has_ended_is_nothing_wrong(process: Process, net: Inside, named: Robot) -> None:
-    """A container that is restarted leaves a port behind each time, and one node."""
+def test_ended_nodes_are_no_fault(process: Process, net: Inside, named: Robot) -> None:
+    """Each restart of a container leaves a held port, but the same node."""
     process.start()
     try:
         node = net.node(net.network(), "roscpp", "pub", "--topic", "/out")
@@ -123,8 +123,8 @@ def test_what_has_ended_is_nothing_wrong(process: Process, net: Inside, named: R
         remove_proxies()
 
 
-def test_a_removed_container_is_nothing_wrong(process: Process, net: Inside, named: Robot) -> None:
-    """While its port is still kept."""
+def test_a_removed_container_is_no_fault(process: Process, net: Inside, named: Robot) -> None:
+    """While the proxy still holds the port."""
     process.start()
     try:
         network = net.network()
@@ -161,7 +161,7 @@ def test_a_misspelt_label(process: Process, net: Inside) -> None:
 def test_a_masters_name_that_leads_nowhere_and_its_fix(
     tmp_path: Path, process: Process, net: Inside, named: Robot
 ) -> None:
-    """The fix names the name, and no label; done as it says, all is well."""
+    """The fix is about the host name, not about a label. After the fix all is well."""
     blind = Process(tmp_path, "--proxy-image", process.options[-1])
     blind._names.clear()
     blind._hosts.write_text("")
@@ -187,7 +187,7 @@ def test_a_masters_name_that_leads_nowhere_and_its_fix(
 
 
 def test_a_proxy_that_outside_does_not_reach(process: Process, net: Inside) -> None:
-    """192.0.2.1 is nobody's; the fix is said in the operator's words."""
+    """Nothing answers at 192.0.2.1. The fix names the operator's label."""
     net.idle(net.network(), labels=(ENABLE, "rosproxy.advertise-host=192.0.2.1"))
     try:
         process.once("--once")

@@ -1,6 +1,6 @@
-"""An engine that is ended and started again, with its userland proxy turned off.
+"""An engine that is ended and restarted, without its userland proxy.
 
-It is the tests' own, so that nobody else's containers are touched.
+The engine is private, so that other containers are not touched.
 """
 
 import signal
@@ -32,7 +32,7 @@ def engine(
 
 @pytest.fixture(scope="module")
 def robot(ros_image: str, engine: PrivateEngine) -> Iterator[Robot]:
-    """A robot that outlives the engine: it runs on this machine's."""
+    """A robot on this machine's engine, which outlives the private engine."""
     with named_robot(ros_image, "android", NUMBER, engine.namespace) as robot:
         robot.start_master()
         yield robot
@@ -42,7 +42,7 @@ def robot(ros_image: str, engine: PrivateEngine) -> Iterator[Robot]:
 def controller(
     engine: PrivateEngine, robot: Robot, proxy_image: str, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Process]:
-    """Beside the engine, in its network namespace."""
+    """A controller in the network namespace of the engine."""
     process = Process(
         tmp_path_factory.mktemp("controller"), "--proxy-image", proxy_image,
         names={robot.name: robot.address}, namespace=engine.namespace,
@@ -81,9 +81,8 @@ def test_everything_comes_back_with_the_engine(
     controller: Process,
     listeners: dict[str, Log],
 ) -> None:
-    """The engine ends the containers, at the latest when it is back, and starts them again.
-
-    Their addresses may be others.
+    """The engine ends the containers, at the latest after its return, and restarts them, perhaps
+    with other addresses.
     """
     for listener in listeners.values():
         listener.wait_for("inside")

@@ -1,4 +1,4 @@
-"""An operator in a container, with the engine's socket mounted, outlives its engine."""
+"""An operator in a container with the engine's socket mounted outlives the engine."""
 
 from collections.abc import Iterator
 
@@ -24,7 +24,9 @@ def engine(
         yield engine
 
 
-def test_it_gets_the_socket_of_the_new_engine(engine: PrivateEngine, controller_image: str) -> None:
+def test_the_operator_gets_the_socket_of_the_new_engine(
+    engine: PrivateEngine, controller_image: str
+) -> None:
     """The mounted file stays that of the former engine until the container starts again."""
     socket = engine.url.removeprefix("unix://")
     docker("run", "--detach", "--name", NAME, "--restart", "always", "--network", "host",
@@ -46,5 +48,5 @@ def test_it_gets_the_socket_of_the_new_engine(engine: PrivateEngine, controller_
 
     wait_until(lambda: "this container has the old /var/run/docker.sock" in logs(), 60, logs)
     wait_until(is_well, 60, logs)
-    # The engine's own RestartCount leaves out a container that ended before the new engine saw it.
+    # The engine's RestartCount misses a container that ended before the new engine's start.
     assert logs().count("health and metrics at") == 2, logs()

@@ -1,4 +1,4 @@
-"""The examples with the operator, started as their READMEs say, with real nodes."""
+"""The examples with the operator, started as in the READMEs, with real nodes."""
 
 import re
 from collections.abc import Iterator
@@ -23,7 +23,9 @@ STATUS = ("exec", "-T", "operator", "rosproxy-operator", "docker", "status", "--
 
 @dataclass
 class Example:
-    """A compose file as it stands, and beside it the robot's name, which no name server knows."""
+    """An unchanged Compose file, with an extra file for the robot's name, which no name server
+    knows.
+    """
 
     directory: Path
     variables: dict[str, str]
@@ -110,7 +112,7 @@ def test_example_with_labels(named: Robot, images: dict[str, str], tmp_path: Pat
 def test_example_with_a_master_by_address(
     robot: Robot, images: dict[str, str], tmp_path: Path
 ) -> None:
-    """Its services are stock ones, but for the label."""
+    """The services are stock, except for the label."""
     with example(EXAMPLES, robot, images, tmp_path) as project:
         assert project.variables["ROS_MASTER_URI"] == f"http://{robot.address}:11311"
         works_both_ways(project, robot)
@@ -141,7 +143,7 @@ def test_example_behind_a_socket_proxy(
 
 
 def test_socket_proxy_allows_what_the_operator_calls() -> None:
-    """The documentation lists that; a unit test compares it with the calls."""
+    """The documentation lists the calls. A unit test compares this list with the code."""
     documented = (ROOT / "docs/reference/permissions.md").read_text()
     calls = re.findall(r"^(GET|POST|DELETE) (/\S+)$", documented, re.MULTILINE)
     text = (SOCKET_PROXY / "haproxy.cfg").read_text()
@@ -186,7 +188,7 @@ def test_example_with_ros_2(
 
 
 def test_examples_need_no_more_than_their_readme_says() -> None:
-    """A variable without a default is one that the README tells to set."""
+    """The README tells to set exactly the variables without a default."""
     for directory in (EXAMPLES, SOCKET_PROXY, ROS2):
         needed = set(re.findall(r"\$\{(\w+):\?", (directory / "compose.yaml").read_text()))
         told = set(re.findall(r"export (\w+)=", (directory / "README.md").read_text()))

@@ -16,7 +16,7 @@ ADVICE = re.compile(r"[Ss]et ROS_MASTER_URI=(\S+)(?: and the label (\S+=\S+))?$"
 
 
 def told(controller: Controller, name: str) -> str:
-    """What the status says of a container, once it says anything."""
+    """Wait for a problem of a container in the status. Return the text."""
     subject = f"container {name}: "
 
     def lines() -> list[str]:
@@ -77,7 +77,7 @@ def test_a_wrong_port_came_first(
 def test_the_running_operator_is_asked(
     start_controller: Callable[..., Controller], net: Inside
 ) -> None:
-    """It has options that the command does not, and knows an image that is nowhere else named."""
+    """The command has neither the operator's options nor the image's name."""
     controller = start_controller("--port-window", "13400-13499", "--ports", "7")
     node = net.idle(net.network())
 
@@ -123,7 +123,7 @@ def test_a_container_without_a_network_is_connected_while_it_runs(
 
 
 def _network_removed() -> bool:
-    """The proxy may still be on it."""
+    """Remove the network, which the proxy may still use."""
     docker("network", "rm", "ros", check=False)
     return "ros" not in docker("network", "ls", "--format", "{{.Name}}").split()
 
@@ -171,7 +171,7 @@ ROSLAUNCH = (
 def test_the_hosts_address_as_the_containers_own(
     start_controller: Callable[..., Controller], net: Inside, named: Robot
 ) -> None:
-    """As manuals of drivers have it: roslaunch ends with it, and starts without."""
+    """As in manuals of drivers: roslaunch ends with this address, and starts without."""
     controller = start_controller()
     network = net.network()
     command = ("sh", "-c", ROSLAUNCH)

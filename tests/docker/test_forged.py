@@ -23,7 +23,7 @@ def proxy(controller: Controller, net: Inside) -> Proxy:
 
 @pytest.fixture(params=["sandbox", "proxy"])
 def forged_image(request: pytest.FixtureRequest, proxy: Proxy, ros_image: str) -> Iterator[str]:
-    """An image with all that an image can have of one of a proxy's containers."""
+    """An image with every property of a proxy's container that an image can have."""
     tag = unique("image")
     made = docker("create", ros_image, "true")
     name = proxy.sandbox if request.param == "sandbox" else proxy.name
@@ -135,7 +135,7 @@ def claimed(net: Inside) -> str:
 
 
 def claim(net: Inside, network: str) -> Proxy:
-    """Start a container whose label names db as its master; the proxy on the network."""
+    """Start a container with db as the master in its label. Return the proxy on the network."""
     net.idle(network, uri="", labels=(ENABLE, "rosproxy.master-uri=http://db:5432"))
     wait_until(lambda: bool(on(network)), 60, lambda: docker("ps", "--all"))
     return on(network)[0]

@@ -1,6 +1,6 @@
-"""Nothing is told of a host that is well: from the operator's start to a minute later.
+"""A healthy host has no problems, from the operator's start to a minute later.
 
-On one network there are nodes of ROS 1, and two domains of ROS 2 with Fast DDS and Cyclone DDS.
+A network has ROS 1 nodes, and two domains of ROS 2 with Fast DDS and Cyclone DDS.
 """
 
 import json
@@ -26,7 +26,7 @@ ON_LAN = (ENABLE, f"rosproxy.advertise-host={HERE}")
 
 @pytest.fixture(scope="module")
 def named(ros_image: str) -> Iterator[Robot]:
-    """A robot whose master knows no nodes of other tests."""
+    """A robot with a new master, without nodes of other tests."""
     with named_robot(ros_image, "rover", ROVER) as robot:
         robot.start_master()
         yield robot
@@ -41,14 +41,14 @@ def _nodes_end(lan: Outside, named: Robot) -> Iterator[None]:
 
 
 def is_up() -> bool:
-    """Whether the operator answers; before, the doctor looks with options of its own."""
+    """Whether the operator answers. Before, the doctor uses its own options."""
     with suppress(OSError):
         return bool(page())
     return False
 
 
 def told(controller: Controller) -> Iterator[str]:
-    """What is told of problems: by the operator, its doctor, its page, and in the proxies' logs."""
+    """All reported problems: by operator, doctor and page, and in the proxies' logs."""
     yield from controller.problems().splitlines()
     text = controller.command("doctor", "--json", check=False)
     for finding in json.loads(text[text.index("{") :])["findings"]:

@@ -1,7 +1,7 @@
-"""Containers whose only setting is a label, seen from a robot and a laptop outside.
+"""Containers with a label as the only setting, and a robot and a laptop outside.
 
-ROS_MASTER_URI is the robot's own, http://robot:11311, everywhere. No container can reach the
-robot's name but through the proxy, and no machine outside can reach a container.
+ROS_MASTER_URI is http://robot:11311 everywhere. Containers reach this name only through the proxy,
+and no machine outside reaches a container.
 """
 
 import pytest
@@ -101,7 +101,7 @@ def test_proxy_containers_have_no_rights(controller: Controller, net: Inside) ->
 
 def test_publishes_what_is_asked_for_by_ipv4_only(controller: Controller, net: Inside) -> None:
     net.idle(net.network(), labels=(ENABLE, "rosproxy.ports=7"))
-    # The test before may have left a proxy with fewer ports, which makes room for this one.
+    # A former test may have left a proxy with fewer ports, which is replaced.
     wait_until(lambda: list(map(len, published_ranges())) == [7], 60, controller.logs)
     proxy = the_proxy()
 
@@ -175,7 +175,7 @@ def test_no_label_no_proxy(controller: Controller, net: Inside) -> None:
 def test_labels_name_master_ports_host_and_network(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
-    """A container of two networks, started with the proxy's name as its master's."""
+    """A container on two networks, with the proxy's name in ROS_MASTER_URI."""
     wanted = net.network()
     other = net.network()
     labels = (ENABLE, f"rosproxy.master-uri={named.master_uri}", "rosproxy.ports=9",
@@ -220,7 +220,7 @@ def test_container_in_anothers_network(controller: Controller, net: Inside, name
 def test_name_that_a_neighbour_holds_is_not_taken(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
-    """Both would answer to it, by turns."""
+    """Otherwise proxy and neighbour would answer in turn."""
     network = net.network()
     squatter = net.idle(network, labels=(), options=("--network-alias", named.name))
     node = net.idle(network)

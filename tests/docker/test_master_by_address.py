@@ -16,9 +16,8 @@ from tests.docker.robot import Robot
 def test_the_label_alone_is_enough(
     library: str, known_by: str, controller: Controller, near: Inside, robot: Robot
 ) -> None:
-    """Topics and services both ways; also where a variable says what nodes call their host.
-
-    Nobody but the network knows that name, and that address is nobody's.
+    """Topics and services both ways, also with a variable for the nodes' host. Only the network
+    knows the name, and nothing has the address.
     """
     network = near.network()
     variables = {"ROS_IP": "192.0.2.99", "ROS_HOSTNAME": "talker"}
@@ -85,7 +84,7 @@ def test_it_is_told_and_leaves_no_more_than_a_record(
 def test_a_network_in_common_that_is_not_the_way_outwards(
     controller: Controller, near: Inside, robot: Robot
 ) -> None:
-    """Nodes' connections are to come from the address by which the proxy knows them."""
+    """The proxy must know nodes by the source address of their connections."""
     first, second = sorted((near.network(), near.network()))
     node = near.node(
         first, "roscpp", "pub", "--topic", "/out", "--word", "inside", verb="create",

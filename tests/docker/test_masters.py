@@ -1,4 +1,4 @@
-"""More than one master, and one whose host moves."""
+"""Several masters, and a master that moves to another address."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -18,7 +18,7 @@ MOVER = 82
 
 @pytest.fixture(scope="module")
 def rover(ros_image: str) -> Iterator[Robot]:
-    """Another robot with a master of its own."""
+    """Another robot with its own master."""
     with named_robot(ros_image, "rover", ROVER) as robot:
         robot.start_master()
         yield robot
@@ -27,7 +27,7 @@ def rover(ros_image: str) -> Iterator[Robot]:
 def test_two_masters_on_one_network(
     start_controller: Callable[..., Controller], net: Inside, named: Robot, rover: Robot
 ) -> None:
-    """Each name leads to a proxy of its own, with ports of its own."""
+    """Each name leads to a different proxy with different ports."""
     start_controller(names={rover.name: rover.address})
     network = net.network()
     robots = {robot.name: robot for robot in (named, rover)}
@@ -53,7 +53,7 @@ def test_two_masters_on_one_network(
 def test_two_masters_of_one_host(
     start_controller: Callable[..., Controller], net: Inside, named: Robot
 ) -> None:
-    """Two roscores on the robot, so one name: in networks of their own both are found by it."""
+    """Two roscores on the robot have the same host name. In separate networks, both are found."""
     named.start_master(port=11312)
     start_controller()
     nodes = {
@@ -115,7 +115,9 @@ def test_masters_host_gets_another_address(
 def test_a_master_given_by_address_gets_another_one(
     ros_image: str, proxy_image: str, net: Inside, tmp_path: Path
 ) -> None:
-    """Where a label has its name, nodes go on with the old address; else a new container does."""
+    """With the master's name in a label, nodes go on with the old address. Otherwise a new
+    container works.
+    """
     with named_robot(ros_image, "mover", MOVER) as robot:
         robot.start_master()
         options = ("--proxy-image", proxy_image, "--advertise-host", robot.host_address)
@@ -156,7 +158,7 @@ def test_a_master_given_by_address_gets_another_one(
 
 
 def move(robot: Robot) -> str:
-    """Give the robot another address on the same cable; return it."""
+    """Give the robot another address on the same cable. Return the address."""
     address = f"198.18.{MOVER + 1}.2"
     run("ip", "route", "add", f"{address}/32", "dev", cable(MOVER))
     script = f"""

@@ -18,14 +18,14 @@ from tests.docker.traffic import traffic
 PATROL = 86
 OPERATOR = "127.0.0.1:21313"
 NODES = 5
-"""Three that talk, one that has a secret, and one that is killed."""
+"""Three nodes for traffic, a node with a hidden topic, and a node that is killed."""
 LABELS = (ENABLE, "rosproxy.data-plane=kernel", f"rosproxy.ports={2 * NODES}")
 """The kernel's share of the range is there for each node."""
 
 
 @pytest.fixture
 def patrol(ros_image: str) -> Iterator[Robot]:
-    """A robot with a master of its own, which the test ends."""
+    """A robot with its own master, which the test ends."""
     with named_robot(ros_image, "patrol", PATROL) as robot:
         robot.start_master()
         yield robot
@@ -59,7 +59,7 @@ def test_dashboard_and_alerts(
     operator: Controller, prometheus: Prometheus, cell: Inside, patrol: Robot,
     lan: Outside, inside2: Inside2,
 ) -> None:  # fmt: skip
-    """One run: all is well; then one thing after the other breaks; each panel has had data."""
+    """First all is well, then parts break in turn. At the end each panel has had data."""
     network = cell.network()
     listener = lan.node("jazzy", "sub", "/out")
     labels = (ENABLE, f"rosproxy.advertise-host={HERE}", "rosproxy.ports=16")
@@ -89,7 +89,7 @@ def test_dashboard_and_alerts(
         cell.idle(cell.network(), labels=elsewhere)
         prometheus.wait_for_alert("RosproxyNotReachable")
 
-        # The port of the dead one goes to one of them, and the last gets none.
+        # A filler gets the port of the dead node, and the last filler gets none.
         for number in range(NODES + 2):
             start_node(box, f"filler_{number}")
         prometheus.wait_for_alert("RosproxyRangeFull", instance=proxy.name)
@@ -109,6 +109,6 @@ def test_dashboard_and_alerts(
 
 
 def start_node(box: Container, name: str) -> None:
-    """One more node in a container, which may be killed while that runs."""
+    """Start another node in a running container, so that a test can kill this node alone."""
     words = " ".join(node_command("roscpp", "pub", "--topic", f"/{name}", f"__name:={name}"))
     box.start("sh", "-c", f"echo $$ >/tmp/{name}.pid; exec {words}")

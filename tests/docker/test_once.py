@@ -12,7 +12,7 @@ from tests.docker.robot import Robot
 
 
 def everything() -> object:
-    """What a plan must leave as it is."""
+    """The state of the engine, which a plan must not change."""
     containers = docker("ps", "--all", "--no-trunc", "--format", "{{json .}}").splitlines()
     columns = ("ID", "Names", "Networks", "State", "Labels")
     rows = [{key: row[key] for key in columns} for row in map(json.loads, containers)]

@@ -1,4 +1,4 @@
-"""Controllers with options of their own."""
+"""Controllers with different options."""
 
 import time
 from collections.abc import Callable
@@ -60,7 +60,7 @@ def test_updated_image_replaces_the_proxy(
 
 
 def secret(proxy: Proxy) -> str:
-    """The hash of its token; nobody but the controller has the token itself."""
+    """The hash of a proxy's token. Only the controller has the token."""
     environment = [str(variable) for variable in inspect(proxy.name)["Config"]["Env"]]
     assert not [
         variable for variable in environment if variable.startswith("ROSPROXY_ADMIN_TOKEN=")

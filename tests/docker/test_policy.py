@@ -12,7 +12,7 @@ from tests.docker.test_proxy_lost import recovered
 def test_a_label_hides_a_topic_from_outside(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
-    """Inside hears it; no moment shows it, also when the proxy is lost, which was made before."""
+    """Inside receives. The topic is never visible outside, not even after a loss of the proxy."""
     network = net.network()
     topic = f"/{unique('hidden').replace('-', '_')}"
     listener = net.node(network, "roscpp", "sub", "--topic", topic)

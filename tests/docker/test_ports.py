@@ -1,4 +1,4 @@
-"""Which ports a proxy gets on a host where others publish and listen."""
+"""The ports of a proxy on a host with other published and listening ports."""
 
 import socket
 import time
@@ -17,7 +17,7 @@ FIRST = WINDOW[0]
 
 
 def occupy(port: int, *, listen: bool) -> socket.socket:
-    """Hold a port of this host; one that is only bound is in no list of listening sockets."""
+    """Hold a port of this host. A port without `listen` is in no list of listening sockets."""
     holder = socket.socket()
     holder.bind(("0.0.0.0", port))
     if listen:
@@ -40,7 +40,7 @@ def publisher(net: Inside, base_image: str) -> Callable[..., str]:
 def test_range_keeps_clear_of_all_others(
     start_controller: Callable[..., Controller], net: Inside, publisher: Callable[..., str]
 ) -> None:
-    """A container that was never started, one that runs, and a program that listens."""
+    """A created container, a running container, and a listening program."""
     publisher(FIRST + 1, "create")
     publisher(FIRST + 5)
     with closing(occupy(FIRST + 9, listen=True)):
@@ -81,7 +81,7 @@ def test_exhausted_window_is_told_with_numbers(
 def test_range_grows_in_place(
     start_controller: Callable[..., Controller], net: Inside, named: Robot
 ) -> None:
-    """A container that asks for more comes; nodes that are there keep their ports."""
+    """A new container asks for more ports. Existing nodes keep their ports."""
     start_controller()
     network = net.network()
     with traffic(net, named, network, "roscpp") as flow:
@@ -108,7 +108,7 @@ def test_range_taken_by_another_while_the_proxy_was_down(
     named: Robot,
     publisher: Callable[..., str],
 ) -> None:
-    """There is a way on, and somebody has to be told: nodes don't register again by themselves."""
+    """The controller takes another range, and reports that nodes have to be restarted."""
     controller = start_controller("--ports", "4")
     node = net.node(net.network(), "roscpp", "pub", "--topic", "/out", "--word", "inside")
     wait_until(lambda: named.knows_proxied(node.node), 60, controller.logs)
@@ -131,7 +131,7 @@ def test_range_taken_by_another_while_the_proxy_was_down(
     assert "Restart the nodes" in controller.problems()
     left = named.uri(node.node)
     docker("restart", "--time", "0", node.name)
-    # roscpp takes what the reply to its subscription says, also if it is older than an update.
+    # roscpp prefers the reply to its subscription, even if an update is newer.
     wait_until(lambda: named.uri(node.node) not in ("", left), 60, node.log.read)
     listener = named.node("listener", "roscpp", "sub", "--topic", "/out")
     try:

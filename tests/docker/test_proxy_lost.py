@@ -44,7 +44,7 @@ HOLDER_LOSSES: dict[str, Callable[[Proxy], object]] = {
 @pytest.mark.parametrize("flow", ["roscpp"], indirect=True)
 @pytest.mark.parametrize("how", HOLDER_LOSSES)
 def test_lost_ports_come_back(how: str, flow: Traffic) -> None:
-    """roscpp alone: rospy outside gets no word of it but by TCP keep-alive, after a minute."""
+    """Only roscpp: rospy outside notices the loss by TCP keep-alive, after a minute."""
     proxy = the_proxy()
     ports = proxy.ports
     lost = time.time()
@@ -89,7 +89,7 @@ def recovered(lost: float) -> float:
 
 
 def started(proxy: Proxy) -> float:
-    """When a proxy's program was started; 0 if it does not run."""
+    """The start time of a proxy's program; 0 if the program does not run."""
     state = inspect(proxy.name, check=False).get("State", {})
     if not state.get("Running") or not proxy.running:
         return 0.0
@@ -103,5 +103,5 @@ def test_paused_proxy_is_resumed(flow: Traffic) -> None:
 
     pause(proxy.name)
 
-    wait_until(lambda: proxy.running, 60, "it is resumed")
+    wait_until(lambda: proxy.running, 60, "the proxy is resumed")
     flow.wait(since=time.time())

@@ -1,4 +1,4 @@
-"""A master given by address, where operators end, begin and change their mind."""
+"""Redirects while operators end, start, and change options."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -118,10 +118,10 @@ def test_the_proxys_address_changes(
     wait_until(lambda: robot.knows_proxied(later.node), 60, later.log.read)
 
 
-def test_it_can_be_switched_off(
+def test_redirects_can_be_switched_off(
     process: Callable[..., Process], near: Inside, robot: Robot, tmp_path: Path
 ) -> None:
-    """By the label for one, by the option for all: what led to the proxy then does no longer."""
+    """By label for a container, by option for all. Existing redirects are removed."""
     network = near.network()
     running = process()
     node = addressed_talker(near, network, robot)

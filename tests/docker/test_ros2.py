@@ -60,7 +60,7 @@ def test_topics(vendor_inside: str, vendor_outside: str, lan: Outside, inside2: 
 
 @pytest.mark.parametrize("vendor", ["jazzy", "cyclone"])
 def test_one_more_where_a_proxy_is(vendor: str, lan: Outside, inside2: Inside2) -> None:
-    """On a network that the proxy is on, and on one that it has to join."""
+    """On a network of the proxy, and on a network that the proxy has to join."""
     listener = lan.node("jazzy", "sub", "/out")
     network = inside2.made.network()
     inside2.node(network, "jazzy", "pub", "/out", "--word", "first")
@@ -73,8 +73,8 @@ def test_one_more_where_a_proxy_is(vendor: str, lan: Outside, inside2: Inside2) 
         sent = datetime.fromisoformat(
             docker("logs", "--timestamps", node.name).split()[0]
         ).timestamp()
-        print(f"{vendor}, {text}: outside hears it {heard - started:.1f} s after docker run, "
-              f"{heard - sent:.1f} s after it has sent its first message")  # fmt: skip
+        print(f"{vendor}, {text}: outside receives {heard - started:.1f} s after docker run, "
+              f"{heard - sent:.1f} s after the node's first message")  # fmt: skip
     assert len(ros2_proxies()) == 1
 
 
@@ -94,7 +94,9 @@ def test_actions(outward: bool, lan: Outside, inside2: Inside2) -> None:
 def exchange(
     server: str, client: str, topic: str, vendor: str, outward: bool, lan: Outside, inside2: Inside2
 ) -> Log:
-    """What a client prints, with its server on the other side; ``outward``: that is inside."""
+    """The output of a client with its server on the other side. With ``outward`` the server is
+    inside.
+    """
     network = inside2.made.network()
     if outward:
         inside2.node(network, vendor, server, topic)
@@ -104,7 +106,7 @@ def exchange(
 
 
 def test_domains_are_apart(lan: Outside, inside2: Inside2) -> None:
-    """That of the variable; outside has another, and hears nothing of it."""
+    """The domain of the variable. Outside has another domain, and receives nothing."""
     network = inside2.made.network()
     inside2.node(network, "jazzy", "pub", "/out", options=("--env", "ROS_DOMAIN_ID=7"))
     heard = inside2.node(network, "jazzy", "pub", "/out", "--word", "zero")
@@ -124,7 +126,9 @@ def test_domains_are_apart(lan: Outside, inside2: Inside2) -> None:
 def test_a_container_that_is_gone_takes_its_participants_with_it(
     end: str, lan: Outside, inside2: Inside2
 ) -> None:
-    """Without word of it outside would believe in them for the 20 s of their lease."""
+    """Without dispose messages, outside would keep the participants for the lease duration
+    of 20 s.
+    """
     network = inside2.made.network()
     neighbour = inside2.node(network, "jazzy", "pub", "/other", "--word", "neighbour")
     node = inside2.node(network, "jazzy", "pub", "/out")

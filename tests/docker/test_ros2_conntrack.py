@@ -1,7 +1,7 @@
-"""Ports that are published while outside goes on sending to them: every node is heard again soon.
+"""Ports that are published while outside goes on sending: each node's messages soon arrive again.
 
-An engine before 23.0, as Debian 12 has it, keeps conntrack entries without DNAT from the time in
-which the ports were not published. The operator deletes these.
+An engine before 23.0, such as that of Debian 12, keeps conntrack entries without DNAT from the time
+before the ports were published. The operator deletes these entries.
 """
 
 import re
@@ -21,7 +21,7 @@ OPTIONS = ROS2_OPTIONS
 SOON_S = 10
 """Seconds after which messages flow again, once all parts run."""
 DISPOSED_S = 5
-"""Seconds in which outside forgets a node whose dispose message it got: without one it takes 20."""
+"""Seconds in which outside forgets a node after a dispose message. Without, the time is 20 s."""
 VENDORS = pytest.mark.parametrize("vendor", ["jazzy", "cyclone"])
 Start = Callable[..., Controller]
 
@@ -35,7 +35,7 @@ def _nodes_end(lan: Outside) -> Iterator[None]:
 
 
 def make_flow(lan: Outside, inside2: Inside2, vendor: str) -> Flow:
-    """Traffic whose participants inside have their ports for good."""
+    """Traffic whose participants inside keep their ports."""
     flow = Flow(lan, inside2, vendors=(vendor, vendor))
     flow.wait(0)
     proxy = the_proxy()
@@ -71,14 +71,14 @@ def test_nodes_that_run_through_uninstall_and_install(
     print(f"{vendor}, since uninstall: {flow.gaps(began)}; since all ran again: {flow.gaps(again)}")
 
 
-def test_outside_is_told_of_the_end_of_what_is_uninstalled(
+def test_uninstall_sends_dispose_messages_outside(
     start_controller: Start,
     lan: Outside,
     inside2: Inside2,
     controller_image: str,
     proxy_image: str,
 ) -> None:
-    """Without dispose messages it believes in nodes inside for 20 s."""
+    """Without dispose messages outside keeps nodes inside for 20 s."""
     controller = start_controller(*OPTIONS)
     flow = make_flow(lan, inside2, "jazzy")
     watcher = lan.node("jazzy", "names", "/any").log.read
@@ -92,7 +92,7 @@ def test_outside_is_told_of_the_end_of_what_is_uninstalled(
 
 
 def wait_for_names(read: Callable[[], str], name: str, there: bool, seconds: float = 60) -> None:
-    """Wait until a node outside knows another one, or does not."""
+    """Wait until a node outside knows another node, or no longer does."""
 
     def holds() -> bool:
         lines = re.findall("^nodes .* end$", read(), re.MULTILINE)

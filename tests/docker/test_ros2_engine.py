@@ -1,6 +1,6 @@
-"""An engine with nodes of ROS 2 that is ended or killed, and started again.
+"""An engine with ROS 2 nodes that is ended or killed, and restarted.
 
-It is the tests' own, so that nobody else's containers are touched.
+The engine is private, so that other containers are not touched.
 """
 
 import signal
@@ -32,7 +32,7 @@ def engine(
 
 @pytest.fixture(scope="module")
 def neighbour(ros2_image: str, engine: PrivateEngine) -> Iterator[Outside]:
-    """A machine on the LAN, which outlives the engine: it runs on this machine's."""
+    """A machine on the LAN, on this machine's engine, which outlives the private engine."""
     with machine_on_lan(ros2_image, "neighbour", NUMBER, engine.namespace) as outside:
         yield outside
 
@@ -42,7 +42,7 @@ def flow(
     engine: PrivateEngine, neighbour: Outside, ros2_image: str, proxy_image: str,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Flow]:  # fmt: skip
-    """Traffic, with a controller beside the engine, in its network namespace."""
+    """Traffic, with a controller in the network namespace of the engine."""
     process = Process(
         tmp_path_factory.mktemp("controller"), "--proxy-image", proxy_image, "--ports", "32",
         "--advertise-host", addresses(NUMBER)[0], namespace=engine.namespace,
@@ -62,9 +62,8 @@ def flow(
 def test_everything_comes_back_with_the_engine(
     how: signal.Signals, then: tuple[str, ...], engine: PrivateEngine, flow: Flow
 ) -> None:
-    """The engine ends the containers, at the latest when it is back, and starts them again.
-
-    Their addresses may be others.
+    """The engine ends the containers, at the latest after its return, and restarts them, perhaps
+    with other addresses.
     """
     proxy = the_proxy()
     port_range = proxy.ports

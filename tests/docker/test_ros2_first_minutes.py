@@ -54,7 +54,7 @@ def test_a_setting_that_leads_past_the_proxy(
     lan: Outside,
     inside2: Inside2,
 ) -> None:
-    """Without the LAN's multicast for ROS_STATIC_PEERS, which are there in its place."""
+    """For ROS_STATIC_PEERS without the LAN's multicast, which static peers replace."""
     is_by_peers = fix == STATIC_PEERS
     controller = start_controller(*OPTIONS, *(("--ros2-lan", "none") if is_by_peers else ()))
     network = inside2.made.network()

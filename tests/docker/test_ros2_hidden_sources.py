@@ -1,4 +1,4 @@
-"""An engine that sends datagrams of outside on with the gateway's address, as rootless ones do."""
+"""An engine that forwards outside datagrams with the gateway's address, like rootless engines."""
 
 import json
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Two hosts with an engine and an operator each, and no multicast between them: they are peers."""
+"""Two hosts with an engine and an operator each, as peers without multicast between the hosts."""
 
 import time
 from collections.abc import Iterator
@@ -22,13 +22,13 @@ HERE, THERE = addresses(NUMBER)
 
 @dataclass(frozen=True)
 class Host:
-    """One of the hosts; ``url`` is its engine's, empty for that of this machine."""
+    """A host. ``url`` is the address of its engine, empty for this machine's engine."""
 
     url: str
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """Within, what is asked of an engine is asked of this host's."""
+        """Send all calls in this context to this host's engine."""
         with pytest.MonkeyPatch.context() as patch:
             if self.url:
                 patch.setenv("DOCKER_HOST", self.url)

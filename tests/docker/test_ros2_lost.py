@@ -41,8 +41,8 @@ LOSSES: dict[str, Callable[[Proxy], object]] = {
 @pytest.mark.parametrize(
     "how", [pytest.param(how, marks=[pytest.mark.smoke] * (how == "docker kill")) for how in LOSSES]
 )
-def test_what_is_lost_comes_back(how: str, flow: Flow) -> None:
-    """On the same ports, which participants keep for their proxy."""
+def test_lost_parts_come_back(how: str, flow: Flow) -> None:
+    """On the same ports, which participants keep for the proxy."""
     proxy = the_proxy()
     wait_until(lambda: ports_are_kept(proxy), 30, lambda: str(domain(proxy).inside))
     before = ports(proxy)
@@ -74,7 +74,9 @@ def test_an_outside_node_that_comes_after_the_lan_relay_was_lost_is_heard(
 
 
 def test_controller_killed(flow: Flow, controller: Controller) -> None:
-    """Everything goes on without it; what is lost meanwhile comes back with it."""
+    """Everything goes on without the controller. Parts lost meanwhile come back with the
+    controller.
+    """
     proxy = the_proxy()
     killed = time.time()
     controller.kill()
@@ -91,7 +93,7 @@ def test_controller_killed(flow: Flow, controller: Controller) -> None:
 def test_proxy_and_lan_relay_crash_while_no_controller_runs(
     flow: Flow, controller: Controller
 ) -> None:
-    """The engine starts both again, and they need nobody else."""
+    """The engine restarts both, which is sufficient."""
     proxy = the_proxy()
     controller.kill()
     try:

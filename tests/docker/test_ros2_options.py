@@ -1,4 +1,4 @@
-"""What a controller is told of ROS 2, and what it finds on its host."""
+"""A controller's options for ROS 2, and taken ports of the host."""
 
 import socket
 import time
@@ -24,7 +24,7 @@ from tests.docker.ros2 import (
 def test_udp_ports_that_are_taken_are_not_chosen(
     start_controller: Callable[..., Controller], inside2: Inside2
 ) -> None:
-    """By another container that publishes them, and by a program on this host."""
+    """Ports of another container, and of a program on this host."""
     network = inside2.made.network()
     first = WINDOW[0]
     web = inside2.made.idle(network, labels=(), options=("--publish", f"{first + 3}:80/udp"))
@@ -42,10 +42,10 @@ def test_udp_ports_that_are_taken_are_not_chosen(
         assert web.state == "running"
 
 
-def test_on_another_range_participants_meet_anew(
+def test_participants_rediscover_each_other_on_another_range(
     start_controller: Callable[..., Controller], lan: Outside, inside2: Inside2
 ) -> None:
-    """Outside heeds no other locators of whom it knows: both sides have to forget, and be told."""
+    """Outside ignores new locators of a known participant: both sides have to forget first."""
     controller = start_controller(*OPTIONS)
     try:
         flow = Flow(lan, inside2)
@@ -76,7 +76,7 @@ def test_on_another_range_participants_meet_anew(
 def test_range_taken_by_another_while_neither_proxy_nor_operator_was_there(
     start_controller: Callable[..., Controller], lan: Outside, inside2: Inside2
 ) -> None:
-    """Nobody knows who was there: they have to be restarted, as nodes of ROS 1 have."""
+    """No program remembers the participants. Users have to restart them, like ROS 1 nodes."""
     controller = start_controller(*OPTIONS)
     try:
         Flow(lan, inside2)
@@ -105,7 +105,7 @@ def test_range_taken_by_another_while_neither_proxy_nor_operator_was_there(
 def test_range_grows_in_place(
     start_controller: Callable[..., Controller], lan: Outside, inside2: Inside2
 ) -> None:
-    """The port that was the LAN relay's is published then, and the LAN relay gets another one."""
+    """The former port of the LAN relay is published, and the LAN relay gets another port."""
     start_controller(*OPTIONS)
     try:
         flow = Flow(lan, inside2)
@@ -180,7 +180,7 @@ def test_a_new_image_replaces_proxy_and_lan_relay(
 
 
 def ids(proxy: Proxy) -> set[str]:
-    """Those of the containers of the proxy's image; empty ones where there is none."""
+    """The ids of the proxy's and the LAN relay's containers, empty if missing."""
     return {inspect(name, check=False).get("Id", "") for name in (proxy.name, proxy.lan_relay)}
 
 
@@ -204,7 +204,7 @@ def test_on_an_internal_network_the_proxy_is_the_way_out(
 def test_rules_are_kept_from_the_start(
     start_controller: Callable[..., Controller], lan: Outside, inside2: Inside2
 ) -> None:
-    """Those of a label, and those of the operator for all."""
+    """The rules of a label, and the operator's rules for all."""
     start_controller(*OPTIONS, "--policy", "deny publish /hidden")
     try:
         network = inside2.made.network()

@@ -1,4 +1,4 @@
-"""A stock Compose file, as tutorials have it: the label is the only change."""
+"""A stock Compose file, like in tutorials. The label is the only change."""
 
 import json
 from collections.abc import Iterator
@@ -19,12 +19,12 @@ NODES = {
     "cpp_sub": ("roscpp", "sub", "--topic", "/to_cpp"),
     "beside": ("roscpp", "pub", "--topic", "/from_beside", "--word", "beside"),
 }
-"""Services, with what they run; ``beside`` is in the network of another one."""
+"""The commands of services. ``beside`` is in the network of another service."""
 
 
 @pytest.fixture
 def project(tmp_path: Path, ros_image: str, robot: Robot) -> Iterator[Path]:
-    """Files of Compose: one without a word of rosproxy, and one that adds labels to it."""
+    """Two Compose files: a stock file without rosproxy, and a file that adds labels."""
     services = {
         name: {
             "image": ros_image,
@@ -45,7 +45,7 @@ def project(tmp_path: Path, ros_image: str, robot: Robot) -> Iterator[Path]:
 
 
 def printed(project: Path, service: str) -> Log:
-    """What a service has printed; Compose puts its name before each line."""
+    """The output of a service. Compose puts the service's name before each line."""
 
     def read() -> str:
         text = compose(project, *FILES, "logs", "--no-color", service, variables={})

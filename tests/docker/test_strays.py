@@ -1,6 +1,7 @@
-"""Nodes that reach the real master before their proxy is there, and register around it.
+"""Nodes that reach the real master before the proxy starts, and register directly.
 
-They are in a network whose name server knows the robot. Nobody outside could reach them then.
+The nodes' network has a name server that knows the robot. Without adoption, outside could not reach
+these nodes.
 """
 
 import time
@@ -24,13 +25,13 @@ def dns_options(named: Robot) -> Iterator[tuple[str, ...]]:
 
 
 def is_stray(robot: Robot, node: Container) -> bool:
-    """Whether the master knows the node by its container's own name."""
+    """Whether the master has the node with the container's host name."""
     hostname = inspect(node.name)["Config"]["Hostname"]
     return robot.uri(node.node).startswith(f"http://{hostname}:")
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
-def test_nodes_that_were_there_first_are_adopted(
+def test_nodes_that_registered_first_are_adopted(
     library: str, start_controller: Callable[..., Controller], net: Inside, named: Robot,
     dns_options: tuple[str, ...],
 ) -> None:  # fmt: skip
@@ -61,7 +62,7 @@ def test_nodes_that_were_there_first_are_adopted(
             assert inspect(container.name)["RestartCount"] == 0
             assert "shutdown" not in container.log.read()
         docker("stop", node.name)
-        wait_until(lambda: not named.uri(node.node), 5, "it is gone from the master")
+        wait_until(lambda: not named.uri(node.node), 5, "the node is unregistered")
     finally:
         named.end("robot_listener")
         named.end("robot_talker")

@@ -1,4 +1,4 @@
-"""Uninstalling as the guide has it: nothing of the operator's is left, and nodes go on."""
+"""Uninstalling by the guide: nothing of the operator is left, and nodes go on."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ from tests.docker.ros2 import Inside2
 
 
 def uninstall(operator_image: str, proxy_image: str, *options: str, check: bool = True) -> str:
-    """Run the guide's command; what it says."""
+    """Run the guide's command. Return the output."""
     socket = "/var/run/docker.sock:/var/run/docker.sock"
     return docker("run", "--rm", "--network", "host", *HARDENED, "--volume", socket,
                   operator_image, "docker", "--proxy-image", proxy_image, *options,

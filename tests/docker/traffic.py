@@ -1,4 +1,4 @@
-"""Topics and services across the proxy while something happens to it."""
+"""Topics and services through a proxy during disturbances."""
 
 import os
 import signal
@@ -15,10 +15,9 @@ from tests.docker.robot import Robot
 
 @dataclass(frozen=True)
 class Traffic:
-    """One node inside that publishes, one that listens and one with a service; and theirs outside.
-
-    ``outward`` is what the robot hears, ``inward`` what is heard inside, ``replies`` what the
-    robot has from the service inside.
+    """A publisher, a subscriber and a server inside, each with a peer outside. ``outward`` are
+    messages at the robot, ``inward`` messages inside, ``service`` the robot's replies from the
+    service inside.
     """
 
     talker: Container
@@ -30,7 +29,7 @@ class Traffic:
     words: tuple[str, str]
 
     def wait(self, since: float = 0, seconds: float = 60) -> None:
-        """Wait until all of it flows."""
+        """Wait until messages and replies flow."""
         self.outward.wait_for(self.words[0], since=since, seconds=seconds)
         self.inward.wait_for(self.words[1], since=since, seconds=seconds)
         self.service.wait_for("ask", since=since, seconds=seconds, verb="reply")
