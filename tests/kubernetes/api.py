@@ -35,7 +35,7 @@ PLURALS = {
 
 
 class Refused(AssertionError):
-    """The API server has refused a call. ``status`` is HTTP's, ``text`` what it says."""
+    """The API server refused a call. ``status`` is the HTTP status, ``text`` the message."""
 
     def __init__(self, status: int, text: str, warnings: str) -> None:
         super().__init__(f"{status}: {text}")
@@ -75,7 +75,7 @@ def objects(resource: str, namespace: str = "", selector: str = "") -> list[Json
 
 
 def create(body: Json) -> Json:
-    """Create an object; its kind and namespace say where."""
+    """Create an object at the path of its kind and namespace."""
     url_path = path(PLURALS[body["kind"]], body["metadata"].get("namespace", ""))
     return json_call("POST", url_path, body)
 
@@ -88,7 +88,7 @@ def patch(resource: str, namespace: str, name: str, change: Json) -> Json:
 
 
 def delete(resource: str, namespace: str, name: str, *, grace: int | None = None) -> None:
-    """Delete an object, if it is there. ``grace`` is in seconds."""
+    """Delete an object if it exists. ``grace`` is in seconds."""
     query = {} if grace is None else {"gracePeriodSeconds": str(grace)}
     try:
         json_call("DELETE", path(resource, namespace, name), query=query)
@@ -98,7 +98,7 @@ def delete(resource: str, namespace: str, name: str, *, grace: int | None = None
 
 
 def logs(namespace: str, pod: str, *, previous: bool = False) -> str:
-    """What a pod's container has printed; empty if it can't be had."""
+    """The output of a pod's container; empty if not available."""
     query = {"previous": "true"} if previous else {}
     try:
         return call("GET", path("pods", namespace, pod, "log"), query=query)[0]
@@ -107,7 +107,7 @@ def logs(namespace: str, pod: str, *, previous: bool = False) -> str:
 
 
 def dry_run(body: Json) -> tuple[Json, str]:
-    """What the API server would make of an object, and what it warns of."""
+    """The object that the API server would create, and the warnings."""
     url_path = path(PLURALS[body["kind"]], body["metadata"].get("namespace", ""))
     text, warnings = call("POST", url_path, body, query={"dryRun": "All"})
     created: Json = json.loads(text)
@@ -125,7 +125,7 @@ def call(
 ) -> tuple[str, str]:  # fmt: skip
     """Make a call; return the body and the warnings of the answer.
 
-    While the API server starts again, it is tried for half a minute.
+    During a restart of the API server, calls are repeated for half a minute.
     """
     end = time.monotonic() + 30
     while True:

@@ -21,7 +21,7 @@ from tests.kubernetes.robot import Robot, robot_with_master
 _LOCK = Path("/run/lock/rosproxy-cluster")
 LAST = ("test_chart", "test_operator_killed", "test_leader", "test_monitoring", "test_api_server",
         "test_node_lost", "test_upgrade", "test_uninstall")  # fmt: skip
-"""The modules whose tests disturb the whole cluster, in their order."""
+"""The modules whose tests disturb the whole cluster, in order."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -62,10 +62,10 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.fixture(scope="session")
 def _cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The cluster that is up; else it is brought up, and down again afterwards."""
+    """Use the running cluster. Otherwise bring a cluster up, and down afterwards."""
     log = tmp_path_factory.mktemp("engine") / "dockerd.log"
     with _LOCK.open("w") as lock, running_engine(log):
-        fcntl.flock(lock, fcntl.LOCK_EX)  # one cluster, one session of tests at a time
+        fcntl.flock(lock, fcntl.LOCK_EX)  # a single session of tests at a time
         was_up = KUBECONFIG.exists()
         cluster("up")
         stop_robot()
@@ -78,7 +78,9 @@ def _cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 def cluster(*command: str) -> None:
-    """Use the cluster's tool. A process of its own: what it starts must not be a test's child."""
+    """Run the cluster's tool in a separate process, so that its programs are not children of a
+    test.
+    """
     words = [sys.executable, "-m", "tests.kubernetes.cluster", *command]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -98,13 +100,13 @@ def _release(_cluster: None) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def robot(_cluster: None) -> Iterator[Robot]:
-    """The robot with a master for the tests of one module."""
+    """The robot with a master for the tests of a module."""
     with robot_with_master() as started_robot:
         yield started_robot
 
 
 @pytest.fixture
 def net(_release: None) -> Iterator[Namespace]:
-    """A namespace for one test."""
+    """A namespace for a test."""
     with namespace() as made:
         yield made

@@ -1,8 +1,7 @@
-"""What Prometheus' discovery of Kubernetes finds, handed to it by HTTP.
+"""A replacement for Prometheus' discovery of Kubernetes, over HTTP.
 
-Debian builds Prometheus without that discovery. The targets and their labels are those of its roles
-`pod` and `endpoints`, as its documentation has them. Which of them are scraped, and as what, is for
-the chart's monitors to say.
+Debian builds Prometheus without that discovery. Targets and labels follow the documentation of the
+roles `pod` and `endpoints`. The chart's monitors choose and relabel the targets.
 """
 
 import contextlib
@@ -35,12 +34,14 @@ def discovery() -> Iterator[str]:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """While the API server is away there is no answer, and Prometheus keeps the targets it has."""
+    """Serves targets. Without the API server there is no answer, and Prometheus keeps its
+    targets.
+    """
 
     def do_GET(self) -> None:
         _, role, namespace = self.path.split("/")
         groups = {"pod": _pods, "endpoints": _endpoints}[role](namespace)
-        with contextlib.suppress(OSError):  # Prometheus waits for no more than a moment
+        with contextlib.suppress(OSError):  # Prometheus has a short time limit
             self.send_response(200)
             self.send_header("Content-Type", "application/json")
             self.end_headers()
@@ -74,7 +75,7 @@ def _pods(namespace: str) -> Iterator[Json]:
 def _endpoints(namespace: str) -> Iterator[Json]:
     """Each port of each address, with the labels of its Service and its pod.
 
-    Left out: ports of such a pod that no Service has, which a monitor that names a port drops.
+    Ports of such a pod without a Service are left out. A monitor with a port name drops these.
     """
     services = _by_name("services", namespace)
     pods = _by_name("pods", namespace)

@@ -1,7 +1,6 @@
-"""The chart's monitors and alerts, made a configuration of Prometheus.
+"""A configuration of Prometheus from the chart's monitors and alerts.
 
-The Prometheus operator would do that; the rules here are those that it writes around a monitor's
-own.
+This replaces the Prometheus operator, and adds the same rules around a monitor's rules.
 """
 
 import re

@@ -31,7 +31,7 @@ class Pod:
 
     @property
     def node(self) -> str:
-        """The ROS name of the test node in it."""
+        """The ROS name of the test node in this pod."""
         return self.name.replace("-", "_")
 
     @property
@@ -56,7 +56,7 @@ class Pod:
 
     @property
     def environment(self) -> dict[str, Any]:
-        """The variables of its first container, fieldRefs as their path."""
+        """The variables of the first container, fieldRefs as their path."""
         return environment(self.body["spec"]["containers"][0])
 
     def wait_ready(self, seconds: float = 30) -> float:
@@ -65,19 +65,19 @@ class Pod:
         )
 
     def run(self, *command: str, seconds: float = 30, check: bool = True) -> str:
-        """Run a command in its first container."""
+        """Run a command in the first container."""
         words = ("exec", "--namespace", self.namespace, self.name, "--", "timeout", str(seconds))
         return kubectl(*words, *command, check=check, seconds=seconds + 10)
 
     def crash(self) -> None:
-        """Kill the first process of its first container from behind, as the kernel would."""
+        """Kill the first process of the first container, like the kernel."""
         body = self.body
         container = body["status"]["containerStatuses"][0]["containerID"]
         node = node_named(body["spec"]["nodeName"])
         crash_container(node, container.removeprefix("containerd://"))
 
     def remove(self, grace: int | None = None, *, wait: bool = True) -> None:
-        """Delete it, and wait until it is gone; another of its name may be there then."""
+        """Delete the pod, and wait until gone. Another pod may have the name then."""
         uid = self.uid
         api.delete("pods", self.namespace, self.name, grace=grace)
         if wait:
@@ -100,13 +100,13 @@ def environment(container: Json) -> dict[str, Any]:
 
 @dataclass
 class Namespace:
-    """Makes pods in one Kubernetes namespace."""
+    """Makes pods in a Kubernetes namespace."""
 
     name: str
     labels: Mapping[str, str] = field(default_factory=lambda: {INJECT: "true"})
 
     def pod(self, *command: str, on: str = "", **more: Any) -> Pod:
-        """Start a pod as a user would: an image, a command and a label."""
+        """Start a pod like a user: an image, a command and a label."""
         pod = Pod(self.name, more.pop("name", "") or unique("pod"))
         api.create(self.pod_body(pod.name, *command, on=on, **more))
         return pod
@@ -134,7 +134,7 @@ class Namespace:
         }  # fmt: skip
 
     def node(self, library: str, role: str, *options: str, **more: Any) -> Pod:
-        """Start one of the test nodes in a pod; both have the same name."""
+        """Start a test node in a pod. Both have the same name."""
         pod = Pod(self.name, more.setdefault("name", unique(role)))
         return self.pod(*node_command(library, role, *options, f"__name:={pod.node}"), **more)
 
@@ -148,7 +148,7 @@ class Namespace:
 
 @contextmanager
 def namespace(name: str = "", labels: Mapping[str, str] | None = None) -> Iterator[Namespace]:
-    """A namespace; with all in it, it is deleted afterwards."""
+    """A namespace, deleted with its objects afterwards."""
     name = name or unique("test")
     api.create({"apiVersion": "v1", "kind": "Namespace",
                 "metadata": {"name": name, "labels": dict(labels or {})}})  # fmt: skip

@@ -52,7 +52,7 @@ def install() -> None:
 
 
 def install_again(**values: Any) -> None:
-    """Install the chart where `uninstall` has removed it, with these values besides."""
+    """Install the chart after `uninstall`, with these additional values."""
     _apply("install", **values)
 
 
@@ -69,7 +69,7 @@ def install_from_a_registry(directory: Path) -> None:
 
 
 def upgrade(**values: Any) -> None:
-    """Upgrade it, with these values besides those of the tests."""
+    """Upgrade the release, with these values in addition to the tests' values."""
     _apply("upgrade", **values)
 
 
@@ -85,21 +85,21 @@ def uninstall() -> None:
 
 
 def remove() -> None:
-    """Leave nothing of it, in whatever state it is."""
+    """Remove the release completely, in any state."""
     helm("uninstall", NAME, "--namespace", NAMESPACE, "--wait", "--ignore-not-found")
     api.delete("namespaces", "", NAMESPACE)
     wait_until(lambda: not api.get("namespaces", "", NAMESPACE), 60, f"{NAMESPACE} is gone")
 
 
 def operators() -> list[Pod]:
-    """The operators' pods, those left out that are about to go."""
+    """The operators' pods, without pods that are being deleted."""
     bodies = api.objects("pods", NAMESPACE, OPERATORS)
     alive = [body["metadata"] for body in bodies if "deletionTimestamp" not in body["metadata"]]
     return [Pod(NAMESPACE, metadata["name"]) for metadata in alive]
 
 
 def holder() -> str:
-    """Who holds the Lease: the name of an operator's pod and something of its process."""
+    """The holder of the Lease: the name of an operator's pod, and a part for the process."""
     return str(api.get("leases", NAMESPACE, FULL_NAME).get("spec", {}).get("holderIdentity", ""))
 
 
@@ -116,9 +116,9 @@ def operator() -> Pod:
 
 
 def kill_operator() -> None:
-    """Kill the process of the operator that leads, and delete its pod.
+    """Kill the process of the leading operator, and delete the pod.
 
-    Without the latter the kubelet waits 10 seconds, 20, 40, … before it starts the next.
+    Without the deletion, the kubelet waits 10 s, 20 s, 40 s, … before the next start.
     """
     pod = operator()
     pod.crash()
@@ -126,9 +126,9 @@ def kill_operator() -> None:
 
 
 def wait_operator(seconds: float = 60) -> None:
-    """Wait until all operators are ready, one leads, and the webhook is reached.
+    """Wait until all operators are ready, one leads, and the webhook answers.
 
-    For a second after that one is ready, kube-proxy still leads to the one before.
+    For a second after an operator is ready, kube-proxy still leads to the former operator.
     """
     wanted = api.get("deployments", NAMESPACE, FULL_NAME)["spec"]["replicas"]
 
@@ -142,7 +142,7 @@ def wait_operator(seconds: float = 60) -> None:
 
 
 def _webhook_answers() -> bool:
-    """Whether it warns of a labelled pod where there is no RosProxy, or whether there is none."""
+    """Whether the webhook warns of a labelled pod without a RosProxy. True without a webhook."""
     if not api.get("mutatingwebhookconfigurations", "", FULL_NAME):
         return True
     body = Namespace("default").pod_body("unused", "true")

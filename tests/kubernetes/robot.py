@@ -1,4 +1,4 @@
-"""The robot outside the cluster: its roscore and its nodes."""
+"""The robot outside the cluster: roscore and nodes."""
 
 import itertools
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ _ports = itertools.count(11311)
 
 @dataclass(frozen=True)
 class Robot:
-    """The robot as one module of tests uses it: with a master of its own at ``port``."""
+    """The robot for a module of tests, with a separate master at ``port``."""
 
     port: int
     root: Path
@@ -26,7 +26,7 @@ class Robot:
         return f"http://{ROBOT_ADDRESS}:{self.port}"
 
     def run(self, *command: str, check: bool = True, seconds: float = 30) -> str:
-        """Run a program; one that hangs is stopped and fails the test."""
+        """Run a program. A hanging program is stopped and fails the test."""
         words = (ROBOT, "timeout", str(seconds), *command)
         variable = ("--env", f"ROS_MASTER_URI={self.master_uri}")
         return docker("exec", *variable, *words, check=check, seconds=seconds + 10)
@@ -38,7 +38,7 @@ class Robot:
         wait_until(lambda: "/rosout" in self.nodes(), 40, lambda: self._output("roscore"))
 
     def node(self, name: str, library: str, role: str, *options: str, master_uri: str = "") -> Log:
-        """Start a test node; what it prints goes to a file."""
+        """Start a test node with its output in a file."""
         words = " ".join(node_command(library, role, *options, f"__name:={name}"))
         self._start(name, words, master_uri or self.master_uri)
         return Log(lambda: self._output(name))
@@ -49,12 +49,12 @@ class Robot:
         docker("exec", ROBOT, "sh", "-c", f"kill -{signal} $(cat {file})", check=False)
 
     def end_all(self) -> None:
-        """Kill all of them with what they have started."""
+        """Kill all nodes with their children."""
         script = f"cat /tmp/{self.port}/*.pid | sed s/^/-/ | xargs kill -KILL --"
         docker("exec", ROBOT, "sh", "-c", script, check=False)
 
     def nodes(self) -> dict[str, str]:
-        """Every node that the master knows, with its URI; none if it does not answer."""
+        """The URI of each node at the master; empty if the master does not answer."""
         return nodes_at(self.master_uri)
 
     def uri(self, node: str) -> str:

@@ -39,7 +39,7 @@ class Robot2:
     def node(
         self, vendor: str, kind: str, topic: str, *options: str, domain: int = 0, name: str = ""
     ) -> Log:
-        """Start a node; what it prints goes to a file."""
+        """Start a node with its output in a file."""
         name = name or f"robot_{kind}_{next(_numbers)}"
         words = " ".join(command(vendor, kind, topic, *options, "--name", name))
         file = f"/tmp/{name}.log"
@@ -94,7 +94,7 @@ def lan_relays(of: RosProxy) -> list[Json]:
 
 
 def domain(proxy: Proxy) -> DomainStatus:
-    """What a proxy tells of its domain; nothing while it does not answer."""
+    """The status of a proxy's domain; empty while the proxy does not answer."""
     try:
         (status,) = parse_status(proxy.run("rosproxy", "status", "--json", check=False)).domains
     except ValueError:
@@ -103,13 +103,13 @@ def domain(proxy: Proxy) -> DomainStatus:
 
 
 def ports_are_kept(proxy: Proxy, count: int) -> bool:
-    """Whether it has so many participants inside, and each keeps its ports for it."""
+    """Whether a proxy has ``count`` participants inside that all keep their ports."""
     kept = [participant.kept for participant in domain(proxy).inside]
     return len(kept) == count and all(kept)
 
 
 def leased(proxy: Proxy) -> dict[str, list[int]]:
-    """The ports of the range that lead to participants inside, by their GUID prefixes."""
+    """The ports of the range that lead to participants inside, by GUID prefix."""
     return {
         participant.guid_prefix: sorted(lease.port for lease in participant.leases)
         for participant in domain(proxy).inside

@@ -1,4 +1,4 @@
-"""RosProxies and what the operator makes of them."""
+"""RosProxies, and the operator's objects for RosProxies."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from tests.kubernetes.pods import Pod
 
 PROXY_OF = "rosproxy.io/proxy-of"
 NOWHERE = {"uri": "http://192.0.2.9:11311"}
-"""A master that nobody has to reach."""
+"""A master that tests do not need to reach."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Proxy(Pod):
-    """A proxy's pod. ``on`` is the node that it is for, ``ports`` its range there."""
+    """A proxy's pod for the node ``on``, with the range ``ports``."""
 
     uid_then: str
     on: str
@@ -60,7 +60,7 @@ class RosProxy:
 
     @property
     def proxies(self) -> list[Proxy]:
-        """The proxies' pods, those being deleted left out."""
+        """The proxies' pods, without pods that are being deleted."""
         selector = f"{PROXY_OF}={self.name},app.kubernetes.io/component=proxy"
         bodies = api.objects("pods", self.namespace, selector)
         return [proxy(body) for body in bodies if "deletionTimestamp" not in body["metadata"]]
@@ -69,7 +69,7 @@ class RosProxy:
         return next((proxy for proxy in self.proxies if proxy.on == node), None)
 
     def the_proxy(self, node: str = "node1", seconds: float = 30) -> Proxy:
-        """The proxy on a node, once it is ready."""
+        """Wait until the proxy on a node is ready. Return the proxy."""
 
         ready: list[Proxy] = []
 
@@ -89,7 +89,7 @@ class RosProxy:
     def wait_for(
         self, kind: str, status: str = "True", reason: str = "", seconds: float = 40
     ) -> Json:
-        """Wait for a condition; return it."""
+        """Wait for a condition. Return the condition."""
 
         def is_met() -> bool:
             condition = self.condition(kind)
@@ -105,7 +105,7 @@ class RosProxy:
         return self.status
 
     def on(self, node: str) -> Json:
-        """What its status says of a node."""
+        """The row of a node in the status."""
         rows = [row for row in self.status.get("perNode", []) if row["name"] == node]
         return rows[0] if rows else {}
 
@@ -117,7 +117,7 @@ class RosProxy:
         return wait_event(self.namespace, self.name, "RosProxy", reason, text, seconds)
 
     def change(self, **spec: Any) -> None:
-        """Change fields of its spec; None takes one out."""
+        """Change fields of the spec. None removes a field."""
         api.patch("rosproxies", self.namespace, self.name, {"spec": spec})
 
     def remove(self) -> None:

@@ -1,4 +1,4 @@
-"""A RosProxy that is changed or deleted while its proxies serve."""
+"""Changes and deletion of a RosProxy while proxies serve."""
 
 import time
 
@@ -16,14 +16,14 @@ from tests.kubernetes.traffic import START, wait_for_service
 
 
 def talker(net: Namespace, topic: str, library: str = "rospy", **more: str) -> str:
-    """Start a node that publishes, once its proxy can be found; its ROS name."""
+    """Start a publisher once the Service of the proxy exists. Return the ROS name."""
     wait_for_service(net)
     pod = net.node(library, "pub", "--topic", topic, "--word", "inside", on="node1", **more)
     return pod.node
 
 
 def test_another_master(net: Namespace, robot: Robot) -> None:
-    """Nodes that start from now on are at the new one, and none is left at the old one."""
+    """New nodes register at the new master, and no node is left at the old master."""
     topic = f"/{unique('moved').replace('-', '_')}"
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     old = talker(net, topic)
@@ -43,7 +43,7 @@ def test_another_master(net: Namespace, robot: Robot) -> None:
 
 
 def test_another_selector(net: Namespace) -> None:
-    """Pods that are not selected any more keep a proxy on their node for the grace period only."""
+    """Pods that are no longer selected keep a proxy on the node for the grace period only."""
     made = rosproxy(net.name, master=NOWHERE, ports=4, graceSeconds=2)
     net.idle(on="node1")
     net.idle(on="node2", labels={INJECT: "true", "app": "x"})
@@ -63,12 +63,12 @@ def test_node_selector(net: Namespace) -> None:
 
 
 def test_advertised_host_of_a_node(net: Namespace, robot: Robot) -> None:
-    """An annotation of the node overrides its address."""
+    """An annotation of the node overrides the node's address."""
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=4)
     api.patch("nodes", "", "node2", {"metadata": {"annotations": {_ADVERTISE: "10.88.0.12"}}})
     try:
         net.idle(on="node2")
-        made.wait_status(lambda s: bool(made.on("node2")), "node2 is told")
+        made.wait_status(lambda s: bool(made.on("node2")), "node2 has a row")
         assert made.on("node2")["advertiseHost"] == "10.88.0.12"
         api.patch("nodes", "", "node2", {"metadata": {"annotations": {_ADVERTISE: "robot-2"}}})
         made.wait_status(
@@ -87,7 +87,7 @@ def test_deleted_rosproxy_leaves_only_the_users_pods(net: Namespace, robot: Robo
 
     made.remove()
 
-    wait_until(lambda: not made.body, 60, "it is gone: nothing holds it")
+    wait_until(lambda: not made.body, 60, "the RosProxy is gone: no finalizer")
     wait_until(lambda: not made.proxies and not made.service, 40, made.tell)
     assert {body["metadata"]["uid"] for body in net.pods(INJECT)} == pods
     wait_until(lambda: not robot.uri(name), 25, lambda: f"unregistered: {robot.nodes()}")
@@ -126,7 +126,7 @@ def test_rosproxy_deleted_and_created_at_once(who: str, net: Namespace, robot: R
 
 
 def test_deleted_service_comes_back_at_its_address(net: Namespace) -> None:
-    """Running pods know it by nothing else."""
+    """Running pods know only the address."""
     made = rosproxy(net.name, master=NOWHERE, ports=4)
     wait_until(lambda: bool(made.service), 60, made.tell)
     before = made.service

@@ -1,4 +1,4 @@
-"""What the chart makes of combinations of its values, as the API server sees it."""
+"""The objects of the chart for combinations of values, checked by the API server."""
 
 import json
 import time
@@ -16,7 +16,7 @@ from tests.kubernetes.pods import Namespace, namespace
 from tests.kubernetes.rosproxies import NOWHERE, rosproxy
 
 FOREIGN = {"cert-manager.io/v1", "monitoring.coreos.com/v1"}
-"""Groups whose definitions are not in this cluster."""
+"""Groups without definitions in this cluster."""
 SECRET = "rosproxy-operator-webhook"
 
 
@@ -29,7 +29,7 @@ def namespaces(_release: None) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def restored(_release: None) -> Iterator[None]:
-    """Afterwards the release has its usual values again."""
+    """Restore the usual values of the release afterwards."""
     yield
     release.upgrade()
 
@@ -44,10 +44,10 @@ def every_object() -> list[Json]:
 
 
 def try_to_create(body: Json) -> str:
-    """Create an object in a dry run; return what the API server has against it.
+    """Create an object in a dry run. Return the API server's objections.
 
-    That something of its name is there already is found out last, after all checks. That its
-    RosProxy is not there is right: nothing is, in a dry run.
+    The API server reports an existing name last, after all checks. A missing RosProxy is right,
+    because a dry run creates nothing.
     """
     group, _, version = body["apiVersion"].rpartition("/")
     start = f"/apis/{group}/{version}" if group else f"/api/{version}"
@@ -82,7 +82,7 @@ def test_every_combination_is_accepted(namespaces: None) -> None:
 
 
 def test_every_pod_is_restricted(namespaces: None) -> None:
-    """As the API server itself understands the standard: the release's namespace enforces it."""
+    """The API server itself checks the standard, which the release's namespace enforces."""
     pods = {
         json.dumps(spec, sort_keys=True): spec for spec in map(pod_spec, every_object()) if spec
     }
@@ -193,7 +193,7 @@ def certificate() -> tuple[Any, Any]:
 
 
 def test_deleted_certificate_is_made_anew(net: Namespace, restored: None) -> None:
-    """Helm restores the empty Secret, and the operator fills it in."""
+    """Helm restores the empty Secret, and the operator fills the Secret."""
     wait_until(lambda: certificate() != (None, None), 60, "a certificate")
     before = certificate()
     api.delete("secrets", release.NAMESPACE, SECRET)

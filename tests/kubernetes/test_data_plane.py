@@ -1,4 +1,4 @@
-"""A RosProxy whose proxies let the kernel forward topics."""
+"""A RosProxy with the kernel plane."""
 
 import json
 import time
@@ -25,7 +25,7 @@ def plane_of(made: RosProxy, node: str) -> dict[str, Any]:
 
 
 def wait_forwarded(made: RosProxy, moving: Flow) -> None:
-    """Wait until the kernel forwards the talker's topic and counts its bytes."""
+    """Wait until the kernel forwards the talker's topic and counts bytes."""
     talker = moving.talker.node
 
     def is_forwarded() -> bool:

@@ -1,7 +1,7 @@
-"""Pods that a NetworkPolicy lets reach nothing but the proxy: ``direction: Both``.
+"""Pods that reach only the proxy, by NetworkPolicy: ``direction: Both``.
 
-The tests' cluster enforces no policies. What the one of the pods says of the way to the robot is
-put into each node's own filter: of the pods those get there that it does not select.
+The tests' cluster enforces no policies. So each node's filter replaces the policy on the way to the
+robot: only pods that the policy does not select get there.
 """
 
 import time
@@ -23,12 +23,12 @@ from tests.kubernetes.traffic import START, flow, wait_for_service
 
 @contextmanager
 def kept_in(made: RosProxy) -> Iterator[None]:
-    """Let no pod get to the robot but the proxies that there are now."""
+    """Block the way to the robot for all pods except the current proxies."""
     free = [made.the_proxy(node.name).ip for node in NODES]
     rules = [("-s", POD_NETWORK, "-d", ROBOT_ADDRESS, "-j", "DROP")]
     rules += [("-s", address, "-d", ROBOT_ADDRESS, "-j", "ACCEPT") for address in free]
     for node in NODES:
-        for rule in rules:  # each is put before the former ones
+        for rule in rules:  # inserted before the former rules
             inside(node, "iptables", "-w", "-I", "FORWARD", *rule)
     try:
         yield
@@ -39,7 +39,7 @@ def kept_in(made: RosProxy) -> Iterator[None]:
 
 
 def selected(made: RosProxy) -> set[str]:
-    """The pods that the policy of the pods is about; it lets them reach no address outside."""
+    """The pods that the pods' policy selects. The policy must allow no address outside."""
     name = f"rosproxy-{made.name}.pods"
     wait_until(lambda: bool(api.get("networkpolicies", made.namespace, name)), 45, made.tell)
     spec = api.get("networkpolicies", made.namespace, name)["spec"]
@@ -99,9 +99,10 @@ def test_without_it_they_hear_nobody_and_doctor_says_what_to_do(
 
 
 def test_udpros_crosses_the_boundary_both_ways(net: Namespace, robot: Robot) -> None:
-    """Not where a header has 54, 108, ... bytes: roscpp ends that by a NUL, with no proxy too.
+    """Not with headers of 54, 108, ... bytes, where roscpp ends the header by a NUL, without a
+    proxy, too.
 
-    Names of pods are as long as they are: with topics as long as these it never has.
+    The length of the topics here avoids such headers.
     """
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8, direction="Both", udp=True)
     wait_for_service(net)

@@ -57,7 +57,7 @@ def test_it_asks_the_doctor_in_each_proxys_pod(net: Namespace, robot: Robot) -> 
 
 
 def page() -> dict[str, Any]:
-    """What the operator's live page shows of all proxies, as its pod's loopback sees it."""
+    """The document of the operator's live page, from loopback in the pod."""
     code = "import urllib.request as u; print(u.urlopen('http://127.0.0.1:11313/graph').read().decode())"
     graph: dict[str, Any] = json.loads(release.operator().run("python3", "-c", code))
     return graph
@@ -85,7 +85,7 @@ def test_a_master_that_is_not_there_is_the_first_cause(net: Namespace) -> None:
 
 
 def test_a_webhook_whose_configuration_is_gone_is_told(net: Namespace) -> None:
-    """Labelled pods are made unwired then, and nobody else says why."""
+    """Otherwise no program reports why labelled pods are unwired."""
 
     def about_webhook() -> list[tuple[str, str]]:
         found = [finding for finding in doctor(net.name)[1] if finding["check"] == "webhook"]
@@ -142,10 +142,10 @@ def test_labelled_pods_without_a_rosproxy_are_told(net: Namespace) -> None:
     assert pod.name in found["text"]
 
 
-def test_who_may_not_look_is_told_which_right_is_missing(net: Namespace, tmp_path: Path) -> None:
-    """Somebody with the rights to RosProxies and pods of one namespace alone."""
+def test_the_doctor_names_missing_rights(net: Namespace, tmp_path: Path) -> None:
+    """A user with rights to RosProxies and pods of a single namespace."""
     made = rosproxy(net.name, master=NOWHERE)
-    made.wait_status(lambda s: s.get("nodes") == 0, "it was looked at")
+    made.wait_status(lambda s: s.get("nodes") == 0, "the operator has looked")
     rights = ("--verb=list", "--resource=rosproxies.rosproxy.io,pods")
     kubectl("create", "role", "looker", *rights, "-n", net.name)
     whom = ("--role=looker", f"--serviceaccount={net.name}:default")

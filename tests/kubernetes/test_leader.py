@@ -1,4 +1,4 @@
-"""Two operators, of which one leads: killed, stopped, upgraded, with pods made all the while."""
+"""Two operators: the leader is killed, stopped and upgraded, while pods are created."""
 
 import threading
 import time
@@ -21,7 +21,7 @@ REMAKE = "rosproxy.io/remake-unwired"
 
 @pytest.fixture
 def made(net: Namespace) -> RosProxy:
-    """A RosProxy with a proxy on each node, which wait for their master."""
+    """A RosProxy with a proxy on each node. The proxies wait for a master."""
     release.wait_operator()
     created = rosproxy(net.name, master=NOWHERE, ports=4)
     for node in ("node1", "node2"):
@@ -32,9 +32,9 @@ def made(net: Namespace) -> RosProxy:
 
 @contextmanager
 def pods_all_the_while(net: Namespace) -> Iterator[list[Pod]]:
-    """Pods are made, five a second, for as long as this lasts.
+    """Create five pods a second in this context.
 
-    No node takes them: what matters is admission, which does not ask where they run.
+    The pods fit no node, because only admission matters here.
     """
     pods: list[Pod] = []
     ended = threading.Event()
@@ -54,7 +54,7 @@ def pods_all_the_while(net: Namespace) -> Iterator[list[Pod]]:
 
 
 def unwired(net: Namespace) -> list[str]:
-    """The pods of users without the variable of their proxy."""
+    """The pods of users without the proxy's variable."""
     return [
         body["metadata"]["name"]
         for body in net.pods(INJECT)
@@ -63,7 +63,7 @@ def unwired(net: Namespace) -> list[str]:
 
 
 def check_once(made: RosProxy, uids: set[str]) -> None:
-    """Each proxy is the one that it was, and was made once."""
+    """Check that each proxy is unchanged, and was made once."""
     assert {proxy.uid_then for proxy in made.proxies} == uids, made.tell()
     events = [event for event in made.events if event.reason == "ProxyCreated"]
     assert [event.count for event in events] == [1, 1], made.tell()
@@ -71,16 +71,16 @@ def check_once(made: RosProxy, uids: set[str]) -> None:
 
 
 def wait_other(before: str) -> float:
-    """Wait until another one leads; in how many seconds it did."""
+    """Wait until another operator leads. Return the seconds."""
 
     def other() -> bool:
         return release.holder() not in ("", before)
 
-    return wait_until(other, 60, lambda: f"another one leads than {before}: {release.holder()}")
+    return wait_until(other, 60, lambda: f"another leader than {before}: {release.holder()}")
 
 
 def serves(net: Namespace, made: RosProxy) -> None:
-    """Wait until a new RosProxy is looked after, by whoever leads."""
+    """Wait until the leader serves a new RosProxy."""
     nobody = {"matchLabels": {"a": "b"}}
     other = rosproxy(net.name, f"{made.name}-2", master=NOWHERE, ports=4, podSelector=nobody)
     wait_until(lambda: bool(other.service), 60, other.tell)
@@ -88,7 +88,7 @@ def serves(net: Namespace, made: RosProxy) -> None:
 
 @pytest.mark.parametrize("turn", [1, 2])
 def test_the_leader_is_killed(turn: int, net: Namespace, made: RosProxy) -> None:
-    """What is made while kube-proxy still leads to the one that is dead may come by unwired."""
+    """While kube-proxy still leads to the dead operator, pods may be unwired."""
     uids = {proxy.uid_then for proxy in made.proxies}
     before = release.holder()
     with pods_all_the_while(net) as pods:
@@ -97,9 +97,9 @@ def test_the_leader_is_killed(turn: int, net: Namespace, made: RosProxy) -> None
         serves(net, made)
         release.wait_operator()
         since = len(pods)
-        wait_until(lambda: len(pods) > since + 10, 60, "more pods are made")
+        wait_until(lambda: len(pods) > since + 10, 60, "more pods are created")
     left = unwired(net)
-    note(f"leader killed: another one led after {took:.1f} s; "
+    note(f"leader killed: another led after {took:.1f} s; "
          f"{len(left)} of {len(pods)} pods not wired")  # fmt: skip
     assert not {pod.name for pod in pods[since:]} & set(left)
     for name in left:
@@ -115,7 +115,7 @@ def test_the_leader_is_stopped(net: Namespace, made: RosProxy) -> None:
         took = wait_other(before)
         serves(net, made)
         release.wait_operator()
-    note(f"leader stopped: another one led after {took:.1f} s; {len(pods)} pods made")
+    note(f"leader stopped: another led after {took:.1f} s; {len(pods)} pods made")
     assert unwired(net) == []
     check_once(made, uids)
 
@@ -138,7 +138,7 @@ def test_they_are_on_nodes_of_their_own() -> None:
     assert sorted(nodes) == ["node1", "node2"]
 
 
-def test_what_came_by_unwired_is_made_anew_on_request(net: Namespace) -> None:
+def test_unwired_pods_are_evicted_on_request(net: Namespace) -> None:
     made = rosproxy(net.name, master=NOWHERE, ports=4)
     wait_until(lambda: bool(made.service), 60, made.tell)
     template = net.pod_body("unused", "sleep", "infinity", on="node1")
@@ -163,4 +163,4 @@ def test_what_came_by_unwired_is_made_anew_on_request(net: Namespace) -> None:
     wait_until(lambda: unwired(net) == [alone.name], 120, lambda: f"{unwired(net)} {made.tell()}")
     for name in pods:
         made.wait_event("PodEvicted", name)
-    assert alone.uid, "nobody would make it anew"
+    assert alone.uid, "no controller would recreate the pod"

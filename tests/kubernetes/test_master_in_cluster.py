@@ -45,7 +45,7 @@ def inside(_release: None, robot: Robot) -> Iterator[Inside]:
 
 
 def start_master(net: Namespace) -> None:
-    """A roscore as a user runs one in a cluster: unlabelled, with a Service."""
+    """Start a roscore like a user in a cluster: unlabelled, with a Service."""
     script = "ROS_IP=$(hostname -i) exec roscore"
     net.pod("sh", "-c", script, name="master", labels={"app": "master"}, on="node2")
     api.create({

@@ -1,7 +1,7 @@
-"""Mistakes that people make: each is told where they look, and the fix that is told works.
+"""Users' mistakes: each is reported where users look, and the reported fix works.
 
-Each mistake is made, the words are waited for, and the fix is followed to the letter. After that
-the RosProxy is ready, its proxy reaches the master, and the doctor finds no error.
+Each test makes a mistake, waits for the words, and follows the fix to the letter. Then the RosProxy
+is ready, the proxy reaches the master, and the doctor finds no error.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Site:
         rosproxy(self.net.name, **{**master, "ports": 8, **spec})
 
     def create_app(self, **template: Any) -> None:
-        """Create the Deployment; ``template`` is what its pods have besides the label."""
+        """Create the Deployment. ``template`` are properties of the pods besides the label."""
         labels = {"app": APP, **template.pop("labels", {INJECT: "true"})}
         metadata = {"labels": labels, "annotations": template.pop("annotations", {})}
         command = template.pop("command", ("sleep", "infinity"))
@@ -100,9 +100,9 @@ Step = Callable[[Site], None]
 
 @dataclass(frozen=True)
 class Mistake:
-    """What is done wrong, the reason and words that are told, and what is done about it.
+    """A mistake, the reported reason and words, and the fix.
 
-    ``undo`` removes what is left of the mistake outside of the namespace.
+    ``undo`` removes remainders outside of the namespace.
     """
 
     make: Step
@@ -197,10 +197,12 @@ def _allowed_image(site: Site) -> None:
 
 
 def restart_as_told(site: Site) -> None:
-    """Restart pods that were created while their RosProxy had no Service, once that is told."""
+    """Restart pods that were created before the RosProxy's Service, once the finding is
+    reported.
+    """
     command = f"rollout restart deployment/{APP}"
     wait_until(
-        lambda: any(command in text for text in site.texts("NotWired")), 60, "a restart is told"
+        lambda: any(command in text for text in site.texts("NotWired")), 60, "a restart is the fix"
     )
     site.restart_app()
 
@@ -297,7 +299,7 @@ def _open_master(site: Site) -> None:
 
 
 def _master_service(site: Site, **spec: Any) -> None:
-    """A Service at port 11400 that leads to the master on the robot, as many sites have one."""
+    """Create a Service at port 11400 for the master on the robot, like many sites."""
     port = {"port": 11400, "targetPort": site.robot.port}
     site.create("Service", "master", ports=[port], **spec)
     ports = [{"port": site.robot.port}]

@@ -1,4 +1,4 @@
-"""A real Prometheus with the chart's monitors: what it scrapes, the dashboard, and alerts."""
+"""A real Prometheus with the chart's monitors: scraped targets, dashboard, and alerts."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,9 +35,9 @@ def prometheus(tmp_path: Path) -> Iterator[Prometheus]:
 def test_what_is_scraped_the_dashboard_and_alerts(
     net: Namespace, robot: Robot, prometheus: Prometheus
 ) -> None:
-    """One run: all is well; then one thing after the other breaks; each panel has had data."""
+    """First all is well, then parts break in turn. At the end each panel has had data."""
     release.wait_operator()
-    # The kernel forwards for the other nodes alone: `docs/reference/policy.md`.
+    # The kernel forwards only for the other nodes: `docs/reference/policy.md`.
     hidden = {"action": "Deny", "kind": "Publish", "names": ["/secret"], "nodes": ["/victim"]}
     made = rosproxy(
         net.name, master={"uri": robot.master_uri}, ports=16, dataPlane="Kernel",
@@ -98,7 +98,7 @@ def wait_for_calm(prometheus: Prometheus) -> None:
 
 
 def nobody_leads(prometheus: Prometheus) -> None:
-    """Operators that may not touch their Lease: the alert names each, and no other one fires."""
+    """Without rights on the Lease, the alert names each operator, and no other alert fires."""
     names = [pod.name for pod in release.operators()]
     expected = sorted(("RosproxyOperatorNoLeader", name) for name in names)
 
@@ -136,7 +136,7 @@ def nobody_sees(prometheus: Prometheus) -> None:
 
 
 def nobody_answers(prometheus: Prometheus, made: RosProxy) -> None:
-    """A proxy that ends twice: the kubelet waits ten seconds before it starts it once more."""
+    """End a proxy twice: before the second restart the kubelet waits ten seconds."""
     proxy = made.the_proxy("node2")
     proxy.crash()
     wait_until(lambda: proxy.restarts == 1 and proxy.ready, 60, made.tell)
@@ -147,7 +147,7 @@ def nobody_answers(prometheus: Prometheus, made: RosProxy) -> None:
 
 
 def nobody_is_let_in(prometheus: Prometheus, made: RosProxy) -> None:
-    """A proxy that outside can't reach: on its node hostPorts are not mapped any more."""
+    """A proxy that outside cannot reach, because its node maps no hostPorts."""
     proxy = made.the_proxy("node2")
     with without_host_ports(node_named("node2")):
         proxy.remove()

@@ -16,7 +16,7 @@ def wait_policy(of: RosProxy) -> Json:
     return policy(of)
 
 
-def test_it_is_made_mended_and_gone_with_its_rosproxy(net: Namespace) -> None:
+def test_the_policy_is_made_mended_and_gone_with_its_rosproxy(net: Namespace) -> None:
     made = rosproxy(net.name, master=NOWHERE, ports=4)
     spec = wait_policy(made)["spec"]
     everybody, pods, operator = spec["ingress"]
@@ -29,8 +29,8 @@ def test_it_is_made_mended_and_gone_with_its_rosproxy(net: Namespace) -> None:
     assert wait_policy(made)["spec"] == spec
     mended = policy(made)["metadata"]["generation"]
     net.idle(on="node1")
-    made.wait_status(lambda s: s.get("nodes") == 1, "there was one more look")
-    assert policy(made)["metadata"]["generation"] == mended  # it is as the operator wants it
+    made.wait_status(lambda s: s.get("nodes") == 1, "another look")
+    assert policy(made)["metadata"]["generation"] == mended  # no further change
 
     made.remove()
     wait_until(lambda: not policy(made), 45, "the policy is gone")

@@ -1,4 +1,4 @@
-"""A node whose plug is pulled, and that comes back."""
+"""A node that loses its plug, and comes back."""
 
 import time
 
@@ -15,9 +15,8 @@ from tests.kubernetes.traffic import flow
 
 
 def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
-    """The other node's traffic does not notice; this one's is there again when it is back.
-
-    The operator that leads is lost with it, and the other one tells.
+    """The other node's traffic goes on. The lost node's traffic returns with the node. The leading
+    operator is lost with the node, and the other operator reports the loss.
     """
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     # The API server reaches Services by way of node1: that is so in this cluster only.
@@ -33,12 +32,12 @@ def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
         lost = time.time()
         cluster("stop-node", lost_node)
         try:
-            made.wait_status(lambda s: not made.on(lost_node).get("ready"), "it is told", 60)
+            made.wait_status(lambda s: not made.on(lost_node).get("ready"), "the loss", 60)
             condition = made.wait_for("Degraded", seconds=60)
             assert lost_node in condition["message"], condition
             noticed = time.time() - lost
             assert made.proxies, "nothing is deleted on a node that may come back"
-            # What is made while kube-proxy still leads to the lost operator comes by unwired.
+            # While kube-proxy still leads to the lost operator, new pods are unwired.
             wait_until(
                 lambda: webhook not in inside(node_named(other), "iptables-save"),
                 60,
@@ -61,7 +60,7 @@ def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
 
 
 def _leader_on(node: str) -> None:
-    """Have the operator lead that runs on a node: each has one."""
+    """Make the operator on a node the leader. Each node has an operator."""
     if release.operator().body["spec"]["nodeName"] != node:
         release.kill_operator()
         release.wait_operator()

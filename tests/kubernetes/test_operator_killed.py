@@ -17,9 +17,9 @@ from tests.kubernetes.traffic import flow
 
 @contextmanager
 def no_operator() -> Iterator[None]:
-    """A cluster whose operator is away."""
+    """A cluster without an operator."""
     _scale(0)
-    wait_until(lambda: not api.objects("pods", release.NAMESPACE, release.OPERATORS), 40, "it ends")
+    wait_until(lambda: not api.objects("pods", release.NAMESPACE, release.OPERATORS), 40, "the end")
     try:
         yield
     finally:
@@ -59,7 +59,7 @@ def test_killed_in_the_middle_of_making_a_proxy(delay: float, net: Namespace) ->
     release.wait_operator()
 
 
-def test_what_happens_while_it_is_away(net: Namespace, robot: Robot) -> None:
+def test_changes_while_the_operator_is_away(net: Namespace, robot: Robot) -> None:
     """Traffic goes on; pods are admitted unwired and told so; what was deleted is seen later."""
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     doomed = rosproxy(
@@ -71,7 +71,7 @@ def test_what_happens_while_it_is_away(net: Namespace, robot: Robot) -> None:
             pod = net.idle(on="node1")
             assert pod.environment == {}
             doomed.remove()
-            wait_until(lambda: not doomed.body, 60, "no finalizer holds it")
+            wait_until(lambda: not doomed.body, 60, "no finalizer")
             made.the_proxy().remove(wait=False)
             uri = robot.uri(traffic.talker.node)
             traffic.listener.remove(grace=0)

@@ -47,14 +47,14 @@ def test_how_long_the_first_message_takes(
     heard = listener.wait_for("inside", seconds=START)
     proxy = "there" if has_proxy else "not there"
     note(f"first message, {library}, proxy {proxy}: {heard - ready:.1f} s after the pod is Ready, "
-         f"{heard - created:.1f} s after it is created")  # fmt: skip
+         f"{heard - created:.1f} s after its creation")  # fmt: skip
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_deleted_pod_is_unregistered_at_once_and_comes_back(
     library: str, made: RosProxy, net: Namespace, robot: Robot
 ) -> None:
-    """Deleted without grace: its node can't say good-bye."""
+    """Without grace the node cannot unregister itself."""
     name = new_topic()
     listener = robot.node(f"listener{name[1:]}", library, "sub", "--topic", name)
     pod = talker(net, library, name)
@@ -62,7 +62,7 @@ def test_deleted_pod_is_unregistered_at_once_and_comes_back(
 
     pod.remove(grace=0)
     gone = wait_until(lambda: not robot.uri(pod.node), 25, lambda: str(robot.nodes()))
-    note(f"pod deleted, {library}: unregistered {gone:.1f} s after it is gone")
+    note(f"pod deleted, {library}: unregistered {gone:.1f} s after its end")
 
     again = time.time()
     new = talker(net, library, name, name=pod.name)
@@ -71,9 +71,9 @@ def test_deleted_pod_is_unregistered_at_once_and_comes_back(
 
 
 def test_pod_that_ends_by_itself(made: RosProxy, net: Namespace, robot: Robot) -> None:
-    """A Job's pod stays as Succeeded: it counts no longer, and its proxy goes."""
+    """A Job's pod stays as Succeeded, but no longer counts, and the proxy goes."""
     made.change(graceSeconds=1)
-    job = "until [ -e /tmp/done ]; do sleep 0.1; done"  # it must not be done before it was seen
+    job = "until [ -e /tmp/done ]; do sleep 0.1; done"  # no end before the operator's look
     pod = net.pod("sh", "-c", job, on="node1", restartPolicy="Never")
     made.the_proxy()
     pod.run("touch", "/tmp/done")
@@ -82,7 +82,7 @@ def test_pod_that_ends_by_itself(made: RosProxy, net: Namespace, robot: Robot) -
 
 
 def test_container_that_restarts_in_its_pod(made: RosProxy, net: Namespace, robot: Robot) -> None:
-    """The same address, another process: its node comes back by itself."""
+    """The same address, another process: the node comes back by itself."""
     name = new_topic()
     listener = robot.node(f"listener{name[1:]}", "rospy", "sub", "--topic", name)
     pod = talker(net, "roscpp", name)
@@ -94,7 +94,9 @@ def test_container_that_restarts_in_its_pod(made: RosProxy, net: Namespace, robo
 
 
 def test_cordoned_and_drained_node(made: RosProxy, net: Namespace, robot: Robot) -> None:
-    """Drain leaves the proxy until the last pod is gone, and does not wait for it for ever."""
+    """Drain leaves the proxy until the last pod is gone, and does not wait for the proxy
+    for ever.
+    """
     name = new_topic()
     made.change(graceSeconds=2)
     listener = robot.node(f"listener{name[1:]}", "rospy", "sub", "--topic", name)
@@ -109,6 +111,6 @@ def test_cordoned_and_drained_node(made: RosProxy, net: Namespace, robot: Robot)
         wait_until(lambda: not made.proxies, 40, made.tell)
     finally:
         kubectl("uncordon", "node2")
-    release.wait_operator()  # it may have been on that node
+    release.wait_operator()  # an operator may have been on that node
     talker(net, "rospy", name, on="node2")
     listener.wait_for("inside", since=time.time(), seconds=60)

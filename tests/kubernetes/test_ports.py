@@ -1,4 +1,4 @@
-"""Which ports the proxies get, and what happens where somebody else has them."""
+"""The ports of proxies, and conflicts with other pods."""
 
 import pytest
 
@@ -85,7 +85,7 @@ def test_range_is_kept_when_the_proxy_goes_and_comes(net: Namespace) -> None:
 
 
 def test_ports_that_the_scheduler_gives_to_another(net: Namespace) -> None:
-    """Both pods wait when it looks, and the other one has waited for longer."""
+    """Both pods wait for the scheduler, and the other pod has waited longer."""
     made = rosproxy(net.name, master=NOWHERE, ports=4, portWindow=window(12300, 12340))
     with paused(SCHEDULER):
         other = net.idle(on="node1", labels={}, ports=(12302,))
@@ -98,7 +98,7 @@ def test_ports_that_the_scheduler_gives_to_another(net: Namespace) -> None:
 
 
 def test_ports_taken_while_the_proxy_is_made_anew(net: Namespace) -> None:
-    """In the moment in which nobody has them, somebody is put onto the node by hand."""
+    """While the ports are free for a moment, another pod is bound to the node by hand."""
     made = rosproxy(net.name, master=NOWHERE, ports=4, portWindow=window(12500, 12540))
     net.idle(on="node1")
     assert ports_on(made, "node1") == "12500-12503"

@@ -1,4 +1,4 @@
-"""Whether outside reaches the proxies' ports, where everything else is as it should be."""
+"""Reachability of the proxies' ports from outside, if all else is well."""
 
 from tests.kubernetes.cluster.layout import node_named
 from tests.kubernetes.cluster.node import without_host_ports

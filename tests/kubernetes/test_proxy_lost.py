@@ -17,7 +17,7 @@ LOSSES: dict[str, Callable[[Proxy], object]] = {
     "pod deleted without grace": lambda proxy: proxy.remove(grace=0, wait=False),
 }
 SERVED = {"pod deleted without grace": 10.0}
-"""Seconds after which nothing comes by the old proxy any more, and who lost it may be silent."""
+"""Seconds after which the old proxy relays nothing more, so that silence counts."""
 CASES = [
     ("container killed", "rospy"),
     ("container killed", "roscpp"),
@@ -27,11 +27,11 @@ CASES = [
     ("pod deleted without grace", "roscpp"),
 ]
 PORTS = 3 * (len(CASES) + 1)
-"""Enough for the three nodes of each test.
+"""Enough ports for the three nodes of each test.
 
-A proxy that is made anew takes what the master holds at its ports for claims of its own, those of
-earlier tests' dead pods too, until it has found out that nobody is there. In a range as small as
-eight ports these leave none for nodes that live: a shortcoming of the proxy, not tested here.
+A recreated proxy takes all registrations with its ports at the master for claims, also of dead pods
+of former tests, until probes fail. In a range of eight ports such claims leave no port for live
+nodes: a shortcoming of the proxy that these tests do not cover.
 """
 
 

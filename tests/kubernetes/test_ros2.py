@@ -39,7 +39,7 @@ def robot2(_release: None) -> Iterator[Robot2]:
 
 @dataclass
 class World:
-    """Who hears, by what it ought to hear: the log, the word and the verb."""
+    """Nodes in pods and on the robot, by the expected messages, replies and results."""
 
     net: Namespace
     rosproxy: RosProxy
@@ -54,7 +54,7 @@ class World:
 
     @property
     def flows(self) -> dict[str, tuple[Log, str]]:
-        """Some of what is heard, by its way."""
+        """A log and a word for each way."""
         return {
             "outward": self.heard["the robot hears /one"],
             "inward": self.heard["jazzy on node1 hears /robot"],
@@ -71,7 +71,7 @@ class World:
 
 @pytest.fixture(scope="module")
 def world(robot2: Robot2) -> Iterator[World]:
-    """Everything at once, so that it is waited for once; outside is found on the LAN."""
+    """All nodes at once, to wait only once. Outside is discovered on the LAN."""
     with namespace() as net:
         made = World(net, rosproxy(net.name, ros=2, multicast=True, ports=64))
         wait_for_service(net)
@@ -110,8 +110,10 @@ def _fill(made: World, robot2: Robot2) -> None:
     made.results["a pod pursues"] = pod("jazzy", "pursue", "/robot_fibonacci", on="node1")
 
 
-def test_everybody_hears_everybody(world: World) -> None:
-    """Pods of one node, of both, and a robot; Fast DDS of two releases, and Cyclone DDS."""
+def test_each_node_hears_all_others(world: World) -> None:
+    """Pods of the same node and of both nodes, and a robot; two releases of Fast DDS, and Cyclone
+    DDS.
+    """
     for listener, (log, text) in world.heard.items():
         print(listener)
         log.wait_for(text, seconds=START)
@@ -158,7 +160,7 @@ def test_what_users_are_told(world: World) -> None:
 
 
 def test_seconds_to_the_first_message(world: World, robot2: Robot2) -> None:
-    """Of a pod that comes where its proxy is, to a robot that waits for it."""
+    """From a new pod on a node with a proxy, to a waiting robot."""
     listener = robot2.node("jazzy", "sub", "/late", name="listener")
     world.heard["the robot hears /one"][0].wait_for("one", since=time.time())
     late = node(world.net, "jazzy", "pub", "/late", "--word", "late", on="node1")
@@ -167,19 +169,21 @@ def test_seconds_to_the_first_message(world: World, robot2: Robot2) -> None:
     wait_for_line(late.log, "^sent 0$", count=1)
     sent = time.time()
     first = listener.wait_for("late")
-    note(f"ROS 2: the first message outside {first - ready:.1f} s after its pod was seen Ready, "
-         f"{first - sent:.1f} s after it was seen to be sent")  # fmt: skip
+    note(f"ROS 2: the first message outside {first - ready:.1f} s after the pod was Ready, "
+         f"{first - sent:.1f} s after its sending")  # fmt: skip
     late.remove()
     robot2.end("listener")
 
 
 def test_a_pod_that_is_gone_takes_its_participant_with_it(world: World, robot2: Robot2) -> None:
-    """Without word of it the robot would believe in it for the 20 s of its lease."""
+    """Without a dispose message the robot would keep the participant for the lease duration of 20
+    s.
+    """
     watcher = robot2.node("jazzy", "names", "/any", name="watcher")
     pod = node(world.net, "jazzy", "pub", "/any", on="node2")
     wait_for_line(watcher, rf"^nodes .*\b{pod.node}\b")
 
-    pod.crash()  # it can't say so itself
+    pod.crash()  # without a dispose message of its own
     pod.remove(grace=0)
 
     def gone() -> bool:
@@ -208,7 +212,7 @@ LOSSES: dict[str, Callable[[RosProxy, Proxy], object]] = {
 
 
 @pytest.mark.parametrize("how", LOSSES)
-def test_what_is_lost_comes_back(how: str, world: World, robot2: Robot2) -> None:
+def test_lost_parts_come_back(how: str, world: World, robot2: Robot2) -> None:
     """On the same ports, for the same participants; outside and inside hear on."""
     of = world.rosproxy
     flows = world.flows
@@ -231,11 +235,11 @@ def test_what_is_lost_comes_back(how: str, world: World, robot2: Robot2) -> None
     assert (now.ports, now.name) == (proxy.ports, proxy.name)
     late = robot2.node("jazzy", "sub", "/one", name="late")
     late.wait_for("one", since=end)
-    robot2.end("late")  # or each test begins with one node more than the one before
+    robot2.end("late")  # keeps the number of nodes in all tests
 
 
 def _wait_until_ports_are_kept(world: World) -> None:
-    """Until all participants have met, so that they have all of their ports, and keep them."""
+    """Wait until all participants have discovered each other and keep all ports."""
     of = world.rosproxy
     now = time.time()
     for log, text in world.flows.values():
@@ -246,8 +250,8 @@ def _wait_until_ports_are_kept(world: World) -> None:
     )  # fmt: skip
 
 
-def test_on_other_ports_participants_meet_anew(world: World) -> None:
-    """Of a RosProxy that forbids the former ones."""
+def test_participants_rediscover_each_other_on_other_ports(world: World) -> None:
+    """The RosProxy's window excludes the former ports."""
     of = world.rosproxy
     changed = time.time()
 
@@ -265,7 +269,7 @@ def _all_leased(of: RosProxy) -> list[dict[str, list[int]]]:
 
 
 def test_another_image_of_the_proxies(world: World) -> None:
-    """It is changed in place: the same pods, the same ports; one proxy after the other."""
+    """The image changes in place, for the proxies in turn: the same pods, the same ports."""
     of = world.rosproxy
     _wait_until_ports_are_kept(world)
     before = _all_leased(of)
@@ -284,7 +288,7 @@ def test_another_image_of_the_proxies(world: World) -> None:
 
 
 def test_a_node_is_stopped_and_comes_back(world: World) -> None:
-    """The robot and the other node's pods hear each other meanwhile; then all do again."""
+    """Meanwhile the robot and the other node's pods hear each other. Afterwards all nodes do."""
     of = world.rosproxy
     lost_node = "node2"
     ports = of.the_proxy(lost_node).ports
@@ -292,7 +296,7 @@ def test_a_node_is_stopped_and_comes_back(world: World) -> None:
     lost = time.time()
     cluster("stop-node", lost_node)
     try:
-        of.wait_status(lambda told: not of.on(lost_node).get("ready"), "it is told", 60)
+        of.wait_status(lambda told: not of.on(lost_node).get("ready"), "the loss", 60)
         outward = world.flows["outward"]
         inward = world.flows["inward"]
         outside = max(log.longest_gap(text, lost, time.time()) for log, text in (outward, inward))
@@ -302,8 +306,8 @@ def test_a_node_is_stopped_and_comes_back(world: World) -> None:
     up = time.time()
     took = [log.wait_for(text, since=up, seconds=120) - up for log, text in back]
     assert of.the_proxy(lost_node, seconds=60).ports == ports
-    note(f"ROS 2, node stopped: messages of its pods again {took[0]:.1f} s, and for them "
-         f"{took[1]:.1f} s after it is ready")  # fmt: skip
+    note(f"ROS 2, node stopped: messages from its pods again {took[0]:.1f} s, and to its pods "
+         f"{took[1]:.1f} s after the node is ready")  # fmt: skip
     release.wait_operator()
 
 
@@ -317,7 +321,7 @@ def test_helm_test(robot2: Robot2) -> None:
 
 
 def test_two_rosproxies_two_domains_without_multicast(robot2: Robot2) -> None:
-    """By peers; the domain goes into the pods. Somebody holds ports in their window."""
+    """By peers. The pods get the domain. Another pod holds ports in the window."""
     with namespace() as net:
         taken = net.idle(on="node1", ports=(12000, 12008), protocol="UDP", labels={})
         taken.wait_ready()

@@ -17,9 +17,8 @@ PLACES = [(library, on) for library in LIBRARIES for on in NODES]
 
 @dataclass
 class World:
-    """For each library and node a pod that publishes, one that serves, one that listens to all.
-
-    On the robot, for each library, one node for each of these.
+    """A publisher, a server and a subscriber to all topics, for each library on each node, and for
+    each library on the robot.
     """
 
     rosproxy: RosProxy
@@ -33,7 +32,7 @@ class World:
 
 @pytest.fixture(scope="module")
 def world(_release: None, robot: Robot) -> Iterator[World]:
-    """Everything at once, so that it is waited for once."""
+    """All nodes at once, to wait only once."""
     with namespace() as net:
         made = World(rosproxy(net.name, master={"uri": robot.master_uri}))
         wait_for_service(net)
@@ -77,7 +76,7 @@ def test_robot_hears_a_pod(library: str, on: str, world: World) -> None:
 @pytest.mark.parametrize("speaker", ["robot", "far", "near"])
 @pytest.mark.parametrize(("library", "on"), PLACES)
 def test_pod_hears(speaker: str, library: str, on: str, world: World) -> None:
-    """The robot, a pod of the other node, a pod of its own node."""
+    """Messages of the robot, of a pod on the other node, and of a pod on the same node."""
     world.listeners[library, on].log.wait_for(speaker, seconds=START)
 
 

@@ -19,7 +19,7 @@ NAMESPACED = ("pods", "services", "secrets", "serviceaccounts", "roles", "rolebi
 
 
 def left() -> list[str]:
-    """What there is of it in the cluster, as resource and name."""
+    """Remainders of the release in the cluster, as resource and name."""
     leftovers = []
     for resource in CLUSTER_WIDE + NAMESPACED:
         for body in api.objects(resource):

@@ -35,7 +35,7 @@ def test_upgrade_of_the_operator_only(net: Namespace, robot: Robot) -> None:
 
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_upgrade_of_the_proxies(library: str, net: Namespace, robot: Robot) -> None:
-    """Their image is changed in place: the same pod, the same ports."""
+    """The image changes in place: the same pod, the same ports."""
     other = release.other_image()
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, library) as traffic:
@@ -52,7 +52,7 @@ def test_upgrade_of_the_proxies(library: str, net: Namespace, robot: Robot) -> N
 
 
 def test_a_wrong_image_of_the_proxies(net: Namespace, robot: Robot) -> None:
-    """Proxies go on with the image that they have, and the RosProxy tells what is wrong."""
+    """Proxies go on with their image, and the RosProxy reports the fault."""
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, "roscpp") as traffic:
         before = made.the_proxy()
@@ -72,7 +72,7 @@ def test_a_wrong_image_of_the_proxies(net: Namespace, robot: Robot) -> None:
 
 
 def test_other_defaults_of_the_proxies(net: Namespace, robot: Robot) -> None:
-    """Proxies are made anew with the defaults, on their ports, and ROS nodes go on."""
+    """Proxies are recreated with the defaults, on the same ports, and ROS nodes go on."""
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, "roscpp") as traffic:
         before = made.the_proxy()
@@ -92,7 +92,7 @@ def test_other_defaults_of_the_proxies(net: Namespace, robot: Robot) -> None:
 
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_other_bounds_of_the_proxies(library: str, net: Namespace, robot: Robot) -> None:
-    """Proxies are made anew with the bounds, on their ports, and ROS nodes go on."""
+    """Proxies are recreated with the bounds, on the same ports, and ROS nodes go on."""
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, library) as traffic:
         before = made.the_proxy()
@@ -108,7 +108,7 @@ def test_other_bounds_of_the_proxies(library: str, net: Namespace, robot: Robot)
 
 
 def test_another_key_of_the_tokens(net: Namespace, robot: Robot) -> None:
-    """Proxies are made anew on their ports, one after the other, and ROS nodes go on."""
+    """Proxies are recreated on the same ports, in turn, and ROS nodes go on."""
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     for node in ("node1", "node2"):
         net.idle(on=node)
@@ -142,7 +142,7 @@ def _hash(proxy: Proxy) -> str:
 
 
 def test_webhook_turned_off(net: Namespace, robot: Robot) -> None:
-    """Pods start all the same; they set their master themselves."""
+    """Pods still start, and set the master themselves."""
     release.upgrade(webhook={"enabled": False})
     release.wait_operator()
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)

@@ -1,4 +1,4 @@
-"""What the webhook does to pods, and what it leaves alone."""
+"""Pods that the webhook wires, and pods that stay unchanged."""
 
 from collections.abc import Iterator
 
@@ -17,7 +17,7 @@ def variables(body: Json, kind: str = "containers", number: int = 0) -> Json:
 
 @pytest.fixture(scope="module")
 def shared(_release: None) -> Iterator[Namespace]:
-    """A namespace with one RosProxy."""
+    """A namespace with a RosProxy."""
     with namespace() as made:
         yield made
 
@@ -83,8 +83,8 @@ def test_a_misspelt_label_is_told_on_the_pod(net: Namespace) -> None:
     made.wait_for("Degraded", "False")
 
 
-def test_a_label_that_no_rosproxy_answers_to_is_told_on_the_pod(net: Namespace) -> None:
-    """A minute later: a RosProxy may be created after its pods."""
+def test_a_label_that_no_rosproxy_selects_is_an_event_on_the_pod(net: Namespace) -> None:
+    """After a minute, because a RosProxy may be created after its pods."""
     made = rosproxy(net.name, master=NOWHERE)
     with namespace() as bare:
         lonely = bare.idle(labels={INJECT: "true"})
@@ -130,7 +130,7 @@ def test_host_network_is_warned_of(shared: Namespace, uri: str) -> None:
 
 
 def test_pod_made_right_after_its_rosproxy_is_wired(net: Namespace) -> None:
-    """Both in one file, as with kubectl apply: the Service is made when the pod comes."""
+    """Both in the same file for kubectl apply: the pod comes before the Service."""
     made = rosproxy(net.name, master=NOWHERE)
     pod = net.idle(on="node1")
     address = made.service["spec"]["clusterIP"]
@@ -146,13 +146,13 @@ def test_pod_made_before_its_rosproxy_is_told_so(net: Namespace) -> None:
 
 def test_no_pod_gets_a_finalizer(shared: Namespace, uri: str) -> None:
     pod = shared.idle(on="node1")
-    wait_until(lambda: pod.body["spec"].get("nodeName", "") != "", 60, "it is scheduled")
+    wait_until(lambda: pod.body["spec"].get("nodeName", "") != "", 60, "the pod is scheduled")
     assert "finalizers" not in pod.body["metadata"]
     assert not [a for a in pod.body["metadata"].get("annotations", {}) if "kopf" in a]
 
 
 def test_pods_of_a_deployment_are_wired(shared: Namespace, uri: str) -> None:
-    """As it stands in a tutorial: with the master's own URI, and nothing but the label added."""
+    """Like a tutorial: with the master's own URI, and only the label added."""
     env = {"ROS_MASTER_URI": f"{NOWHERE['uri']}/"}
     template = shared.pod_body("unused", "sleep", "infinity", env=env)
     labels = {"app": "many", INJECT: "true"}
@@ -172,7 +172,7 @@ def test_pods_of_a_deployment_are_wired(shared: Namespace, uri: str) -> None:
 
 
 def test_pod_that_sets_the_right_master_itself_is_served(net: Namespace) -> None:
-    """Selected by the RosProxy and not labelled: the webhook does not see it."""
+    """The RosProxy selects the pod. Without the label, the webhook does not see the pod."""
     made = rosproxy(net.name, master=NOWHERE, podSelector={"matchLabels": {"app": "own"}})
     pod = net.pod("sleep", "infinity", labels={"app": "own"}, on="node1",
                   env={"ROS_MASTER_URI": "http://rosproxy-robot:11311"})  # fmt: skip

@@ -25,10 +25,9 @@ A SYN that passes while kube-proxy changes from refusing to translating is sent 
 
 @dataclass(frozen=True)
 class Flow:
-    """One pod that publishes, one that listens and one with a service; and theirs on the robot.
-
-    ``outward`` is what the robot hears, ``inward`` what is heard in the cluster, ``replies`` what
-    the robot has from the service.
+    """A publisher, a subscriber and a server in pods, each with a peer on the robot. ``outward``
+    are messages at the robot, ``inward`` messages in the cluster, ``replies`` the robot's replies
+    from the service.
     """
 
     talker: Pod
@@ -42,7 +41,7 @@ class Flow:
         return self.listener.log
 
     def wait(self, since: float = 0, seconds: float = 60) -> None:
-        """Wait until all of it flows."""
+        """Wait until messages and replies flow."""
         self.outward.wait_for("inside", since=since, seconds=seconds)
         self.inward.wait_for("outside", since=since, seconds=seconds)
         self.replies.wait_for("ask", since=since, seconds=seconds, verb="reply")
@@ -90,10 +89,10 @@ def wait_for_service(net: Namespace) -> None:
 
 
 def _is_known(namespace: str) -> bool:
-    """Whether each node knows the Service of the RosProxy there: it translates it, or refuses.
+    """Whether each node knows the Service of a RosProxy, and translates or refuses calls.
 
-    A pod that connects before is silent for two minutes; on a busy machine the webhook's waiting
-    is not always enough.
+    Otherwise a pod that connects earlier would hang for two minutes. On a busy machine the webhook
+    does not always wait long enough.
     """
     services = api.objects("services", namespace, PROXY_OF)
     rules = [inside(node, "iptables-save") for node in NODES]

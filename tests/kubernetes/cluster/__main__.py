@@ -1,4 +1,4 @@
-"""A Kubernetes cluster of two nodes and a robot outside it, on this machine.
+"""A Kubernetes cluster of two nodes and a robot outside, on this machine.
 
 python -m tests.kubernetes.cluster up, down, …; --help lists the commands.
 """
@@ -23,12 +23,12 @@ _PASSED_ON = {"ignore_unknown_options": True, "help_option_names": []}
 
 @click.group()
 def cluster() -> None:
-    """A Kubernetes cluster of two nodes and a robot outside it. Needs root."""
+    """A Kubernetes cluster of two nodes and a robot outside. Needs root."""
 
 
 @cluster.command()
 def up() -> None:
-    """Bring it up; what is up already stays."""
+    """Bring the cluster up. Running parts stay."""
     started = time.monotonic()
     lifetime.up()
     click.echo(f"up in {time.monotonic() - started:.0f} s: export KUBECONFIG={layout.KUBECONFIG}")
@@ -36,7 +36,7 @@ def up() -> None:
 
 @cluster.command()
 def down() -> None:
-    """Remove all of it."""
+    """Remove the whole cluster."""
     lifetime.down()
 
 
@@ -49,7 +49,7 @@ def kubeconfig() -> None:
 @cluster.command("load-image")
 @click.argument("images", nargs=-1)
 def load_image(images: tuple[str, ...]) -> None:
-    """Give images of Docker to both nodes, without names the ones of the tests."""
+    """Load images of Docker into both nodes; without names, all images of the tests."""
     for node, names in load_images(*(images or IMAGES)).items():
         click.echo(f"{node}: {' '.join(names)}")
 
@@ -57,7 +57,7 @@ def load_image(images: tuple[str, ...]) -> None:
 @cluster.command("build-image")
 @click.argument("images", nargs=-1, type=click.Choice(IMAGES))
 def build_images(images: tuple[str, ...]) -> None:
-    """Build images from this tree and give them to both nodes; without names, all."""
+    """Build images from this tree and load them into both nodes; without names, all."""
     for image in images or IMAGES:
         build_image(image)
     load_images(*(images or IMAGES))
@@ -100,7 +100,7 @@ def start(node: str) -> None:
 
 @cluster.command("restart-apiserver")
 def restart() -> None:
-    """Kill the API server and start it again."""
+    """Kill and restart the API server."""
     restart_api_server()
 
 

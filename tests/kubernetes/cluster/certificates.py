@@ -1,4 +1,4 @@
-"""Who is who in the cluster: one authority, a certificate for each program, and kubeconfigs."""
+"""Identities in the cluster: an authority, a certificate for each program, and kubeconfigs."""
 
 import base64
 import datetime
@@ -35,7 +35,7 @@ _API_NAMES = ("kubernetes", "kubernetes.default", "kubernetes.default.svc", "loc
 
 @dataclass(frozen=True)
 class LeaseHolder:
-    """Somebody with a key and a certificate, as files ``NAME.key`` and ``NAME.crt``."""
+    """A holder of a key and a certificate, in the files ``NAME.key`` and ``NAME.crt``."""
 
     name: str
     certificate: x509.Certificate
@@ -56,7 +56,7 @@ def key_file(name: str) -> Path:
 
 
 def make_certificates() -> None:
-    """Make all keys, certificates and kubeconfigs, unless they are there."""
+    """Make all keys, certificates and kubeconfigs, unless they exist."""
     if KUBECONFIG.exists():
         return
     PKI.mkdir(parents=True, exist_ok=True)
@@ -76,7 +76,7 @@ def make_certificates() -> None:
 
 
 def write_kubeconfig(file: Path, holder: str) -> None:
-    """Write the kubeconfig of a holder, which holds all it needs."""
+    """Write the complete kubeconfig of a holder."""
 
     def data(path: Path) -> str:
         return base64.b64encode(path.read_bytes()).decode()

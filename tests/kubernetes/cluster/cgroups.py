@@ -10,24 +10,24 @@ _ROOT = Path("/sys/fs/cgroup")
 
 
 def make(name: str) -> None:
-    """Make a cgroup of that name: one in each hierarchy, or the one there is in version 2."""
+    """Make a cgroup with this name in each hierarchy, or in the only hierarchy of version 2."""
     for hierarchy in _hierarchies():
         path = hierarchy / name
         path.mkdir(exist_ok=True)
-        # In version 1, a new cpuset has no processors until it is given some.
+        # In version 1, a new cpuset has no processors.
         for file in ("cpuset.cpus", "cpuset.mems"):
             if (path / file).exists() and not _version_2():
                 (path / file).write_text((hierarchy / file).read_text())
 
 
 def empty(name: str) -> None:
-    """Kill every process in it, and what those start meanwhile."""
+    """Kill every process in a cgroup, also processes that start meanwhile."""
     while pids := _pids(name):
         kill(pids)
 
 
 def remove(name: str) -> None:
-    """Remove it with all below."""
+    """Remove a cgroup with all cgroups below."""
     empty(name)
     for hierarchy in _hierarchies():
         for directory, _, _ in os.walk(hierarchy / name, topdown=False):
@@ -35,7 +35,7 @@ def remove(name: str) -> None:
 
 
 def _remove(directory: Path, seconds: float = 5) -> None:
-    """Remove a cgroup; for a moment after its last process it is still busy."""
+    """Remove a cgroup, which is still busy for a moment after its last process."""
     end = time.monotonic() + seconds
     while True:
         try:

@@ -71,7 +71,7 @@ def kubectl(*arguments: str | Path, check: bool = True, seconds: float = 60) -> 
 
 
 def start_control_plane() -> None:
-    """Start all of it, and wait for the API server."""
+    """Start the whole control plane, and wait for the API server."""
     for program in (ETCD, API_SERVER):
         program.start()
     wait_for_api_server()
@@ -89,7 +89,7 @@ def wait_for_api_server(seconds: float = 60) -> None:
 
 
 def restart_api_server() -> None:
-    """Kill the API server and start it. On SIGTERM it would hold its port for a minute."""
+    """Kill and restart the API server. On SIGTERM it would hold its port for a minute."""
     API_SERVER.kill()
     API_SERVER.start()
     wait_for_api_server()

@@ -1,4 +1,4 @@
-"""Container images: those of the Docker tests, given to the nodes."""
+"""Container images of the Docker tests, loaded into the nodes."""
 
 import json
 import tarfile
@@ -15,7 +15,7 @@ IMAGES = (PROXY, OPERATOR, ROS)
 
 
 def load_images(*images: str) -> dict[str, list[str]]:
-    """Give images to all nodes that do not have them; return which were given to whom."""
+    """Load missing images into all nodes. Return the loaded images by node."""
     _make_pause_image()
     ids = {image: _id(image) for image in images}
     missing = {node: [name for name in images if _loaded(node).get(name) != ids[name]]
@@ -50,7 +50,7 @@ def _id(image: str) -> str:
 
 
 def _make_pause_image() -> None:
-    """The image whose only program holds a pod's namespaces."""
+    """Make the image whose only program holds a pod's namespaces."""
     if not docker("images", "--quiet", PAUSE_IMAGE):
         with tempfile.NamedTemporaryFile(suffix=".tar") as archive:
             with tarfile.open(archive.name, "w") as tar:

@@ -24,7 +24,7 @@ API_SERVICE = "10.96.0.1"
 
 @dataclass(frozen=True)
 class Node:
-    """A machine of the cluster: a network namespace with a kubelet and what belongs to it."""
+    """A machine of the cluster: a network namespace with a kubelet and its companions."""
 
     number: int
 
@@ -55,7 +55,7 @@ class Node:
 
     @property
     def images(self) -> Path:
-        """Which images it has: ids by name, as JSON."""
+        """The file of the node's images: ids by name, as JSON."""
         return self.directory / "images.json"
 
     @property

@@ -25,10 +25,10 @@ from tests.kubernetes.cluster.robot import start_robot, stop_robot
 
 
 def up() -> None:
-    """Bring up whatever of the cluster is not: control plane, nodes, images, robot."""
-    assert answers(), "Docker does not answer: it builds the images and runs the robot"
+    """Bring up all missing parts of the cluster: control plane, nodes, images, robot."""
+    assert answers(), "Docker does not answer, and has to build the images and run the robot"
     if STATE.exists() and not (KUBECONFIG.exists() and PKI.exists()):
-        down()  # whoever made it, or took it away, was killed half-way
+        down()  # a former `up` or `down` was killed half-way
     STATE.mkdir(parents=True, exist_ok=True)
     make_certificates()
     make_bridge()
@@ -47,8 +47,8 @@ def up() -> None:
 
 
 def down() -> None:
-    """Stop all of it and leave nothing behind."""
-    KUBECONFIG.unlink(missing_ok=True)  # first: `up` knows by it that the rest is not whole
+    """Stop the whole cluster and leave nothing behind."""
+    KUBECONFIG.unlink(missing_ok=True)  # first: a sign for `up` that the rest is incomplete
     for node in NODES:
         remove_node(node)
     stop_control_plane()

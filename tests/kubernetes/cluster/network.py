@@ -16,23 +16,23 @@ from tests.kubernetes.cluster.layout import (
 _FORWARD = (
     ("FORWARD", "-i", BRIDGE, "-j", "ACCEPT"),
     ("FORWARD", "-o", BRIDGE, "-j", "ACCEPT"),
-    # A pod that calls a Service before its node's kube-proxy knows it must not end at another
-    # node's: only this machine finds Services by way of a node (`route_services`).
+    # If a pod calls a Service that its node's kube-proxy does not know yet, another node must not
+    # answer: only this machine finds Services through a node (`route_services`).
     ("FORWARD", "-i", BRIDGE, "-d", SERVICE_NETWORK, "-j", "DROP"),
 )
-"""Each is put before the former ones."""
+"""Each rule is inserted before the former rules."""
 _ROBOT_CABLE = "rpxrobot"
 
 
 def make_bridge() -> None:
-    """Make the bridge on which everybody is, unless it is there."""
+    """Make the bridge of all machines, unless the bridge exists."""
     if not _exists(BRIDGE):
         run("ip", "link", "add", BRIDGE, "type", "bridge")
     run("ip", "address", "replace", f"{GATEWAY}/24", "dev", BRIDGE)
     run("ip", "link", "set", BRIDGE, "up")
     run("sysctl", "-qw", "net.ipv4.ip_forward=1")
     for rule in _FORWARD:
-        # Docker's policy for what is forwarded is DROP.
+        # Docker's policy for forwarding is DROP.
         if run("iptables", "-w", "-C", *rule, check=False):
             run("iptables", "-w", "-I", *rule)
 
@@ -73,7 +73,7 @@ def plug_in_node(node: Node) -> None:
 
 
 def unplug_node(node: Node) -> None:
-    """Take away a node's namespace and with it its cable."""
+    """Remove a node's namespace together with the cable."""
     if node.namespace in namespaces():
         run("ip", "netns", "delete", node.namespace)
     run("ip", "link", "delete", f"rpx{node.name}", check=False)
@@ -91,7 +91,7 @@ def route_services() -> None:
 
 
 def plug_in_robot(process: str, address: str = ROBOT_ADDRESS, cable: str = _ROBOT_CABLE) -> None:
-    """Lay the cable to a container that has no network: it reaches the bridge, nothing behind."""
+    """Lay a cable to a container without a network. The container reaches only the bridge."""
     run("ip", "link", "delete", cable, check=False)
     run("ip", "link", "add", cable, "type", "veth", "peer", "name", "eth0",
         "netns", process)  # fmt: skip

@@ -67,7 +67,7 @@ def kube_proxy(node: Node) -> Program:
 
 
 def start_containerd(node: Node) -> None:
-    """Plug a node in and start its containerd, which images can be loaded into then."""
+    """Plug a node in and start its containerd, ready to load images."""
     node.directory.mkdir(parents=True, exist_ok=True)
     _write_configuration(node)
     plug_in_node(node)
@@ -80,7 +80,7 @@ def start_containerd(node: Node) -> None:
 
 
 def join(node: Node) -> None:
-    """Make a node part of the cluster; its API server must be up."""
+    """Join a node to the cluster, whose API server must be up."""
     body = {
         "apiVersion": "v1", "kind": "Node", "metadata": {"name": node.name},
         "spec": {"podCIDR": node.pod_network, "podCIDRs": [node.pod_network]},
@@ -95,7 +95,7 @@ def join(node: Node) -> None:
 
 
 def wait_until_ready(node: Node, seconds: float = 60) -> None:
-    """Wait until a node takes pods: ready, and without the mark that it was not."""
+    """Wait until a node takes pods: ready and without taints."""
     kubectl("wait", f"node/{node.name}", "--for=condition=Ready", f"--timeout={seconds:.0f}s",
             seconds=seconds + 10)  # fmt: skip
     wait_until(lambda: not _taints(node),
@@ -103,7 +103,7 @@ def wait_until_ready(node: Node, seconds: float = 60) -> None:
 
 
 def stop_node(node: Node) -> None:
-    """Pull the plug: everything on it stops at once and nobody is told; its disk stays."""
+    """Pull the plug of a node: everything stops at once without notice. The disk stays."""
     for program in (kubelet(node), kube_proxy(node), containerd(node)):
         program.kill()
     kill(_shims(node))
@@ -145,7 +145,7 @@ def _write_configuration(node: Node) -> None:
 
 
 def plug_in_pods(node: Node, configuration: dict[str, Any]) -> None:
-    """Say how new pods of a node are plugged in; containerd heeds it at once."""
+    """Set how new pods of a node are plugged in. containerd notices the change at once."""
     path = node.directory / "cni/rosproxy.conflist"
     new = path.with_suffix(".new")  # a name that containerd does not read
     new.write_text(json.dumps(configuration, indent=1))

@@ -1,4 +1,4 @@
-"""Programs that go on running after the command that started them."""
+"""Programs that outlive the command that started them."""
 
 import contextlib
 import os
@@ -19,9 +19,8 @@ _ENVIRONMENT = {"GOGC": "400"}  # memory for time: fewer garbage collections
 
 @dataclass(frozen=True)
 class Program:
-    """A program with a log and a file that holds its process id.
-
-    ``namespace`` is the network namespace it runs in, by its name below /run/netns.
+    """A program with a log and a pid file. ``namespace`` is the name of the program's network
+    namespace below /run/netns.
     """
 
     name: str
@@ -38,7 +37,7 @@ class Program:
 
     @property
     def pid(self) -> int | None:
-        """Its process, if that still is one of this program."""
+        """The process id, if the process still runs this program."""
         try:
             pid = int(self._pid_file.read_text())
         except (OSError, ValueError):
@@ -47,12 +46,12 @@ class Program:
         return pid if own in command_line(pid) else None
 
     def start(self) -> None:
-        """Start it unless it runs."""
+        """Start the program unless running."""
         if self.pid is not None:
             return
         for directory in (_RUN, LOGS):
             directory.mkdir(parents=True, exist_ok=True)
-        # Not `ip netns exec`: it mounts /sys anew, where a kubelet then finds no cgroups.
+        # Not `ip netns exec`, which mounts a new /sys where a kubelet finds no cgroups.
         enter = ("nsenter", f"--net=/run/netns/{self.namespace}") if self.namespace else ()
         with self.log.open("ab") as output:
             process = subprocess.Popen(
@@ -65,7 +64,7 @@ class Program:
         wait_until(lambda: self.pid is not None or process.poll() is not None, 60, self.name)
 
     def kill(self) -> None:
-        """Kill it, as power loss would."""
+        """Kill the program, like a loss of power."""
         if self.pid is not None:
             kill([self.pid])
         self._pid_file.unlink(missing_ok=True)
@@ -91,7 +90,7 @@ def processes() -> list[int]:
 
 
 def command_line(pid: int) -> bytes:
-    """The words of a process, each ended by a zero byte; empty if it is gone or dead."""
+    """The words of a process, each ended by a zero byte; empty if the process is gone or dead."""
     try:
         return Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
@@ -99,7 +98,7 @@ def command_line(pid: int) -> bytes:
 
 
 def kill(pids: list[int], seconds: float = 20) -> None:
-    """Kill processes and wait until they are gone."""
+    """Kill processes and wait until all are gone."""
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -111,7 +110,7 @@ def kill(pids: list[int], seconds: float = 20) -> None:
 
 
 def _alive(pid: int) -> bool:
-    """Whether it still holds anything; a zombie does while it has threads, its sockets for one."""
+    """Whether a process still holds resources. A zombie with threads still holds its sockets."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text()
         threads = len(os.listdir(f"/proc/{pid}/task"))

@@ -10,7 +10,7 @@ from tests.kubernetes.cluster.network import plug_in_robot, unplug_robot
 
 
 def start_robot() -> None:
-    """Start it, unless it runs the image that there is now."""
+    """Start the robot, unless running with the current image."""
     inspection = inspect(ROBOT, check=False)
     wanted = docker("image", "inspect", "--format", "{{.Id}}", ROS)
     if inspection and inspection["State"]["Running"] and inspection["Image"] == wanted:
@@ -30,6 +30,6 @@ def stop_robot() -> None:
 
 
 def exec_on_robot(command: tuple[str, ...]) -> int:
-    """Run a command there, with this terminal; return its exit code."""
+    """Run a command on the robot, with this terminal. Return the exit code."""
     terminal = ("--interactive", "--tty") if os.isatty(0) and os.isatty(1) else ("--interactive",)
     return subprocess.run(["docker", "exec", *terminal, ROBOT, *command], check=False).returncode
