@@ -1,4 +1,4 @@
-"""The combinations that most tests run in: libraries, directions, and who is first."""
+"""The combinations of most tests: libraries, directions, and the first to start."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ VIEWS = {
     "inside-about-outside": ("c1", "out"),
     "outside-about-inside": ("out", "c1"),
 }
-"""Where a tool runs, and where the node is that it is asked about."""
+"""The machine of a tool, and the machine of the node in question."""
 
 each_view = pytest.mark.parametrize(("side", "machine"), VIEWS.values(), ids=VIEWS.keys())
 
@@ -58,10 +58,10 @@ def each_pair(first: str, second: str) -> pytest.MarkDecorator:
 def each_way_and_order(
     first: str, second: str, directions: tuple[str, ...] = tuple(DIRECTIONS)
 ) -> pytest.MarkDecorator:
-    """Every pair of libraries in every direction; who starts first (``starter``) takes turns.
+    """Every pair of libraries in every direction. The first to start (``starter``) alternates.
 
-    So each library is, in each role and direction, once the first and once the second to start;
-    and each pair of libraries starts in both orders.
+    So in each role and direction, each library starts first once and second once, and each pair of
+    libraries starts in both orders.
     """
     rows = [
         (a, b, *DIRECTIONS[way], (first, second)[(i + j + k) % 2], f"{a}-to-{b}-{way}")
@@ -79,10 +79,10 @@ def each_way_and_order(
 def each_way_in_turn(
     first: str, second: str, directions: tuple[str, ...] = tuple(DIRECTIONS)
 ) -> pytest.MarkDecorator:
-    """Each library in each role in each direction, and each pair of libraries: half of all.
+    """Each library in each role and direction, and each pair of libraries: half of all cases.
 
-    For what is built on messages and calls, which `each_way_and_order` tries in every combination:
-    a defect that needs both libraries and the direction to be certain ones shows there.
+    For features that use messages and calls. `each_way_and_order` tries messages and calls in every
+    combination, so defects of a single combination show there.
     """
     rows = [
         (a, b, *DIRECTIONS[way], f"{a}-to-{b}-{way}")

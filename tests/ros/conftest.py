@@ -1,9 +1,9 @@
-"""Fixtures of the real-ROS layer, and the report at its end.
+"""Fixtures of the real-ROS layer, and the report at the end.
 
-With ROS_TESTS_FLAT=1 the same tests run in a network without boundary and without the
-proxy: what fails there is wrong with a test, or with ROS, and not with the proxy. With
-ROS_TESTS_KERNEL=1 the kernel forwards topics in all of them. With ROS_TESTS_ISOLATED=1 inside has
-no way out but a proxy with ``--direction both``, or what ROS_TESTS_DIRECTION says.
+With ROS_TESTS_FLAT=1 the same tests run in a network without boundary and without the proxy: a
+failure there is a fault of the test or of ROS. With ROS_TESTS_KERNEL=1 the kernel forwards topics
+in all tests. With ROS_TESTS_ISOLATED=1 inside has no way out but a proxy with ``--direction both``,
+or the direction in ROS_TESTS_DIRECTION.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     dropped = [item for item in own if any(map(item.get_closest_marker, off))]
     problem = requirements.missing(with_proxy=not FLAT)
     if problem and own:
-        # One failure that says what to do is better than two hundred that say the same.
+        # A single failure with a fix is better than two hundred.
         config.stash[_MISSING] = problem
         dropped = own[1:]
     if dropped:
@@ -73,7 +73,7 @@ def pytest_runtest_makereport(
 
 
 class Collector:
-    """Gathers what the cases report, also those that run in other processes (pytest-xdist)."""
+    """Gathers the reports of all cases, also from other processes (pytest-xdist)."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._report = config.stash[report.KEY]
@@ -96,7 +96,7 @@ def pytest_terminal_summary(
 
 @pytest.fixture(scope="session")
 def topology_of() -> Iterator[Callable[[Plan], Topology]]:
-    """Builds the network of a plan when it is first asked for; all go at the end."""
+    """Builds the network of a plan on first use. All networks are removed at the end."""
     remove_leftovers()
     built: dict[Plan, Topology] = {}
 
@@ -132,7 +132,7 @@ def module_lab(
     forks: Forks,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Lab]:
-    """One master and one proxy for a module, which may set PLAN and what else is read here."""
+    """A master and a proxy for a module, which may set PLAN and the other names below."""
     compiled_node()
     plan = getattr(request.module, "PLAN", SHARED)
     lab = Lab(topology_of(plan), tmp_path_factory.mktemp("lab"), forks)

@@ -1,8 +1,8 @@
-"""Compiles the C++ test nodes, once per version of their sources and of ROS.
+"""Compiles the C++ test nodes, once for each version of the sources and of ROS.
 
     python -m tests.ros.cpp
 
-does so ahead, while other things go on.
+compiles in advance.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from pathlib import Path
 
 NODES = Path(__file__).parent / "nodes"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rosproxy/ros-nodes"
-"""Beside what other tests keep between runs, so that a fresh clone need not compile them."""
+"""Beside the caches of other tests, so that a fresh clone need not compile."""
 PACKAGES = ("roscpp", "std_msgs", "actionlib", "topic_tools")
 FLAGS = ("-std=c++17", "-O1", "-w", "-DBOOST_BIND_GLOBAL_PLACEHOLDERS")
 
 
 def compiled_node() -> Path:
-    """The path of the C++ node program, compiled now if its sources have changed."""
+    """The path of the C++ node program, compiled now if the sources have changed."""
     CACHE.mkdir(parents=True, exist_ok=True)
     binary = CACHE / f"node-{_digest()}"
     with (CACHE / "lock").open("w") as lock:
@@ -42,7 +42,7 @@ def _digest() -> str:
 
 
 def _compile(binary: Path) -> None:
-    """Compiles each source at the same time as the others, then links."""
+    """Compiles all sources at the same time, then links."""
     flags = [*FLAGS, *_pkg_config("--cflags")]
     parts = {
         source: binary.with_suffix(f".{os.getpid()}.{source.stem}.o")

@@ -1,7 +1,7 @@
-"""ROS's Python programs as forks: one process for each machine has imported rospy for them.
+"""ROS's Python programs as forks of a process on each machine that has imported rospy.
 
-To import rospy takes a third of a second of a processor, which is more than all else that most
-tests do; and there are some hundred nodes and tools. See nodes/forked.py for the other end.
+Importing rospy takes a third of a second of a processor, more than everything else in most tests,
+and there are some hundred nodes and tools. The other end is nodes/forked.py.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Forks:
         self._parents: dict[str, subprocess.Popen[str]] = {}
 
     def start(self, place: Place, argv: Sequence[str], env: Mapping[str, str], log: Path) -> Fork:
-        """Starts one of PROGRAMS with its arguments."""
+        """Starts a program of PROGRAMS with arguments."""
         ended = log.with_suffix(".ended")
         log.touch()
         parent = self._parents.get(place.namespace) or self._start_parent(place, env)
@@ -59,7 +59,7 @@ class Forks:
 
 
 class Fork:
-    """A program's process, used as one of subprocess is."""
+    """A program's process, with the interface of subprocess."""
 
     def __init__(self, pid: int, ended: Path) -> None:
         self.pid = pid

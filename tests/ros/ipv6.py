@@ -44,7 +44,7 @@ class Topology6(Topology):
         proxy = self.places["px"]
         peer = ("peer", "name", "eth0", "netns", place.namespace)
         ip("-n", proxy.namespace, "link", "add", f"{role}0", "type", "veth", *peer)
-        # Without duplicate address detection they can be used at once.
+        # Without duplicate address detection the addresses are usable at once.
         give(place, "eth0", f"{ADDRESSES[role]}/64", "nodad")
         give(proxy, f"{role}0", f"{PROXY_ADDRESSES[role]}/64", "nodad")
 
@@ -58,12 +58,12 @@ class Topology6(Topology):
 
 
 class Lab6(Lab):
-    """A lab whose nodes and roscore speak IPv6."""
+    """A lab with IPv6 for nodes and roscore."""
 
     def environment(self, role: str) -> dict[str, str]:
-        """All that a ROS program on this machine gets."""
+        """The environment of a ROS program on this machine."""
         return super().environment(role) | {"ROS_IPV6": "on"}
 
     def master_address(self, role: str) -> tuple[str, int]:
-        """Where a machine finds its master."""
+        """The address of the master for a machine."""
         return (PROXY_ADDRESSES if role == "c1" else ADDRESSES)[role], MASTER_PORT

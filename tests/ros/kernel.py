@@ -36,13 +36,13 @@ def status(lab: Lab) -> dict[str, Any]:
 
 
 def node_status(lab: Lab, name: str) -> dict[str, Any]:
-    """What the status says of one node."""
+    """The row of a node in the status."""
     matching_nodes = (node for node in status(lab)["nodes"] if f"/{name}" in node["nodes"])
     return next(matching_nodes, {"data_plane": {}, "connections": []})
 
 
 def in_table(lab: Lab, name: str) -> bool:
-    """Whether ``rosproxy status`` tells as many connections through the kernel as its JSON does."""
+    """Whether ``rosproxy status`` has as many connections through the kernel as the JSON."""
     plane = plane_of(lab, name)
     text = lab.rosproxy("status").output
     counted = text.replace("1 connection ", "1 connections ")
@@ -76,7 +76,9 @@ def forwarded_ports(lab: Lab) -> list[int]:
 
 
 def wait_forwarded(lab: Lab, name: str) -> dict[str, Any]:
-    """Waits until the kernel forwards a node's topics and has counted some; what it says then."""
+    """Waits until the kernel forwards a node's topics and counts bytes. Returns the plane's
+    status.
+    """
 
     def is_forwarded() -> bool:
         plane = plane_of(lab, name)
@@ -87,12 +89,12 @@ def wait_forwarded(lab: Lab, name: str) -> dict[str, Any]:
 
 
 def wait_more(receiver: Process, count: int = 10) -> None:
-    """Waits until a subscriber has got more messages than it had."""
+    """Waits until a subscriber has got more messages."""
     receiver.wait_for_count("^got ", count, LIMIT, since=receiver.mark())
 
 
 def numbers(receiver: Process) -> list[int]:
-    """The numbers of the messages that a subscriber has got, in the order in which it got them."""
+    """The numbers of a subscriber's messages, in order of arrival."""
     return [int(number) for number in re.findall(r"^got \S+ (\d+) ", receiver.output(), re.M)]
 
 
@@ -109,7 +111,9 @@ def refuses(lab: Lab, port: int, host: str = OUT_HOST) -> bool:
 
 
 def outlive_a_kill(lab: Lab, library: str) -> str:
-    """A topic that goes on while the proxy is dead and after, on its port; its node's name."""
+    """Checks that a topic goes on during and after a kill of the proxy, on the same port. Returns
+    the node's name.
+    """
     name, _, receiver = talk(lab, library, library)
     before = wait_forwarded(lab, name)
     assert lab.proxy is not None
@@ -123,7 +127,7 @@ def outlive_a_kill(lab: Lab, library: str) -> str:
 
 
 def end_without_a_trace(lab: Lab, family: str = "ipv4") -> None:
-    """A proxy that is stopped leaves nothing in the kernel; its successor forwards again."""
+    """A stopped proxy leaves nothing in the kernel. The next proxy forwards again."""
     name, _, receiver = talk(lab)
     wait_forwarded(lab, name)
     assert lab.proxy is not None
@@ -137,7 +141,7 @@ def end_without_a_trace(lab: Lab, family: str = "ipv4") -> None:
 
 
 def status_of_unanswered(lab: Lab) -> tuple[str, dict[str, Any]]:
-    """A topic that a subscriber gets though nothing comes back through the kernel; its node."""
+    """A topic that arrives without answers through the kernel, and its node's status."""
     topic = f"/{lab.unique('topic')}"
     name = lab.unique("talker")
     lab.node("roscpp", "c1", "pub", name=name, topic=topic, rate=50)
@@ -162,7 +166,7 @@ def dropping(lab: Lab) -> Iterator[None]:
 
 @contextlib.contextmanager
 def other_proxy(lab: Lab, prefix: tuple[str, ...] = (), path: str = "") -> Iterator[None]:
-    """Runs the proxy in another way; afterwards it is as it was."""
+    """Runs the proxy in another way, and restores the usual way afterwards."""
     assert lab.proxy is not None
     before = lab.proxy_prefix, lab.proxy_path
     lab.proxy.stop()

@@ -1,4 +1,4 @@
-"""What a test drives: machines, a roscore, a proxy, and the nodes and tools it starts."""
+"""A test's lab: machines, a roscore, a proxy, nodes and tools."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 MASTER_URI = f"http://robot:{MASTER_PORT}"
 ROSCORE = f"exec roscore -p {MASTER_PORT}"
 CORE = f"/usr/lib/rosout/rosout & exec rosmaster --core -p {MASTER_PORT}"
-"""What roscore starts, without roslaunch, which it is itself: at a fifth of the cost."""
+"""The programs of roscore without roslaunch, at a fifth of the cost."""
 ADMIN_PORT = 11312
 CALLER = "/rosproxy_tests"
 
 
 @dataclass(frozen=True)
 class Result:
-    """How a tool ended, and all that it printed."""
+    """The exit code and the output of a tool."""
 
     returncode: int
     output: str
 
 
 class Lab:
-    """One topology with a real master outside and a proxy at the boundary."""
+    """A topology with a real master outside and a proxy at the boundary."""
 
     def __init__(self, topology: Topology, folder: Path, forks: Forks) -> None:
         self.topology = topology
@@ -77,7 +77,7 @@ class Lab:
     # roscore and proxy
 
     def start_master(self) -> None:
-        """Starts a real master and rosout, and waits until they serve."""
+        """Starts a real master and rosout, and waits until both serve."""
         place = self.place(self.master_role)
         uri = f"http://{place.hostname}:{MASTER_PORT}"
         env = self.environment(place.role) | {"ROS_MASTER_URI": uri}
@@ -96,7 +96,7 @@ class Lab:
             return False
 
     def start_proxy(self) -> None:
-        """Starts the proxy with this lab's settings and waits until it is listening."""
+        """Starts the proxy with this lab's settings, and waits until ready."""
         if self.flat:
             return
         ports = self.topology.plan.ports
@@ -108,14 +108,14 @@ class Lab:
         usual = "both" if plan.isolated else "out"
         argv += ["--direction", os.environ.get("ROS_TESTS_DIRECTION", usual)]
         if plan.isolated and plan.second is None:
-            # Else its first network, by which it gets outside here, would not be inside.
+            # By default the first network, which here is the proxy's way out, is not inside.
             for number in range(1, len(plan.networks) + 1):
                 argv += ["--inside-network", f"172.30.{number}.0/24"]
         self.proxy = self.spawn_proxy("px", [*argv, *self.proxy_options])
         self.proxy.wait_for(r"listening: ")
 
     def _upstream(self) -> str:
-        """The real master, as the proxy reaches it."""
+        """The URI of the real master for the proxy."""
         if self.master_role == "out":
             return MASTER_URI
         return f"http://{self.place(self.master_role).address}:{MASTER_PORT}"
@@ -128,7 +128,7 @@ class Lab:
         return self._spawn("rosproxy", self.place(role), [*self.proxy_prefix, *argv], env)
 
     def ensure_running(self) -> None:
-        """Starts roscore and proxy where a test before has left them dead."""
+        """Starts roscore and proxy if a former test has left them dead."""
         if self.master is None or self.master.returncode is not None:
             self.start_master()
         if self.proxy is None or self.proxy.returncode is not None:
@@ -159,9 +159,8 @@ class Lab:
     def node(
         self, library: str, role: str, kind: str, name: str = "", env: Any = None, **options: Any
     ) -> Process:
-        """Starts a test node: `library` is one of `programs`, `kind` one of its roles.
-
-        Remappings go in through an option named `remap`, as a list of words.
+        """Starts a test node of a library in `programs`, in the role `kind`. The option `remap` is
+        a list of remappings.
         """
         words = [*options.pop("remap", []), f"__name:={name or self.unique(kind)}"]
         for option, value in options.items():
@@ -169,7 +168,7 @@ class Lab:
         return self.start(role, *self.programs[library], kind, *words, env=env)
 
     def start(self, role: str, *argv: str, env: Mapping[str, str] | None = None) -> Process:
-        """Starts any program on a machine; it is ended with the test."""
+        """Starts any program on a machine. The program ends with the test."""
         title = " ".join([Path(argv[0]).name, *argv[1:]])
         forks = self._forks if argv[0] in PROGRAMS else None
         if forks:
@@ -185,7 +184,7 @@ class Lab:
         return process
 
     def run(self, role: str, *argv: str, timeout: float = 30, check: bool = True) -> Result:
-        """Runs a program on a machine to its end. Raises AssertionError when it fails."""
+        """Runs a program on a machine until the end. Raises AssertionError after a failure."""
         process = self.start(role, *argv)
         code = process.wait(timeout)
         if check and code != 0:
@@ -226,7 +225,7 @@ class Lab:
         return [link for link in links if link["name"] == topic]
 
     def wait_shown(self, topic: str, **wanted: Any) -> dict[str, Any]:
-        """A link of a topic on the live page, once it is so and its messages are counted."""
+        """Waits for a link of a topic on the live page with these values and counted messages."""
         shown: list[dict[str, Any]] = []
 
         def is_so() -> bool:
@@ -271,7 +270,7 @@ class Lab:
         return wire.call(self.place(role), address, port, method, CALLER, *arguments)
 
     def master_uri(self, role: str) -> str:
-        """ROS_MASTER_URI on a machine: inside it names the proxy, if need be by an alias."""
+        """ROS_MASTER_URI on a machine; inside with a name of the proxy, perhaps an alias."""
         if self._is_inside(role) and not self.topology.plan.alias:
             return f"http://rosproxy:{MASTER_PORT}"
         if self.master_role == "out":
@@ -309,8 +308,8 @@ class Lab:
     def wait_registered(self, name: str, timeout: float = 60) -> None:
         """Wait until a node is up.
 
-        Its logger's services come last of what every node registers. Before, it is still asking
-        the master for parameters, and rospy gives up for good when one such call fails.
+        The services of the logger are the last registrations of every node. Before, a node asks the
+        master for parameters, and rospy gives up for good after a failed call.
         """
         level = f"{_absolute(name)}/set_logger_level"
 

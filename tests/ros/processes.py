@@ -1,4 +1,4 @@
-"""Programs on the machines of a topology: started, watched by their output, and reaped."""
+"""Programs on the machines of a topology: start, output, end."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.ros.forks import Forks
 from tests.ros.topology import Place
 
 STOP_PATIENCE = 8.0
-"""Seconds that a process gets to end after SIGINT before it is killed."""
+"""Seconds from SIGINT to SIGKILL."""
 _POLL = 0.01
 
 
 class Process:
-    """One running program, in a process group of its own, with its output in a file."""
+    """A running program in a separate process group, with the output in a file."""
 
     def __init__(
         self, title: str, place: Place, argv: Sequence[str], env: Mapping[str, str], log: Path,
@@ -41,7 +41,7 @@ class Process:
         return self._popen.poll()
 
     def output(self, since: int = 0) -> str:
-        """What it printed, from character `since` on."""
+        """The output from character `since` on."""
         return self.log.read_text(errors="replace")[since:]
 
     def mark(self) -> int:
@@ -55,7 +55,7 @@ class Process:
     def wait_for_count(
         self, pattern: str, count: int, timeout: float = 60.0, since: int = 0
     ) -> list[re.Match[str]]:
-        """Waits until `count` matches are there; returns all of them."""
+        """Waits for `count` matches in the output. Returns all matches."""
         compiled = re.compile(pattern, re.MULTILINE)
         deadline = time.monotonic() + timeout
         while True:
@@ -75,7 +75,7 @@ class Process:
         )
 
     def wait(self, timeout: float = 60.0) -> int:
-        """Waits until it ends by itself; returns its exit code."""
+        """Waits for the end. Returns the exit code."""
         try:
             return self._popen.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -83,14 +83,13 @@ class Process:
             raise AssertionError(text + self.output()[-3000:]) from None
 
     def send(self, number: signal.Signals) -> None:
-        """Signals the whole process group. Nothing happens when it is gone."""
+        """Signals the whole process group, if the group still exists."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, number)
 
     def kill(self) -> None:
-        """SIGKILL, to it and to all that it has started, and reaps it.
-
-        roscore and roslaunch put every child into a process group of its own.
+        """Kills the process and all descendants with SIGKILL, and reaps the process. roscore and
+        roslaunch put every child into a separate process group.
         """
         for pid in (self.pid, *descendants(self.pid)):
             with contextlib.suppress(ProcessLookupError):
@@ -99,7 +98,7 @@ class Process:
         self._popen.wait()
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
-        """Asks it to end, kills what is left, and returns its exit code."""
+        """Asks the process to end, kills the rest, and returns the exit code."""
         if self.returncode is None:
             self.send(signal.SIGCONT)
             self.send(number)
@@ -116,7 +115,7 @@ class Process:
         return self._popen.wait()
 
     def _group_lives(self) -> bool:
-        """Whether it, or a child in its group (rosbag's recorder for one), still runs."""
+        """Whether the process, or a child in the group such as rosbag's recorder, still runs."""
         try:
             os.killpg(self.pid, 0)
         except ProcessLookupError:
@@ -139,7 +138,7 @@ def _execute(
 
 
 def descendants(pid: int) -> list[int]:
-    """The children of a process, their children, and so on."""
+    """All descendants of a process."""
     pids = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         with contextlib.suppress(OSError):
@@ -149,7 +148,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def stop_all(processes: Sequence[Process], patience: float = STOP_PATIENCE) -> None:
-    """Ends all of them at the same time."""
+    """Ends all processes at the same time."""
     running = [process for process in processes if process.returncode is None]
     for process in running:
         process.send(signal.SIGCONT)
@@ -159,7 +158,7 @@ def stop_all(processes: Sequence[Process], patience: float = STOP_PATIENCE) -> N
 
 
 def wait_until(condition: str, check: object, timeout: float = 60.0) -> None:
-    """Polls the callable `check` until it gives something true."""
+    """Polls the callable `check` until the result is true."""
     assert callable(check)
     deadline = time.monotonic() + timeout
     while not check():

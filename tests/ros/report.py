@@ -22,7 +22,7 @@ class Report:
         return len(self.outcomes)
 
     def add(self, result: pytest.TestReport) -> None:
-        """Counts a phase of a case; a case has passed when all its phases have."""
+        """Counts a phase of a case. A case passes if all phases pass."""
         if not result.skipped:
             self.outcomes[result.nodeid] = self.outcomes.get(result.nodeid, True) and result.passed
         if result.when == "call":

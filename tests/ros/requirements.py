@@ -1,4 +1,4 @@
-"""What this layer needs from the machine, and what to say where it is missing."""
+"""The layer's requirements of the machine, and the message for a missing requirement."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FILES = (
 
 
 def missing(with_proxy: bool) -> str | None:
-    """What stops this layer from running and the command that mends it, or nothing."""
+    """The obstacle for this layer with the command against it, or None."""
     gone = [name for name in _PROGRAMS if shutil.which(name) is None]
     gone += [name for name in _FILES if not Path(name).exists()]
     if gone:

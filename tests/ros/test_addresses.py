@@ -1,4 +1,4 @@
-"""Whatever address an inside node gives for itself, it is reached."""
+"""An inside node is reached with any address or host name of its own."""
 
 from __future__ import annotations
 
@@ -67,7 +67,9 @@ def test_services_with_ros_ip_set_to_the_inside_address(lab: Lab, library: str, 
 @pytest.mark.boundary
 @each_library
 def test_a_node_bound_to_loopback_is_named_in_the_log_with_the_fix(lab: Lab, library: str) -> None:
-    """With ROS_IP=127.0.0.1 both libraries listen on loopback only: nobody can reach them."""
+    """With ROS_IP=127.0.0.1 both libraries listen on loopback only, unreachable for other
+    machines.
+    """
     assert lab.proxy is not None
     since = lab.proxy.mark()
     name = lab.unique("lonely")
@@ -93,7 +95,7 @@ def test_nodes_in_a_namespace(lab: Lab, first: str, second: str, source: str, si
 
 @each_library
 def test_two_containers_with_the_same_ports(lab: Lab, library: str) -> None:
-    """Both nodes have the same port numbers, each on its own address."""
+    """Both nodes have the same port numbers on different addresses."""
     nodes = {role: lab.unique("twin") for role in ("c1", "c2")}
     fixed = (
         {"xmlrpc_port": 20001, "tcpros_port": 20002}

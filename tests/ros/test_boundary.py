@@ -1,4 +1,4 @@
-"""The test network itself: its boundary is real, so that passing it proves something."""
+"""The test network: a real boundary, so that passing traffic proves something."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_without_the_proxy_outside_hears_nothing_from_inside(lab: Lab, library: 
 @pytest.mark.direct
 @pytest.mark.parametrize("first", ["publisher", "subscriber"], ids=lambda w: f"{w}-first")
 def test_datagrams_of_an_inside_publisher_pass_through_nat(lab: Lab, first: str) -> None:
-    """UDPROS without the proxy's doing: the subscriber outside says where it wants them."""
+    """UDPROS without the proxy: the subscriber outside names the target of the datagrams."""
     topic = f"/{lab.unique('udp')}"
     if first == "subscriber":
         receiver = lab.node("roscpp", "out", "sub", topic=topic, udp=1)

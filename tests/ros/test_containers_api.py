@@ -1,8 +1,8 @@
-"""What a controller tells the proxy of containers: gone, moved, arrived; and its end.
+"""Updates of a controller about containers (gone, moved, arrived), and the end of a controller.
 
-Machines stand for containers. Inside, the master's host name leads to the proxy; a node that is
-started while it still leads to the real master registers around the proxy, as one does whose
-container starts before the proxy has joined its network.
+Machines replace containers. Inside, the master's host name leads to the proxy. A node that starts
+while this name still leads to the real master registers directly, like a node in a container that
+starts before the proxy has joined the network.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def off_the_network(place: Place) -> Iterator[None]:
 
 @contextlib.contextmanager
 def reached_by_the_master(lab: Lab, role: str) -> Iterator[None]:
-    """The master reaches this machine's address, as it does on the containers' own host."""
+    """Let the master reach this machine's address, as on the containers' host."""
     host = lab.place("host").namespace
     rule = ["ip", "netns", "exec", host, "nft", "-e", "-a"]
     words = f"insert rule ip boundary forward ip daddr {lab.place(role).address} accept"
@@ -83,13 +83,13 @@ def reached_by_the_master(lab: Lab, role: str) -> Iterator[None]:
 
 
 def stray(lab: Lab, library: str, kind: str, role: str = "c1", **options: Any) -> Process:
-    """A node that registers around the proxy, with the machine's address as its host."""
+    """A node that registers directly, with the machine's address as its host."""
     env = options.pop("env", {"ROS_IP": lab.place(role).address})
     with before_the_proxy(lab, role):
         node = lab.node(library, role, kind, env=env, **options)
         node.wait_for("^ready")
         lab.wait_registered(options["name"])
-        time.sleep(0.3)  # its last registrations, for the logger, follow
+        time.sleep(0.3)  # time for the logger's registrations
     return node
 
 
@@ -105,7 +105,7 @@ def is_leased(lab: Lab, name: str) -> bool:
 
 @each_library
 def test_nodes_of_a_container_that_is_gone(lab: Lab, library: str, measure: Measure) -> None:
-    """Killed with its container: within a second the master knows none of them."""
+    """After a kill of the container, the master knows none of the nodes within a second."""
     names = {role: lab.unique("gone") for role in ROLES.values()}
     nodes = [
         lab.node(library, "c3", role, name=name, topic=f"/{name}/t", service=f"/{name}/s")
@@ -144,7 +144,7 @@ def test_a_node_that_answers_survives_the_update_that_it_is_gone(lab: Lab, libra
 @pytest.mark.direct
 @each_library
 def test_a_stray_publisher_is_adopted(lab: Lab, library: str, measure: Measure) -> None:
-    """Heard outside and inside, by those who listened before and after; it lives on."""
+    """Subscribers from before and after, outside and inside, receive. The publisher lives on."""
     name = lab.unique("stray")
     topic = f"/{lab.unique('t')}"
     before = {
@@ -172,7 +172,7 @@ def test_a_stray_publisher_is_adopted(lab: Lab, library: str, measure: Measure) 
 
 
 def assert_no_gap(receiver: Process) -> None:
-    """Each message has come once: its connection was never dropped."""
+    """Checks that each message has come once, so that the connection was never dropped."""
     numbers = [int(m[1]) for m in receiver.wait_for_count(r"^got hello (\d+) ", 3)]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), numbers
 
@@ -180,7 +180,7 @@ def assert_no_gap(receiver: Process) -> None:
 @pytest.mark.direct
 @each_library
 def test_a_stray_subscriber_is_adopted(lab: Lab, library: str) -> None:
-    """It hears those that it could hear before without a gap, and those that come later."""
+    """The subscriber receives from known publishers without a gap, and from later publishers."""
     name = lab.unique("stray")
     topic = f"/{lab.unique('t')}"
     outside = lab.node("roscpp", "out", "pub", topic=topic)
@@ -239,7 +239,7 @@ def test_rosnode_kill_ends_an_adopted_node(lab: Lab, library: str) -> None:
 def test_an_adopted_node_that_ends_leaves_nothing(
     lab: Lab, library: str, way: signal.Signals, measure: Measure
 ) -> None:
-    """It unregisters around the proxy, to no effect: its connection to the master is open yet."""
+    """The node unregisters directly, without effect: its connection to the master is still open."""
     started = {role: lab.unique("stray") for role in ROLES.values()}
     nodes = [
         stray(lab, library, role, name=name, topic=f"/{name}/t", service=f"/{name}/s")
@@ -259,7 +259,9 @@ def test_an_adopted_node_that_ends_leaves_nothing(
 def test_strays_that_the_master_reaches_are_not_shut_down(
     lab: Lab, library: str, tmp_path: Path
 ) -> None:
-    """Adopted while the master could end them; and then registering around the proxy again."""
+    """Adopted although the master reaches the node, and again after a further direct
+    registration.
+    """
     name = lab.unique("stray")
     more = tmp_path / "more"
     with reached_by_the_master(lab, "c1"):
@@ -272,12 +274,12 @@ def test_strays_that_the_master_reaches_are_not_shut_down(
         node.wait_for("^more")
         for topic in ("a", "b"):
             lab.node(library, "out", "sub", topic=f"/{name}/{topic}").wait_for_count("^got ", 3)
-        wait_until("it is behind the proxy again", lambda: is_leased(lab, name))
+        wait_until("the node is behind the proxy again", lambda: is_leased(lab, name))
         assert node.returncode is None
 
 
 def provider(lab: Lab, service: str) -> str:
-    """Where the master has a service; empty while a name changes hands, or nobody has it."""
+    """The URI of a service at the master; empty without a provider, or during a change."""
     try:
         return str(lab.ask_master("lookupService", service))
     except LookupError:
@@ -287,7 +289,7 @@ def provider(lab: Lab, service: str) -> str:
 @pytest.mark.direct
 @each_library
 def test_a_stray_that_is_adopted_while_it_registers(lab: Lab, library: str) -> None:
-    """Half of its registrations go around the proxy after it has been adopted."""
+    """Some registrations go to the master directly after the adoption."""
     nodes = []
     names = [lab.unique("stray") for _ in range(4)]
     with reached_by_the_master(lab, "c1"), before_the_proxy(lab, "c1"):
@@ -329,7 +331,9 @@ def test_an_adopted_node_that_drops_a_topic_around_the_proxy(
 def test_a_stray_that_registers_through_the_proxy_before_the_update(
     lab: Lab, library: str, tmp_path: Path
 ) -> None:
-    """Its connection to the master is lost; the next registration takes the others along."""
+    """The node has lost its connection to the master. The next registration brings the others
+    along.
+    """
     name = lab.unique("stray")
     more = tmp_path / "more"
     with reached_by_the_master(lab, "c1"):
@@ -347,13 +351,13 @@ def test_a_stray_that_registers_through_the_proxy_before_the_update(
 
 
 def end_connections(place: Place, master: str) -> None:
-    """Ends the idle connections that the nodes of a machine keep to their master."""
+    """Ends the idle connections from a machine's nodes to the master."""
     ip("netns", "exec", place.namespace, "ss", "-K", "dst", master, "dport", "=", ":11311")
 
 
 @contextlib.contextmanager
 def address_changed(place: Place, after: str) -> Iterator[None]:
-    """The machine has another address, as a container that was taken off its network and back."""
+    """Gives the machine another address, like a container that left and rejoined its network."""
     before = place.address
     gateway = place.address.rpartition(".")[0] + ".1"
 
@@ -374,7 +378,7 @@ def address_changed(place: Place, after: str) -> Iterator[None]:
 def test_a_container_that_has_moved(
     lab: Lab, library: str, measure: Measure, tmp_path: Path
 ) -> None:
-    """Heard again on the same port, outside and inside; and it can register more."""
+    """The node is reached again on the same port, outside and inside, and may register more."""
     name = lab.unique("moved")
     more = tmp_path / "more"
     place = lab.place("c3")
@@ -388,7 +392,8 @@ def test_a_container_that_has_moved(
     peers = [lab.node(p, r, "sub", topic=f"/{name}/a") for r in ("out", "c2") for p in LIBRARIES]
     for peer in peers:
         peer.wait_for_count("^got ", 3)
-    # The proxy ends connections that are idle for 75 s; one that is kept hangs with its address.
+    # The proxy ends connections after 75 idle seconds. A kept connection hangs with the old
+    # address.
     end_connections(place, lab.place("px").address)
     before = lab.node_uri(name)
     old = place.address

@@ -1,8 +1,8 @@
-"""Inside has no way out: with ``--direction out`` it hears nobody there, and doctor says why.
+"""Inside has no way out. With ``--direction out`` inside receives nothing from outside, and the
+doctor has the reason. With ``both`` inside receives, also from outside nodes on the proxy's
+machine.
 
-With ``both`` it does, also if the nodes of outside are on the proxy's own machine.
-
-The tests of both directions run in that network with ROS_TESTS_ISOLATED=1.
+The tests of both directions run in this network with ROS_TESTS_ISOLATED=1.
 """
 
 from __future__ import annotations
@@ -43,9 +43,10 @@ def test_inside_is_heard_and_hears_nobody(lab: Lab, library: str) -> None:
 
 @pytest.fixture
 def beside(lab: Lab) -> Iterator[dict[str, str]]:
-    """A proxy for both directions on a machine with nodes of outside; what nodes inside are told.
+    """A proxy for both directions on a machine with outside nodes. Yields the environment of inside
+    nodes.
 
-    Its machine is their network's gateway: as a Docker host is, with an internal network.
+    The machine is the gateway of the inside network, like a Docker host with an internal network.
     """
     gateway = "172.30.1.1"
     argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", MASTER_URI]
@@ -65,7 +66,7 @@ def beside(lab: Lab) -> Iterator[dict[str, str]]:
 def test_nodes_of_outside_may_run_beside_the_proxy(
     lab: Lab, beside: dict[str, str], outside_library: str, inside_library: str
 ) -> None:
-    """On its machine, by an address that is the proxy's own as well."""
+    """On the proxy's machine, with an address that the proxy has, too."""
     topic = f"/{lab.unique('topic')}"
     service = f"/{lab.unique('service')}"
     host_env = {"ROS_IP": OUT_HOST}

@@ -1,7 +1,7 @@
-"""Nodes inside have no way outwards but the proxy, which has no ports for datagrams.
+"""Inside nodes have no way out but the proxy, which has no ports for datagrams.
 
-So rules about what is outside hold: elsewhere they hide, and a node that knows an address connects
-to it by itself. And who wants UDP alone is told by doctor what is missing.
+So rules about outside names are enforced. Elsewhere rules only hide, and a node that knows an
+address connects by itself. For subscribers with UDP alone, the doctor reports the missing option.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PLAN = replace(SHARED, name="p", isolated=True)
 
 
 def told(lab: Lab, method: str, name: str, role: str = "c1") -> tuple[str, int]:
-    """Where the master has a node or service, as it is told to a machine."""
+    """The address of a node or service that a machine gets from the master."""
     parts = urlsplit(lab.ask_master(method, name, role=role))
     assert parts.hostname
     assert parts.port

@@ -36,7 +36,9 @@ def stand_in(lab: Lab, name: str) -> dict[str, Any]:
 
 
 def wait_forwarded(lab: Lab, name: str) -> dict[str, Any]:
-    """Waits until the kernel forwards a node's topics and has counted some; what it says then."""
+    """Waits until the kernel forwards a node's topics and counts bytes. Returns the plane's
+    status.
+    """
 
     def is_forwarded() -> bool:
         plane = stand_in(lab, name)["data_plane"]
@@ -98,8 +100,8 @@ def test_a_proxy_that_ends_lets_its_successor_serve(lab: Lab) -> None:
     wait_forwarded(lab, name_of(lab, topic))
 
 
-def test_who_is_not_selected_gets_nothing(lab: Lab) -> None:
-    """The kernel sends on what comes from those alone who may use the proxy as their master."""
+def test_an_unselected_source_gets_nothing(lab: Lab) -> None:
+    """The kernel forwards only connections from sources that may use the proxy as their master."""
     topic, _, receiver = talk(lab, "rospy", "roscpp")
     port = wait_forwarded(lab, name_of(lab, topic))["port"]
     c1_address = lab.place("c1").address
@@ -114,14 +116,14 @@ def test_who_is_not_selected_gets_nothing(lab: Lab) -> None:
 
     assert forwarded()
     lab.tell("/containers", selected=[c1_address])
-    wait_until("the other one is not forwarded", lambda: not forwarded(), LIMIT)
+    wait_until("the other source is not forwarded", lambda: not forwarded(), LIMIT)
     kernel.wait_more(receiver)
     lab.tell("/containers", selected=[c1_address, c2_address])
-    wait_until("it is forwarded again", forwarded, LIMIT)
+    wait_until("the source is forwarded again", forwarded, LIMIT)
 
 
-def test_a_rule_takes_it_back(lab: Lab) -> None:
-    """What the kernel forwards nobody looks at: with a rule for it, topics go through the proxy."""
+def test_a_rule_ends_forwarding_by_the_kernel(lab: Lab) -> None:
+    """The kernel cannot enforce rules, so topics with a rule go through the proxy."""
     topic, _, receiver = talk(lab, "rospy", "rospy")
     other, _, deaf = talk(lab, "rospy", "roscpp")
     for forwarded_topic in (topic, other):

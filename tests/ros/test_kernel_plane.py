@@ -1,4 +1,4 @@
-"""Topics that the kernel forwards: real nodes behind a proxy that may change its own tables."""
+"""Topics on the kernel plane: real nodes behind a proxy with the rights for nftables."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def test_the_kernel_forwards_a_topic(lab: Lab, publisher: str, subscriber: str) 
     assert kernel.node_status(lab, name)["connections"] == []
     listed = [line for line in kernel.flows(lab).splitlines() if f"dport={plane['port']}" in line]
     assert any("ESTABLISHED" in line and lab.place("c1").address in line for line in listed)
-    # That of /rosout comes by itself: the table tells as many as the JSON once it is there.
-    wait_until("the table tells of the connections", lambda: kernel.in_table(lab, name))
+    # A connection for /rosout comes later. Then the table has as many as the JSON.
+    wait_until("the table has the connections", lambda: kernel.in_table(lab, name))
     kernel.wait_more(receiver)
     wait_until("more is counted", lambda: kernel.plane_of(lab, name)["sent"] > plane["sent"])
 
@@ -90,12 +90,12 @@ def test_a_restarted_node_is_forwarded_again(lab: Lab, library: str) -> None:
     kernel.wait_forwarded(lab, name)
 
 
-def test_a_table_that_somebody_removed_is_made_again(lab: Lab) -> None:
+def test_a_removed_table_is_made_again(lab: Lab) -> None:
     name, _, _ = talk(lab)
     port = kernel.wait_forwarded(lab, name)["port"]
     kernel.in_proxy(lab, "nft", "delete", "table", "inet", kernel.TABLE)
     wait_until("the table is there", lambda: kernel.TABLE in kernel.tables(lab), LIMIT)
-    wait_until("it is forwarded", lambda: port in kernel.forwarded_ports(lab), LIMIT)
+    wait_until("the port is forwarded", lambda: port in kernel.forwarded_ports(lab), LIMIT)
     late = lab.node("rospy", "out", "sub", topic=kernel.node_status(lab, name)["publishes"][1])
     late.wait_for_count("^got ", 5, LIMIT)
     assert kernel.node_status(lab, name)["connections"] == []

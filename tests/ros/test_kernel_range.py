@@ -58,7 +58,7 @@ def test_fast_ports_are_given_back_and_connections_under_way_go_on(lab: Lab, lib
     before = kernel.plane_of(lab, talkers[0][0])
     assert before["connections"] > 0
     moved = before["sent"]
-    wait_until("it is counted", lambda: kernel.plane_of(lab, talkers[0][0])["sent"] > moved, LIMIT)
+    wait_until("counted", lambda: kernel.plane_of(lab, talkers[0][0])["sent"] > moved, LIMIT)
 
 
 def test_a_range_with_room_again_is_used(lab: Lab) -> None:

@@ -38,7 +38,7 @@ each_role = pytest.mark.parametrize("role", ROLES.values(), ids=ROLES.keys())
 def start(
     lab: Lab, library: str, role: str, machine: str = "c1", name: str = ""
 ) -> tuple[Process, str]:
-    """A registered node of that role, and its name."""
+    """A registered node of a role, and the node's name."""
     name = name or lab.unique("mortal")
     names = {"serve": {"service": f"/{name}/service"}}.get(role, {"topic": f"/{name}/topic"})
     node = lab.node(library, machine, role, name=name, **names)
@@ -94,8 +94,8 @@ def test_nodes_ended_by_sigkill_are_cleaned_up(lab: Lab, library: str, measure: 
 
 @pytest.mark.boundary
 @each_library
-def test_a_node_answers_over_one_connection_until_it_ends(lab: Lab, library: str) -> None:
-    """As it is asked by the proxy while it is well."""
+def test_a_node_answers_over_a_single_connection_until_its_end(lab: Lab, library: str) -> None:
+    """Like the proxy's calls to a healthy node."""
     node, name = start(lab, library, "pub")
     own = lab.ask_master("lookupNode", f"/{name}", role="c1")
     address = HostPort(lab.place("c1").address, urlsplit(own).port)
@@ -118,9 +118,9 @@ async def asked_until_it_ends(address: HostPort, node: Process) -> None:
     for _ in range(3):
         assert connections.ask("first", address, pid, 0.0)
         assert not connections.ask("second", address, pid, 0.0)  # that would be another connection
-        wait_until("it answers", lambda: told() == [ProbeResult.ANSWERED])
+        wait_until("the node answers", lambda: told() == [ProbeResult.ANSWERED])
     node.kill()
-    wait_until("its end is noticed", lambda: told() == [None])
+    wait_until("the end is noticed", lambda: told() == [None])
     connections.close_all()
     await upstream.close()
 
@@ -175,7 +175,7 @@ WAYS_TO_END = {
 def test_a_restart_under_the_same_name(
     lab: Lab, library: str, machine: str, way: signal.Signals | None
 ) -> None:
-    """Subscribers that heard the old node hear the new one, without being told."""
+    """Subscribers of the old node hear the new node, without any help."""
     name = lab.unique("phoenix")
     topic = f"/{name}/topic"
     old = lab.node(library, "c1", "pub", name=name, topic=topic, word="old")
@@ -210,7 +210,7 @@ def test_a_server_killed_and_restarted_under_the_same_name(
 
 
 def descriptors(lab: Lab) -> int:
-    """How many the proxy has open, without the connections to the master that it keeps."""
+    """The number of the proxy's open descriptors, without kept connections to the master."""
     assert lab.proxy is not None
     to_master = lab.run("px", "ss", "-Htn", "dst", f":{MASTER_PORT}").output.splitlines()
     return len(list(Path(f"/proc/{lab.proxy.pid}/fd").iterdir())) - len(to_master)

@@ -1,4 +1,4 @@
-"""The master itself runs inside; outside finds it at a port that the proxy publishes."""
+"""The master runs inside. Outside finds the master at a port that the proxy publishes."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Inside nodes on networks of their own, a mapped port range, and a host with a name.
+"""Inside nodes on separate networks, a mapped port range, and a host with a name.
 
-c1 and c2 are on two bridges which have only the proxy in common; the host publishes
-46000-46029 to the proxy's 45000-45029; outside knows the host by its name.
+c1 and c2 are on two bridges that share only the proxy. The host publishes 46000-46029 to the
+proxy's 45000-45029. Outside knows the host by name.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def test_services(lab: Lab, server: str, client: str, source: str, sink: str) ->
 
 @each_library
 def test_the_same_name_in_use_on_both_networks(lab: Lab, library: str) -> None:
-    """ROS's own rule holds: the newer node ends the older one of the same name."""
+    """ROS's own rule holds: the newer node ends the older node of the same name."""
     name = lab.unique("same")
     topic = f"/{lab.unique('topic')}"
     older = lab.node(library, "c1", "pub", name=name, topic=topic, word="older")

@@ -1,4 +1,4 @@
-"""Parameters keep their exact type and bytes on the way through."""
+"""Parameters keep the exact type and bytes on the way through."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def _no_rules_are_left(lab: Lab) -> Iterator[None]:
 
 
 def tell(lab: Lab, *rules: str, mode: str = "enforce") -> dict[str, Any]:
-    """Gives the proxy a layer of rules; what followed from it."""
+    """Sends a layer of rules to the proxy. Returns the result."""
     layers = [{"name": "test", "mode": mode, "rules": list(rules), "addresses": None}]
     with lab.place("px").entered():
         connection = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
@@ -149,7 +149,7 @@ def test_hidden_topics_are_known_to_a_proxy_that_was_killed(lab: Lab, library: s
     late = lab.node("roscpp", "c2", "sub", topic=topic)
     late.wait_for_count("^got ", 5)
     mark = early.mark()
-    wait_until("the early one hears as well", lambda: "got " in early.output(mark), 30)
+    wait_until("the early subscriber receives, too", lambda: "got " in early.output(mark), 30)
     assert topic not in lab.run("out", "rostopic", "list", "-p").output
     assert "deny publish" in greet(lab, name, topic=topic, type="*")["error"]
 

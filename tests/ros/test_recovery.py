@@ -25,7 +25,7 @@ Measure = Callable[[str, float], None]
 
 
 def restart_proxy(lab: Lab) -> float:
-    """Kills the proxy with SIGKILL and starts it again; gives the time of the start."""
+    """Kills the proxy with SIGKILL and restarts the proxy. Returns the time of the start."""
     assert lab.proxy is not None
     lab.proxy.kill()
     started = time.time()
@@ -34,7 +34,7 @@ def restart_proxy(lab: Lab) -> float:
 
 
 def restart_master(lab: Lab) -> float:
-    """Kills roscore with SIGKILL and starts it again; gives the time when it answered."""
+    """Kills roscore with SIGKILL and restarts roscore. Returns the time of the first answer."""
     assert lab.master is not None
     lab.master.kill()
     lab.start_master()
@@ -42,7 +42,7 @@ def restart_master(lab: Lab) -> float:
 
 
 def next_time(process: Process, pattern: str, started: float) -> float:
-    """Seconds from `started` to the first matching line that was printed after it."""
+    """Seconds from `started` to the next matching line."""
     deadline = time.monotonic() + HARD_LIMIT
     while time.monotonic() < deadline:
         lines = process.wait_for_count(rf"{pattern}.* at ([\d.]+)$", 1, HARD_LIMIT)
@@ -122,7 +122,7 @@ def test_nodes_keep_their_ports_and_can_be_ended_after_a_restart(lab: Lab, libra
     before = {name: lab.node_uri(name) for name in names}
     restart_proxy(lab)
     assert lab.proxy is not None
-    lab.proxy.wait_for(r"recovered 4 nodes")  # a port refuses until its node has borne it out
+    lab.proxy.wait_for(r"recovered 4 nodes")  # a port refuses until its node is confirmed
     assert {name: lab.node_uri(name) for name in names} == before
     for name, node in zip(names, nodes, strict=True):
         assert f"Pid: {node.pid}" in lab.run("out", "rosnode", "info", name).output
@@ -178,7 +178,7 @@ def test_nodes_that_start_while_the_proxy_is_away_are_there_when_it_is_back(
 
 @each_library
 def test_a_proxy_ended_by_sigterm_is_followed_by_another(lab: Lab, library: str) -> None:
-    """An upgrade: the old one ends cleanly and takes back no registration."""
+    """An upgrade: the old proxy ends cleanly and removes no registration."""
     name = lab.unique("kept")
     sender = lab.node(library, "c1", "pub", name=name, topic=f"/{name}/topic")
     receiver = lab.node(library, "out", "sub", topic=f"/{name}/topic")
@@ -227,7 +227,7 @@ def test_a_subscribed_parameter_is_updated_after_a_restart(
     watcher.wait_for("^param before$")
     restart(lab)
     lab.wait_registered(name, HARD_LIMIT)
-    # What the master tells a node while its port is not served is lost, as without a proxy.
+    # Updates are lost while the node's port is not served, as without a proxy.
     lab.run("out", "rosnode", "ping", "-c", "1", name)
     lab.ask_master("setParam", f"/{name}/key", "after")
     watcher.wait_for("^param after$", HARD_LIMIT)
@@ -261,7 +261,7 @@ def test_roscore_and_proxy_restarted_one_after_the_other(lab: Lab, library: str)
 
 @each_library
 def test_everything_started_before_roscore(lab: Lab, library: str) -> None:
-    """The proxy starts without a master; nodes wait for it, as they do without a proxy."""
+    """The proxy starts without a master. Nodes wait for the master, as without a proxy."""
     assert lab.master is not None
     assert lab.proxy is not None
     lab.proxy.kill()

@@ -1,4 +1,4 @@
-"""roslaunch starts nodes, sets parameters and ends with its nodes, inside and outside."""
+"""roslaunch starts nodes, sets parameters and ends together with the nodes, inside and outside."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LAUNCH = """
 
 
 def launch_package(folder: Path) -> Path:
-    """A ROS package with the C++ node as its program."""
+    """A ROS package with the C++ node as the only program."""
     package = folder / "rosproxy_test_nodes"
     package.mkdir()
     (package / "package.xml").write_text(

@@ -10,7 +10,7 @@ from tests.ros.processes import Process
 
 
 def talker(lab: Lab, library: str, machine: str) -> tuple[Process, str]:
-    """A publishing node that is registered, and its name."""
+    """A registered publisher, and the node's name."""
     name = lab.unique("talker")
     node = lab.node(library, machine, "pub", name=name, topic=f"/{name}_topic", rate=5)
     node.wait_for("^sent ")

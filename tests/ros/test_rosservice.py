@@ -9,7 +9,7 @@ from tests.ros.lab import Lab
 
 
 def server(lab: Lab, machine: str, library: str = "roscpp") -> tuple[str, str]:
-    """Starts a server; gives its name and its service."""
+    """Starts a server. Returns the names of node and service."""
     name = lab.unique("server")
     service = f"/{name}/echo"
     lab.node(library, machine, "serve", name=name, service=service).wait_for("^ready")

@@ -13,7 +13,7 @@ STAMPED = ("geometry_msgs/PointStamped", "{header: auto, point: {x: 1.0, y: 2.0,
 
 
 def talker(lab: Lab, machine: str, library: str = "roscpp", **options: int) -> tuple[str, str]:
-    """Starts a publisher that runs at 20 Hz; gives its name and its topic."""
+    """Starts a publisher at 20 Hz. Returns the names of node and topic."""
     name = lab.unique("talker")
     topic = f"/{name}/chatter"
     lab.node(library, machine, "pub", name=name, topic=topic, **options).wait_for("^sent ")

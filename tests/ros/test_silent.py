@@ -1,4 +1,4 @@
-"""A subscriber that has given its publisher up is told of it again, and no other is disturbed."""
+"""A subscriber that gave its publisher up gets updates again, and no other is disturbed."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ pytestmark = pytest.mark.boundary
 PLAN = replace(SHARED, name="w", forwarding=True)
 
 GIVING_UP = 1.0
-"""Seconds in which roscpp tries to connect anew; as that fails at once, it is the last time."""
+"""Seconds in which roscpp tries to reconnect. After an immediate failure roscpp gives up."""
 LOOKED_AFTER = 45.0
 """Seconds in which the proxy looks for subscribers without connection."""
 
 
 @pytest.fixture(params=["splice", "kernel"])
 def lab_with_plane(lab: Lab, request: pytest.FixtureRequest) -> Iterator[Lab]:
-    """A proxy that relays connections itself, or has the kernel forward them."""
+    """A proxy with a relay in user space, or with the kernel plane."""
     before = lab.proxy_options
     lab.proxy_options = ("--data-plane", request.param)
     restart_proxy(lab)
@@ -89,7 +89,7 @@ def test_what_the_kernel_forwards_is_not_interrupted_by_a_restart(
 
 
 def silence(lab: Lab, connection: str) -> None:
-    """Break a subscriber's connection and have the next one fail before it has begun."""
+    """Break a subscriber's connection, and let the next attempt fail at once."""
     (port,) = re.findall(r"on port (\d+) to", connection)
     with no_connections(lab), reset(lab, port):
         # The kernel may give the same port to a connection elsewhere.
@@ -102,7 +102,7 @@ def silence(lab: Lab, connection: str) -> None:
 
 
 def connection(lab: Lab, name: str, topic: str) -> str:
-    """A subscriber's only connection for a topic, as its getBusInfo tells: with its ports."""
+    """A subscriber's only connection for a topic, with the ports, from getBusInfo."""
     port = urlsplit(lab.node_uri(name)).port
     out = lab.place("out")
     assert isinstance(port, int)
@@ -123,7 +123,7 @@ def reset(lab: Lab, port: str) -> Iterator[None]:
 
 @contextmanager
 def no_connections(lab: Lab) -> Iterator[None]:
-    """Has every new connection from outside fail at once, for want of a port of its own."""
+    """Let every new connection from outside fail at once, without a free local port."""
     option = "net.ipv4.ip_local_reserved_ports"
     outside(lab, "sysctl", "-w", f"{option}=1-65535")
     try:

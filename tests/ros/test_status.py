@@ -19,7 +19,7 @@ NOWHERE = {"ROS_HOSTNAME": "a-name-that-resolves-nowhere"}
 
 
 def status_of(lab: Lab, name: str) -> dict[str, Any]:
-    """What the status says about one inside node; empty when it is not there."""
+    """The row of an inside node in the status; empty if missing."""
     nodes = json.loads(lab.rosproxy("status", "--json").output)["nodes"]
     return next((node for node in nodes if f"/{name}" in node["nodes"]), {})
 
@@ -60,7 +60,7 @@ def counted(lab: Lab, topic: str, side: str) -> float:
 
 @each_library
 def test_metrics_count_the_messages_of_nodes_inside(lab: Lab, library: str) -> None:
-    """Once each, though two hear them; of what comes in as well."""
+    """Each message once, even with two subscribers; incoming messages, too."""
     name = lab.unique("counted")
     outward = f"/{name}/outward"
     inward = f"/{name}/inward"
@@ -69,11 +69,11 @@ def test_metrics_count_the_messages_of_nodes_inside(lab: Lab, library: str) -> N
     for role, topic in (("out", outward), ("out", outward), ("c2", inward)):
         lab.node(library, role, "sub", topic=topic).wait_for("^got ")
     first = counted(lab, outward, "published")
-    wait_until("sent ones are counted", lambda: counted(lab, outward, "published") > first, 60)
-    wait_until("received ones are counted", lambda: counted(lab, inward, "received") > 0, 60)
+    wait_until("sent messages are counted", lambda: counted(lab, outward, "published") > first, 60)
+    wait_until("received messages are counted", lambda: counted(lab, inward, "received") > 0, 60)
     published = counted(lab, outward, "published")
     sent = re.findall("^sent ", publisher.output(), re.MULTILINE)
-    assert published <= len(sent) + 1, "the last is printed after it was sent"
+    assert published <= len(sent) + 1, "the last line is printed after the sending"
     assert not counted(lab, inward, "published")
 
 

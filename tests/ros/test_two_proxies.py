@@ -1,4 +1,4 @@
-"""Two proxies: one behind the other, or each before a network of its own, with one master outside.
+"""Two proxies, in a row or each for a separate network, with a single master outside.
 
 No network has a way to another but through the proxies: c1 is behind px, c2 behind px2.
 """
@@ -54,7 +54,7 @@ class Second:
         return process
 
     def restart(self) -> None:
-        """Kills it and starts it again."""
+        """Kills and restarts the proxy."""
         self.process.kill()
         self.process = self._start()
 

@@ -1,7 +1,7 @@
-"""UDPROS between nodes of roscpp, which alone has it, where neither side has a way to the other.
+"""UDPROS between roscpp nodes (rospy has no UDPROS), if neither side has a way to the other.
 
-Without ``--direction both`` datagrams of an inside publisher still find their way through NAT: that
-is in `tests/ros/test_boundary.py`.
+Without ``--direction both``, datagrams of an inside publisher still pass NAT: see
+`tests/ros/test_boundary.py`.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def test_a_relay_ends_with_its_subscriber(lab: Lab, source: str, sink: str) -> N
 @pytest.mark.boundary
 @in_directions(RELAYED)
 def test_messages_come_again_after_the_proxy_was_killed(lab: Lab, source: str, sink: str) -> None:
-    """The subscriber's node is told of its publishers anew, and asks again."""
+    """The subscriber's node gets its publishers again, and sends a new request."""
     topic = f"/{lab.unique('udp')}"
     sender = lab.node("roscpp", source, "pub", topic=topic, rate=50)
     receiver = listener(lab, sink, topic)

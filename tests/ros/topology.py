@@ -1,15 +1,15 @@
 """A network with a boundary: machines outside, machines inside, NAT between them.
 
-Every machine is a network namespace with its own host name and its own `/etc/hosts`,
-so that a host name which is known in one place and nowhere else is the real thing.
+Every machine is a network namespace with a different host name and `/etc/hosts`, so that a host
+name may be known on a single machine only.
 
     out (roscore, outside nodes) -- LAN -- host (NAT, published ports) -- bridge -- px, c1, c2
 
-The host drops what outside sends to inside, apart from the ports it publishes to `px`;
-inside gets out through masquerade only: just what Docker's bridge network does.
+The host drops traffic from outside to inside, except to ports that are published to `px`. Inside
+gets out through masquerade only. Docker's bridge network does the same.
 
-In an isolated plan inside does not get out at all, but for the proxy: the other machines have no
-route there, and the host passes nothing of theirs on.
+In an isolated plan only the proxy gets out: other inside machines have no route, and the host does
+not forward for them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from typing import NamedTuple
 OUT_HOST = "10.77.0.1"
 OUT_NODE = "10.77.0.2"
 ADVERTISED_NAME = "dockerhost"
-"""A name for the host that outside machines know; `OUT_HOST` is its address."""
+"""A name of the host that outside machines know. `OUT_HOST` is the address."""
 MASTER_PORT = 11311
 PUBLISHED_MASTER_PORT = 11411
 
@@ -41,7 +41,7 @@ _CLONE_NEWNET = 0x40000000
 
 
 class PortMap(NamedTuple):
-    """The ports that the proxy binds, and the host ports which are published to them."""
+    """The ports that the proxy binds, and the host ports that lead there."""
 
     first: int
     last: int
@@ -64,9 +64,8 @@ class PortMap(NamedTuple):
 
 @dataclass(frozen=True)
 class SecondProxy:
-    """The machine px2: the numbers of the inside networks that it is on, and its ports.
-
-    The host publishes the ports if it has a way out of its own, without px.
+    """The machine px2: the numbers of its inside networks, and its ports. The host publishes the
+    ports if px2 has a way out without px.
     """
 
     networks: tuple[int, ...]
@@ -74,25 +73,23 @@ class SecondProxy:
 
     @property
     def behind_first(self) -> bool:
-        """Whether outside is reached through px alone."""
+        """Whether px is the only way outside."""
         return 1 in self.networks
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a topology looks like: its inside networks, ports, and whether it has a boundary.
+    """The plan of a topology: inside networks, ports, and the boundary.
 
-    With `flat`, nothing separates the machines and every name resolves everywhere: nodes
-    then work without a proxy, which shows that a test and its nodes are sound.
-    With `alias`, the master's host name leads inside to the proxy, as a network alias of
-    Docker does; in the proxy's own machine it does so, too.
-    With `hairpin`, inside reaches the published ports at the host's address too, as it does
-    with Docker's own proxy process; without, a wrong address handed to inside is found out.
-    With `forwarding`, the proxy's machine forwards, as containers of Docker do, and as the
-    kernel plane needs it; without, every topic goes through the proxy itself.
-    With `isolated`, inside has no way out but the proxy.
-    With `second`, there is another proxy, and px is on the first network alone.
-    `host` and `robot` are the addresses of the machines host and out on the LAN.
+    With `flat`, nothing separates the machines and every name resolves everywhere. Then nodes work
+    without a proxy, which proves that a test and its nodes are sound. With `alias`, the master's
+    host name leads inside to the proxy, like a network alias of Docker, also on the proxy's
+    machine. With `hairpin`, inside also reaches the published ports at the host's address, as with
+    Docker's proxy process. Without, a wrong address for inside fails a test. With `forwarding`, the
+    proxy's machine forwards, like containers of Docker. The kernel plane needs that. Without, every
+    topic goes through the proxy in user space. With `isolated`, inside has no way out but the
+    proxy. With `second`, there is another proxy, and px is only on the first network. `host` and
+    `robot` are the addresses of the machines host and out on the LAN.
     """
 
     name: str
@@ -115,7 +112,7 @@ ALIAS = Plan("a", (("c1", "c2"),), PortMap(11500, 11599, 11500), alias=True)
 
 @dataclass
 class Place:
-    """One machine: a network namespace, its host name and its addresses."""
+    """A machine: a network namespace with a host name and addresses."""
 
     role: str
     namespace: str
@@ -144,7 +141,7 @@ class Place:
 
 
 class Topology:
-    """The machines of one plan. Made by `build`, taken away by `remove`."""
+    """The machines of a plan. `build` makes and `remove` removes the machines."""
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
@@ -169,7 +166,7 @@ class Topology:
             self._write_names(place)
 
     def remove(self) -> None:
-        """Kills what still runs in the namespaces and deletes them."""
+        """Kills all processes in the namespaces, and deletes the namespaces."""
         for place in self.places.values():
             _remove_namespace(place.namespace)
 
@@ -248,7 +245,7 @@ class Topology:
         folder.mkdir(parents=True, exist_ok=True)
         lines = [f"{address} {name}" for address, name in self._known_names(place)]
         (folder / "hosts").write_text("127.0.0.1 localhost\n" + "\n".join(lines) + "\n")
-        # No DNS: an unknown name fails at once, as it does with a container network's own DNS.
+        # No DNS: an unknown name fails at once, as with a container network's DNS.
         (folder / "nsswitch.conf").write_text("hosts: files\n")
 
     def _known_names(self, place: Place) -> Iterator[tuple[str, str]]:
@@ -306,10 +303,10 @@ def boundary_rules(plan: Plan, proxies: list[str]) -> str:
 
 
 def remove_leftovers(prefix: str = _PREFIX) -> None:
-    """Takes away the namespaces of runs whose process is gone, killed before it could.
+    """Removes the namespaces of killed test runs.
 
-    They are those whose names are the prefix, then the process. Several runs may begin at the same
-    moment: one at a time looks and removes.
+    The names of namespaces have the prefix, then the process id. A lock protects against other runs
+    that start at the same moment.
     """
     with Path("/run/lock/rosproxy-tests-leftovers").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -348,19 +345,19 @@ def ip(*arguments: str) -> None:
 
 
 def give(place: Place, device: str, address: str, *flags: str) -> None:
-    """Gives a device that is set up an address, with the length of its network's prefix."""
+    """Gives a device an address with the prefix length of its network, and sets the device up."""
     ip("-n", place.namespace, "addr", "add", address, "dev", device, *flags)
     ip("-n", place.namespace, "link", "set", device, "up")
     place.addresses.append(address.partition("/")[0])
 
 
 def sysctl(place: Place, setting: str) -> None:
-    """Sets one of a namespace's parameters, as ``name=value``."""
+    """Sets a parameter of a namespace, as ``name=value``."""
     run_command("ip", "netns", "exec", place.namespace, "sysctl", "-q", "-w", setting)
 
 
 def run_command(*argv: str, text: str | None = None) -> str:
-    """What a program prints; RuntimeError if it fails."""
+    """The output of a program. Raises RuntimeError after a failure."""
     done = subprocess.run(argv, input=text, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(argv)}: {done.stderr.strip()[:500]}")

@@ -26,7 +26,7 @@ def post(place: Place, address: str, port: int, body: bytes, path: str = "/") ->
 
 
 def call(place: Place, address: str, port: int, method: str, *arguments: Any) -> Any:
-    """Calls a method; gives the value of its ROS status triple, or raises LookupError."""
+    """Calls a method. Returns the value of the ROS triple, or raises LookupError."""
     reply = post(place, address, port, dumps(arguments, method).encode())
     triple: Any = loads(reply)[0][0]
     code, message, value = triple

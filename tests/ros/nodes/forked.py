@@ -1,10 +1,11 @@
-"""Runs ROS's Python programs as forks of one process: to import rospy costs more than most tests.
+"""Runs ROS's Python programs as forks of a single process: importing rospy costs more than most
+tests.
 
     forked.py <REQUESTS >PIDS
 
-A request is one line of JSON: the program's `argv`, its whole `env`, the file `log` for what it
-prints, and the file `ended` for its exit status as subprocess gives it. The answer is a line with
-its process's number. The program leads a session of its own.
+A request is a line of JSON: `argv` and the whole `env` of the program, the file `log` for the
+output, and the file `ended` for the exit status in the form of subprocess. The answer is a line
+with the process id. The program leads a separate session.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def main() -> None:
 
 
 def become(request: dict[str, object], writer: int) -> None:
-    """Makes this process what it would be, had it been started with these arguments."""
+    """Makes this process equal to a program started with these arguments."""
     os.setsid()
     log = os.open(request["log"], os.O_WRONLY | os.O_TRUNC)
     for number in (1, 2):
@@ -57,8 +58,8 @@ def become(request: dict[str, object], writer: int) -> None:
     sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", buffering=0), write_through=True)
     os.environ.clear()
     os.environ.update(request["env"])
-    sys.argv[:] = request["argv"]  # in place: some have kept the list
-    # Both were read when it was imported.
+    sys.argv[:] = request["argv"]  # in place: modules have kept the list
+    # rospy reads both on import.
     rospy.names.reload_mappings(sys.argv)
     rospy.names._set_caller_id(f"{get_ros_namespace()}unnamed")
     os.write(writer, str(os.getpid()).encode())
@@ -66,7 +67,7 @@ def become(request: dict[str, object], writer: int) -> None:
 
 
 def keep(child: int, ended: str) -> None:
-    """Waits for a program's end and tells it."""
+    """Waits for a program's end and writes the exit status."""
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     with open(f"{ended}.new", "w") as file:
         file.write(str(code))

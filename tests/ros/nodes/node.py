@@ -1,8 +1,8 @@
-"""Small rospy nodes, one for each role; the C++ program beside takes the same arguments.
+"""Small rospy nodes, one for each role. The C++ program takes the same arguments.
 
     node.py ROLE [--option value]... [__name:=NAME]
 
-Each prints plain lines that the tests wait for.
+Each node prints plain lines for the tests.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class Options:
 
 
 def say(*words: object) -> None:
-    # At once: callbacks of several threads would otherwise mix their lines.
+    # At once: otherwise callbacks of several threads would mix lines.
     sys.stdout.write(" ".join(map(str, words)) + "\n")
     sys.stdout.flush()
 
 
 def spin() -> None:
-    """Waits for the end; rospy.spin takes half a second to see it."""
+    """Waits for the end, which rospy.spin notices only after half a second."""
     while not rospy.is_shutdown():
         time.sleep(0.02)
 
@@ -58,14 +58,14 @@ def payload(prefix: str, number: int, size: int) -> str:
 
 
 def describe(text: str) -> str:
-    """What identifies a payload: its first two words, its size and its checksum."""
+    """The identity of a payload: the first two words, the size and the checksum."""
     prefix, number = text.split(" ", 2)[:2]
     data = text.encode()
     return f"{prefix} {number} size {len(data)} crc {zlib.crc32(data):08x} at {time.time():.3f}"
 
 
 def publish(options: Options) -> None:
-    """Publishes for ever, or `--count` messages; with `--latch 1` keeps the last one."""
+    """Publishes for ever, or `--count` messages; latched with `--latch 1`."""
     latch = options.number("latch", 0) > 0
     topic = options.text("topic")
     publisher = rospy.Publisher(topic, String, queue_size=10, latch=latch)
@@ -121,7 +121,7 @@ def serve(options: Options) -> None:
 
 
 def call(options: Options) -> None:
-    """Waits for the service, then calls it `--count` times; a failed call is only told."""
+    """Waits for the service, then makes `--count` calls, and prints failed calls."""
     service = options.text("service")
     persistent = options.number("persistent", 0) > 0
     say("waiting")
@@ -151,7 +151,7 @@ def get_parameter(options: Options) -> None:
 
 
 def action_server(options: Options) -> None:
-    """Adds two integers, unless it is told to stop before `--seconds` are over."""
+    """Adds two integers, unless preempted before `--seconds` are over."""
 
     def execute(goal: TwoIntsGoal) -> None:
         say("goal", goal.a, goal.b)
@@ -172,10 +172,10 @@ def action_server(options: Options) -> None:
 
 
 def action_client(options: Options) -> None:
-    """Sends one goal; with `--cancel 1` takes it back when feedback comes.
+    """Sends a goal; with `--cancel 1` cancels after feedback.
 
-    Only once the status has named the goal: until then a status of before the goal may arrive, and
-    a client that has cancelled its goal takes the goal for lost.
+    Cancels only once the status has the goal. Before, an older status may arrive, and a client that
+    has cancelled would take the goal for lost.
     """
     client = actionlib.SimpleActionClient(options.text("action"), TwoIntsAction)
     if not client.wait_for_server(rospy.Duration(20)):
