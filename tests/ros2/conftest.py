@@ -24,7 +24,7 @@ SMOKE = ("jazzy",)
 
 
 def missing(environments: Iterable[str]) -> str | None:
-    """What stops this layer from running and the command that mends it, or nothing."""
+    """The obstacle for this layer with the command against it, or None."""
     gone = [
         name
         for name in ("ip", "nft", "conntrack", "unshare", "sysctl")
@@ -62,7 +62,7 @@ def pytest_runtest_makereport(
 def topology(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Topology]:
-    """The machines of a module, which may have a PLAN; they go at its end."""
+    """The machines of a module, which may have a PLAN, removed at the end."""
     remove_leftovers()
     with built(
         getattr(request.module, "PLAN", PLAN), tmp_path_factory.mktemp("machines")
@@ -74,7 +74,7 @@ def topology(
 def other_topology(
     topology: Topology, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Topology]:
-    """Another host with its machines, on the same LAN."""
+    """Another host with machines, on the same LAN."""
     with built(OTHER_PLAN, tmp_path_factory.mktemp("machines")) as other:
         join_lans(topology, other)
         yield other
@@ -82,7 +82,7 @@ def other_topology(
 
 @pytest.fixture
 def lab(request: pytest.FixtureRequest, topology: Topology, tmp_path: Path) -> Iterator[Lab]:
-    """A proxy that has just started; a module may set its OPTIONS, and have a LAN_RELAY."""
+    """A lab with a new proxy. A module may set OPTIONS, LAN_RELAY and PROXY."""
     lab = Lab(topology, tmp_path)
     lab.options = getattr(request.module, "OPTIONS", lab.options)
     with lab.used():
@@ -95,7 +95,7 @@ def lab(request: pytest.FixtureRequest, topology: Topology, tmp_path: Path) -> I
 
 @pytest.fixture
 def other(other_topology: Topology, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
-    """What is on the other host; its proxy has not started."""
+    """The lab on the other host, without a running proxy."""
     other = Lab(other_topology, tmp_path_factory.mktemp("other"))
     with other.used():
         yield other

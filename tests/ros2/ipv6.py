@@ -78,7 +78,7 @@ class Topology6(Topology):
 
     def _give(self, role: str, device: str, addresses: Sequence[str]) -> None:
         for address, length in zip(addresses[: self._families], _LENGTHS, strict=False):
-            # Without duplicate address detection it can be used at once.
+            # Without duplicate address detection the address is usable at once.
             flags = ("nodad",) if ":" in address else ()
             give(self.places[role], device, f"{address}/{length}", *flags)
 

@@ -1,4 +1,4 @@
-"""What a test drives: machines, a proxy, a LAN relay, and the participants that it starts."""
+"""A test's lab: machines, a proxy, a LAN relay, and participants."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ ENVIRONMENTS = (
 )
 NODES = Path(__file__).parent / "nodes"
 PROGRAMS = {"jazzy": "node.py", "kilted": "node.py", "cyclone": "participant.py"}
-"""The program that stands for a node, by the implementation of DDS that it has."""
+"""The program of a node for each implementation of DDS."""
 LAN_RELAY_PORT = 47090
 LAN_RELAY_SECRET = "0123456789abcdef"
 ADMIN_PORT = 11312
 
 
 def numbers(reader: Process) -> list[int]:
-    """The numbers of the messages that a subscriber has got, in their order."""
+    """The numbers of a subscriber's messages, in order of arrival."""
     return [int(line.split()[2]) for line in reader.output().splitlines() if "got " in line]
 
 
 def is_whole(reader: Process) -> bool:
-    """Whether a subscriber has got each message once and in order, from its first one on."""
+    """Whether a subscriber has got each message once and in order, from the first on."""
     got = numbers(reader)
     return got == list(range(got[0], got[0] + len(got)))
 
@@ -61,11 +61,11 @@ class Lab:
         return self.topology.places[role]
 
     def unique(self, stem: str) -> str:
-        """A name that nobody else has."""
+        """A unique name."""
         return f"{stem}_{next(self._numbers)}"
 
     def start_proxy(self) -> None:
-        """Start the proxy and wait until it listens."""
+        """Start the proxy and wait until ready."""
         argv = [*self.proxy_prefix, sys.executable, "-m", "rosproxy", "run", "--ros", "2"]
         argv += ["--advertise-host", self.host, "--port-range", self.port_range, *self.options]
         self.proxy = self._spawn("rosproxy", self.proxy_role, argv, self._own_environment())
@@ -80,7 +80,7 @@ class Lab:
         self.lan_relay.wait_for("ready: ")
 
     def restart_proxy(self) -> None:
-        """Kill it and start it again."""
+        """Kill and restart the proxy."""
         assert self.proxy is not None
         self.proxy.kill()
         self.start_proxy()
@@ -94,7 +94,7 @@ class Lab:
         env: Mapping[str, str] | None = None,
         **options: object,
     ) -> Process:
-        """Start a node on a machine; options are those of its program."""
+        """Start a node on a machine, with options of its program."""
         name = name or self.unique(kind.replace(",", "_"))
         argv = [str(ENVIRONMENTS / vendor / "bin/python"), str(NODES / PROGRAMS[vendor]), kind]
         argv += ["--name", name]
@@ -111,12 +111,12 @@ class Lab:
         return parse_status(self._get("/status"))
 
     def page(self) -> dict[str, Any]:
-        """What its live page shows."""
+        """The document of the live page."""
         document: dict[str, Any] = json.loads(self._get("/graph"))
         return document
 
     def told(self) -> set[str]:
-        """What the proxy reports: its problems, and the findings and broken links of its page."""
+        """The texts of the proxy's problems, and of findings and broken links on the page."""
         page = self.page()
         findings = [finding["text"] for finding in page.get("findings", ())]
         broken = [link["text"] for link in page["links"].values() if link["state"] == "broken"]
@@ -131,7 +131,7 @@ class Lab:
                 return asking.getresponse().read()
 
     def tell(self, path: str, **body: object) -> dict[str, int]:
-        """What the proxy answers when an operator tells it something."""
+        """The proxy's answer to an operator's call."""
         with self.place(self.proxy_role).entered():
             asking = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
             with closing(asking):
@@ -147,7 +147,7 @@ class Lab:
         return process.output()
 
     def domain(self) -> DomainStatus:
-        """What it tells of its domain."""
+        """The status of the proxy's only domain."""
         (domain,) = self.status().domains
         return domain
 
@@ -164,7 +164,7 @@ class Lab:
         }
 
     def ports(self) -> dict[str, list[tuple[int, str]]]:
-        """The ports of the range with their locators, by participant inside."""
+        """The ports of the range and the locators of each participant inside."""
         return {
             participant.guid_prefix: sorted(
                 (lease.port, lease.where) for lease in participant.leases
@@ -192,7 +192,7 @@ class Lab:
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """Check what was started, and end it, when it is not used any more."""
+        """Check and end all programs after use."""
         try:
             yield
             self.check()
@@ -208,7 +208,7 @@ class Lab:
                 assert "Traceback" not in process.output(), process.output()
 
     def transcripts(self) -> list[tuple[str, str]]:
-        """What everybody has printed."""
+        """The output of all programs."""
         processes = [*self.nodes, *(process for process in (self.proxy, self.lan_relay) if process)]
         return [(process.title, process.output()[-3000:]) for process in processes]
 

@@ -1,12 +1,11 @@
-"""The machines of this layer: those of the real-ROS layer, with a /dev/shm of each one's own.
+"""The machines of this layer: machines of the real-ROS layer, each with a separate /dev/shm.
 
     out (robot) -- host (NAT, published ports, the LAN relay) -- bridge -- px (the proxy), c1, c2
 
-Participants compare machines to choose shared memory: two containers may look like one machine and
-yet have nothing in common. Here all do look like one.
+Participants compare machines to choose shared memory. Two containers may look like the same machine
+without sharing memory. Here all machines look alike.
 
-Where two hosts are wanted, there is all of this once more, with the same addresses inside, and the
-two LANs are one.
+With two hosts, all of this exists twice, with the same addresses inside, and with connected LANs.
 """
 
 from __future__ import annotations
@@ -34,19 +33,19 @@ class Machines(Protocol):
 
 @dataclass
 class Machine(Place):
-    """A place with a /dev/shm of its own, which is a folder."""
+    """A place with a separate /dev/shm, which is a folder."""
 
     shared_memory: Path = Path("/dev/shm")
 
     def command(self, argv: Sequence[str]) -> list[str]:
-        """The command line that runs `argv` there, as the same single process."""
+        """The command line that runs `argv` there, as a single process."""
         mount = f'mount --bind {self.shared_memory} /dev/shm && exec "$@"'
         return super().command(["unshare", "--mount", "sh", "-c", mount, "sh", *argv])
 
 
 @contextmanager
 def built(plan: Plan, folder: Path) -> Iterator[Topology]:
-    """The machines of a plan, whose links are up; they go at the end."""
+    """The machines of a plan with links that are up, removed at the end."""
     topology = Topology(plan)
     try:
         topology.build()
@@ -58,7 +57,7 @@ def built(plan: Plan, folder: Path) -> Iterator[Topology]:
 
 
 def with_shared_memory(topology: Topology, folder: Path) -> None:
-    """Give each machine of a topology a /dev/shm of its own."""
+    """Give each machine of a topology a separate /dev/shm."""
     for role, place in topology.places.items():
         own = folder / f"shm-{role}"
         own.mkdir()
@@ -68,7 +67,7 @@ def with_shared_memory(topology: Topology, folder: Path) -> None:
 
 
 def join_lans(first: Topology, second: Topology) -> None:
-    """Make the LANs of two topologies one."""
+    """Connect the LANs of two topologies."""
     first_namespace, second_namespace = (
         topology.places["host"].namespace for topology in (first, second)
     )

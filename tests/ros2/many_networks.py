@@ -1,6 +1,6 @@
-"""Joins more networks than a socket may, and others after them, and tells what it hears: JSON.
+"""Joins more networks than a socket may, and later networks, and prints received sources as JSON.
 
-It is run in a network namespace of its own, where it makes and removes the networks.
+Runs in a separate network namespace, and makes and removes the networks there.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ AT_ONCE = 25
 IN_ALL = 60
 MESSAGE = b"message"
 END = b"end"
-"""What is sent, and what is sent after it: a socket has heard all before the end."""
+"""The datagrams of a test: after the end, a socket has received everything before."""
 
 
 class Hearing:
@@ -44,7 +44,7 @@ class Hearing:
         sock.close()
 
     async def heard(self, addresses: list[str]) -> list[str]:
-        """From where it hears what is sent through the networks of these addresses, once each."""
+        """The received sources, after a datagram through the network of each address."""
         self.sources.clear()
         self.ends.clear()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
@@ -63,7 +63,7 @@ def ip(command: str) -> None:
 
 
 def networks() -> Iterator[str]:
-    """Networks of this machine, each made when it is asked for; their addresses here."""
+    """Make a network for each step, and yield this machine's address there."""
     for number in range(IN_ALL):
         ip(f"link add d{number} type veth peer name e{number}")
         ip(f"addr add 10.60.{number}.1/24 dev d{number}")

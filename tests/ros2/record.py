@@ -1,8 +1,8 @@
-"""Records what participants of each implementation send: ``python -m tests.ros2.record`` as root.
+"""Records datagrams of each implementation: ``python -m tests.ros2.record`` as root.
 
-A publisher and a subscriber are on machines of a container network, without the proxy, from their
-start to their end. What they send is written to ``tests/unit/ros2/recordings``, a file for each
-implementation. Of datagrams that are made alike the first two are kept.
+A publisher and a subscriber run on machines of a container network, without the proxy. Their
+datagrams from start to end go to ``tests/unit/ros2/recordings``, in a file for each implementation.
+Of datagrams with the same form only the first two are kept.
 """
 
 import select
@@ -35,14 +35,14 @@ ETHERNET = 14
 IPV4 = b"\x08\x00"
 UDP = 17
 LONG = {"cyclone": {"user_data": 2000}}
-"""What makes an announcement so long that it is sent in fragments; Fast DDS does so from 64 KB."""
+"""Options for an announcement that is sent in fragments. Fast DDS fragments only from 64 KB."""
 HEARD = 20
 """Messages after which the two have met for certain."""
 
 
 @dataclass
 class Recorder:
-    """Writes down what passes a port of a machine, in a thread of its own."""
+    """Records the datagrams at a network device of a machine, in a separate thread."""
 
     place: Place
     datagrams: list[Datagram] = field(default_factory=list)
@@ -69,7 +69,7 @@ class Recorder:
 
 
 def datagrams_in(frame: bytes) -> Iterator[Datagram]:
-    """The datagram of RTPS in a frame of Ethernet, if there is a whole one."""
+    """The RTPS datagram in an Ethernet frame, if complete."""
     if frame[ETHERNET - 2 : ETHERNET] != IPV4:
         return
     packet = frame[ETHERNET:]
@@ -86,9 +86,10 @@ def datagrams_in(frame: bytes) -> Iterator[Datagram]:
 
 
 def form(datagram: Datagram) -> tuple[object, ...]:
-    """What datagrams have in common that are made alike.
+    """The form of a datagram, equal for datagrams that are made alike.
 
-    Their way, which submessages there are, of whom, which topics are announced, and which parts.
+    Source and target, kinds and entities of submessages, announced topics, and numbers of
+    fragments.
     """
     payload = datagram.content
     ends = [payload[body.start + 4 : body.start + 12] for _, _, body in submessages(payload)]
@@ -109,12 +110,12 @@ def selected(datagrams: list[Datagram]) -> Iterator[Datagram]:
 
 
 def make_look_alike(place: Place) -> None:
-    """Give a machine the id that all have, as containers of one image may."""
+    """Give a machine the same machine id as all others, like containers of the same image."""
     (Path("/etc/netns") / place.namespace / "machine-id").write_text(f"{1:032}\n")
 
 
 def avoid_fragments(lab: Lab) -> None:
-    """Have each datagram be one packet."""
+    """Raise the MTU, so that each datagram is a single packet."""
     host = lab.place("host").namespace
     links = [(host, "c1-1"), (host, "c2-1"), *((lab.place(r).namespace, "eth0") for r in ROLES)]
     for namespace, device in links:

@@ -1,7 +1,7 @@
-"""The boundary is one: without the proxy nothing passes, and all of it does once that has started.
+"""The boundary is real: nothing passes without the proxy, and everything passes with the proxy.
 
-So what the other tests see pass is the proxy's doing. A listener on the near side shows that there
-was something to hear.
+So passing traffic in other tests proves that the proxy works. A listener on the near side proves
+that there is traffic.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The demonstration's small nodes of ROS 2 speak with real ones, through the proxy."""
+"""The demonstration's small ROS 2 nodes talk to real nodes, through the proxy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can't work is told: by `rosproxy doctor`, with who is concerned and what mends it."""
+"""`rosproxy doctor` reports setups that cannot work, with the participants and the fix."""
 
 from __future__ import annotations
 
@@ -41,13 +41,15 @@ def wait_shown(lab: Lab, topic: str, state: str, text: str = "") -> None:
 
 
 def doctor_of_networks(lab: Lab) -> str:
-    """What the doctor says once the proxy has settled: before, it says nothing of who is there."""
+    """The doctor's output once the proxy has settled. Before, the doctor reports no
+    participants.
+    """
     wait_until("the proxy has settled", lambda: lab.status().uptime > SETTLED, 30)
     return " ".join(lab.tool("doctor").split())
 
 
 def line(text: str, start: str) -> str:
-    """The finding that begins so, in one line, with what mends it."""
+    """The finding with this beginning, in a single line with the fix."""
     shown = " ".join(text.split())
     findings = [finding for finding in shown.split("ERROR ") if finding.startswith(start)]
     assert findings, text
@@ -112,7 +114,7 @@ def test_a_discovery_range_of_one_machine(lab: Lab, vendor: str) -> None:
     )
     assert "ROS_STATIC_PEERS" in told
 
-    # As it says: the range stays, and the proxy is a peer.
+    # Follow the fix: the range stays, and the proxy is a peer.
     env["ROS_STATIC_PEERS"] = lab.place("px").address
     lab.node(vendor, "c2", "pub", topic="/chatter", env=env)
     lab.node(vendor, "out", "sub", topic="/chatter").wait_for_count("^got hello ", 5)
@@ -140,7 +142,9 @@ def test_tcp(lab: Lab) -> None:
 
 
 def test_a_peer_that_does_not_get_in(lab: Lab) -> None:
-    """It is heard at the first port of the range, and a firewall is in front of the others."""
+    """The peer reaches the first port of the range, and a firewall drops datagrams to the
+    others.
+    """
     host = ("ip", "netns", "exec", lab.place("host").namespace, "nft")
     rule = f"udp dport {{ {PORTS.first + 1}-{PORTS.last} }} drop"
     run_command(*host, "-f", "-", text=f"""
@@ -165,11 +169,11 @@ def test_a_peer_that_does_not_get_in(lab: Lab) -> None:
 
 
 def test_cyclone_with_ports_of_its_own(lab: Lab) -> None:
-    """Where it has multicast, as most machines have, no peer knows its ports."""
+    """With multicast, as on most machines, Cyclone DDS has no well-known ports."""
     lab.node("cyclone", "out", "sub", topic="/chatter").wait_for("^ready")
     lab.node("jazzy", "c1", "pub", topic="/chatter")
     passer_by = lab.node("jazzy", "out", "sub", topic="/chatter")
-    passer_by.wait_for("^got hello ")  # so announcements have gone there
+    passer_by.wait_for("^got hello ")  # proves that announcements arrive there
     passer_by.stop()
     lab.wait_for_participants(1, 0)
     told = " ".join(lab.tool("doctor").split())
@@ -177,7 +181,7 @@ def test_cyclone_with_ports_of_its_own(lab: Lab) -> None:
     assert "no participant outside has been heard" in told
     assert peer in told
 
-    # As it says.
+    # Follow the fix.
     lab.stop_nodes()
     uri = f"<CycloneDDS><Domain><Discovery><Peers>{peer}</Peers></Discovery></Domain></CycloneDDS>"
     lab.node("jazzy", "c1", "pub", topic="/chatter")

@@ -60,7 +60,9 @@ def test_services(lab: Lab, source_vendor: str, sink_vendor: str, source: str, s
 
 @ways
 def test_a_thousand_calls(lab: Lab, source: str, sink: str) -> None:
-    """One client: of two that share a service, rmw loses replies now and then without a proxy."""
+    """A single client: with two clients of a service, rmw sometimes loses replies, without
+    a proxy.
+    """
     lab.node("jazzy", source, "serve", topic="/add")
     options = {"topic": "/add", "count": 1000, "period": 0.001, "in_turn": True}
     caller = lab.node("jazzy", sink, "call", **options)

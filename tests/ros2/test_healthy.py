@@ -59,10 +59,10 @@ def test_nothing_is_told_from_the_start_on(lab: Lab) -> None:
     ("source", "sink"), [("c1", "out"), ("out", "c1")], ids=["outward", "inward"]
 )
 def test_a_node_that_crashes_again_and_again(lab: Lab, vendor: str, source: str, sink: str) -> None:
-    """A new process at a port ends the former one, which would be known for its lease duration.
+    """A new process at a port ends the former participant before its lease duration is over.
 
-    Cyclone DDS takes another port each time. There are `LIVES`, since what a start brings for a
-    moment is told once it goes on for ten seconds.
+    Cyclone DDS takes another port each time. `LIVES` lasts longer than ten seconds, after which
+    even short problems of a start would be reported.
     """
     reader = lab.node("jazzy", sink, "sub", topic="/chatter")
     seen = set[str]()

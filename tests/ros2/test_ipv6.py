@@ -1,7 +1,7 @@
-"""IPv6 alone: each implementation announces itself there to a group of its own.
+"""IPv6 alone: each implementation announces participants to a different group.
 
-So Fast DDS and Cyclone DDS do not hear each other by multicast; through the proxy, which hears
-both, and on the LAN by the LAN relay, they do.
+So Fast DDS and Cyclone DDS do not discover each other by multicast. The proxy hears both groups, as
+does the LAN relay on the LAN.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def lab(topology: Topology, tmp_path: Path) -> Iterator[Lab]:
 
 
 def proxy(lab: Lab, *options: str) -> None:
-    """Start the proxy, and the LAN relay if it is to hear one."""
+    """Start the proxy, with the LAN relay if in the options."""
     lab.options = options
     if options == LAN_RELAY:
         lab.start_lan_relay()
@@ -89,7 +89,7 @@ def test_without_the_proxy_nobody_is_met_across(lab: Lab, vendor: str) -> None:
 def test_without_the_proxy_implementations_do_not_meet(lab: Lab) -> None:
     node(lab, "jazzy", "c1", "pub", topic="/chatter")
     stranger = node(lab, "cyclone", "c2", "sub", topic="/chatter")
-    # On the stranger's machine this one's membership would make the group heard by all there.
+    # On the stranger's machine, this membership would deliver the group to all programs.
     node(lab, "jazzy", "c1", "sub", topic="/chatter").wait_for_count("^got hello ", 30)
     assert not numbers(stranger)
 

@@ -44,7 +44,7 @@ def test_ports_that_stand_for_outside_are_the_same_again(lab: Lab) -> None:
     wait_until("each locator outside has a stand-in", everything, 30)
     before = stand_ins(lab)
     lab.restart_proxy()
-    wait_until("they are the same", lambda: stand_ins(lab) == before, 30)
+    wait_until("the stand-ins are the same", lambda: stand_ins(lab) == before, 30)
     for subscriber in (reader, inner):
         subscriber.wait_for_count("^got hello ", 10, since=subscriber.mark())
         got = [int(line.split()[2]) for line in subscriber.output().splitlines() if "got " in line]

@@ -1,4 +1,4 @@
-"""User data that the kernel forwards: real nodes, and a proxy that may change its own tables."""
+"""User data on the kernel plane: real nodes, and a proxy with the rights for nftables."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def leases(lab: Lab, kind: str = "data") -> list[LocatorStatus]:
 
 
 def are_forwarded(lab: Lab, count: int) -> bool:
-    """Whether so many leases of user data are there, and the kernel forwards them all."""
+    """Whether there are ``count`` port mappings for user data, all forwarded by the kernel."""
     data_leases = leases(lab)
     return len(data_leases) == count and all(lease.plane == "kernel" for lease in data_leases)
 
@@ -57,14 +57,14 @@ def forwarded_ports(lab: Lab) -> list[int]:
 
 
 def tracked_ports(lab: Lab) -> set[int]:
-    """The ports of the proxy whose senders the kernel tracks on the proxy's machine."""
+    """The proxy's ports with entries in conntrack on the proxy's machine."""
     text = lab.in_proxy("conntrack", "-L", "-p", "udp", "--orig-dst", lab.place("px").address)
-    # The first port of a line is of the datagrams as they came, the second of their answers.
+    # The first port of a line is of the original datagrams, the second of the answers.
     return {int(port) for port in re.findall(r"^udp .*?dport=(\d+)", text, re.M)}
 
 
 def forwarded_reader(lab: Lab, **options: object) -> tuple[Process, Process]:
-    """A publisher outside and a subscriber inside, which gets its messages by the kernel."""
+    """A publisher outside and a subscriber inside, with messages forwarded by the kernel."""
     reader = lab.node("jazzy", "c1", "sub", topic="/chatter", depth=100, **options)
     wait_until("the kernel forwards", lambda: are_forwarded(lab, 2))
     writer = lab.node("jazzy", "out", "pub", topic="/chatter", depth=100, **options)

@@ -1,6 +1,6 @@
-"""No peer is known by name: the LAN relay carries announcements between the LAN and the proxy.
+"""Without peers: the LAN relay passes announcements between the LAN and the proxy.
 
-So Cyclone DDS is found outside as well: unless told otherwise it has no well-known ports.
+So the proxy also discovers Cyclone DDS outside, which by default has no well-known ports.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Nodes start in any order, hang, crash and come back; the proxy starts between them or last."""
+"""Nodes start in any order, hang, crash and come back. The proxy starts in between or last."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SHORT_LEASE = """<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Pr
     </discovery_config></builtin></rtps>
   </participant>
 </profiles>"""
-"""For Fast DDS, in place of its own 20 and 3 seconds."""
+"""For Fast DDS, instead of the default 20 and 3 seconds."""
 
 
 @pytest.mark.parametrize(
@@ -102,14 +102,13 @@ def test_a_node_that_ends_is_gone_on_the_other_side(lab: Lab) -> None:
     inside.wait_for("^nodes inside outside end$", since=inside.mark())
     inside.stop()
     outside.wait_for("^nodes outside end$", since=outside.mark())
-    wait_until("its ports are free", lambda: lab.domain().ports_used == 0, 20)
+    wait_until("the ports are free", lambda: lab.domain().ports_used == 0, 20)
 
 
 @ways
 def test_a_forged_end_is_no_end_for_good(lab: Lab, source: str, sink: str) -> None:
-    """A container with the right for raw packets sends it from the address of another one.
-
-    The number of the end is greater than those of the announcements that follow.
+    """A container with the right for raw packets sends a dispose message from another container's
+    address. Its sequence number is greater than the numbers of the following announcements.
     """
     lab.node("jazzy", source, "pub", topic="/chatter", depth=1000)
     reader = lab.node("jazzy", sink, "sub", topic="/chatter", depth=1000)
@@ -118,5 +117,5 @@ def test_a_forged_end_is_no_end_for_good(lab: Lab, source: str, sink: str) -> No
     prefix = bytes.fromhex(participant.guid_prefix.replace(".", ""))
     with lab.place("c1").entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.sendto(dispose_message(prefix, FAST_DDS, 1000), (lab.place("px").address, 7410))
-    wait_until("it has ended", lambda: not lab.domain().inside)
+    wait_until("the participant has ended", lambda: not lab.domain().inside)
     reader.wait_for_count("^got hello ", 20, since=reader.mark())

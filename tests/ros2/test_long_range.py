@@ -12,9 +12,8 @@ PROXY = False
 
 @pytest.mark.parametrize("vendor", ["jazzy", "kilted", "cyclone"])
 def test_nodes_meet_with_a_range_of_1100_ports(lab: Lab, vendor: str) -> None:
-    """Fast DDS counted one by one up to the number that holds a participant's ports.
-
-    The number had 48 bits, so a node did not answer for days.
+    """Fast DDS counts in steps of 1 up to the number that encodes a participant's ports. With a
+    number of 48 bits, a node would not answer for days.
     """
     lab.proxy_role = "host"
     lab.port_range = "47200-48299"
@@ -22,4 +21,4 @@ def test_nodes_meet_with_a_range_of_1100_ports(lab: Lab, vendor: str) -> None:
     lab.node("jazzy", "out", "pub", topic="/inward")
     reader = lab.node(vendor, "c1", "sub", topic="/inward")
     reader.wait_for_count("^got hello ", 5)
-    wait_until("its ports are kept", lambda: all(p.kept for p in lab.domain().inside), 30)
+    wait_until("the ports are kept", lambda: all(p.kept for p in lab.domain().inside), 30)

@@ -8,7 +8,7 @@ from tests.ros2.many_networks import AT_ONCE, IN_ALL
 
 
 def test_networks_that_come_and_go_are_heard() -> None:
-    """A socket has 20 memberships, and keeps those of networks that are gone."""
+    """A socket has 20 memberships, and keeps memberships of networks that are gone."""
     run = subprocess.run(
         ["unshare", "--net", sys.executable, "-m", "tests.ros2.many_networks"],
         capture_output=True,

@@ -1,4 +1,4 @@
-"""The advertised host gets another address, as by DHCP; its name leads there, and all flows."""
+"""The advertised host gets another address, as by DHCP. The name leads there, and all flows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOVED = "10.77.0.21"
 
 @pytest.fixture
 def topology(tmp_path: Path) -> Iterator[Topology]:
-    """Machines for one test, which changes them."""
+    """Machines for a single test, which changes the machines."""
     with built(PLAN, tmp_path) as topology:
         yield topology
 
@@ -32,7 +32,7 @@ def lab(topology: Topology, tmp_path: Path) -> Iterator[Lab]:
 
 
 def move(topology: Topology) -> None:
-    """Give the host another address on the LAN, and its name that address."""
+    """Give the host another address on the LAN, and let its name lead there."""
     host = topology.places["host"].namespace
     proxy = topology.places["px"]
     rules = boundary_rules(replace(PLAN, host=MOVED), [proxy.address])

@@ -1,4 +1,4 @@
-"""Policy: what is denied is not there for the other side; a change needs no restart of anybody."""
+"""Policy: the other side does not see denied names. A change requires no restart."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def lab(lab: Lab) -> Lab:
 
 
 def gets(reader: Process, count: int = 5) -> None:
-    """Wait until it gets so many from now on."""
+    """Wait until the node gets ``count`` more messages or replies."""
     reader.wait_for_count("^(got|reply)", count, since=reader.mark())
 
 
 def gets_nothing(reader: Process, meanwhile: Process) -> None:
-    """While another gets messages, this one does not."""
-    gets(meanwhile, 3)  # what was on its way
+    """Check that a subscriber gets no messages while another does."""
+    gets(meanwhile, 3)  # messages on the way
     mark = reader.mark()
     gets(meanwhile, 20)
     assert not [line for line in reader.output()[mark:].splitlines() if line.startswith("got")]
@@ -57,7 +57,7 @@ def test_a_topic_is_denied_and_allowed_again(
     gets(secret)
     gets(public)
     rules(lab, f"deny {kind} /secret")
-    wait_until("it is hidden", lambda: (kind, "/secret") in hidden(lab), 10)
+    wait_until("the topic is hidden", lambda: (kind, "/secret") in hidden(lab), 10)
     gets_nothing(secret, public)
     rules(lab, "# allowed again")
     gets(secret)

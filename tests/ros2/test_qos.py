@@ -1,6 +1,6 @@
-"""What readers and writers promise each other holds across the boundary, and who breaks it is told.
+"""QoS policies hold across the boundary, and violations are reported.
 
-Deadlines are the reader's own clock; liveliness is told by messages of discovery.
+Readers measure deadlines. Discovery messages carry liveliness.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def test_deadline(lab: Lab, source: str, sink: str) -> None:
     reader = lab.node("jazzy", sink, "sub", topic="/imu", deadline=2)
     strict = lab.node("jazzy", sink, "sub", topic="/imu", deadline=0.01)
     reader.wait_for("^deadline missed 1")
-    assert "got hello 29 " in reader.output(), "it was missed before the last message"
+    assert "got hello 29 " in reader.output(), "missed before the last message"
     writer.wait_for("^offered deadline missed 1")
     for node in (writer, strict):
         node.wait_for("^incompatible deadline")
@@ -41,7 +41,7 @@ def test_liveliness(lab: Lab, source: str, sink: str) -> None:
     listener.wait_for("^alive 0 not 1")
     silent.wait_for("^liveliness lost 1")
     assert silent.returncode is None
-    # The other has published nothing for longer: its participant says by itself that it is there.
+    # The other node has published nothing for longer. Its participant asserts liveliness by itself.
     assert "alive 0" not in reader.output()
     writer.kill()
     reader.wait_for("^alive 0 not 1")

@@ -29,9 +29,7 @@ def test_ten_participants_get_their_ports_again(lab: Lab) -> None:
     for reader in readers:
         reader.wait_for_count("^got hello ", 5)
     wait_until("all ports are given", lambda: lab.domain().ports_used == 33, 90)
-    wait_until(
-        "they are kept", lambda: all(participant.kept for participant in lab.domain().inside), 90
-    )
+    wait_until("all kept", lambda: all(participant.kept for participant in lab.domain().inside), 90)
     before = lab.ports()
 
     lab.restart_proxy()
@@ -50,9 +48,7 @@ def test_a_participant_gets_its_ports_again(lab: Lab, vendor: str, ports: int) -
     reader = lab.node("jazzy", "out", "sub", topic="/chatter")
     reader.wait_for_count("^got hello ", 5)
     wait_until("all ports are given", lambda: lab.domain().ports_used == 2 * ports, 90)
-    wait_until(
-        "they are kept", lambda: all(participant.kept for participant in lab.domain().inside), 90
-    )
+    wait_until("all kept", lambda: all(participant.kept for participant in lab.domain().inside), 90)
     before = lab.ports()
     for _ in range(2):
         lab.restart_proxy()
@@ -85,9 +81,9 @@ def test_a_node_that_comes_back_is_heard_again(lab: Lab) -> None:
 def test_a_node_that_ends_gives_its_ports_back(lab: Lab) -> None:
     node = lab.node("jazzy", "c1", "pub", topic="/chatter")
     lab.wait_for_participants(1, 0)
-    wait_until("its ports are given", lambda: lab.domain().ports_used == 3, 20)
+    wait_until("the ports are given", lambda: lab.domain().ports_used == 3, 20)
     node.stop()
-    wait_until("its ports are free", lambda: lab.domain().ports_used == 0, 20)
+    wait_until("the ports are free", lambda: lab.domain().ports_used == 0, 20)
 
 
 @pytest.mark.smoke
@@ -106,9 +102,7 @@ def test_50_messages_a_second_and_calls_go_on_without_a_loss(lab: Lab) -> None:
     for reader in readers.values():
         reader.wait_for_count("^got hello ", 50)
     wait_until("all ports are given", lambda: lab.domain().ports_used == 9, 90)
-    wait_until(
-        "they are kept", lambda: all(participant.kept for participant in lab.domain().inside), 90
-    )
+    wait_until("all kept", lambda: all(participant.kept for participant in lab.domain().inside), 90)
 
     lab.restart_proxy()
 
@@ -124,9 +118,8 @@ def test_50_messages_a_second_and_calls_go_on_without_a_loss(lab: Lab) -> None:
 def test_a_forged_announcement_after_a_restart_is_no_end(
     lab: Lab, source: str, sink: str, count: int
 ) -> None:
-    """A container with the right for raw packets is the first to announce another one's node.
-
-    With 16 locators, the announcement took all ports that the node may have.
+    """A container with the right for raw packets is the first to announce another container's node.
+    The 16 forged locators must not take all ports of the node.
     """
     lab.node("jazzy", source, "pub", topic="/chatter")
     reader = lab.node("jazzy", sink, "sub", topic="/chatter")
@@ -149,6 +142,6 @@ def test_a_forged_announcement_after_a_restart_is_no_end(
             sock.sendto(forged, (lab.place("px").address, 7410))
         return bool(lab.domain().inside)
 
-    wait_until("it is announced", is_taken_in)
+    wait_until("the forged announcement is accepted", is_taken_in)
     node.send(signal.SIGCONT)
     reader.wait_for_count("^got hello ", 20, since=reader.mark())

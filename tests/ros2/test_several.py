@@ -1,6 +1,7 @@
 """Several participants in a process and in a container, several containers, robots, hosts, domains.
 
-Both hosts have the same addresses inside, so that their containers look like one machine each.
+Both hosts have the same addresses inside, so containers on the two hosts look like the same
+machine.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from tests.ros2.machines import PORTS
 
 
 def all_hear_all(nodes: Mapping[str, Process]) -> None:
-    """Wait until each node, by the word that it says, hears that of each other one."""
+    """Wait until each node gets the word of each other node."""
     marks = {name: node.mark() for name, node in nodes.items()}
     for name, node in nodes.items():
         for other in nodes.keys() - {name}:
@@ -29,7 +30,7 @@ def all_see_all(nodes: Iterable[Process], names: Iterable[str]) -> None:
 
 
 def talk(lab: Lab, role: str, name: str, **options: object) -> Process:
-    """A node that publishes its name and hears others."""
+    """A node that publishes its name and subscribes to all names."""
     return lab.node("jazzy", role, "names,pub,sub", name=name, word=name, period=0.2, **options)
 
 

@@ -1,6 +1,6 @@
-"""A container on two networks loses the one where the proxy serves it.
+"""A container on two networks loses the network with the proxy.
 
-Not with Cyclone DDS, which takes one interface at its start and stays with it.
+Not with Cyclone DDS, which keeps the interface from its start.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PLAN = Plan("t", (("c1", "c2"), ("c1",)), PORTS)
 
 @pytest.fixture
 def topology(tmp_path: Path) -> Iterator[Topology]:
-    """Machines for one test, which changes them."""
+    """Machines for a single test, which changes the machines."""
     with built(PLAN, tmp_path) as topology:
         yield topology
 

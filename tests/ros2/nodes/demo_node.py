@@ -1,6 +1,6 @@
-"""A node of the demonstration, as a process: announces itself to the proxy, and tells what it does.
+"""A node of the demonstration as a process, which announces itself to the proxy, and prints events.
 
-It needs no ROS: `python demo_node.py pub|sub ADDRESS PROXY TOPIC`.
+Without ROS: `python demo_node.py pub|sub ADDRESS PROXY TOPIC`.
 """
 
 import asyncio
@@ -12,7 +12,7 @@ from rosproxy.net.addresses import HostPort
 
 
 class PrintingListener(Ros2Listener):
-    """Prints what it hears."""
+    """Prints each received message."""
 
     def hear(self, payload: bytes) -> None:
         print("got", unpack_string(payload), flush=True)

@@ -1,8 +1,7 @@
-"""A ROS 2 node as tests need one. It runs under the Python of a ROS 2 distribution, by itself.
+"""A ROS 2 node for tests, under the Python of a ROS 2 distribution.
 
-It is of one kind, or of several at once (``pub,serve``), and with ``--contexts`` there are several
-such nodes in the process, each with a participant of its own. Prints a line for each thing that
-happens, and ends by SIGINT.
+The node has a kind, or several at once (``pub,serve``). With ``--contexts`` the process has several
+such nodes, each with a separate participant. Prints a line for each event, and ends by SIGINT.
 """
 
 import argparse
@@ -31,8 +30,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
-# An action that is over in a millisecond ends before its feedback's publisher and the client's
-# subscription have found each other; feedback is volatile, so that is lost without a proxy as well.
+# An action that takes only a millisecond ends before the feedback's publisher and the client's
+# subscription have discovered each other. Volatile feedback is then lost, without a proxy as well.
 FEEDBACK_PAUSE = 0.2
 # A server drops a response whose client's reader it does not know after a tenth of a second
 # (rmw_fastrtps, `check_for_subscription`), though the client knows the server already. So on a busy
@@ -250,13 +249,13 @@ def read_options() -> argparse.Namespace:
     parser.add_argument("--count", type=int, default=0)
     parser.add_argument("--depth", type=int, default=10)
     parser.add_argument("--period", type=float, default=0.1)
-    parser.add_argument("--matched", action="store_true", help="publish when somebody subscribes")
+    parser.add_argument("--matched", action="store_true", help="publish only with a subscriber")
     parser.add_argument("--best-effort", action="store_true")
     parser.add_argument("--latched", action="store_true")
     parser.add_argument("--deadline", type=float, default=0, help="seconds")
     parser.add_argument("--liveliness", choices=LivelinessPolicy.__members__)
     parser.add_argument("--lease", type=float, default=0, help="of liveliness, in seconds")
-    parser.add_argument("--in-turn", action="store_true", help="call when the last is answered")
+    parser.add_argument("--in-turn", action="store_true", help="call after the last reply")
     parser.add_argument("--of", default="", help="the node whose parameters are asked for")
     parser.add_argument("--contexts", type=int, default=1)
     return parser.parse_args(sys.argv[1:])

@@ -62,7 +62,7 @@ def subscribe(reader: DataReader) -> None:
     say("ready")
     while True:
         for sample in reader.take(10):
-            if sample.sample_info.valid_data:  # else it tells that a writer has gone
+            if sample.sample_info.valid_data:  # otherwise a writer has gone
                 text = sample.data.rstrip(".")
                 say("got", text, "size", len(sample.data), "at", f"{time.time():.3f}")
         time.sleep(0.02)
