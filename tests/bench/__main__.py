@@ -1,7 +1,7 @@
-"""``make bench``: rosproxy next to a direct connection and to its peers.
+"""``make bench``: rosproxy beside a direct connection and other relays.
 
-They take turns within every round, so that a machine that is busy for a while is so for all.
-The numbers are kept after each section: a run that is broken off has what it got so far.
+All ways take turns in every round, so that a busy moment of the machine affects all ways. The
+numbers are saved after each section, so that an interrupted run keeps its results.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FOLDER = Path("build/bench")
 
 
 class Section(NamedTuple):
-    """What the sizes of a part of the benchmark count, and how often it is run."""
+    """The meaning of the sizes in a part of the benchmark, and the number of rounds."""
 
     axis: str
     rounds: int
@@ -61,7 +61,9 @@ def main() -> None:
 
 
 def measured(book: Book, name: str, options: argparse.Namespace) -> bool:
-    """Whether a section came to its end; what it has got until then is kept, and shown."""
+    """Run a section, then save and show the results so far. Return whether the section was
+    complete.
+    """
     section = SECTIONS[name]
     book.begin(name, section.axis)
     started = time.monotonic()
@@ -89,8 +91,8 @@ def parse() -> argparse.Namespace:
         default=list(SECTIONS),
         help=f"some of {section_names}, with commas",
     )
-    parser.add_argument("--rounds", type=int, help="instead of each section's own number")
-    parser.add_argument("--quick", action="store_true", help="one short round, for a first look")
+    parser.add_argument("--rounds", type=int, help="instead of the default of each section")
+    parser.add_argument("--quick", action="store_true", help="a short round, for a first look")
     parser.add_argument("--folder", type=Path, default=FOLDER, help="where the results go")
     return parser.parse_args()
 

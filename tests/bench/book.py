@@ -1,4 +1,4 @@
-"""The numbers of a run, kept by row, path and size, and the arithmetic on them."""
+"""The numbers of a run by row, path and size, and the arithmetic."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from typing import Any, TypeVar
 _Way = TypeVar("_Way")
 
 DIRECT = "direct"
-"""The path that the others are compared with: without anything in between."""
+"""The path for comparison: without anything in between."""
 
 
 def ratio(values: list[float], base: list[float]) -> float | None:
-    """The median of the rounds' own ratios: a busy moment of the machine hits both of a pair.
+    """The median of the ratios of all rounds: a busy moment of the machine hits both values of a
+    pair.
 
-    Where a round is missing on one side, nothing can be paired: then the ratio of the medians.
-    None without a base, or with one that is nothing.
+    If a side misses a round, the ratio of the medians. None without a base, or with a zero in the
+    base.
     """
     if not values or not base or not all(base):
         return None
@@ -29,14 +30,14 @@ def ratio(values: list[float], base: list[float]) -> float | None:
 
 
 def percentile(values: list[float], percent: float) -> float:
-    """The smallest value that is not below `percent` of a hundred of them (nearest rank)."""
+    """The smallest value that is not below `percent` percent of the values (nearest rank)."""
     ordered = sorted(values)
     rank = -(-len(ordered) * percent // 100)
     return ordered[max(0, int(rank) - 1)]
 
 
 def smallest_share(amounts: list[float]) -> float:
-    """How much of the mean the one that got least has got: 1 is fair, 0 is starved."""
+    """The smallest amount as a share of the mean: 1 is fair, 0 is starved."""
     mean = sum(amounts) / len(amounts)
     return min(amounts) / mean if mean else 0.0
 
@@ -48,7 +49,7 @@ def loss(sent: float, arrived: float) -> float:
 
 @dataclass(frozen=True)
 class Line:
-    """The values of all rounds of one row, path and size, and what they come to."""
+    """The values of all rounds for a row, path and size, and derived numbers."""
 
     section: str
     row: str
@@ -68,10 +69,10 @@ class Line:
 
 @dataclass
 class Book:
-    """What has been measured.
+    """All results.
 
-    ``section`` is what `add` belongs to now, ``axes`` what the sizes of each section count.
-    ``machine`` describes where it was measured; ``notes`` are for readers of the tables.
+    `add` adds to ``section``. ``axes`` has the meaning of the sizes in each section. ``machine``
+    describes the machine. ``notes`` are for readers of the tables.
     """
 
     machine: dict[str, str] = field(default_factory=dict)
@@ -81,21 +82,21 @@ class Book:
     _values: dict[tuple[str, str, str, int], list[float]] = field(default_factory=dict)
 
     def begin(self, section: str, axis: str = "connections") -> None:
-        """What is added from now on belongs to this section; ``axis`` says what sizes count."""
+        """Start a section for all later numbers. ``axis`` is the meaning of the sizes."""
         self.section = section
         self.axes[section] = axis
 
     def add(self, row: str, path: str, value: float, size: int = 1) -> None:
-        """One number of one round: ``row`` ends with its unit, as in ``rate, MB/s``."""
+        """Add a number of a round. ``row`` ends with the unit, as in ``rate, MB/s``."""
         self._values.setdefault((self.section, row, path, size), []).append(float(value))
 
     def note(self, text: str) -> None:
-        """A sentence that the tables need, once however often it is said."""
+        """Add a sentence for the tables, without repetition."""
         if (line := f"{self.section}: {text}") not in self.notes:
             self.notes.append(line)
 
     def lines(self) -> list[Line]:
-        """All of them, in the order in which they were first added."""
+        """All lines, in the order of their first numbers."""
         return [Line(*key, values, self._to_direct(key)) for key, values in self._values.items()]
 
     def _to_direct(self, key: tuple[str, str, str, int]) -> float | None:
@@ -104,7 +105,7 @@ class Book:
         return None if path == DIRECT else ratio(self._values[key], base)
 
     def save(self, path: Path) -> None:
-        """Write all of it as JSON."""
+        """Write the whole book as JSON."""
         rows = [line.as_json() for line in self.lines()]
         document = {"machine": self.machine, "axes": self.axes, "notes": self.notes, "rows": rows}
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -122,6 +123,8 @@ class Book:
 
 
 def in_turn(ways: Sequence[_Way], number: int) -> list[_Way]:
-    """The ways in the order of a round: each begins once, as whoever follows a busy one suffers."""
+    """The ways in the order of a round. Each way is first once, because a way after a busy way
+    suffers.
+    """
     first = number % len(ways)
     return [*ways[first:], *ways[:first]]

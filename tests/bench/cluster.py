@@ -1,8 +1,8 @@
-"""The Kubernetes operator in a cluster that grows: a labelled pod on each node, and others' pods.
+"""The Kubernetes operator in a growing cluster: a labelled pod on each node, and other pods.
 
-etcd and API server are real; nodes, kubelets and proxies are made up (`crowded_cluster`), so that
-all of it is the operator's and the API server's own. Each size has a network namespace of its own,
-where ``python -m tests.bench.cluster NODES SECONDS`` measures it.
+etcd and API server are real. Nodes, kubelets and proxies are fake (`crowded_cluster`), so the costs
+are only those of the operator and the API server. For each size, ``python -m tests.bench.cluster
+NODES SECONDS`` measures in a separate network namespace.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ QUICK_SIZES = (10,)
 PODS_A_NODE = 30
 SECONDS = 60.0
 QUICK_SECONDS = 10.0
-"""How long it is watched when nothing happens, and while others' pods come and go."""
+"""Seconds of measuring without events, and while other pods come and go."""
 CHURN = 20.0
-"""Others' pods that come and go in a second."""
+"""Other pods that come and go in a second."""
 TRIES = 5
 PATIENCE = 600.0
 
 
 class Operator:
-    """The operator as a process, with the rights that the manifests give it."""
+    """The operator as a process, with the rights of the manifests."""
 
     def __init__(self, plane: ControlPlane) -> None:
         self._admin = f"127.0.0.1:{free_port()}"
@@ -64,7 +64,7 @@ class Operator:
         self._process.wait()
 
     async def looks(self) -> tuple[float, float]:
-        """Seconds that all looks have taken, and their number."""
+        """The seconds of all looks, and the number of looks."""
         async with (
             aiohttp.ClientSession() as session,
             session.get(f"http://{self._admin}/metrics") as reply,
@@ -86,7 +86,7 @@ def run(book: Book, rounds: int, quick: bool) -> None:
 
 
 def _apart(book: Book, size: int, seconds: float) -> None:
-    """Measure in a network where nobody else has the proxies' port."""
+    """Measure in a network namespace where no other program has the proxies' port."""
     words = [sys.executable, "-m", "tests.bench.cluster", str(size), str(seconds)]
     inside = f"ip link set lo up && exec {shlex.join(words)}"
     done = subprocess.run(
@@ -126,7 +126,7 @@ class Bench:
         self.started = started
 
     async def rest(self, quiet: float = 5.0) -> None:
-        """Wait until the operator has asked nothing but what it asks by the clock for a while."""
+        """Wait until the operator has made no writing requests for a while."""
         end = time.monotonic() + PATIENCE
         before = -1
         while True:
@@ -152,7 +152,9 @@ class Bench:
         return own, api, dict(self.plane.asked() - asked)
 
     async def reaction(self, node: str) -> float:
-        """Seconds from a labelled pod that is bound to a new node until its proxy's pod is made."""
+        """Seconds from the binding of a labelled pod to a new node until the proxy's pod is
+        created.
+        """
         await self.cluster.add_node(node)
         bound = await self.cluster.add_robot(node)
         return await self.cluster.made_on(node, 120.0) - bound
@@ -189,7 +191,7 @@ async def _measure(book: Book, size: int, seconds: float, bench: Bench) -> None:
 
 
 def main() -> None:
-    """Measure one size, and print what was found as JSON."""
+    """Measure a size, and print the results as JSON."""
     book = Book()
     asyncio.run(_measure_size(book, int(sys.argv[1]), float(sys.argv[2])))
     rows = [(line.row, line.middle) for line in book.lines()]

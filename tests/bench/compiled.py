@@ -1,4 +1,4 @@
-"""The C++ programs of the benchmark, compiled once per version of their sources."""
+"""The C++ programs of the benchmark, compiled once for each version of the sources."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ FLAGS = ("-std=c++17", "-O2", "-w", "-DBOOST_BIND_GLOBAL_PLACEHOLDERS")
 
 
 def compiled(name: str, *packages: str) -> Path:
-    """The path of a program. RuntimeError where it can't be compiled, with the compiler's words.
-
-    ``packages`` are what pkg-config knows the needed libraries by.
+    """The path of a program. Raises RuntimeError with the compiler's output. ``packages`` are the
+    names of the needed libraries for pkg-config.
     """
     source = SOURCES / f"{name}.cpp"
     words = " ".join([*FLAGS, *packages, source.read_text()])

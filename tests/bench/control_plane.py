@@ -1,7 +1,7 @@
-"""etcd and an API server for the benchmark, and what talks to them: no kubelet, no scheduler.
+"""etcd and an API server for the benchmark, and their clients, without kubelet and scheduler.
 
-They are the programs of tests/kubernetes, on loopback and in a folder of their own, so that a
-cluster of those tests is not in the way. Who asks how often tells the API server's audit log.
+The programs of tests/kubernetes run on loopback and in a separate folder, so that a cluster of
+those tests is not in the way. The API server's audit log has the number of requests of each user.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class ControlPlane:
 
     @property
     def api_server(self) -> int:
-        """Its process id."""
+        """The process id of the API server."""
         return self.programs[1].pid
 
     async def __aenter__(self) -> ControlPlane:
@@ -121,7 +121,7 @@ class ControlPlane:
             await asyncio.sleep(0.2)
 
     async def _install(self) -> None:
-        """What the manifests install, but the webhook, which nobody serves here."""
+        """Install the manifests without the webhook, which no program serves here."""
         self.write_kubeconfig("admin", _ADMIN)
         self.kubectl("create", "namespace", "rosproxy-system")
         self.kubectl("apply", "-f", str(ROOT / "manifests/install.yaml"))
@@ -132,7 +132,7 @@ class ControlPlane:
         self.write_kubeconfig("operator", token.strip())
 
     def kubectl(self, *words: str) -> str:
-        """What it prints; the administrator's."""
+        """Run kubectl as the administrator. Return the output."""
         config = f"--kubeconfig={self.folder}/admin"
         command = [str(BIN / "kubectl"), config, *words]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
@@ -154,7 +154,7 @@ class ControlPlane:
         (self.folder / name).write_text(json.dumps(config))
 
     async def call(self, method: str, path: str, body: Json | None = None, kind: str = "") -> Json:
-        """One call of the administrator's; what is there or gone already is well."""
+        """A call of the administrator. Objects that exist already, or are gone, are no errors."""
         headers = {"Content-Type": kind} if kind else {}
         data = json.dumps(body) if body is not None else None
         headers.setdefault("Content-Type", "application/json")

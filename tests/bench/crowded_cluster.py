@@ -1,6 +1,6 @@
-"""Nodes that are not there: what a scheduler and kubelets write, and a web server for all proxies.
+"""Fake nodes: the writes of a scheduler and kubelets, and a web server for all proxies.
 
-The addresses of proxies are all of this machine's loopback, so that one server answers for them.
+All proxies have loopback addresses of this machine, so that a single server answers for all.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tests.bench.control_plane import ControlPlane
 ROBOTS = "robots"
 OTHERS = "others"
 MASTER = "http://10.96.7.7:11311"
-"""Where pods find their proxy: the RosProxy's Service is given the address that they know."""
+"""The proxy's URI in pods. The RosProxy's Service gets this address."""
 ADMIN_PORT = 11312
 OWN = "app.kubernetes.io/component=proxy"
 _READY = [{"type": "Ready", "status": "True"}]
@@ -29,7 +29,7 @@ STATUS = {
 
 
 class CrowdedCluster:
-    """Nodes, pods, and who looks after them. ``made`` is when the proxy of a node was seen."""
+    """Nodes, pods, and their kubelets. ``made`` has the time when the proxy of a node appeared."""
 
     def __init__(self, plane: ControlPlane) -> None:
         self.plane = plane
@@ -56,7 +56,7 @@ class CrowdedCluster:
     # what is there
 
     async def fill(self, nodes: int, pods: int) -> None:
-        """So many nodes, a labelled pod on each, and others up to so many pods."""
+        """Add nodes with a labelled pod each, and other pods up to ``pods``."""
         for name in (ROBOTS, OTHERS):
             await self.plane.call("POST", "/api/v1/namespaces", {"metadata": {"name": name}})
         spec = {"master": {"uri": "http://192.0.2.1:11311"}, "ports": 8}
@@ -87,7 +87,7 @@ class CrowdedCluster:
         )
 
     async def add_robot(self, node: str) -> float:
-        """A labelled pod; when it was bound."""
+        """Add a labelled pod. Return the time of the binding."""
         name = f"robot-{node}"
         labels = {"rosproxy.io/inject": "true", "app": "robot"}
         path = f"/api/v1/namespaces/{ROBOTS}/pods"
@@ -100,14 +100,14 @@ class CrowdedCluster:
         return bound
 
     async def add_other(self, name: str, node: str) -> None:
-        """Somebody else's pod, of a Deployment of 20."""
+        """Add an unrelated pod, of a Deployment of 20."""
         app = f"app-{hash(name) % 1500}"
         labels = {"app": app, "pod-template-hash": "5d9c7b8f6", "team": f"team-{len(app)}"}
         path = f"/api/v1/namespaces/{OTHERS}/pods"
         await self.plane.call("POST", path, _pod(name, node, labels))
 
     async def churn(self, nodes: int, a_second: float) -> None:
-        """Others' pods come and go until it is cancelled."""
+        """Let unrelated pods come and go until cancelled."""
         path = f"/api/v1/namespaces/{OTHERS}/pods"
 
         async def come_and_go(name: str, node: str) -> None:

@@ -1,8 +1,8 @@
-"""The Docker operator on a host with more and more labelled containers.
+"""The Docker operator on a host with a growing number of labelled containers.
 
-Engine, proxies and masters are real. The labelled containers do nothing, so that what is measured
-is the operator's work and the engine's own; ten of them share a network and a master, so there is
-a proxy for ten. The second half of them is started at once, as ``docker compose up`` does.
+Engine, proxies and masters are real. The labelled containers do nothing, so the costs are only
+those of the operator and the engine. Ten containers share a network and a master, and so a proxy.
+The second half of the containers starts at once, as with ``docker compose up``.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ PATH = "rosproxy-operator"
 SIZES = (20, 100, 200)
 QUICK_SIZES = (20,)
 SHARE = 10
-"""Containers of one master and network."""
+"""Containers that share a master and a network."""
 PORTS = 12
 SECONDS = 30.0
 QUICK_SECONDS = 5.0
-"""How long it is watched when nothing happens."""
+"""Seconds of measuring without events."""
 AT_ONCE = 8
 FIRST_MASTER = 21400
 PATIENCE = 600.0
@@ -122,14 +122,14 @@ def _rest(operator: Process, quiet: float = 6.0) -> None:
     end = time.monotonic() + PATIENCE
     before = -1
     while (now := done()) != before:
-        assert time.monotonic() < end, f"it does not come to rest: {operator.logs()[-3000:]}"
+        assert time.monotonic() < end, f"the operator never rests: {operator.logs()[-3000:]}"
         before = now
         time.sleep(quiet)
 
 
 @contextmanager
 def _masters(count: int) -> Iterator[None]:
-    """Masters on this host, one for each network."""
+    """Run masters on this host, one for each network."""
     masters = []
     try:
         for number in range(count):

@@ -1,6 +1,6 @@
 """The rospy twin of cpp/images.cpp: the same lines on standard input, the same answers.
 
-Run by the system's Python, which has rospy; so it imports nothing of this repository.
+Runs with the system's Python, which has rospy, and imports nothing of this repository.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Window:
         self._socket.bind(path)
 
     def take(self) -> None:
-        """A message that is lost gives its place back after a second."""
+        """Take a place in the window. A lost message frees its place after a second."""
         while self._arrived(0.0 if self._left > 0 else 1.0):
             self._left += 1
         self._left = max(self._left, 1) - 1
@@ -45,7 +45,7 @@ class Window:
 
 
 class Node:
-    """What it publishes and receives at the moment."""
+    """The node's current publisher and subscriber."""
 
     def __init__(self) -> None:
         self._publisher: Any = None

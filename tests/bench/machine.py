@@ -1,4 +1,4 @@
-"""The machine before it is put to work, and the versions of what runs on it."""
+"""The idle machine, and the versions of all programs."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def memory() -> str:
 
 
 def pinned(environment: str, package: str) -> str:
-    """A package with its version, as an environment of the ROS 2 layer has it."""
+    """A package with its version in an environment of the ROS 2 layer."""
     pins = ENVIRONMENTS / environment / "pins"
     lines = pins.read_text().splitlines() if pins.exists() else []
     requirements = (line.split()[0] for line in lines if line.startswith(f"{package}=="))

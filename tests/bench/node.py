@@ -1,8 +1,8 @@
 """The node of the streams: ``python -m tests.bench.node MASTER WIRE ADDRESS``.
 
-A slave API in Python in front of a TCPROS server in C++, which is the source of the bytes. It
-publishes /stream (without end) and /echo (what comes goes back), prints the port of the server
-when it has registered, and runs until it is ended.
+A slave API in Python in front of a TCPROS server in C++, which is the source of the bytes. The node
+publishes /stream (without end) and /echo (returns all bytes), prints the port of the server after
+registering, and runs until killed.
 """
 
 from __future__ import annotations

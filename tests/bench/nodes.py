@@ -26,7 +26,7 @@ SETTLE_SECONDS = 12.0
 """What registering has left to do: the first two probes of each node make the connection that is
 kept, and what the master knows is read once more."""
 LEAST_NODES = 100
-"""Of fewer, what the process takes and gives back by itself is more than what they take."""
+"""With fewer nodes, the noise of the process exceeds the memory of the nodes."""
 PATIENCE = 120.0
 PATH = "rosproxy"
 
@@ -46,7 +46,7 @@ def run(book: Book, rounds: int, quick: bool) -> None:
 
 
 def registered(machines: World, master: str, size: int) -> float:
-    """Seconds in which so many nodes register; they are killed then."""
+    """The seconds for registering ``size`` nodes, which are killed then."""
     process = crowd(machines, master, size)
     seconds = seconds_of(process)
     process.kill()
@@ -54,7 +54,7 @@ def registered(machines: World, master: str, size: int) -> float:
 
 
 def measure(book: Book, machines: World, size: int, idle: float) -> None:
-    """A proxy's life with so many nodes behind it."""
+    """Measure a proxy's life with ``size`` nodes inside."""
     with machines.proxy("auto", *OPTIONS) as proxy:
         before = resident(proxy.pid)
         nodes = crowd(machines, proxy.master, size)

@@ -1,6 +1,6 @@
-"""The live page of 10 to 1,000 nodes, each of whose links changes every second, in Chromium.
+"""The live page of 10 to 1,000 nodes with links that change every second, in Chromium.
 
-The nodes are made up (`tests.browser.many`), the page and what serves it are the proxy's own.
+The nodes are fake (`tests.browser.many`). The proxy's own code serves the page.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def run(book: Book, rounds: int, quick: bool) -> None:
 
 
 def measure(book: Book, machines: World, size: int, seconds: float) -> None:
-    """Look at one page for a while, and at what is sent to it."""
+    """Measure a page for a while, and the events to the page."""
 
     def add(row: str, value: float) -> None:
         book.add(row, PATH, value, size)
@@ -88,7 +88,7 @@ def first_rows(browser: Browser) -> float:
 
 
 def events(count: int) -> tuple[int, list[int]]:
-    """How many bytes the first event has, and so many after it."""
+    """The bytes of the first event, and of ``count`` later events."""
     connection = http.client.HTTPConnection("127.0.0.1", PORT, timeout=PATIENCE)
     connection.request("GET", "/events")
     reply = connection.getresponse()

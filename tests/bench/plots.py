@@ -10,11 +10,11 @@ from tests.bench.report import grows, paths_of
 
 COLUMNS = 2
 SPREADING = 20
-"""From this many times its smallest value on, a row is drawn on a logarithmic scale."""
+"""If the largest value of a row is this multiple of the smallest, the scale is logarithmic."""
 
 
 def draw(book: Book, section: str, file: Path) -> bool:
-    """One picture of a section: a plot for each row that grows. False if none does."""
+    """Draw a section, with a plot for each growing row. False without such a row."""
     rows: dict[str, list[Line]] = {}
     for line in book.lines():
         if line.section == section:
@@ -52,7 +52,7 @@ def _is_not_direct(line: Line) -> bool:
 
 
 def _plot(place: Any, row: str, lines: list[Line], axis: str, everybody: list[str]) -> None:
-    """Medians as a line for each path, in its colour, lowest to highest as bars."""
+    """Draw the medians as a coloured line for each path, with bars from lowest to highest."""
     for path in paths_of(lines):
         mine = sorted((line for line in lines if line.path == path), key=lambda line: line.size)
         middles = [line.middle for line in mine]

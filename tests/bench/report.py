@@ -1,10 +1,10 @@
-"""What has been measured, for readers: a table, Markdown, and plots of what grows.
+"""The results for readers: a table, Markdown, and plots of growing rows.
 
     python -m tests.bench.report [--folder build/bench] [--page docs/performance.md [--part ros2]]
 
-writes them from ``results.json``; with a page, what stands between its two marks is written anew
-and the plots are put beside it, so that no number of it is typed by hand. A part of a page, which
-was measured by itself, has marks of its own.
+writes the results from ``results.json``. With a page, the command replaces the text between two
+marks, and puts the plots beside the page, so that no number is typed by hand. A separately measured
+part of a page has different marks.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def notes_of(book: Book, section: str) -> list[str]:
 
 
 def tables(book: Book, section: str) -> Iterator[str]:
-    """One table for each row that was measured at several sizes, and one for all others."""
+    """A table for each row with several sizes, and tables for all other rows."""
     rows: dict[str, list[Line]] = {}
     for line in book.lines():
         if line.section == section:
@@ -105,7 +105,7 @@ def tables(book: Book, section: str) -> Iterator[str]:
 
 
 def split(row: str) -> tuple[str, str]:
-    """What a row is of, and what it counts: the latter heads a table of all such rows."""
+    """Subject and measure of a row. The measure is the heading of a table."""
     subject, _, measure = row.partition(": ")
     return subject, measure
 
@@ -140,7 +140,7 @@ def paths_of(lines: list[Line]) -> list[str]:
 
 
 def cell(line: Line) -> str:
-    """The median with the ratio to direct, and the spread if there was more than one round."""
+    """The median with the ratio to direct, and the spread of several rounds."""
     ratio = f" **x {line.to_direct:.2f}**" if line.to_direct is not None else ""
     spread = f" ({number(min(line.values))} .. {number(max(line.values))})"
     return number(line.middle) + ratio + (spread if len(line.values) > 1 else "")
@@ -152,7 +152,9 @@ def table(head: list[str], body: list[list[str]]) -> str:
 
 
 def paste(page: Path, folder: Path, section: str = "") -> None:
-    """Write the results into a page, between the marks of a part. SystemExit if it has none."""
+    """Write the results into a page, between the marks of a part. Raises SystemExit without
+    marks.
+    """
     text = page.read_text()
     begin, end = (
         mark.replace("results", f"results of {section}" if section else "results")

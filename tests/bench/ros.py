@@ -19,13 +19,13 @@ LIBRARIES = ("rospy", "roscpp")
 IMAGE = 6_000_000
 SMALL = 1024
 WINDOW = 4
-"""Images on their way at most: enough to keep both ends busy, few enough that none is dropped."""
+"""Most images on the way: enough to keep both ends busy, few enough to avoid drops."""
 SECONDS = 0.8
 QUICK_SECONDS = 0.5
 PATIENCE = 1.0
-"""Seconds without another message after which what is missing counts as lost."""
+"""Seconds without a message after which missing messages count as lost."""
 _NUMBERS = itertools.count(1)
-# As a container's network has it.
+# As in a container's network.
 _MASQUERADE = f"""
 table ip nat {{
   chain leaving {{
@@ -37,7 +37,7 @@ table ip nat {{
 
 
 class Kind(NamedTuple):
-    """Messages of a size, at a rate; 0 is as fast as they are received."""
+    """Messages of a size, at a rate; 0 is as fast as the subscriber receives."""
 
     title: str
     size: int
@@ -48,7 +48,7 @@ KINDS = (Kind("6 MB at full rate", IMAGE, 0), Kind("1 KiB at 1 kHz", SMALL, 1000
 
 
 class Pair(NamedTuple):
-    """Who publishes to whom."""
+    """A publisher and a subscriber."""
 
     publisher: str
     subscriber: str
@@ -82,7 +82,7 @@ def run(book: Book, rounds: int, quick: bool) -> None:
 
 @contextmanager
 def site(name: str) -> Iterator[Site]:
-    """A world with its master, its proxy if there is one, and four nodes that wait to be told."""
+    """A world with a master, perhaps a proxy, and four nodes that wait for commands."""
     with world(apart=True) as place, place.master(), ExitStack() as stack:
         if name != DIRECT:
             place.run("host", "nft", "-f", "-", text=_MASQUERADE)
@@ -94,7 +94,7 @@ def site(name: str) -> Iterator[Site]:
 
 
 def measure(book: Book, site: Site, kind: Kind, pair: Pair, seconds: float) -> None:
-    """One topic: a new one each time, so that nothing of an earlier one is taken for it."""
+    """Measure a new topic each time, so that no earlier message counts."""
     other = "outside" if pair.role == "inside" else "inside"
     publisher = site.nodes[pair.publisher, pair.role]
     subscriber = site.nodes[pair.subscriber, other]
@@ -136,14 +136,14 @@ def enter(
 
 
 class RosNode:
-    """A running node that is told what to do, one line after another."""
+    """A running node that executes commands, one a line."""
 
     def __init__(self, process: subprocess.Popen[str], log: Path) -> None:
         self._process = process
         self._log = log
 
     def ask(self, *words: object) -> list[str]:
-        """The words of its answer. RuntimeError if it says that it failed, or has ended."""
+        """The words of the answer. Raises RuntimeError if the node failed or ended."""
         pipe: Any = self._process.stdin
         pipe.write(" ".join(map(str, words)) + "\n")
         pipe.flush()
@@ -151,7 +151,7 @@ class RosNode:
 
     def answer(self) -> list[str]:
         lines: Any = self._process.stdout
-        reply = next((line for line in lines if line.startswith("= ")), "= failed: it has ended")
+        reply = next((line for line in lines if line.startswith("= ")), "= failed: ended")
         words: list[str] = reply.split()[1:]
         if words[0] == "failed:":
             raise RuntimeError(" ".join(words[1:]) + self._log.read_text()[-500:])
@@ -160,7 +160,7 @@ class RosNode:
 
 @contextmanager
 def ros_node(place: World, library: str, role: str, master: str) -> Iterator[RosNode]:
-    """A node of a library on a machine, when it is ready."""
+    """A node of a library on a machine, once ready."""
     programs = {
         "rospy": ["/usr/bin/python3", str(Path(__file__).with_name("images.py"))],
         "roscpp": [str(compiled("images", "roscpp", "sensor_msgs"))],
@@ -173,7 +173,7 @@ def ros_node(place: World, library: str, role: str, master: str) -> Iterator[Ros
 
 @contextmanager
 def running_node(command: Sequence[str], env: Mapping[str, str], log: Path) -> Iterator[RosNode]:
-    """A program that is asked by its standard input, when it is ready; it is killed at the end."""
+    """A program with commands on standard input, once ready, killed at the end."""
     pipe = subprocess.PIPE
     with (
         log.open("w") as errors,

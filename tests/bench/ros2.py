@@ -1,7 +1,7 @@
-"""ROS 2: nodes of rclpy that talk directly, by the kernel and by the proxy; many participants.
+"""ROS 2: rclpy nodes with a direct path, the kernel plane and a relay; many participants.
 
-What outside sends to inside passes the proxy or its kernel plane; what inside sends to outside does
-not, with any of the ways. So a ping passes one way only.
+Data from outside to inside passes the proxy or the kernel plane. Data from inside to outside passes
+neither, so a ping passes in one direction only.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from tests.ros2.machines import wait_for_links
 FIRST_PORT = 41000
 NETWORK = "172.31.0.0/24"
 SECOND = "172.31.0.3"
-"""Another address of the inside machine: the proxy serves at most 64 participants at one."""
+"""Another address of the inside machine: the proxy serves at most 64 participants at an address."""
 SECONDS = 2.0
 QUICK_SECONDS = 1.0
 SIZES = (1, 10, 100)
@@ -63,7 +63,7 @@ STREAMS = (Stream("1 KiB at 200 Hz", 1024, 200), Stream("1 MB at 20 Hz", 1_000_0
 
 
 class Site(NamedTuple):
-    """A way with a node at either end, and the process of the proxy if there is one."""
+    """A way with a node at either end, and perhaps the process of a proxy."""
 
     name: str
     nodes: dict[str, RosNode]
@@ -121,7 +121,7 @@ def enter(book: Book, site: Site, title: str, times: list[float]) -> None:
 
 @contextmanager
 def site(name: str) -> Iterator[Site]:
-    """A world with its proxy if there is one, and two nodes that have found each other."""
+    """A world with perhaps a proxy, and two nodes that have discovered each other."""
     with world(apart=True) as place, ExitStack() as stack:
         wait_for_links(place)
         pid = None if name == DIRECT else stack.enter_context(proxy(place, PLANES[name]))
@@ -138,7 +138,7 @@ def site(name: str) -> Iterator[Site]:
 
 @contextmanager
 def proxy(place: World, plane: str) -> Iterator[int]:
-    """The proxy on the host, when it is ready; its process id."""
+    """Run the proxy on the host. Yields the process id, once ready."""
     argv = [sys.executable, "-m", "rosproxy", "run", "--ros", "2", "--data-plane", plane]
     argv += ["--advertise-host", HOST, "--port-range", f"{FIRST_PORT}-{FIRST_PORT + 999}"]
     argv += ["--inside-network", NETWORK, "--ros2-peer", OUTSIDE]
@@ -162,10 +162,10 @@ def wait_forwarded(place: World) -> None:
 
 @contextmanager
 def talker(place: World, role: str, peer: str, direct: bool) -> Iterator[RosNode]:
-    """A node of rclpy on a machine, when it is ready; a direct one knows where the other is."""
+    """An rclpy node on a machine, once ready. A direct node knows the other's address."""
     program = str(Path(__file__).with_name("ros2_node.py"))
     command = place.command(role, python("jazzy"), program, role, peer)
-    # Shared memory is what these machines have in common.
+    # The machines share memory, which must not carry data here.
     env = environment(place) | {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
     if direct:
         env["ROS_STATIC_PEERS"] = ADDRESSES[peer]
@@ -183,15 +183,15 @@ def python(name: str) -> str:
 
 
 def discovered(size: int) -> float:
-    """Seconds in which so many participants are found that know where the others are."""
+    """The seconds for discovering ``size`` participants directly."""
     with world() as place:
         return crowded(place, size, OUTSIDE)
 
 
 def measure_crowd(book: Book, size: int, idle: float) -> None:
-    """The same through the proxy, and what they cost it."""
+    """Measure the same through the proxy, with the proxy's costs."""
     with world() as place, proxy(place, "auto") as pid:
-        time.sleep(REMEMBERED)  # it waits no more for who had ports before it started
+        time.sleep(REMEMBERED)  # now the proxy no longer waits for former participants
         before = anonymous(pid)
         book.add("discovery, s", PATH, crowded(place, size), size)
         book.add("CPU when idle, ms/s", PATH, busy(pid, idle) * 1000, size)

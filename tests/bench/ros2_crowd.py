@@ -1,10 +1,10 @@
-"""Many participants of Cyclone DDS in one process, or one that waits until it has found them.
+"""Many participants of Cyclone DDS in a process, or a participant that waits to discover them.
 
-    ros2_crowd.py crowd COUNT     makes COUNT participants with a writer each, and keeps them
-    ros2_crowd.py watch           says when a reader has found how many writers
+    ros2_crowd.py crowd COUNT     makes COUNT participants with a writer each
+    ros2_crowd.py watch           prints when a reader has found how many writers
 
-Run by a Python that has cyclonedds, so that it imports nothing of this repository. Both print times
-of the machine's clock.
+Runs with a Python that has cyclonedds, and imports nothing of this repository. Both print times of
+the machine's clock.
 """
 
 import signal

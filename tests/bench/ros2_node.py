@@ -1,8 +1,8 @@
-"""A node of rclpy that is told what to do, one line after another; a line that it says begins "= ".
+"""An rclpy node that executes commands, one a line. Its answers begin with "= ".
 
-Run by the Python of a ROS 2 distribution, so that it imports nothing of this repository. Messages
-are std_msgs/String in their serialized form: what Python makes of a text is no part of the times.
-A message begins with the time when it was sent, in nanoseconds of the machine's clock.
+Runs with the Python of a ROS 2 distribution, and imports nothing of this repository. Messages are
+serialized std_msgs/String, so that the times do not include Python's conversion. A message begins
+with the time of sending, in nanoseconds of the machine's clock.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ LOST = 2.0
 
 
 def message(size: int) -> bytes:
-    """A text with the time in its first bytes, as CDR."""
+    """A CDR text with the time in the first bytes."""
     stamped = struct.pack("<q", time.time_ns()).ljust(size, b"\1")
     return CDR_LE + struct.pack("<I", size + 1) + stamped + b"\0"
 
@@ -36,7 +36,7 @@ def age(data: bytes) -> int:
 
 
 class Talker:
-    """Topics of its own (``/NAME/...``), and those of the other node (``/PEER/...``)."""
+    """The own topics (``/NAME/...``), and the topics of the other node (``/PEER/...``)."""
 
     def __init__(self, node: Any, name: str, peer: str) -> None:
         qos = QoSProfile(depth=1000)
@@ -55,7 +55,7 @@ class Talker:
         ]
 
     def met(self) -> str:
-        """Wait until the other has found all three topics, and this one all of the other's."""
+        """Wait until both nodes have discovered all three topics of the other."""
         end = time.monotonic() + PATIENCE
         publishers = (self._ping, self._stream, self._pong)
         while not all(publisher.get_subscription_count() for publisher in publishers):

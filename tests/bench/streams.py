@@ -22,7 +22,7 @@ MESSAGE = 1024
 STALL_SECONDS = 1.0
 MEMORY_ROUNDS = 2
 LEAST_CONNECTIONS = 10
-"""Of fewer, what the process takes and gives back by itself is more than what they take."""
+"""With fewer connections, the noise of the process exceeds the memory of the connections."""
 GIB = 2**30
 LATEST = 0.7
 """The part of a measurement that has to lie between two readings of CPU time."""
@@ -43,7 +43,7 @@ Measure = Callable[[Book, Way, int, float], None]
 
 
 def measure_ways(book: Book, ways: list[Way], size: int, measure: Measure, seconds: float) -> None:
-    """One measurement of each way; a way that fails it is named, and the others go on."""
+    """Make a measurement on each way. A note names a failed way, and the others go on."""
     for way in ways:
         try:
             measure(book, way, size, seconds)
@@ -53,7 +53,7 @@ def measure_ways(book: Book, ways: list[Way], size: int, measure: Measure, secon
 
 
 def settle(way: Way) -> None:
-    """Lets what a measurement has left behind end before the next one."""
+    """Wait until the relay has finished the work of the last measurement."""
     deadline = time.monotonic() + 3
     while way.pid and time.monotonic() < deadline:
         before = cpu_seconds(way.pid)
@@ -80,7 +80,7 @@ def stream(book: Book, way: Way, size: int, seconds: float) -> None:
     if size > 1:
         book.add("smallest share of the mean", way.name, smallest_share(counts), size)
     if after.when - before.when < took * LATEST:
-        raise RuntimeError("its CPU time could not be read in time")
+        raise RuntimeError("the CPU time could not be read in time")
     of_relay, of_all = (cost * took / total * GIB for cost in per_second(before, after))
     if way.pid:
         book.add("CPU of the relay, s/GiB", way.name, of_relay, size)
@@ -89,7 +89,7 @@ def stream(book: Book, way: Way, size: int, seconds: float) -> None:
 
 @contextmanager
 def urgently() -> Iterator[None]:
-    """This process goes before a thousand busy ones of a relay, or it reads too late."""
+    """Give this process priority over a relay's thousand busy processes, or it reads too late."""
     os.setpriority(os.PRIO_PROCESS, 0, -15)
     try:
         yield
@@ -98,12 +98,12 @@ def urgently() -> Iterator[None]:
 
 
 def warm_up(size: int) -> float:
-    """Seconds until a stream has grown its buffers; with more of them it takes longer."""
+    """Seconds until the buffers of a stream have grown, which takes longer with many streams."""
     return 0.3 if size < 100 else 0.6
 
 
 class Spent(NamedTuple):
-    """CPU seconds of the relay and of the machine, and when they were read."""
+    """CPU seconds of the relay and of the machine, and the time of reading."""
 
     when: float
     relay: float
@@ -116,13 +116,13 @@ def spent(relay: list[int]) -> Spent:
 
 
 def per_second(before: Spent, after: Spent) -> tuple[float, float]:
-    """CPU seconds of the relay and of the machine a second: on a busy machine it is read late."""
+    """CPU seconds of the relay and of the machine a second, independent of late readings."""
     elapsed = after.when - before.when
     return (after.relay - before.relay) / elapsed, (after.machine - before.machine) / elapsed
 
 
 def ping(book: Book, way: Way, size: int, seconds: float) -> None:
-    """A message there and back on one connection after the other."""
+    """Measure a message there and back, on the connections in turn."""
     with wire(way, "ping", size, seconds, MESSAGE) as process:
         times = [float(duration) / 1000 for duration in line(process).split()]
     book.add("1 KiB ping p50, us", way.name, percentile(times, 50), size)
@@ -130,7 +130,7 @@ def ping(book: Book, way: Way, size: int, seconds: float) -> None:
 
 
 def memory(book: Book, rounds: int, quick: bool) -> None:
-    """Of new processes each time: later they could live on what others have left."""
+    """Measure new processes each time: older processes could reuse freed memory."""
     for _ in range(rounds):
         with all_ways(book, only=(*PLANES, *PEERS)) as ways:
             for way in ways:
@@ -161,7 +161,7 @@ def connections(book: Book, way: Way, sizes: tuple[int, ...]) -> None:
 
 @contextmanager
 def wire(way: Way, role: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """The end that connects; RuntimeError with its words if it fails."""
+    """The connecting end. Raises RuntimeError with the program's output."""
     address, port = way.address
     words = [str(argument) for argument in (role, address, port, *arguments)]
     command = way.world.command(way.end, str(compiled("wire")), *words)
@@ -191,4 +191,4 @@ def line(process: subprocess.Popen[str]) -> str:
     if text := process.stdout.readline().strip():
         return text
     process.wait(30)
-    raise RuntimeError(process.stderr.read().strip() or f"it ended with {process.returncode}")
+    raise RuntimeError(process.stderr.read().strip() or f"exit code {process.returncode}")

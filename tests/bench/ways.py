@@ -1,10 +1,9 @@
-"""The ways from outside to a node inside: directly, through rosproxy, through its peers.
+"""The ways from outside to a node inside: directly, through rosproxy, through other relays. And the
+way from inside to a node outside, through rosproxy with ``--direction both``, where the node's
+bytes go *inwards*.
 
-And from inside to a node outside, through rosproxy with ``--direction both``: *inwards* is where
-the bytes of that node go.
-
-The kernel's ways have worlds of their own, so that their rules cost the others nothing. Each peer
-is set up in its own favour: large buffers, splicing where it can.
+The ways through the kernel have separate worlds, so that the rules cost the other ways nothing.
+Each relay has its best configuration: large buffers, and splicing if possible.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ table ip by-hand {{
   }}
 }}
 """
-# Its own 8 KiB would show it at its worst.
+# The default of 8 KiB would be unfair.
 _SOCAT = ("socat", "-lf", "/dev/null", "-b", "131072")
 _HAPROXY = """
 global
@@ -81,9 +80,8 @@ stream {{
 
 
 class Way(NamedTuple):
-    """Where one end connects to reach the node, and the process in between if there is one.
-
-    ``end`` is the machine that connects.
+    """The address to connect to for the node, and perhaps the process in between. ``end`` is the
+    machine that connects.
     """
 
     name: str
@@ -120,7 +118,7 @@ def _note_missing(book: Book, wanted: tuple[str, ...], ways: list[Way]) -> None:
 
 @contextmanager
 def node(place: World, master: str, role: str = "inside") -> Iterator[tuple[str, int]]:
-    """A node on a machine, registered; the address of its TCPROS server."""
+    """Run a registered node on a machine. Yields the address of the TCPROS server."""
     wire = str(compiled("wire"))
     address = ADDRESSES[role]
     argv = (sys.executable, "-m", "tests.bench.node", master, wire, address)
@@ -131,7 +129,7 @@ def node(place: World, master: str, role: str = "inside") -> Iterator[tuple[str,
 
 @contextmanager
 def by_hand() -> Iterator[Way]:
-    """What anyone can write down who knows the node's address and port."""
+    """Rules for nftables that a user can write with the node's address and port."""
     with world(apart=True) as place, node(place, NO_MASTER) as (address, port):
         rules = _RULES.format(host=HOST, port=PORT, target=f"{address}:{port}")
         place.run("host", "nft", "-f", "-", text=rules)
@@ -140,7 +138,7 @@ def by_hand() -> Iterator[Way]:
 
 @contextmanager
 def proxied(name: str) -> Iterator[Way]:
-    """The proxy with one of its planes, and a node that registered through it."""
+    """The proxy with a data plane, and a node that registered through the proxy."""
     with (
         world(apart=True) as place,
         place.master(),
@@ -153,7 +151,7 @@ def proxied(name: str) -> Iterator[Way]:
 
 @contextmanager
 def proxied_inwards(name: str) -> Iterator[Way]:
-    """The proxy with one of its planes, and a node outside that is heard inside."""
+    """The proxy with a data plane, and a node outside with a subscriber inside."""
     plane = INWARDS[name]
     with (
         world(apart=True) as place,
@@ -173,9 +171,8 @@ def tcpros_address(
     end: str = "outside",
     master: str = MASTER,
 ) -> tuple[str, int]:
-    """What a subscriber on a machine is told when it asks its master and then the node.
-
-    RuntimeError if the kernel was to forward and the port is the one that the proxy serves.
+    """The TCPROS address that a subscriber on a machine gets from the node, by the master. Raises
+    RuntimeError if the kernel should forward, but the port is the proxy's.
     """
     with place.entered(end):
         uri = call(master, "lookupNode", node_name)
@@ -186,7 +183,7 @@ def tcpros_address(
 
 
 def call(uri: str, method: str, *arguments: Any) -> Any:
-    """The value of a reply. RuntimeError with its words if it is no success."""
+    """The value of a reply. Raises RuntimeError with the text of a failure."""
     with ServerProxy(uri) as server:
         reply: Any = getattr(server, method)("/bench", *arguments)
     if reply[0] != 1:
@@ -196,14 +193,14 @@ def call(uri: str, method: str, *arguments: Any) -> Any:
 
 @contextmanager
 def peer(place: World, name: str, port: int, target: tuple[str, int]) -> Iterator[Way]:
-    """A relay that knows nothing of ROS, when it listens."""
+    """Run a relay that knows nothing of ROS, and yield its way once it listens."""
     with place.running("host", *peer_command(place, name, port, target)) as process:
         place.wait_listening(process, HOST, port)
         yield Way(name, place, (HOST, port), process.pid)
 
 
 def peer_command(place: World, name: str, port: int, target: tuple[str, int]) -> list[str]:
-    """The command line of a relay, and its configuration in the world's folder."""
+    """The command line of a relay, with its configuration written into the world's folder."""
     values = {"host": HOST, "port": port, "target": "{}:{}".format(*target)}
     if name == "socat":
         listen = f"TCP-LISTEN:{port},bind={HOST},fork,nodelay,backlog=4096"

@@ -1,8 +1,8 @@
-"""Three machines in a row, each a network namespace, and the programs that run on them.
+"""Three machines in a row, each a network namespace, and programs on these machines.
 
-    outside (the master) -- host (the proxy, or what it is compared with) -- inside (the nodes)
+    outside (the master) -- host (the proxy, or another relay) -- inside (the nodes)
 
-The host routes, and nothing stands in the way: so the same two machines also talk directly.
+The host routes without a filter, so that the same two machines also talk directly.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from tests.ros.topology import Place, run_command
 
 OUTSIDE = "10.78.0.2"
 HOST = "10.78.0.1"
-"""The outside machine, and what it knows the host by."""
+"""The outside machine, and the host's address there."""
 INSIDE = "172.31.0.2"
 GATEWAY = "172.31.0.1"
-"""The inside machine, and what it knows the host by."""
+"""The inside machine, and the host's address there."""
 MASTER_PORT = 11311
 MASTER = f"http://{OUTSIDE}:{MASTER_PORT}/"
 PROXY = f"http://{GATEWAY}:{MASTER_PORT}/"
-"""The master as the inside machine has it: the proxy."""
+"""The master for the inside machine: the proxy."""
 DESCRIPTORS = 65536
-"""The limit of open files for this process and all that it starts."""
+"""The limit of open files for this process and its children."""
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 """ROS's programs are the system Python's: no other Python may come first."""
 PREFIX = "rosb"
-"""Of the names of the namespaces; the process that has made them follows."""
+"""The prefix of the namespaces' names. The process id follows."""
 _TICKS = os.sysconf("SC_CLK_TCK")
 _NUMBERS = itertools.count(1)
 ADDRESSES = {"outside": OUTSIDE, "host": HOST, "inside": INSIDE}
@@ -50,7 +50,7 @@ net.core.somaxconn=4096
 
 
 class Proxy(NamedTuple):
-    """A running proxy, its process id, and where inside nodes find their master."""
+    """A running proxy, the process id, and the master's URI for inside nodes."""
 
     process: Process
     pid: int
@@ -58,11 +58,11 @@ class Proxy(NamedTuple):
 
 
 class World:
-    """The machines. Worlds do not see each other; they all have the same addresses.
+    """The machines. Worlds are separate, with the same addresses in each.
 
-    With ``apart``, outside and inside have processors of their own, half of them each: on the same
-    one, two ends wake each other many times faster than two machines ever do, or these two at
-    another moment. The host has them all.
+    With ``apart``, outside and inside have half of the processors each, and the host has all. On
+    the same processor, two ends wake each other many times faster than two machines, which would
+    distort some measurements.
     """
 
     def __init__(self, apart: bool = False) -> None:
@@ -113,11 +113,11 @@ class World:
         return ("taskset", "--cpu-list", self._processors[role], *argv)
 
     def run(self, role: str, *argv: str, text: str | None = None) -> str:
-        """Runs a program on a machine to its end; what it printed. RuntimeError if it fails."""
+        """Runs a program on a machine. Returns the output. Raises RuntimeError after a failure."""
         return run_command("ip", "netns", "exec", self.places[role].namespace, *argv, text=text)
 
     def start(self, role: str, *argv: str, env: dict[str, str] | None = None) -> Process:
-        """Starts a program on a machine; `stop`, or the end of the world, ends it."""
+        """Starts a program on a machine, which runs until `stop` or the end of the world."""
         title = f"{' '.join(Path(argument).name for argument in argv[:4])} ({role})"
         log = self.folder / f"{len(self.processes):04d}.log"
         env = self.environment(role) if env is None else env
@@ -129,7 +129,7 @@ class World:
     def running(
         self, role: str, *argv: str, env: dict[str, str] | None = None
     ) -> Iterator[Process]:
-        """A program on a machine, ended with its context."""
+        """A program on a machine, ended with the context."""
         process = self.start(role, *argv, env=env)
         try:
             yield process
@@ -149,7 +149,7 @@ class World:
         return clean_environment(**more)
 
     def ros_environment(self, role: str) -> dict[str, str]:
-        """For ROS's own programs, the system Python's among them."""
+        """The environment of ROS's own programs, also with the system's Python."""
         uri = PROXY if role == "inside" else MASTER
         kept = {"PATH": SYSTEM_PATH, "LANG": "C.UTF-8", "PYTHONUNBUFFERED": "1"}
         home = {"HOME": str(self.folder), "ROS_LOG_DIR": str(self.folder)}
@@ -157,7 +157,7 @@ class World:
 
     @contextmanager
     def master(self) -> Iterator[Process]:
-        """ROS's own master, outside, when it answers."""
+        """ROS's own master, outside, once it answers."""
         argv = ("/usr/bin/python3", "/usr/bin/rosmaster", "--core", "-p", str(MASTER_PORT))
         with self.running("outside", *argv, env=self.ros_environment("outside")) as process:
             self.wait_listening(process, OUTSIDE, MASTER_PORT)
@@ -165,7 +165,7 @@ class World:
 
     @contextmanager
     def proxy(self, data_plane: str = "auto", *options: str) -> Iterator[Proxy]:
-        """A proxy of that master on the host, when it is ready, with the options of its users."""
+        """A proxy of that master on the host, once ready, with a user's options."""
         argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", MASTER]
         argv += ["--advertise-host", HOST, "--data-plane", data_plane, *options]
         with self.running("host", *argv) as process:
@@ -191,7 +191,7 @@ def _accepts(address: str, port: int) -> bool:
 
 
 def processors() -> dict[str, str]:
-    """Whose processors are which; of a single one, both have it."""
+    """The processors of each machine. A single processor is shared."""
     cpus = sorted(os.sched_getaffinity(0))
     half = len(cpus) // 2
     parts = {"inside": cpus[:half] or cpus, "outside": cpus[half:]}
@@ -200,7 +200,7 @@ def processors() -> dict[str, str]:
 
 @contextmanager
 def world(apart: bool = False) -> Iterator[World]:
-    """A new world, taken away with its context."""
+    """A new world, removed with the context."""
     made = World(apart)
     try:
         made.build()
@@ -210,25 +210,27 @@ def world(apart: bool = False) -> Iterator[World]:
 
 
 def cpu_seconds(pid: int) -> float:
-    """CPU time of a process and all below it, user's and system's, since each began."""
+    """The CPU time of a process and all descendants, user and system, since their starts."""
     return cpu_seconds_of(family(pid))
 
 
 def family(pid: int) -> list[int]:
-    """A process and all below it."""
+    """A process and all descendants."""
     return [pid, *descendants(pid)]
 
 
 def cpu_seconds_of(pids: list[int]) -> float:
-    """Their CPU time; to find a thousand of them can take longer than what is measured."""
+    """The CPU time of processes. Finding a thousand processes may take longer than the
+    measurement.
+    """
     return sum(map(_seconds, pids))
 
 
 def _seconds(pid: int) -> float:
-    """With that of children that it has reaped; none for one that has just ended.
+    """The CPU time of a process and its reaped children; 0 after its end.
 
-    A clock tick is more than each of a thousand processes gets in a second: where a process has
-    no other thread, its own nanoseconds are taken.
+    A clock tick is more than each of a thousand processes gets in a second. So a process with a
+    single thread is measured in nanoseconds.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -248,17 +250,15 @@ def machine_cpu_seconds() -> float:
 
 
 def resident(pid: int) -> int:
-    """KiB of memory of a process and all below it, shared pages shared out among their users.
-
-    What the kernel holds for sockets and pipes is not in it.
+    """The memory of a process and all descendants in KiB, with a share of each shared page. Without
+    the kernel's memory for sockets and pipes.
     """
     return sum(_rolled_up(member, "Pss:") for member in family(pid))
 
 
 def anonymous(pid: int) -> int:
-    """KiB of memory of a process and all below it that no file stands behind.
-
-    Other than the share of what is shared it does not get less where others start.
+    """The anonymous memory of a process and all descendants in KiB. Unlike shares of shared pages,
+    this does not shrink when other processes start.
     """
     return sum(_rolled_up(member, "Anonymous:") for member in family(pid))
 
