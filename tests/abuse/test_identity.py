@@ -64,8 +64,9 @@ async def test_strangers_flood_the_master_port(apart, apart_master, make_node):
 
 
 async def test_unselected_callers_flood_the_master_port(start_apart, make_node):
-    """With an operator, a new container waits for the update as long as unselected callers. Some
-    callers come before the operator's first update after the start.
+    """With an operator, a new container waits for the update as long as unselected callers.
+
+    Some callers come before the operator's first update after the start.
     """
     apart = start_apart(admin_token_hash=hash_token(TOKEN))
     node = await make_node(address=NODES[0])

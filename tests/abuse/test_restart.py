@@ -38,8 +38,9 @@ MESSAGES = 20
 
 
 class Reader(Participant):
-    """A participant that answers the proxy, and remembers the expected number of each writer. A
-    number in ``claimed`` replaces the true number.
+    """A participant that answers the proxy, and remembers the expected number of each writer.
+
+    A number in ``claimed`` replaces the true number.
     """
 
     def __init__(self, prefix: bytes, address: str, port: int) -> None:

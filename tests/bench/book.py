@@ -16,8 +16,7 @@ DIRECT = "direct"
 
 
 def ratio(values: list[float], base: list[float]) -> float | None:
-    """The median of the ratios of all rounds: a busy moment of the machine hits both values of a
-    pair.
+    """The median of the ratios of all rounds: a busy moment hits both values of a pair.
 
     If a side misses a round, the ratio of the medians. None without a base, or with a zero in the
     base.

@@ -13,8 +13,10 @@ FLAGS = ("-std=c++17", "-O2", "-w", "-DBOOST_BIND_GLOBAL_PLACEHOLDERS")
 
 
 def compiled(name: str, *packages: str) -> Path:
-    """The path of a program. Raises RuntimeError with the compiler's output. ``packages`` are the
-    names of the needed libraries for pkg-config.
+    """The path of a program.
+
+    Raises RuntimeError with the compiler's output. ``packages`` are the names of the needed
+    libraries for pkg-config.
     """
     source = SOURCES / f"{name}.cpp"
     words = " ".join([*FLAGS, *packages, source.read_text()])

@@ -1,6 +1,7 @@
-"""The ways from outside to a node inside: directly, through rosproxy, through other relays. And the
-way from inside to a node outside, through rosproxy with ``--direction both``, where the node's
-bytes go *inwards*.
+"""The ways from outside to a node inside: directly, through rosproxy, through other relays.
+
+And the way from inside to a node outside, through rosproxy with ``--direction both``, where the
+node's bytes go *inwards*.
 
 The ways through the kernel have separate worlds, so that the rules cost the other ways nothing.
 Each relay has its best configuration: large buffers, and splicing if possible.
@@ -80,8 +81,9 @@ stream {{
 
 
 class Way(NamedTuple):
-    """The address to connect to for the node, and perhaps the process in between. ``end`` is the
-    machine that connects.
+    """The address to connect to for the node, and perhaps the process in between.
+
+    ``end`` is the machine that connects.
     """
 
     name: str
@@ -171,8 +173,9 @@ def tcpros_address(
     end: str = "outside",
     master: str = MASTER,
 ) -> tuple[str, int]:
-    """The TCPROS address that a subscriber on a machine gets from the node, by the master. Raises
-    RuntimeError if the kernel should forward, but the port is the proxy's.
+    """The TCPROS address that a subscriber on a machine gets from the node, by the master.
+
+    Raises RuntimeError if the kernel should forward, but the port is the proxy's.
     """
     with place.entered(end):
         uri = call(master, "lookupNode", node_name)

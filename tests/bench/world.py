@@ -250,15 +250,17 @@ def machine_cpu_seconds() -> float:
 
 
 def resident(pid: int) -> int:
-    """The memory of a process and all descendants in KiB, with a share of each shared page. Without
-    the kernel's memory for sockets and pipes.
+    """The memory of a process and all descendants in KiB, with a share of each shared page.
+
+    Without the kernel's memory for sockets and pipes.
     """
     return sum(_rolled_up(member, "Pss:") for member in family(pid))
 
 
 def anonymous(pid: int) -> int:
-    """The anonymous memory of a process and all descendants in KiB. Unlike shares of shared pages,
-    this does not shrink when other processes start.
+    """The anonymous memory of a process and all descendants in KiB.
+
+    Unlike shares of shared pages, this does not shrink when other processes start.
     """
     return sum(_rolled_up(member, "Anonymous:") for member in family(pid))
 

@@ -65,8 +65,9 @@ def _families(metrics: CommonMetrics) -> set[str]:
 
 
 def relabel_configs(endpoint: Json) -> list[Json]:
-    """The relabelings of a monitor's endpoint, with the names of Prometheus' own file. The
-    Prometheus operator passes relabelings on unchanged.
+    """The relabelings of a monitor's endpoint, with the names of Prometheus' own file.
+
+    The Prometheus operator passes relabelings on unchanged.
     """
     names = {"sourceLabels": "source_labels", "targetLabel": "target_label"}
     return [

@@ -22,8 +22,10 @@ def is_new(node: EndpointStatus) -> bool:
 
 
 def restart_proxy(lab: Lab) -> None:
-    """Kill and restart the proxy, once the proxy has asked all nodes. A roslisp node ends if its
-    caller dies before the node has answered, and the proxy asks each new node.
+    """Kill and restart the proxy, once the proxy has asked all nodes.
+
+    A roslisp node ends if its caller dies before the node has answered, and the proxy asks each new
+    node.
     """
     assert lab.proxy is not None
     wait_until("all nodes have answered", lambda: not any(is_new(node) for node in nodes_of(lab)))

@@ -168,8 +168,9 @@ class Controller:
 def running_controller(
     image: str, *options: str, names: Mapping[str, str], container: str = ""
 ) -> Iterator[Controller]:
-    """A controller as in examples/docker/compose.yaml. Later options win. ``names`` are entries of
-    the hosts file.
+    """A controller as in examples/docker/compose.yaml.
+
+    Later options win. ``names`` are entries of the hosts file.
     """
     container = container or f"rosproxy-test-controller-{os.getpid()}"
     every = (*OPTIONS, *options)

@@ -114,8 +114,9 @@ def logs(name: str) -> str:
 def wait_until(
     condition: Callable[[], bool], seconds: float, message: str | Callable[[], str]
 ) -> float:
-    """Wait for a condition. Return the seconds. The intervals grow, because many conditions start a
-    program.
+    """Wait for a condition.
+
+    Return the seconds. The intervals grow, because many conditions start a program.
     """
     started = time.monotonic()
     while not condition():

@@ -16,9 +16,11 @@ from tests.docker.nodes import Log, node_command
 
 @dataclass(frozen=True)
 class Machine:
-    """A machine at ``address``. ``host_address`` is this host at the other end of the cable.
-    ``engine`` runs the machine, and may differ from the engine of the nodes inside. ``root`` is the
-    path to the machine's files from here.
+    """A machine at ``address``.
+
+    ``host_address`` is this host at the other end of the cable. ``engine`` runs the machine, and
+    may differ from the engine of the nodes inside. ``root`` is the path to the machine's files from
+    here.
     """
 
     container: str

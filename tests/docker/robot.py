@@ -28,8 +28,10 @@ print(json.dumps({name: master.lookupNode("/test", name)[2] for name in names}))
 
 @dataclass(frozen=True)
 class Robot(Machine):
-    """A machine with a master. ``name`` is the host in URIs. A ``hidden`` robot is beside another
-    network namespace, and this host does not reach the robot.
+    """A machine with a master.
+
+    ``name`` is the host in URIs. A ``hidden`` robot is beside another network namespace, and this
+    host does not reach the robot.
     """
 
     name: str

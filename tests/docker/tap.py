@@ -13,6 +13,7 @@ ENGINE = "/var/run/docker.sock"
 
 class EngineTap:
     """Relays a controller's requests to the engine, and counts the requests that change something.
+
     ``arm`` sets an action for such a request: before the engine gets the request, or during its
     execution.
     """

@@ -16,8 +16,9 @@ from tests.docker.robot import Robot
 def test_the_label_alone_is_enough(
     library: str, known_by: str, controller: Controller, near: Inside, robot: Robot
 ) -> None:
-    """Topics and services both ways, also with a variable for the nodes' host. Only the network
-    knows the name, and nothing has the address.
+    """Topics and services both ways, also with a variable for the nodes' host.
+
+    Only the network knows the name, and nothing has the address.
     """
     network = near.network()
     variables = {"ROS_IP": "192.0.2.99", "ROS_HOSTNAME": "talker"}

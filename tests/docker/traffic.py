@@ -15,9 +15,10 @@ from tests.docker.robot import Robot
 
 @dataclass(frozen=True)
 class Traffic:
-    """A publisher, a subscriber and a server inside, each with a peer outside. ``outward`` are
-    messages at the robot, ``inward`` messages inside, ``service`` the robot's replies from the
-    service inside.
+    """A publisher, a subscriber and a server inside, each with a peer outside.
+
+    ``outward`` are messages at the robot, ``inward`` messages inside, ``service`` the robot's
+    replies from the service inside.
     """
 
     talker: Container

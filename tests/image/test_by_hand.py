@@ -1,5 +1,6 @@
-"""The examples with a proxy declared by hand, started as in the READMEs, with real nodes. The robot
-cannot reach any container, so all traffic goes through the proxy's published ports.
+"""The examples with a proxy declared by hand, started as in the READMEs, with real nodes.
+
+The robot cannot reach any container, so all traffic goes through the proxy's published ports.
 """
 
 import json

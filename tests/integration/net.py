@@ -65,6 +65,7 @@ async def refuses(address: Address, source: str = OUTSIDE) -> bool:
 
 async def knock(address: Address, data: bytes, source: str = OUTSIDE) -> str:
     """Connect, send, and wait for the outcome: ``refused``, ``reset``, ``closed`` or ``answered``.
+
     To prove that there is *no* answer, wait for a later event.
     """
     try:

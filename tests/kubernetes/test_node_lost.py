@@ -15,8 +15,10 @@ from tests.kubernetes.traffic import flow
 
 
 def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
-    """The other node's traffic goes on. The lost node's traffic returns with the node. The leading
-    operator is lost with the node, and the other operator reports the loss.
+    """The other node's traffic goes on.
+
+    The lost node's traffic returns with the node. The leading operator is lost with the node, and
+    the other operator reports the loss.
     """
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     # The API server reaches Services by way of node1: that is so in this cluster only.

@@ -25,9 +25,10 @@ A SYN that passes while kube-proxy changes from refusing to translating is sent 
 
 @dataclass(frozen=True)
 class Flow:
-    """A publisher, a subscriber and a server in pods, each with a peer on the robot. ``outward``
-    are messages at the robot, ``inward`` messages in the cluster, ``replies`` the robot's replies
-    from the service.
+    """A publisher, a subscriber and a server in pods, each with a peer on the robot.
+
+    ``outward`` are messages at the robot, ``inward`` messages in the cluster, ``replies`` the
+    robot's replies from the service.
     """
 
     talker: Pod

@@ -159,8 +159,9 @@ class Lab:
     def node(
         self, library: str, role: str, kind: str, name: str = "", env: Any = None, **options: Any
     ) -> Process:
-        """Starts a test node of a library in `programs`, in the role `kind`. The option `remap` is
-        a list of remappings.
+        """Starts a test node of a library in `programs`, in the role `kind`.
+
+        The option `remap` is a list of remappings.
         """
         words = [*options.pop("remap", []), f"__name:={name or self.unique(kind)}"]
         for option, value in options.items():

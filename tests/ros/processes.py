@@ -88,8 +88,9 @@ class Process:
             os.killpg(self.pid, number)
 
     def kill(self) -> None:
-        """Kills the process and all descendants with SIGKILL, and reaps the process. roscore and
-        roslaunch put every child into a separate process group.
+        """Kills the process and all descendants with SIGKILL, and reaps the process.
+
+        roscore and roslaunch put every child into a separate process group.
         """
         for pid in (self.pid, *descendants(self.pid)):
             with contextlib.suppress(ProcessLookupError):

@@ -1,6 +1,7 @@
-"""Inside has no way out. With ``--direction out`` inside receives nothing from outside, and the
-doctor has the reason. With ``both`` inside receives, also from outside nodes on the proxy's
-machine.
+"""Inside has no way out.
+
+With ``--direction out`` inside receives nothing from outside, and the doctor has the reason. With
+``both`` inside receives, also from outside nodes on the proxy's machine.
 
 The tests of both directions run in this network with ROS_TESTS_ISOLATED=1.
 """
@@ -43,8 +44,9 @@ def test_inside_is_heard_and_hears_nobody(lab: Lab, library: str) -> None:
 
 @pytest.fixture
 def beside(lab: Lab) -> Iterator[dict[str, str]]:
-    """A proxy for both directions on a machine with outside nodes. Yields the environment of inside
-    nodes.
+    """A proxy for both directions on a machine with outside nodes.
+
+    Yields the environment of inside nodes.
 
     The machine is the gateway of the inside network, like a Docker host with an internal network.
     """

@@ -64,8 +64,9 @@ class PortMap(NamedTuple):
 
 @dataclass(frozen=True)
 class SecondProxy:
-    """The machine px2: the numbers of its inside networks, and its ports. The host publishes the
-    ports if px2 has a way out without px.
+    """The machine px2: the numbers of its inside networks, and its ports.
+
+    The host publishes the ports if px2 has a way out without px.
     """
 
     networks: tuple[int, ...]

@@ -12,8 +12,9 @@ PROXY = False
 
 @pytest.mark.parametrize("vendor", ["jazzy", "kilted", "cyclone"])
 def test_nodes_meet_with_a_range_of_1100_ports(lab: Lab, vendor: str) -> None:
-    """Fast DDS counts in steps of 1 up to the number that encodes a participant's ports. With a
-    number of 48 bits, a node would not answer for days.
+    """Fast DDS counts in steps of 1 up to the number that encodes a participant's ports.
+
+    With a number of 48 bits, a node would not answer for days.
     """
     lab.proxy_role = "host"
     lab.port_range = "47200-48299"

@@ -119,6 +119,7 @@ def test_a_forged_announcement_after_a_restart_is_no_end(
     lab: Lab, source: str, sink: str, count: int
 ) -> None:
     """A container with the right for raw packets is the first to announce another container's node.
+
     The 16 forged locators must not take all ports of the node.
     """
     lab.node("jazzy", source, "pub", topic="/chatter")

@@ -121,9 +121,9 @@ async def test_an_outside_node_that_is_gone(
 
 
 async def test_an_outside_node_of_an_unknown_host(proxy: Proxy, master: FakeMaster) -> None:
-    await rpc(master.uri, "registerPublisher", "/far", "/t", "a/B", "http://nobody.invalid:4/")
+    await rpc(master.uri, "registerPublisher", "/far", "/t", "a/B", "http://missing.invalid:4/")
     findings = [f for f in await faults(proxy) if f.subject == "/far"]
-    assert "the host name nobody.invalid can't be resolved" in findings[0].text
+    assert "the host name missing.invalid can't be resolved" in findings[0].text
 
 
 async def test_a_stale_registration(proxy: Proxy, node: FakeNode, master: FakeMaster) -> None:
@@ -246,9 +246,9 @@ async def test_data_ports_of_a_publisher_outside(
     assert "md5sum" in (await only(proxy, "/chatter")).text
     robot.stream = refuse
     assert "md5sums do not match" in (await only(proxy, "/chatter")).text
-    robot.answers["requestTopic"] = value([1, "", ["TCPROS", "nobody.invalid", 4]])
+    robot.answers["requestTopic"] = value([1, "", ["TCPROS", "missing.invalid", 4]])
     assert (
-        "nobody.invalid:4 as its data port: the host name can't be resolved here"
+        "missing.invalid:4 as its data port: the host name can't be resolved here"
         in (await only(proxy, "/chatter")).text
     )
     robot.answers["requestTopic"] = value([1, "", ["TCPROS", OUTSIDE, 1]])

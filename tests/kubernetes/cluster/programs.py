@@ -19,8 +19,9 @@ _ENVIRONMENT = {"GOGC": "400"}  # memory for time: fewer garbage collections
 
 @dataclass(frozen=True)
 class Program:
-    """A program with a log and a pid file. ``namespace`` is the name of the program's network
-    namespace below /run/netns.
+    """A program with a log and a pid file.
+
+    ``namespace`` is the name of the program's network namespace below /run/netns.
     """
 
     name: str

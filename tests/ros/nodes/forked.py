@@ -1,5 +1,4 @@
-"""Runs ROS's Python programs as forks of a single process: importing rospy costs more than most
-tests.
+"""Runs ROS's Python programs as forks of a process, because importing rospy is slow.
 
     forked.py <REQUESTS >PIDS
 

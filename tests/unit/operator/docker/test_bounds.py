@@ -217,9 +217,9 @@ def test_slave_control(option: SlaveControl, label: str | None, gets: str, told:
 
 
 def test_a_slave_control_that_can_not_be() -> None:
-    member, (problem,) = read(slave_control="nobody")
+    member, (problem,) = read(slave_control="none")
     assert member is None
-    assert problem.text.startswith("label rosproxy.slave-control='nobody' is none of any, master.")
+    assert problem.text.startswith("label rosproxy.slave-control='none' is none of any, master.")
 
 
 def test_an_exited_container_keeps_slave_control_narrow_for_the_grace() -> None:

@@ -80,8 +80,9 @@ def told_of_talker(
     age: float = SETTLED,
     uptime: float = SETTLED,
 ) -> list[str]:
-    """The problems of a labelled ROS 2 container in the status of a host. ``inside`` are the
-    addresses of the participants that the proxy has heard.
+    """The problems of a labelled ROS 2 container in the status of a host.
+
+    ``inside`` are the addresses of the participants that the proxy has heard.
     """
     labels = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
     talker = container(labels=labels, networks=[TALKER], env="")

@@ -1,6 +1,7 @@
-"""Random events on a host, and an operator that is killed anywhere, end in the wanted state. After
-each event the test checks the invariants (`Hosts.check`). In pauses without events the operator
-must come to rest, with everything as wished.
+"""Random events on a host, and an operator that is killed anywhere, end in the wanted state.
+
+After each event the test checks the invariants (`Hosts.check`). In pauses without events the
+operator must come to rest, with everything as wished.
 """
 
 from dataclasses import replace

@@ -34,8 +34,9 @@ SECOND = ProxyAccess(WHERE, "token", "run 2")
 
 
 class Proxies(ProxyClient):
-    """A proxy that notes updates, and answers only with ``known_status``. ``calls`` are all updates
-    in order: addresses, or names of layers.
+    """A proxy that notes updates, and answers only with ``known_status``.
+
+    ``calls`` are all updates in order: addresses, or names of layers.
     """
 
     def __init__(self) -> None:
@@ -99,8 +100,9 @@ async def tasks() -> AsyncIterator[Tasks]:
 def look(
     *addresses: str, access: ProxyAccess = FIRST, policy: str = "", ports: PortRange = RANGE
 ) -> tuple[DockerSnapshot, list[Member]]:
-    """Selected containers at these addresses, on the proxy's network. ``policy`` is the label of
-    each container.
+    """Selected containers at these addresses, on the proxy's network.
+
+    ``policy`` is the label of each container.
     """
     nodes = [
         container(f"node{number}", networks=[Attachment("app", address)])

@@ -1,5 +1,6 @@
-"""A small API server on loopback: objects in a dictionary, and the HTTP of Kubernetes. The server
-has the kinds that the operator and kopf need. `refuse` makes a request fail.
+"""A small API server on loopback: objects in a dictionary, and the HTTP of Kubernetes.
+
+The server has the kinds that the operator and kopf need. `refuse` makes a request fail.
 """
 
 import asyncio

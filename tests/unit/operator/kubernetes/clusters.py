@@ -1,5 +1,6 @@
-"""A cluster with random events, and its invariants. Each event is a method of two numbers, which
-choose the object.
+"""A cluster with random events, and its invariants.
+
+Each event is a method of two numbers, which choose the object.
 """
 
 import contextlib

@@ -1,4 +1,5 @@
 """Random events in a cluster, and an operator that is killed anywhere, end in the wanted state.
+
 After each event the test checks the invariants (`Clusters.check`). In pauses without events the
 operator must come to rest, with everything as wished.
 """

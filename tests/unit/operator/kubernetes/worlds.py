@@ -258,8 +258,9 @@ class World:
         self.check_lan_relays(plan, unready)
 
     def check_lan_relays(self, plan: ClusterPlan, unready: set[str]) -> None:
-        """Exactly the proxies with multicast have a LAN relay, which knows the proxy's address. If
-        a finding reports an obstacle, the proxy stays, and gets no LAN relay meanwhile.
+        """Exactly the proxies with multicast have a LAN relay, which knows the proxy's address.
+
+        If a finding reports an obstacle, the proxy stays, and gets no LAN relay meanwhile.
         """
         lan_relays = {}
         for pod in self.own():

@@ -312,8 +312,10 @@ def test_a_tool_inside_ends_the_registration_of_another_node() -> None:
 def test_a_node_that_makes_room_for_its_successor_ends_none_of_its_registrations(
     method: str, params: list[Any]
 ) -> None:
-    """The master shuts down the older node of a name. This node unregisters with its own URI, and
-    the master answers 1. That answer must not end the newer node's lease.
+    """The master shuts down the older node of a name.
+
+    This node unregisters with its own URI, and the master answers 1. That answer must not end the
+    newer node's lease.
     """
     addressing = world()
     done = exchange(addressing, NODE, py_call(method, *params), py_reply([1, "not known", 0]))

@@ -601,8 +601,10 @@ def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
 
 @pytest.mark.parametrize("count", [1, MOST_MAPPINGS])
 def test_a_participant_with_other_locators_than_before_is_met_anew(count: int) -> None:
-    """After a restart, a forged announcement may come before the participant's own. With 16 forged
-    locators the participant got no port. Fast DDS ignores new locators of a known participant.
+    """After a restart, a forged announcement may come before the participant's own.
+
+    With 16 forged locators the participant got no port. Fast DDS ignores new locators of a known
+    participant.
     """
     domain = make_domain(lan_relay=None, ports=LONG_RANGE)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)

@@ -78,8 +78,10 @@ def test_a_port_more_is_a_greater_number(ports: list[int]) -> None:
 
 @given(st.integers(1, 60_000), st.data())
 def test_no_number_keeps_fast_dds_busy(size: int, drawn: st.DataObject) -> None:
-    """Fast DDS counts up to a number in steps of 1. With 1,100 ports a participant counted for
-    days, and so it did after a container had announced five locators in the participant's name.
+    """Fast DDS counts up to a number in steps of 1.
+
+    With 1,100 ports a participant counted for days, and so it did after a container had announced
+    five locators in the participant's name.
     """
     port_store = make_port_store(ports=PortRange(2000, 1999 + size))
     ports = drawn.draw(st.lists(st.integers(2000, 1999 + size), max_size=16, unique=True))
@@ -203,6 +205,7 @@ def count_of(question: bytes) -> int:
 
 def test_participants_that_come_and_go_do_not_raise_the_count_of_others() -> None:
     """A participant ignores counts that are not greater than the last, also from the next process.
+
     Once participants that came and went for an hour made others ignore the next process.
     """
     first = make_port_store(1000.0)

@@ -436,8 +436,10 @@ def test_an_answer_inside_is_not_held_up_either() -> None:
 
 @pytest.mark.parametrize("speaks_another", [False, True])
 def test_an_announcement_beside_an_answer_is_charged(speaks_another: bool) -> None:
-    """Otherwise an address could exceed its allowance with announcements behind an answer. Each
-    announcement goes to all ports of the peers at once, and no other source would have its turn.
+    """Otherwise an address could exceed its allowance with announcements behind an answer.
+
+    Each announcement goes to all ports of the peers at once, and no other source would have its
+    turn.
     """
     domain = make_domain()
     prove(domain, INSIDE, ROBOT)
