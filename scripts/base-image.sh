@@ -15,8 +15,8 @@ tree=$(mktemp -d)
 trap 'rm -rf "$tree"' EXIT
 debootstrap --variant=minbase --include=ca-certificates "$suite" "$tree" "$mirror" >&2
 
-# Where a company's own certificates stand between here and the package index, pip
-# inside the image needs them as much as pip outside.
+# If a company's certificates are necessary for the package index, pip inside the image
+# needs these certificates, too.
 changes=()
 bundle=/etc/ssl/certs/ca-certificates.crt
 if [ -n "${PIP_CERT:-${SSL_CERT_FILE:-}}" ]; then

@@ -1,11 +1,11 @@
 #!/bin/sh
-# Sourced by scripts that install Debian packages: what is missing, and having it installed.
+# Sourced by scripts that install Debian packages: find and install missing packages.
 
 _is_installed() {
     dpkg-query -W -f '${Status}\n' "$1" 2>/dev/null | grep -q '^install ok installed$'
 }
 
-# need NAME PACKAGE…: sets $missing; ends the script NAME where there is nothing to do, or no way.
+# need NAME PACKAGE…: sets $missing. Ends the script NAME if nothing is missing or installable.
 need() {
     script=$1
     shift
@@ -31,7 +31,7 @@ need() {
 install_missing() {
     export DEBIAN_FRONTEND=noninteractive
     apt="apt-get -o DPkg::Lock::Timeout=300 -o Acquire::Retries=3"
-    # A fresh machine has no package lists; one that has them may hold outdated ones.
+    # A fresh machine has no package lists, and existing lists may be outdated.
     $apt update -q
     # shellcheck disable=SC2086
     $apt install -q -y --no-install-recommends $missing

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Print the path of a Go that builds what the tests need: the machine's own from 1.21 on, which
-# fetches the toolchain that a module asks for; else one from the Go module proxy, put into the
-# user's cache. Any Linux on amd64 or arm64.
+# Print the path of a Go for the programs of the tests: the machine's own from 1.21 on, which
+# fetches the toolchain that a module asks for. Otherwise fetch Go from the Go module proxy into the
+# user's cache. Works on any Linux on amd64 or arm64.
 set -euo pipefail
 version=1.26.0
 declare -A sum_of=(

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Installs what the layer abuse (tests/abuse) needs, on Debian or Ubuntu, as root: the tools for its
-# network namespaces and for the kernel plane. Does nothing where both are there.
+# Installs the requirements of the layer abuse (tests/abuse), on Debian or Ubuntu, as root: the tools
+# for network namespaces and for the kernel plane. Does nothing if both are installed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/debian.sh

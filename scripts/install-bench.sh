@@ -1,7 +1,7 @@
 #!/bin/sh
-# Installs what `make bench` measures and compares with, on Debian or Ubuntu, as root: ROS 1 and
-# ROS 2 as their tests have them, image messages, the peers, the tools of the kernel's packet filter,
-# and the programs of a Kubernetes cluster. Does nothing when all of it is there.
+# Installs the requirements of `make bench`, on Debian or Ubuntu, as root: ROS 1 and ROS 2 of the
+# tests, image messages, the other relays, the tools of the kernel's packet filter, and the programs
+# of a Kubernetes cluster. Does nothing if all are installed.
 set -eu
 cd "$(dirname "$0")/.."
 . scripts/debian.sh
@@ -14,7 +14,7 @@ need install-bench \
     socat haproxy nginx libnginx-mod-stream nftables conntrack iproute2 procps \
     libsensor-msgs-dev python3-sensor-msgs
 
-# What is only compared with must not start by itself, now or later, and take port 80.
+# The other relays must not start by themselves, now or later, and take port 80.
 hold_back_services() {
     if [ ! -e /usr/sbin/policy-rc.d ]; then
         printf '#!/bin/sh\nexit 101\n' >/usr/sbin/policy-rc.d

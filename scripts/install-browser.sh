@@ -1,7 +1,7 @@
 #!/bin/sh
-# Installs what the tests of the live page (tests/browser) need besides ROS, on Debian, as root:
-# Chromium, its WebDriver, and a font. Does nothing when all of it is there; on Ubuntu, whose
-# Chromium is a snap, Chrome and its driver will do as well.
+# Installs the requirements of the live page's tests (tests/browser) besides ROS, on Debian, as root:
+# Chromium, its WebDriver, and a font. Does nothing if all are installed. On Ubuntu, where Chromium is
+# a snap, install Chrome and chromedriver instead.
 set -eu
 . "$(dirname "$0")/debian.sh"
 

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Install Docker Compose, which the tests of the examples need. Needs root, and
-# scripts/install-docker.sh before. What is already there is left as it is.
+# Install Docker Compose for the tests of the examples. Needs root, and
+# scripts/install-docker.sh before. An installed Compose stays.
 set -euo pipefail
 
-# Version 2, the plug-in that users have; or version 1 where nothing else can be had.
+# Version 2, the plug-in that users have; or version 1 if version 2 is not available.
 compose() {
   docker compose version >/dev/null 2>&1 ||
     { command -v docker-compose >/dev/null && ! command -v go >/dev/null; }
@@ -28,7 +28,7 @@ install_compose() {
 build_compose() {
   local version=v2.40.3 module=github.com/docker/compose/v2
   command -v go >/dev/null || return 1
-  # In a module of our own: Compose's has directives that keep `go install` from it.
+  # In a separate module: Compose's module has directives that `go install` refuses.
   (
     cd "$(mktemp -d)" &&
       trap 'rm -rf "$PWD"' EXIT &&

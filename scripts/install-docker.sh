@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Install a Docker engine, and what the tests make images and other machines with.
-# An engine that is already there, Debian's or not, is left as it is. Needs root.
+# Install a Docker engine, and the tools with which the tests make images and other machines.
+# An installed engine, Debian's or not, stays. Needs root.
 set -euo pipefail
 
 declare -A package_of=(
@@ -17,7 +17,7 @@ packages() {
   DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends "$@"
 }
 
-# Newer releases have the command line in a package of its own.
+# Newer releases have the command line in a separate package.
 command_line() {
   command -v docker >/dev/null || packages docker-cli
 }

@@ -1,11 +1,11 @@
 #!/bin/sh
-# Installs Prometheus and promtool, with which the dashboard and the alerts are tested, on Debian or
-# Ubuntu, as root. Does nothing when they are there.
+# Installs Prometheus and promtool for the tests of dashboard and alerts, on Debian or Ubuntu, as
+# root. Does nothing if both are installed.
 set -eu
 . "$(dirname "$0")/debian.sh"
 
 need install-prometheus prometheus
-# The tests start their own: the package's service must not start now, nor with the machine.
+# The tests start Prometheus. The package's service must not start, now or with the machine.
 if [ ! -e /usr/sbin/policy-rc.d ]; then
     printf '#!/bin/sh\nexit 101\n' >/usr/sbin/policy-rc.d
     chmod 755 /usr/sbin/policy-rc.d

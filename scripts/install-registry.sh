@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Build a container registry, to which `make release-check` pushes: a Go module, pinned in
-# scripts/registry. Prints its path. Kept in the user's cache until a pin changes.
+# Build a container registry for `make release-check`: a Go module, pinned in scripts/registry.
+# Prints the path of the program, which stays in the user's cache until a pin changes.
 set -euo pipefail
 cd "$(dirname "$0")/registry"
 cache=${XDG_CACHE_HOME:-$HOME/.cache}/rosproxy
@@ -9,7 +9,7 @@ if [ ! -x "$program" ]; then
   echo "building a registry, in two minutes" >&2
   go=$(../go.sh)
   mkdir -p "$cache"
-  # Moved when it is whole: a build that is broken off leaves nothing that looks like one.
+  # Moved at the end, so that an interrupted build leaves no incomplete program.
   CGO_ENABLED=0 "$go" build -trimpath -ldflags="-s -w" -o "$program.$$" \
     github.com/distribution/distribution/v3/cmd/registry
   mv "$program.$$" "$program"

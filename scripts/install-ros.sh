@@ -1,7 +1,7 @@
 #!/bin/sh
-# Installs what the real-ROS test layer (tests/ros) needs, on Debian or Ubuntu, as root:
-# ROS 1 with its tools, the headers to compile the C++ test nodes, and the tools that
-# lay out the network namespaces. Does nothing when all of it is there.
+# Installs the requirements of the real-ROS test layer (tests/ros), on Debian or Ubuntu, as root:
+# ROS 1 with tools, the headers to compile the C++ test nodes, and the tools for network
+# namespaces. Does nothing if all are installed.
 set -eu
 . "$(dirname "$0")/debian.sh"
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Installs what the ROS 2 layer (tests/ros2) needs, on Debian or Ubuntu, as root: two distributions
-# of ROS 2 and another vendor's DDS, each in an environment of its own in the user's cache, and the
-# tools that lay out the network namespaces. Given names of environments, only those. Does nothing
-# where all of it is there.
+# Installs the requirements of the ROS 2 layer (tests/ros2), on Debian or Ubuntu, as root: two
+# distributions of ROS 2 and another vendor's DDS, each in a separate environment in the user's cache,
+# and the tools for network namespaces. Arguments select environments. Does nothing if all are
+# installed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/debian.sh

@@ -25,8 +25,8 @@ if grep -n ' @ \|://' "$work/constraints.txt"; then
 fi
 cp "$work/constraints.txt" "$target"
 
-# What the layers ros2 and zenoh of the tests run: environments of their own. empy is left out: it
-# comes as sources alone, and only programs that generate code need it.
+# The separate environments of the test layers ros2 and zenoh. Without empy, which is available as
+# sources only, and which only code generators need.
 for wanted in tests/{ros2,zenoh}/environments/*.in; do
   "$work/venv/bin/uv" pip compile --quiet --no-header --universal --python-version 3.11 \
     --generate-hashes --no-emit-package empy --output-file "${wanted%.in}.txt" "$wanted"

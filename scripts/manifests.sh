@@ -1,9 +1,8 @@
 #!/usr/bin/env bash
-# Write what is made from the chart: manifests/install.yaml, its README.md, and the tables of the
-# RosProxy's fields in docs/; and that of the proxy's settings.
+# Write the generated files: manifests/install.yaml and the chart's README.md from the chart, and the
+# tables of the RosProxy's fields and of the proxy's settings in docs/.
 #   scripts/manifests.sh [DIRECTORY]      manifest and README go there instead, and the tables stay
-# Needs helm and helm-docs: those of the cluster's programs (scripts/install-kubernetes.sh), else the
-# PATH's.
+# Needs helm and helm-docs, from the cluster's programs (scripts/install-kubernetes.sh) or from PATH.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 manifests=${1:-manifests}
@@ -15,7 +14,7 @@ namespace=rosproxy-system
 {
   echo "# Made from charts/rosproxy-operator by scripts/manifests.sh: don't change it here."
   printf -- '---\napiVersion: v1\nkind: Namespace\nmetadata:\n  name: %s\n' "$namespace"
-  # A helm that was not built by its own makefile takes the cluster for an ancient one.
+  # Without --kube-version, a helm that its makefile did not build assumes an ancient cluster.
   helm template rosproxy charts/rosproxy-operator --namespace "$namespace" --kube-version 1.30.0 --no-hooks --set crds.keep=false |
     sed -e '/^# Source: /d' -e 's/app.kubernetes.io\/managed-by: Helm/app.kubernetes.io\/managed-by: kubectl/' \
       -e '/helm.sh\/chart: /d'

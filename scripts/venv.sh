@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Make a virtual environment with rosproxy in it, editable.
+# Make a virtual environment with an editable rosproxy.
 #   scripts/venv.sh DIR [EXTRAS]      for example: scripts/venv.sh .venv dev,uvloop
-# PYTHON names the interpreter to use; without it the first Python >= 3.11 of PATH is taken.
+# PYTHON names the interpreter. The default is the first Python >= 3.11 in PATH.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -23,7 +23,7 @@ find_python() {
   return 1
 }
 
-# Debian and Ubuntu ship `venv` in a package of its own.
+# Debian and Ubuntu ship `venv` in a separate package.
 install_venv_module() {
   local package
   package="python$("$1" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv"
@@ -51,6 +51,6 @@ pins=$(mktemp)
 trap 'rm -f "$pins"' EXIT
 "$directory/bin/python" scripts/pins.py "build-system,${2:-}" >"$pins"
 install=("$directory/bin/python" -m pip install --quiet --disable-pip-version-check)
-# Wheels only: an archive of sources would run its own code, with whatever that needs unpinned.
+# Wheels only: an archive of sources would run code with unpinned build requirements.
 "${install[@]}" --only-binary :all: --require-hashes --requirement "$pins"
 "${install[@]}" --no-deps --no-build-isolation --editable .

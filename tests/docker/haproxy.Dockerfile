@@ -1,4 +1,4 @@
-# HAProxy from Debian, for the example that uses Docker's own image of it.
+# HAProxy from Debian, for the example that uses Docker's image of HAProxy.
 ARG BASE_IMAGE
 FROM ${BASE_IMAGE}
 RUN apt-get update \
