@@ -1,12 +1,12 @@
-// A roscpp node that publishes or receives images when it is told to, by lines on standard input.
+// A roscpp node that publishes or receives images, by commands on standard input.
 //
 //   go TOPIC BYTES RATE SECONDS WINDOW SOCKET   -> "= sent COUNT"
 //   on TOPIC SOCKET                             -> "= on"
 //   count                                       -> "= count COUNT"
 //   off                                         -> "= got COUNT SECONDS MICROSECONDS..."
 //
-// With RATE 0 a message is sent as soon as no more than WINDOW are on their way: the receiver tells
-// by datagrams to SOCKET, past the network. images.py beside takes the same.
+// With RATE 0 the node sends whenever at most WINDOW messages are on the way. The receiver reports
+// arrivals by datagrams to SOCKET, past the network. images.py takes the same commands.
 #include <ros/ros.h>
 #include <sensor_msgs/Image.h>
 #include <sys/socket.h>
@@ -28,7 +28,7 @@ static sockaddr_un at(const std::string& path) {
   return address;
 }
 
-// How many messages may still be sent.
+// The number of messages that may still be sent.
 class Window {
  public:
   Window(const std::string& path, int size) : path_(path), left_(size) {
@@ -43,7 +43,7 @@ class Window {
     close(fd_);
     unlink(path_.c_str());
   }
-  // A message that is lost gives its place back after a second.
+  // A lost message frees its place after a second.
   void take() {
     char byte;
     while (recv(fd_, &byte, 1, left_ > 0 ? MSG_DONTWAIT : 0) == 1) left_++;

@@ -1,14 +1,14 @@
-// The two ends of TCPROS connections, fast enough not to be what is measured.
+// The two ends of TCPROS connections, fast enough not to distort a measurement.
 //
-//   wire source                                    serves topics; prints its port
+//   wire source                                    serves topics; prints the port
 //   wire sink HOST PORT CONNECTIONS WARM SECONDS   takes /stream; prints bytes of each connection
 //   wire ping HOST PORT CONNECTIONS SECONDS SIZE   /echo there and back, one connection after the
 //                                                  other; prints nanoseconds of each
 //   wire hold HOST PORT CONNECTIONS TOPIC          connects, and does not read
 //
-// The sink has the kernel throw the bytes away (MSG_TRUNC): a reader that copies them would be the
-// slower end of a direct connection. It prints `connected`, waits for a line on its standard input,
-// and prints `begin` and `end` as they happen. Whoever holds ends with its standard input.
+// The sink lets the kernel throw the bytes away (MSG_TRUNC): a reader that copies would be the
+// slower end of a direct connection. The sink prints `connected`, waits for a line on standard
+// input, and prints `begin` and `end`. `wire hold` ends with its standard input.
 #include <arpa/inet.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
@@ -90,8 +90,8 @@ static void echo(int fd) {
     if (!writeAll(fd, buffer.data(), size)) return;
 }
 
-// One thread for all, with a bounded write for each in turn: a source that is fair, so that the
-// shares tell of what is in between.
+// A single thread for all, with a bounded write for each connection in turn: a fair source, so that
+// the shares show the fairness of the relay.
 static void stream(int poll) {
   static const std::vector<char> data(kTurn, 'x');
   std::vector<epoll_event> events(1024);
@@ -159,7 +159,7 @@ static std::vector<int> connectedMany(const Strings& arguments, const std::strin
   return sockets;
 }
 
-// Takes what comes, one read of a connection at a time, and counts it.
+// Reads and counts, with a single read of a connection at a time.
 class Sink {
  public:
   explicit Sink(const std::vector<int>& sockets) : sockets_(sockets), counts_(sockets.size()) {
@@ -171,7 +171,7 @@ class Sink {
     }
   }
 
-  // Seconds that it took.
+  // The elapsed seconds.
   double take(double seconds) {
     auto begin = Clock::now();
     std::fill(counts_.begin(), counts_.end(), 0);
@@ -228,7 +228,7 @@ static uint64_t bounce(int fd, std::vector<char>& message) {
 static int ping(const Strings& arguments) {
   auto sockets = connectedMany(arguments, "/echo");
   std::vector<char> message(std::stoi(arguments[4]), 'x');
-  // Once around, and a hundred times at least: nothing of that counts.
+  // A warm-up that does not count: once around, and a hundred times at least.
   for (size_t i = 0; i < std::max<size_t>(100, sockets.size()); i++)
     bounce(sockets[i % sockets.size()], message);
   std::vector<uint64_t> times;

@@ -6,7 +6,7 @@
 
 #include "node.hpp"
 
-// Adds two integers, unless it is told to stop before `--seconds` are over.
+// Adds two integers, unless preempted before `--seconds` are over.
 void actionServer(const Options& options) {
   ros::NodeHandle node;
   typedef actionlib::SimpleActionServer<actionlib::TwoIntsAction> Server;
@@ -44,9 +44,8 @@ static int status(const actionlib::SimpleClientGoalState& state) {
   return -1;
 }
 
-// Sends one goal; with `--cancel 1` takes it back when feedback comes. Only once the status has named
-// the goal: until then a status of before the goal may arrive, and a client that has cancelled its
-// goal takes the goal for lost.
+// Sends a goal; with `--cancel 1` cancels after feedback, only once the status has the goal. Before,
+// an older status may arrive, and a client that has cancelled would take the goal for lost.
 void actionClient(const Options& options) {
   typedef actionlib::SimpleActionClient<actionlib::TwoIntsAction> Client;
   Client client(options.text("action"), true);

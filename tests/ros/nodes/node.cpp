@@ -1,8 +1,8 @@
-// Small roscpp nodes, one for each role; node.py beside takes the same arguments.
+// Small roscpp nodes, one for each role. node.py takes the same arguments.
 //
 //     node ROLE [--option value]... [__name:=NAME]
 //
-// Each prints plain lines that the tests wait for.
+// Each node prints plain lines for the tests.
 #include <ros/ros.h>
 #include <std_msgs/String.h>
 #include <topic_tools/MuxSelect.h>
@@ -24,7 +24,7 @@ static std::string payload(const std::string& word, int number, size_t size) {
   return text;
 }
 
-// What identifies a payload: its first two words, its size and its checksum.
+// The identity of a payload: the first two words, the size and the checksum.
 static std::string describe(const std::string& text) {
   std::string word, number;
   std::istringstream(text.substr(0, 100)) >> word >> number;
@@ -37,7 +37,7 @@ static std::string describe(const std::string& text) {
   return line.str();
 }
 
-// Publishes for ever, or `--count` messages; with `--latch 1` keeps the last one.
+// Publishes for ever, or `--count` messages; latched with `--latch 1`.
 static void publish(const Options& options) {
   ros::NodeHandle node;
   bool latch = options.number("latch", 0) > 0;
@@ -57,7 +57,7 @@ static void publish(const Options& options) {
   ros::spin();
 }
 
-// Publishes; once the file `--when` is there, also to `--then`; `--last` ends the first topic then.
+// Publishes; once the file `--when` exists, also to `--then`. `--last` ends the first topic then.
 static void publishMore(const Options& options) {
   ros::NodeHandle node;
   auto first = node.advertise<std_msgs::String>(options.text("topic"), 10);
@@ -108,13 +108,13 @@ static void serve(const Options& options) {
   ros::spin();
 }
 
-// Calls; once more, if that fails and each call has its own connection. Of such, roscpp loses the
-// reply of one in some 7,000 by itself, also with nothing between two roscpp nodes.
+// Calls, and repeats a failed call unless the connection is persistent. With a connection for each
+// call, roscpp loses a reply in some 7,000 calls, also without anything between two roscpp nodes.
 static bool callOnceOrTwice(ros::ServiceClient& client, topic_tools::MuxSelect& call) {
   return client.call(call) || (!client.isPersistent() && client.call(call));
 }
 
-// Waits for the service, then calls it `--count` times; a failed call is only told.
+// Waits for the service, then makes `--count` calls, and prints failed calls.
 static void call(const Options& options) {
   ros::NodeHandle node;
   std::string service = options.text("service");
@@ -136,7 +136,7 @@ static void call(const Options& options) {
   say("done");
 }
 
-// Sets `--key` to one value of each type that roscpp can send.
+// Sets `--key` to a value of each type that roscpp can send.
 static void setParameters(const Options& options) {
   ros::NodeHandle node;
   std::string key = options.text("key");
@@ -168,7 +168,7 @@ static void getParameter(const Options& options) {
   say(found ? "value " + value.toXml() : "no value");
 }
 
-// Prints `--key` whenever it changes, read the way that subscribes to it at the master.
+// Prints `--key` after each change, with a read that subscribes at the master.
 static void watchParameter(const Options& options) {
   ros::NodeHandle node;
   std::string key = options.text("key"), last = "?";
@@ -201,10 +201,10 @@ int main(int argc, char** argv) {
   std::vector<std::string> words(argv + 2, argv + argc);
   ros::start();
   say("node " + ros::this_node::getName());
-  // The first line for rosout makes roscpp subscribe to a parameter. If that happens only when
-  // a node of the same name has it shut down, the master takes it for the newer of the two.
+  // The first line for rosout makes roscpp subscribe to a parameter. If this node did so only during
+  // its shutdown by a node of the same name, the master would take this node for the newer.
   ROS_INFO("started");
   roles.at(argv[1])(Options(words));
-  // Left to static destructors, the shutdown dead-locks with one that SIGINT asks for.
+  // In static destructors, the shutdown would dead-lock with a shutdown by SIGINT.
   ros::shutdown();
 }

@@ -1,4 +1,4 @@
-// What the two sources of the C++ test nodes share.
+// Shared by the two sources of the C++ test nodes.
 #pragma once
 
 #include <cstdlib>
@@ -26,7 +26,7 @@ class Options {
   std::map<std::string, std::string> values_;
 };
 
-// One line in one write, so that lines of several threads do not mix.
+// A line in a single write, so that lines of several threads do not mix.
 inline void say(const std::string& line) { std::cout << line + "\n" << std::flush; }
 
 void actionServer(const Options& options);
