@@ -79,7 +79,7 @@ class Layer:
 
     @property
     def cache(self) -> Path:
-        """Where pytest notes which tests failed."""
+        """The folder in which pytest notes failed tests."""
         return LOGS / f"{self.name}-cache"
 
     def report(self, again: bool = False) -> Path:
