@@ -1,4 +1,4 @@
-"""What tests of all layers share: ports that no other worker draws."""
+"""Shared by all layers: ports that no other worker draws."""
 
 import os
 

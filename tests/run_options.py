@@ -14,7 +14,7 @@ from rosproxy.settings import Settings
 
 
 def parse_settings(options: Mapping[str, Any]) -> Settings:
-    """What ``rosproxy run`` makes of options, and of nothing in the environment.
+    """The settings of ``rosproxy run`` with options and an empty environment.
 
     Raises SettingError for the first value that can't be used.
     """
@@ -24,7 +24,7 @@ def parse_settings(options: Mapping[str, Any]) -> Settings:
 
 
 def settings_of(variables: Mapping[str, str]) -> Settings:
-    """What ``rosproxy run`` makes of an environment. Raises SettingError."""
+    """The settings of ``rosproxy run`` with an environment. Raises SettingError."""
     return _run([], variables)
 
 

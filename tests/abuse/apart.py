@@ -20,7 +20,7 @@ INSIDE = "198.18.2.0/24"
 """The proxy's inside address and inside network."""
 APART_HOST = "198.18.1.254"
 APART_MASTER = "198.18.1.1"
-"""What outside knows the proxy's machine by, and the master's address."""
+"""The outside address of the proxy's machine, and the master's address."""
 NODES = tuple(f"198.18.2.{number}" for number in range(11, 31))
 STRANGERS = tuple(f"198.18.1.{number}" for number in range(11, 31))
 """Machines outside."""

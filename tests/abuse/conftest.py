@@ -97,7 +97,7 @@ class Abused(Process):
         return float(line.split()[-1])
 
     def lease(self, of: FakeNode) -> Address:
-        """Where outside reaches a node."""
+        """The address at which outside reaches a node."""
         lease = next(lease for lease in self.status()["nodes"] if of.name in lease["nodes"])
         return self.options["advertise_host"], lease["port"]
 

@@ -27,7 +27,7 @@ LAST_WAIT = 0.5
 
 
 class Figures(NamedTuple):
-    """What a pair has seen."""
+    """The results of a pair."""
 
     sent: int
     lost: int

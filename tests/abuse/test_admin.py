@@ -87,7 +87,7 @@ def writers(address: str, number: int) -> Iterator[tuple[str, Address, bytes]]:
 
 
 def told_writers(abused: Abused) -> int:
-    """How many writers of hostile participants the status shows or counts."""
+    """The number of hostile participants' writers that the status shows or counts."""
     (domain,) = abused.status()["domains"]
     return sum(
         len(participant["publishes"]) + participant["left_out"]

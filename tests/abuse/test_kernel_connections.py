@@ -66,7 +66,7 @@ def syn(source: str, to: Address, port: bytes) -> bytes:
 
 
 def plane(abused: Abused) -> dict[str, Any]:
-    """What the status says of how the topics of the only node are forwarded."""
+    """The data plane of the only node's topics in the status."""
     (node,) = abused.status()["nodes"]
     told: dict[str, Any] = node["data_plane"]
     return told

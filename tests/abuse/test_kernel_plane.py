@@ -51,7 +51,7 @@ def abused(start_abused, forwarding, first) -> Abused:  # noqa: F811 - the fixtu
 
 
 def data_lease(abused: Abused) -> dict[str, Any]:
-    """What the status says of the port for user data."""
+    """The port for user data in the status."""
     (domain,) = abused.status()["domains"]
     leases = [lease for participant in domain["inside"] for lease in participant["leases"]]
     (lease,) = [lease for lease in leases if lease["kind"] == "data"]

@@ -92,7 +92,7 @@ def announced() -> list[bytes]:
 
 
 def arrived(reader: Participant, last: bytes) -> list[bytes]:
-    """What has come to the port for user data in front of the last datagram."""
+    """The datagrams at the port for user data before the last datagram."""
     datagrams = list[bytes]()
     while (datagram := reader.data.recv(65536)) != last:
         datagrams.append(datagram)

@@ -27,7 +27,7 @@ EVIL = NODES[1]
 PEER = STRANGERS[0]
 PORTS = 64
 ANNOUNCED = APART, WELL_KNOWN
-"""Where participants inside announce themselves."""
+"""The target of announcements from inside."""
 LONGEST_GAP = 0.3
 """Seconds without a message, of a hundred in a second."""
 

@@ -112,7 +112,7 @@ class Book:
 
     @classmethod
     def load(cls, path: Path) -> Book:
-        """What `save` wrote."""
+        """The book that `save` wrote."""
         document = json.loads(path.read_text())
         book = cls(document["machine"], "", document["axes"], document["notes"])
         for row in document["rows"]:

@@ -115,7 +115,7 @@ async def _measure_size(book: Book, size: int, seconds: float) -> None:
 
 
 class Bench:
-    """What is measured, and since when the operator runs."""
+    """The measured programs, and the start time of the operator."""
 
     def __init__(
         self, plane: ControlPlane, cluster: CrowdedCluster, operator: Operator, started: float

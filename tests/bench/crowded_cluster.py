@@ -129,7 +129,7 @@ class CrowdedCluster:
             await self._seen.wait_for(lambda: len(self.made) >= count)
 
     async def made_on(self, node: str, seconds: float) -> float:
-        """When the proxy of a node was made. TimeoutError."""
+        """The time when the proxy of a node was created. Raises TimeoutError."""
         async with asyncio.timeout(seconds), self._seen:
             await self._seen.wait_for(lambda: node in self.made)
         return self.made[node]
@@ -154,7 +154,7 @@ class CrowdedCluster:
             self._do(self._run(path, meta["name"], node))
 
     async def _run(self, path: str, name: str, node: str) -> None:
-        """As scheduler and kubelet do."""
+        """Bind and run a pod, like scheduler and kubelet."""
         target = {"apiVersion": "v1", "kind": "Node", "name": node}
         await self._call(
             "POST", f"{path}/binding",
@@ -183,7 +183,7 @@ class CrowdedCluster:
         await web.TCPSite(self._server, "0.0.0.0", ADMIN_PORT, backlog=4096).start()
 
     async def _answer(self, request: web.BaseRequest) -> web.Response:
-        """What a proxy answers in which nothing happens."""
+        """The answer of a proxy without events."""
         if request.path == "/status/changes":
             if request.query.get("since") == "1":
                 await asyncio.sleep(float(request.query.get("within", "25")))

@@ -19,7 +19,7 @@ NO_MASTER = "none"
 
 
 class SlaveApi:
-    """What master and subscribers call."""
+    """The calls from master and subscribers."""
 
     def __init__(self, address: str, port: int) -> None:
         self._address = address

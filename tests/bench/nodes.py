@@ -1,4 +1,4 @@
-"""What 1 to 1,000 inside nodes with ten topics each cost, and how long the proxy takes for all.
+"""The cost of 1 to 1,000 inside nodes with ten topics each, and the proxy's times for all nodes.
 
 Registration is compared with nodes that register at the master itself.
 """
@@ -23,8 +23,9 @@ FIRST_SLAVE = 50000
 IDLE_SECONDS = 10.0
 QUICK_IDLE_SECONDS = 6.0
 SETTLE_SECONDS = 12.0
-"""What registering has left to do: the first two probes of each node make the connection that is
-kept, and what the master knows is read once more."""
+"""Seconds for the work after registering: the first two probes of each node, which make the kept
+connection, and another reading of the master's graph.
+"""
 LEAST_NODES = 100
 """With fewer nodes, the noise of the process exceeds the memory of the nodes."""
 PATIENCE = 120.0
@@ -94,7 +95,7 @@ def busy(pid: int, seconds: float) -> float:
 
 
 def topics_at_master(machines: World) -> int:
-    """How many topics of the nodes the master has a publisher for."""
+    """The number of the nodes' topics with a publisher at the master."""
     with machines.entered("outside"), ServerProxy(MASTER) as master:
         state: Any = master.getSystemState("/bench")
     return sum(topic.startswith("/crowd/") for topic, _ in state[2][0])

@@ -75,7 +75,7 @@ def measure(book: Book, machines: World, size: int, seconds: float) -> None:
 
 
 def first_rows(browser: Browser) -> float:
-    """When the table has rows, in seconds after the page was asked for."""
+    """The seconds from opening the page until the table has rows."""
     seen: list[float] = []
 
     def are_there() -> bool:
@@ -103,7 +103,7 @@ def events(count: int) -> tuple[int, list[int]]:
 
 
 def costs() -> list[float]:
-    """What each document took, in seconds."""
+    """The seconds of each document."""
     connection = http.client.HTTPConnection("127.0.0.1", PORT, timeout=PATIENCE)
     connection.request("GET", "/cost")
     took: list[float] = json.loads(connection.getresponse().read())

@@ -178,7 +178,7 @@ def environment(place: World) -> dict[str, str]:
 
 
 def python(name: str) -> str:
-    """That of an environment of the ROS 2 layer's."""
+    """The Python of an environment of the ROS 2 layer."""
     return str(ENVIRONMENTS / name / "bin/python")
 
 

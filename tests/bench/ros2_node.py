@@ -87,7 +87,7 @@ class Talker:
         return f"sent {count}"
 
     def count(self) -> str:
-        """How many have arrived of a stream."""
+        """The number of arrived messages of a stream."""
         return f"count {len(self._ages)}"
 
     def off(self) -> str:

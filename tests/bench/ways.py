@@ -23,7 +23,7 @@ from tests.bench.node import NAME, NO_MASTER
 from tests.bench.world import ADDRESSES, HOST, MASTER, World, world
 
 PORT = 46000
-"""Where the peers listen on the host; not in rosproxy's default range."""
+"""Ports of the other relays on the host, outside of rosproxy's default range."""
 BY_HAND = "nft by hand"
 KERNEL = "rosproxy kernel"
 SPLICE = "rosproxy splice"

@@ -55,7 +55,7 @@ def lab(lab_of_all: Lab) -> Iterator[Lab]:
 
 @pytest.fixture
 def machine(lab: Lab) -> Place:
-    """Where the browser is: beside the proxy."""
+    """The machine of the browser: the proxy's."""
     return lab.place("px")
 
 

@@ -18,7 +18,7 @@ from tests.ros.topology import Place, run_command
 
 UNKNOWN = "\N{EN DASH}"
 MANY_PORT = 21312
-"""Where made-up nodes are shown."""
+"""The port of the page with fake nodes."""
 URL = f"http://127.0.0.1:{ADMIN_PORT}/"
 ROWS = """
 return [...document.querySelectorAll("#rows tr")].map((row) => ({

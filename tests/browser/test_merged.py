@@ -98,7 +98,7 @@ def second(lab: Lab) -> Iterator[Second]:
 
 @pytest.fixture
 def machine(lab: Lab) -> Place:
-    """Where the operator and the browser are: at the host, which is on both networks."""
+    """The machine of operator and browser: the host, which is on both networks."""
     return lab.place("host")
 
 

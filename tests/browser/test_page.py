@@ -31,7 +31,7 @@ from tests.ros.processes import wait_until
 from tests.ros.topology import OUT_HOST
 
 MOST_ROWS = 400
-"""What the page shows at once."""
+"""Rows that the page shows at once."""
 HOSTILE = "/<img src=x onerror=document.title='mine'>"
 
 

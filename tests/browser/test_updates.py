@@ -1,4 +1,4 @@
-"""What stays while the live page follows: the focus, what is chosen, what is said, the connection.
+"""The state of the live page during updates: focus, chosen line, announcements, connection.
 
 The nodes are made up (`tests.browser.many`).
 """

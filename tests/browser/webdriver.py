@@ -55,7 +55,7 @@ class Browser:
         self._post("/url", url=url)
 
     def run(self, script: str, *arguments: Any) -> Any:
-        """What a script returns."""
+        """Run a script. Return the result."""
         return self._post("/execute/sync", script=script, args=list(arguments))
 
     def resize(self, width: int, height: int) -> None:
@@ -79,7 +79,7 @@ class Browser:
         self._post("/actions", actions=[source])
 
     def screenshot(self) -> bytes:
-        """What is seen, as PNG."""
+        """The visible page, as PNG."""
         return base64.b64decode(self._call("GET", f"{self._session}/screenshot"))
 
     def console(self) -> list[str]:

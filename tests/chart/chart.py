@@ -173,7 +173,7 @@ def program() -> Path:
 def render(
     values: Values | None = None, *options: str, release: str = "rosproxy", chart: Path = CHART
 ) -> str:
-    """What the chart makes of values, as YAML."""
+    """The chart's objects for these values, as YAML."""
     words = ("template", release, chart, "--namespace", NAMESPACE, "--kube-version", KUBERNETES)
     done = helm(*words, *options, values=values)
     assert done.returncode == 0, done.stderr

@@ -138,7 +138,7 @@ def test_options_of_a_proxy_are_the_operators(name: str) -> None:
 
 
 def test_bounds_of_a_policy_are_the_operators() -> None:
-    """What the API server takes the operator can read."""
+    """The operator can read everything that the API server accepts."""
     (rule,) = SPEC["spec.policy"]["x-kubernetes-validations"]
     assert f"<= {MOST_AUTHORS_RULES}" in " ".join(rule["rule"].split())
     assert SPEC["spec.policy.rules[].kind"]["enum"] == [*RULE_KINDS]

@@ -140,7 +140,7 @@ def documented_rights() -> set[tuple[str, str, tuple[str, ...]]]:
 
 
 def test_named_secrets_only() -> None:
-    """What could be read or changed for harm is granted by name."""
+    """Rights on critical objects are for single names only."""
     rules = [rule for role in [*of_kind(objects(), "ClusterRole"), *of_kind(objects(), "Role")]
              for rule in role["rules"]]  # fmt: skip
     for rule in rules:

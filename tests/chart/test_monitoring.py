@@ -97,7 +97,7 @@ def test_the_operator_is_called_as_alerts_have_it(tmp_path: Path) -> None:
 
 
 def targets(directory: Path, labels: Json, endpoint: Json, *addresses: str) -> list[Json]:
-    """What Prometheus makes of addresses that were found with labels, by a monitor's rules."""
+    """Prometheus' targets for discovered addresses and labels, by a monitor's rules."""
     targets_file = directory / "found.json"
     targets_file.write_text(json.dumps([{"targets": addresses, "labels": labels}]))
     job = {"job_name": "found", "file_sd_configs": [{"files": [str(targets_file)]}],

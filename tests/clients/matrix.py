@@ -23,7 +23,7 @@ LIMITS: dict[str, tuple[str, ...]] = {
     "foxglove": (SERVE, SERVE_ON, CALL, CALL_ON),
     "roslisp": (SERVE_ON,),
 }
-"""What a library can't do."""
+"""Features that a library lacks."""
 
 
 def able(*needs: str) -> list[str]:

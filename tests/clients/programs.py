@@ -21,7 +21,7 @@ ROSNODEJS = (
 
 
 def programs() -> dict[str, tuple[str, ...]]:
-    """How a node of each library is started."""
+    """The command line of a node for each library."""
     return {
         "goroslib": (str(CACHE / "goroslib"),),
         "rosrust": (str(CACHE / "rosrust"),),

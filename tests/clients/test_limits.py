@@ -1,4 +1,4 @@
-"""What the matrix leaves out: the same fails without a proxy."""
+"""The gaps of the matrix: the same cases fail without a proxy."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class Container:
         return str(inspect(self.name)["NetworkSettings"]["Networks"][network]["IPAddress"])
 
     def resolve(self, name: str) -> set[str]:
-        """What a name leads to in there."""
+        """The addresses of a name in this container."""
         lines = self.run("getent", "ahostsv4", name, check=False).splitlines()
         return {line.split()[0] for line in lines}
 

@@ -29,7 +29,7 @@ class Got:
 
 @dataclass(frozen=True)
 class Log:
-    """What a node prints, read anew each time."""
+    """The output of a node, read anew each time."""
 
     read: Callable[[], str]
 

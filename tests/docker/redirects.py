@@ -7,7 +7,7 @@ from tests.docker.robot import Robot
 
 
 def rules(container: Container) -> str:
-    """What nftables has in a container's network; empty if no redirect is there."""
+    """The nftables rules in a container's network; empty without a redirect."""
     pid = inspect(container.name)["State"]["Pid"]
     text = run("nsenter", f"--net=/proc/{pid}/ns/net", "nft", "list", "tables")
     tables = [line.split()[-1] for line in text.splitlines() if "rosproxy-redirect" in line]

@@ -131,7 +131,7 @@ def all_run(proxy: Proxy) -> bool:
 
 
 def runs(proxy: Proxy) -> list[tuple[str, str]]:
-    """Which containers there are, and since when each runs."""
+    """The containers of a proxy with their start times."""
     inspections = (
         inspect(name, check=False) for name in (proxy.name, proxy.sandbox, proxy.lan_relay)
     )

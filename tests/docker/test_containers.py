@@ -32,7 +32,7 @@ def old_talker(net: Inside, network: str, robot: Robot) -> Container:
 
 
 def unregistered(controller: Controller) -> int:
-    """How many nodes proxies have unregistered on the controller's word."""
+    """The number of nodes that proxies have unregistered after updates."""
     return sum(map(int, re.findall(r"nodes updated: \S+, (\d+) unregistered", controller.logs())))
 
 

@@ -28,7 +28,7 @@ def status(proxy: Proxy) -> dict[str, Any]:
 
 
 def plane_of(node: str) -> dict[str, Any]:
-    """How the topics of an inside node are forwarded."""
+    """The data plane of an inside node's topics."""
     nodes = status(the_proxy())["nodes"]
     mine = [row["data_plane"] for row in nodes if f"/{node}" in row["nodes"]]
     assert len(mine) == 1, nodes
@@ -63,7 +63,7 @@ def test_kernel_forwards_what_the_label_asks_for(
 
 
 def has_one_capability(proxy: Proxy) -> None:
-    """Which the user that the proxy runs as can't use but by two programs."""
+    """Check that the proxy's user has no capabilities, except through two programs."""
     host = inspect(proxy.name)["HostConfig"]
     assert (host["CapDrop"], host["CapAdd"]) == (["ALL"], ["NET_ADMIN"])
     assert host["ReadonlyRootfs"]

@@ -17,7 +17,7 @@ CONNECT = "import socket, sys; socket.create_connection((sys.argv[1], int(sys.ar
 
 
 def told_direction() -> str:
-    """What the proxy has been told."""
+    """The direction in the proxy's settings."""
     env = dict(variable.split("=", 1) for variable in inspect(the_proxy().name)["Config"]["Env"])
     return env.get("ROSPROXY_DIRECTION", "out")
 

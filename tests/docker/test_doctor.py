@@ -41,7 +41,7 @@ def wrong(process: Process) -> tuple[int, list[dict[str, Any]]]:
 
 
 def page() -> dict[str, Any]:
-    """What the operator's live page shows of all proxies."""
+    """The document of the operator's live page."""
     with urllib.request.urlopen(f"http://{OPTIONS[-1]}/graph", timeout=30) as reply:
         graph: dict[str, Any] = json.loads(reply.read())
     return graph

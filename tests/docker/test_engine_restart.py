@@ -58,7 +58,7 @@ def controller(
 def listeners(
     engine: PrivateEngine, robot: Robot, controller: Process, ros_image: str
 ) -> Iterator[dict[str, Log]]:
-    """What the robot hears of two nodes inside, in either language."""
+    """The robot's output for two nodes inside, one in each language."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DOCKER_HOST", engine.url)
         inside = Inside(ros_image, robot.master_uri)

@@ -79,7 +79,7 @@ def images(
 
 
 def works_both_ways(project: Example, robot: Robot) -> None:
-    """What the README says is to be seen."""
+    """Check the traffic that the README promises."""
     heard = robot.run("rostopic", "echo", "-n", "3", "/chatter")
     assert heard.count("hello from inside") == 3
 

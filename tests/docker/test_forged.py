@@ -1,4 +1,4 @@
-"""What an image can't get: to be taken for a proxy, or more than the administrator allows."""
+"""An image cannot pass for a proxy, or get more than the administrator allows."""
 
 from collections.abc import Iterator
 

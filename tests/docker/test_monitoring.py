@@ -33,7 +33,7 @@ def patrol(ros_image: str) -> Iterator[Robot]:
 
 @pytest.fixture
 def cell(ros_image: str, patrol: Robot) -> Iterator[Inside]:
-    """Where the nodes of that master's inside live."""
+    """Networks and containers for inside nodes of that master."""
     with inside(ros_image, patrol.master_uri) as made:
         yield made
 

@@ -35,7 +35,7 @@ def process(
 
 
 def told(running: Process, directory: Path) -> str:
-    """What the status says that has a controller's options."""
+    """The output of the status with a controller's options."""
     return " ".join(Process(directory, *running.options).once("status").split())
 
 

@@ -96,7 +96,7 @@ def test_names_a_bad_setting_and_exits(proxy_image: str, container_name: str) ->
 
 @pytest.mark.parametrize(("image", "most"), [("proxy_image", 45), ("controller_image", 135)])
 def test_adds_little_to_its_base(image: str, most: int, request: pytest.FixtureRequest) -> None:
-    """What the build adds to a base that has Python, in MiB."""
+    """The size that the build adds to a base with Python, in MiB."""
     measure = ("--entrypoint", "du", request.getfixturevalue(image), "-sm", "/opt/rosproxy")
     assert int(docker("run", "--rm", *measure).split()[0]) <= most
 

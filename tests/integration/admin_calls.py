@@ -24,7 +24,7 @@ async def tell(proxy: Proxy, path: str, **fields: Any) -> dict[str, Any]:
 
 
 async def update(proxy: Proxy, **fields: Any) -> tuple[int, int, int]:
-    """How many nodes were unregistered, moved and adopted upon an update of containers."""
+    """Send an update of containers. Return the numbers of unregistered, moved and adopted nodes."""
     answer = await tell(proxy, "/containers", **fields)
     assert set(answer) == {"unregistered", "moved", "adopted"}
     return answer["unregistered"], answer["moved"], answer["adopted"]

@@ -1,4 +1,4 @@
-"""What former proxies left at a master: registrations of nodes that have gone."""
+"""Remainders of former proxies at a master: registrations of gone nodes."""
 
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager

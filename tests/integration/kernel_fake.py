@@ -47,7 +47,7 @@ class FakeTools(Tools):
         self.forgotten: list[tuple[bool, tuple[str, ...]]] = []
 
     async def nft(self, *words: str, document: str = "") -> str:
-        """What nft prints."""
+        """The output of nft."""
         self._maybe_fail()
         if "list" in words:
             return self._listed()
@@ -59,7 +59,7 @@ class FakeTools(Tools):
         return ""
 
     async def list_flows(self, take: Callable[[str], None], ipv6: bool, *which: str) -> None:
-        """What conntrack prints."""
+        """The output of conntrack."""
         self._maybe_fail()
         take("" if ipv6 else self.flows)
 

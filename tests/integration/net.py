@@ -24,7 +24,7 @@ NODE = "127.0.2.11"
 OTHER_NODE = "127.0.2.12"
 THIRD_NODE = "127.0.2.13"
 HOST = "127.0.3.1"
-"""What outside knows the proxy's machine by."""
+"""The advertised host: the outside address of the proxy's machine."""
 
 PATIENCE = 30.0
 """Seconds after which something awaited counts as missing, on however busy a machine."""
@@ -88,7 +88,7 @@ class Reply:
 
     @property
     def value(self) -> Any:
-        """What an XML-RPC response holds. Raises Fault."""
+        """The value of an XML-RPC response. Raises Fault."""
         return xmlrpc.client.loads(self.body)[0][0]
 
     @property
@@ -153,7 +153,7 @@ class Wire:
         return "closed"
 
     async def outcome(self) -> str:
-        """What becomes of a request: ``answered``, ``closed`` or ``reset``."""
+        """The outcome of a request: ``answered``, ``closed`` or ``reset``."""
         try:
             async with asyncio.timeout(PATIENCE):
                 return "answered" if await self.reader.read(1) else "closed"
@@ -254,7 +254,7 @@ async def read_header(wire: Wire) -> Header:
 
 
 async def greet(address: Address | str, header: bytes) -> Header:
-    """What a TCPROS header is answered with."""
+    """The answer to a TCPROS header."""
     target = host_and_port(address) if isinstance(address, str) else address
     async with connect(target) as wire:
         await wire.send(header)

@@ -18,7 +18,7 @@ from tests.run_options import parse_settings
 BY_THE_WALL = {"probe_timeout": 20.0}
 """Of proxies that go by the wall's clock: no node of theirs hangs because the machine is busy."""
 PORTS = 8
-"""How many ports a proxy of the tests has for nodes, unless told otherwise."""
+"""The default number of a test proxy's ports for nodes."""
 
 
 def options_for(**options: Any) -> dict[str, Any]:
@@ -89,7 +89,7 @@ class Proxy:
                 await self.app.stop()
 
     def metric(self, name: str, /, **labels: str) -> float:
-        """What a metric stands at; 0 if there is none of these labels yet."""
+        """The value of a metric; 0 before the first value with these labels."""
         registry = self.ros1.context.metrics.registry
         return registry.get_sample_value(f"rosproxy_{name}", labels) or 0
 
@@ -102,12 +102,12 @@ class Proxy:
         await until(lambda: not self.metric("open_connections"), "all relays end")
 
     def endpoint(self, node: FakeNode) -> Endpoint:
-        """What the proxy knows of a node."""
+        """The endpoint of a node."""
         slave = HostPort(node.address, node.slave.address[1])
         return next(e for e in self.ros1.context.registry if e.slave == slave)
 
     def lease(self, node: FakeNode) -> Address:
-        """Where outside reaches a node."""
+        """The address at which outside reaches a node."""
         endpoint = self.endpoint(node)
         return host_and_port(self.ros1.context.addressing.advertised_uri(endpoint))
 

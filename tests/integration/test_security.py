@@ -1,4 +1,4 @@
-"""What forged replies, registrations and entries at the master must not lead to."""
+"""Attacks by forged replies, registrations and entries at the master."""
 
 from collections.abc import AsyncIterator
 from xmlrpc.client import Fault

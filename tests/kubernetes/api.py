@@ -26,7 +26,7 @@ GROUPS = {
     "roles": "apis/rbac.authorization.k8s.io/v1",
     "rolebindings": "apis/rbac.authorization.k8s.io/v1",
 }
-"""Where resources are that are not in the core group."""
+"""Paths of resources outside of the core group."""
 PLURALS = {
     "Pod": "pods", "Service": "services", "RosProxy": "rosproxies", "Namespace": "namespaces",
     "Deployment": "deployments", "ResourceQuota": "resourcequotas", "LimitRange": "limitranges",

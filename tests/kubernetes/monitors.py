@@ -77,7 +77,7 @@ def _job(monitor: Json, endpoint: Json, url: str, rules: list[Json]) -> Json:
 
 
 def _namespaces(monitor: Json) -> list[str]:
-    """Where a monitor looks; an empty name stands for everywhere."""
+    """The namespaces of a monitor. An empty name stands for all."""
     selector = monitor["spec"].get("namespaceSelector", {})
     if selector.get("any"):
         return [""]

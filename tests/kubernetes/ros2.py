@@ -26,7 +26,7 @@ _CYCLONE = (
     "<CycloneDDS><Domain><Discovery><ParticipantIndex>auto</ParticipantIndex><Peers>"
     '<Peer Address="$(ROS_STATIC_PEERS)"/></Peers></Discovery></Domain></CycloneDDS>'
 )
-"""What ROS_STATIC_PEERS becomes by ROS 2's layer above Cyclone DDS, which the tests don't have."""
+"""The setting that ROS 2's layer above Cyclone DDS, missing here, makes from ROS_STATIC_PEERS."""
 _numbers = itertools.count(1)
 
 

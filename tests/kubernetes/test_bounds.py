@@ -1,4 +1,4 @@
-"""What RosProxies may not ask for, in a real cluster."""
+"""Bounds of RosProxies, in a real cluster."""
 
 import shlex
 

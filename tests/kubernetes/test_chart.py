@@ -186,7 +186,7 @@ def test_upgrade_keeps_the_certificate(restored: None) -> None:
 
 
 def certificate() -> tuple[Any, Any]:
-    """What the webhook shows, and what the API server is to believe."""
+    """The certificate of the webhook, and the CA bundle for the API server."""
     secret = api.get("secrets", release.NAMESPACE, SECRET)
     (webhook,) = api.get("mutatingwebhookconfigurations", "", release.FULL_NAME)["webhooks"]
     return secret.get("data"), webhook["clientConfig"].get("caBundle")

@@ -12,7 +12,7 @@ from tests.kubernetes.traffic import Flow, flow
 
 
 def status(made: RosProxy) -> dict[str, Any]:
-    """What the proxy on node1 says of itself."""
+    """The status of the proxy on node1."""
     text = made.the_proxy().run("rosproxy", "status", "--json", check=False)
     document: dict[str, Any] = json.loads(text)
     return document

@@ -93,7 +93,7 @@ def test_missing_service_is_told(net: Namespace) -> None:
 
 
 def start_master_service_later(net: Namespace, made: RosProxy) -> None:
-    """What was missing comes: nothing else has to be done."""
+    """Start the missing master with its Service, which suffices."""
     start_master(net)
     made.change(master={"service": {"name": "master"}})
     made.wait_for("Ready", seconds=60)

@@ -75,7 +75,7 @@ class Site:
         api.create({"apiVersion": "v1", "kind": kind, "metadata": metadata, "spec": spec})
 
     def texts(self, reason: str) -> list[str]:
-        """What is told with this reason: in Events of pods and RosProxies, and in conditions."""
+        """The texts with this reason, in Events of pods and RosProxies, and in conditions."""
         conditions = self.rosproxy.status.get("conditions", [])
         own = self.rosproxy.events
         pods = [

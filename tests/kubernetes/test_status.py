@@ -1,4 +1,4 @@
-"""What a RosProxy says of itself."""
+"""The status of a RosProxy."""
 
 from tests.docker.engine import wait_until
 from tests.kubernetes import api

@@ -61,7 +61,7 @@ def test_a_release_from_a_registry(net: Namespace, tmp_path: Path) -> None:
 
 
 def test_rosproxies_stay_until_their_definition_is_deleted(net: Namespace) -> None:
-    """What `crds.keep` promises, which is on by default."""
+    """The promise of `crds.keep`, which is on by default."""
     release.install_again(crds={"keep": True})
     release.wait_operator()
     made = rosproxy(net.name, master=NOWHERE, ports=4)

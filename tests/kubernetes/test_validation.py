@@ -1,4 +1,4 @@
-"""What the API server itself refuses, and with which words."""
+"""Refusals of the API server, with messages."""
 
 from typing import Any
 

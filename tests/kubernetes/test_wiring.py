@@ -24,7 +24,7 @@ def shared(_release: None) -> Iterator[Namespace]:
 
 @pytest.fixture(scope="module")
 def uri(shared: Namespace) -> str:
-    """Where the Service of the RosProxy is."""
+    """The URI of the RosProxy's Service."""
     made = rosproxy(
         shared.name, master=NOWHERE, hostAliases=[{"ip": "192.0.2.9", "hostnames": ["robot"]}]
     )

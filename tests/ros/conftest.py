@@ -119,7 +119,7 @@ def topology_of() -> Iterator[Callable[[Plan], Topology]]:
 
 @pytest.fixture(scope="session")
 def forks() -> Iterator[Forks]:
-    """What rospy nodes are started with."""
+    """The command line of rospy nodes."""
     forks = Forks()
     yield forks
     forks.stop()

@@ -20,7 +20,7 @@ _POLL = 0.01
 
 _TOOLS = ("rosnode", "rosparam", "rosservice", "rostopic")
 PROGRAMS = {"node.py": str(NODES / "node.py"), **{name: f"/usr/bin/{name}" for name in _TOOLS}}
-"""What is started so, by name."""
+"""Programs that start as forks, by name."""
 
 
 class Forks:

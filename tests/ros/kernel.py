@@ -1,4 +1,4 @@
-"""What the tests of the kernel plane look at: the proxy's status, and the kernel's own tables."""
+"""Helpers for the tests of the kernel plane: the proxy's status, and the kernel's tables."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ def in_table(lab: Lab, name: str) -> bool:
 
 
 def plane_of(lab: Lab, name: str) -> dict[str, Any]:
-    """What the status says of how a node's topics are forwarded."""
+    """The data plane of a node's topics in the status."""
     return node_status(lab, name)["data_plane"]
 
 
 def in_proxy(lab: Lab, *argv: str) -> str:
-    """What a program prints on the proxy's machine."""
+    """The output of a program on the proxy's machine."""
     return lab.run("px", *argv).output
 
 

@@ -211,7 +211,7 @@ class Lab:
         return answer
 
     def read(self, path: str) -> str:
-        """What the proxy's admin endpoint has, asked from where the proxy is."""
+        """A document of the proxy's admin endpoint, from the proxy's machine."""
         with self.place("px").entered():
             connection = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
             try:

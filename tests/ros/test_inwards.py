@@ -33,7 +33,7 @@ def told(lab: Lab, method: str, name: str, role: str = "c1") -> tuple[str, int]:
 
 
 def greet(lab: Lab, address: tuple[str, int], **fields: str) -> dict[str, str]:
-    """What a TCPROS header is answered with that comes from inside."""
+    """The answer to a TCPROS header from inside."""
     header = {"callerid": "/spy", "md5sum": "*", "type": "*", **fields}
     with lab.place("c1").entered(), socket.create_connection(address, timeout=20) as conn:
         conn.sendall(encode_header(header))

@@ -30,7 +30,7 @@ def talk(lab: Lab, library: str, sink: str) -> tuple[str, Process, Process]:
 
 
 def stand_in(lab: Lab, name: str) -> dict[str, Any]:
-    """What the status says of the port that stands in for a node outside."""
+    """The row of a stand-in for an outside node in the status."""
     uri = lab.node_uri(name)
     return next(row for row in kernel.status(lab)["stand_ins"] if row["uri"] == uri)
 

@@ -50,7 +50,7 @@ def tell(lab: Lab, *rules: str, mode: str = "enforce") -> dict[str, Any]:
 
 
 def lease(lab: Lab, name: str) -> tuple[str, int]:
-    """Where outside reaches a node."""
+    """The address at which outside reaches a node."""
     parts = urlsplit(lab.node_uri(name) or "")
     assert parts.hostname
     assert parts.port
@@ -58,7 +58,7 @@ def lease(lab: Lab, name: str) -> tuple[str, int]:
 
 
 def greet(lab: Lab, name: str, **fields: str) -> dict[str, str]:
-    """What a TCPROS header is answered with that is sent to a node from outside."""
+    """A node's answer to a TCPROS header from outside."""
     place = lab.place("out")
     header = {"callerid": "/spy", "md5sum": "*", **fields}
     with place.entered(), socket.create_connection(lease(lab, name), timeout=20) as conn:

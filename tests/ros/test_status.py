@@ -47,7 +47,7 @@ def test_status_shows_a_node_with_its_addresses_and_connections(lab: Lab, librar
 
 
 def counted(lab: Lab, topic: str, side: str) -> float:
-    """How many messages of a topic the metrics have."""
+    """The number of messages of a topic in the metrics."""
     families = text_string_to_metric_families(lab.read("/metrics"))
     labels = {"name": topic, "side": side}
     return sum(

@@ -36,7 +36,7 @@ def listener(lab: Lab, role: str, topic: str) -> Process:
 
 
 def relays(lab: Lab, topic: str) -> list[dict[str, Any]]:
-    """What the proxy's status says of the datagrams of a topic."""
+    """The rows for the datagrams of a topic in the proxy's status."""
     if lab.flat:
         return []
     document = json.loads(lab.rosproxy("status", "--json").output)

@@ -20,7 +20,7 @@ from tests.ros2.lab import ENVIRONMENTS, PROGRAMS, Lab  # noqa: E402
 from tests.ros2.machines import OTHER_PLAN, PLAN, built, join_lans  # noqa: E402
 
 SMOKE = ("jazzy",)
-"""What `make test` installs: all that tests need which are marked `smoke`."""
+"""The environments that `make test` installs, for tests marked `smoke`."""
 
 
 def missing(environments: Iterable[str]) -> str | None:

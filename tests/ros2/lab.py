@@ -107,7 +107,7 @@ class Lab:
         return node
 
     def status(self) -> ProxyStatus:
-        """What the proxy tells of itself."""
+        """The status of the proxy."""
         return parse_status(self._get("/status"))
 
     def page(self) -> dict[str, Any]:
@@ -140,7 +140,7 @@ class Lab:
         return answer
 
     def tool(self, command: str, *names: str, fails: bool = False) -> str:
-        """What a command prints that looks at the proxy, where that runs."""
+        """The output of a command that asks the proxy, on the proxy's machine."""
         argv = [sys.executable, "-m", "rosproxy", command, *names]
         process = self._spawn(command, "px", argv, self._own_environment())
         assert process.wait() == int(fails), process.output()
@@ -152,11 +152,11 @@ class Lab:
         return domain
 
     def in_proxy(self, *argv: str) -> str:
-        """What a program prints on the proxy's machine."""
+        """The output of a program on the proxy's machine."""
         return run_command("ip", "netns", "exec", self.place("px").namespace, *argv)
 
     def unproven(self) -> dict[str, int]:
-        """How many participants have not proved to receive, by side."""
+        """The number of unproven participants on each side."""
         lines = self._get("/metrics").decode().splitlines()
         told = (line for line in lines if line.startswith("rosproxy_ros2_unproven_participants{"))
         return {

@@ -26,7 +26,7 @@ OTHER_PLAN = replace(PLAN, name="o", host="10.77.0.11", robot="10.77.0.12")
 
 
 class Machines(Protocol):
-    """What has machines: a topology, or the world of a benchmark."""
+    """An object with machines: a topology, or the world of a benchmark."""
 
     places: dict[str, Place]
 

@@ -21,7 +21,7 @@ END = b"end"
 
 
 class Hearing:
-    """What is heard of the group; ``opened`` counts sockets."""
+    """The received datagrams of the group. ``opened`` counts sockets."""
 
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()

@@ -73,7 +73,7 @@ class Forger:
             self._sock.sendto(datagram, to)
 
     def received(self, word: bytes) -> int:
-        """How many datagrams with a word have come."""
+        """The number of received datagrams with a word."""
         with suppress(BlockingIOError):
             while True:
                 self._received.append(self._sock.recv(65536))

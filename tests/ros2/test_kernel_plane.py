@@ -41,12 +41,12 @@ def are_forwarded(lab: Lab, count: int) -> bool:
 
 
 def by_kernel(lab: Lab) -> int:
-    """How many datagrams the kernel has forwarded."""
+    """The number of datagrams that the kernel has forwarded."""
     return sum(lease.kernel_datagrams for lease in leases(lab))
 
 
 def by_proxy(lab: Lab) -> int:
-    """How many datagrams of user data the proxy has passed on."""
+    """The number of user datagrams that the proxy has relayed."""
     return sum(lease.datagrams for lease in leases(lab))
 
 

@@ -88,7 +88,7 @@ def raw_call(*values: str, method: str = "m", encoding: str = "utf-8") -> bytes:
 
 
 DIALECTS = {"rospy": (py_call, py_reply), "roscpp": (cpp_call, cpp_reply)}
-"""How each client library writes calls and replies."""
+"""The builders of calls and replies for each client library."""
 
 
 def decoded(body: bytes) -> tuple[Any, str | None]:
@@ -189,7 +189,7 @@ def exchange(
     reply: bytes,
     refuse: Refuse = lambda uri: False,
 ) -> Exchange:
-    """What the shell does with a call: admit, export, ask the master, note, import."""
+    """Do the shell's work on a call: admit, export, ask the master, note, import."""
     request = master_calls.read_request(body, caller)
     outcomes = [_outcome(addressing, call, caller, refuse) for call in request.calls]
     exported = master_api.export_request(request, outcomes, addressing)

@@ -1,4 +1,4 @@
-"""What a test drives: the robot's router, the proxy, and nodes with the sessions of rmw_zenoh."""
+"""A test's lab: the robot's router, the proxy, and nodes with the sessions of rmw_zenoh."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class Lab:
             run_command(*enter, "nft", "delete", "table", "ip", "zenoh_redirect")
 
     def status(self) -> ProxyStatus:
-        """What the proxy tells of itself."""
+        """The status of the proxy."""
         with self.topology.places["px"].entered():
             asking = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
             with closing(asking):
@@ -167,5 +167,5 @@ class Lab:
             self.end_redirects()
 
     def transcripts(self) -> list[tuple[str, str]]:
-        """What the programs have printed."""
+        """The output of all programs."""
         return [(process.title, process.output()[-3000:]) for process in self.processes]

@@ -8,7 +8,7 @@ from tests.zenoh.lab import PORTS, VERSIONS, Lab
 
 PAIRS = [("c1", "c2"), ("c1", "out"), ("out", "c1"), ("c1", "c1")]
 WAYS = ("redirect", "client")
-"""How nodes in containers reach the proxy."""
+"""The ways of nodes in containers to the proxy."""
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -1,4 +1,4 @@
-"""What the proxy tells of routers, sessions and nodes, and how laptops reach the hub."""
+"""Routers, sessions and nodes in the proxy's status, and laptops that reach the hub."""
 
 from __future__ import annotations
 

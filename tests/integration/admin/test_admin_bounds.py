@@ -1,4 +1,4 @@
-"""What the admin endpoint is asked: by which name, how often, and by readers that take nothing."""
+"""Requests to the admin endpoint: host names, frequency, and readers that read nothing."""
 
 import asyncio
 import json

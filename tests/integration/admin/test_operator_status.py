@@ -59,7 +59,7 @@ async def operator() -> AsyncIterator[RunningOperator]:
 
 @pytest.fixture(autouse=True)
 def own_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the command sees by itself."""
+    """A fake look of the command itself."""
 
     async def survey(settings: PlanSettings) -> dict[str, Any]:
         assert settings is SETTINGS

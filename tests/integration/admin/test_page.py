@@ -43,7 +43,7 @@ def from_afar(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is done each second or two is done at once."""
+    """Shorten all intervals of the feed."""
     for name in ("TICK", "LOOK_AGAIN", "LINGER"):
         monkeypatch.setattr(f"rosproxy.page.feed.{name}", 0.05)
     monkeypatch.setattr("rosproxy.page.feed.PER_SECOND", 10_000.0)

@@ -52,7 +52,7 @@ def no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def ask(proxy: Any, node: Any) -> Address:
-    """Where a subscriber outside is sent for a node's topic."""
+    """The address that an outside subscriber gets for a node's topic."""
     _, _, (protocol, host, port) = await rpc(
         proxy.uri(node), "requestTopic", "/x", "/chatter", TCPROS
     )

@@ -35,7 +35,7 @@ def container(address: str = NODE, *names: str) -> dict[str, Any]:
 
 
 async def adopt(proxy: Proxy, *containers: dict[str, Any]) -> int:
-    """How many nodes are adopted when containers arrive."""
+    """Report arrived containers. Return the number of adopted nodes."""
     return (await update(proxy, arrived=containers or [container()]))[2]
 
 
@@ -184,7 +184,7 @@ async def test_nodes_elsewhere_are_left_alone(
 async def test_another_node_at_the_same_port(
     proxy: Proxy, master: FakeMaster, node: FakeNode
 ) -> None:
-    """What the master has is from a former container of that name."""
+    """The registration at the master is from a former container of that name."""
     await node.call(
         host_and_port(master.uri), "registerPublisher", "/old", "std_msgs/String", node.uri
     )

@@ -66,12 +66,12 @@ async def robot(make_node: MakeNode, master: FakeMaster) -> FakeNode:
 
 
 def slave(node: FakeNode, address: str = PROXY) -> Address:
-    """Where inside finds a node's slave API."""
+    """The address of a node's slave API for inside."""
     return address, node.slave.address[1]
 
 
 def service(node: FakeNode, address: str = PROXY) -> Address:
-    """Where inside finds a node's services."""
+    """The address of a node's services for inside."""
     return address, node.tcpros_port
 
 
@@ -481,7 +481,7 @@ async def test_a_recovered_subscriber_is_given_open_ports(
 async def test_nodes_on_the_masters_host_are_told_at_its_address(
     proxy: Proxy, robot: FakeNode, node: FakeNode, master: FakeMaster
 ) -> None:
-    """What the proxy itself tells outside subscribers goes to the master's address as well."""
+    """Updates from the proxy to outside subscribers also go to the master's address."""
     await robot.subscribe(host_and_port(master.uri))
     await node.publish(proxy.master)
     robot.calls.clear()

@@ -55,7 +55,7 @@ async def robot(make_node: MakeNode, master: FakeMaster) -> FakeNode:
 
 
 def stand_ins(proxy: Proxy) -> dict[str, int]:
-    """What is stood in for, with the open connections."""
+    """The URIs with stand-ins, with the number of open connections."""
     return {row["uri"]: row["connections"] for row in proxy.app.status()["stand_ins"]}
 
 

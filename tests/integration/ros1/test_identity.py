@@ -55,7 +55,7 @@ def problems(proxy: Proxy) -> dict[str, str]:
 
 
 def address_of(proxy: Proxy, name: str) -> str:
-    """Where the proxy takes a node to be."""
+    """The address that the proxy has for a node."""
     return proxy.ros1.context.registry.by_caller[name].location.address
 
 
@@ -155,7 +155,7 @@ def _only_localhost_is_own(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 BY_AN_OPERATOR = {"admin_token_hash": hash_token("the operator's")}
-"""What a proxy is started with that has an operator."""
+"""Options of a proxy with an operator."""
 
 
 @pytest.mark.usefixtures("_only_localhost_is_own")

@@ -37,7 +37,7 @@ def ask(kept: Kept, node: FakeNode, now: float = 0.0) -> bool:
 
 
 async def told(kept: Kept, now: float = 0.0) -> ProbeResult | None:
-    """What becomes of the question, as soon as that is known."""
+    """Wait for the result of a question."""
     results = dict[str, ProbeResult | None]()
 
     def collected() -> bool:

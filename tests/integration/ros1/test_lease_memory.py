@@ -85,7 +85,7 @@ async def test_a_node_is_believed_for_itself_alone(
 
 
 async def leave_behind(master: FakeMaster, uri: str) -> None:
-    """What a node has at the master that had the port of a slave URI before, and is gone."""
+    """Register a gone node with this slave URI at the master."""
     await rpc(master.uri, "registerPublisher", "/former", "/former/topic", "x/Y", uri)
     service = uri.replace("http://", "rosrpc://").rstrip("/")
     await rpc(master.uri, "registerService", "/former", "/former/service", service, uri)
@@ -111,7 +111,7 @@ async def test_a_node_does_not_answer_for_the_one_before_at_its_port(
 async def only_own_services(
     node: FakeNode, reader: StreamReader, writer: StreamWriter, header: Header
 ) -> None:
-    """As nodes do: for a service of another name there is an error and no name."""
+    """Answer like nodes: for a service of another node with an error and without a name."""
     known = header.get("service", node.name).startswith(node.name)
     answer = {"callerid": node.name} if known else {"error": "no such service"}
     writer.write(encode_header(answer))

@@ -1,4 +1,4 @@
-"""How long nodes and leases live: probes, clean-up, coming back, lingering."""
+"""The lifetime of nodes and leases: probes, clean-up, return, linger time."""
 
 import asyncio
 import os

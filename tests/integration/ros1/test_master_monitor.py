@@ -1,4 +1,4 @@
-"""What the proxy itself asks the master, and masters that answer oddly or not at all."""
+"""The proxy's own calls to the master, and masters with odd or no answers."""
 
 import asyncio
 import xmlrpc.client

@@ -214,7 +214,7 @@ async def test_outside_nodes_are_never_touched(proxy, master, node, make_node):
 
 
 class EverythingChanges(NetworkChanges):
-    """As if the kernel told of a change before each call."""
+    """Reports a change of networks before each call."""
 
     def noticed(self, _now: float) -> bool:
         return True

@@ -33,7 +33,9 @@ OUTSIDE_PUBLISHER = "http://127.0.1.9:4711/"
 
 
 async def told(proxy, *rules, mode="enforce", name="administrator"):
-    """How many registrations were hidden, shown, and connections cut by new rules."""
+    """Send new rules. Return the numbers of hidden and shown registrations, and of cut
+    connections.
+    """
     layer = {"name": name, "mode": mode, "rules": list(rules), "addresses": None}
     answer = await tell(proxy, "/policy", layers=[layer])
     return answer["hidden"], answer["shown"], answer["cut"]

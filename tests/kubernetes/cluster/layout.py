@@ -1,4 +1,4 @@
-"""Where everything of the cluster is: addresses, names and files."""
+"""Addresses, names and files of the cluster."""
 
 import os
 from dataclasses import dataclass

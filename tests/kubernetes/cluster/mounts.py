@@ -1,4 +1,4 @@
-"""What is mounted below a directory."""
+"""Mounts below a directory."""
 
 from pathlib import Path
 

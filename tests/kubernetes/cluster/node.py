@@ -190,7 +190,9 @@ def _kubelet_configuration(node: Node) -> dict[str, object]:
 
 
 def _cni_configuration(node: Node) -> dict[str, Any]:
-    """How pods are plugged in: `ptp`, as Services that lead back to a node fail with `bridge`."""
+    """The CNI plug-in of pods: `ptp`, because Services that lead back to a node fail with
+    `bridge`.
+    """
     ipam = {
         "type": "host-local",
         "dataDir": f"{node.directory}/cni-addresses",

@@ -185,7 +185,7 @@ def test_what_zenoh_tells_is_bounded(flood: dict[str, Any]) -> None:
 
 
 def _rows(status: ProxyStatus) -> int:
-    """How many rows the tables have."""
+    """The number of rows in each table."""
     policy = status.policy
     (domain,) = status.domains
     assert policy

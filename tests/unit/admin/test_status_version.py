@@ -1,4 +1,4 @@
-"""Which changes of a status make another version."""
+"""Changes of a status that change the version."""
 
 from typing import Any
 

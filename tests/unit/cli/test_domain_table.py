@@ -1,4 +1,4 @@
-"""How ``rosproxy status`` shows domains of ROS 2."""
+"""Domains of ROS 2 in ``rosproxy status``."""
 
 from msgspec.structs import replace
 

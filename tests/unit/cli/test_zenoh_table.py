@@ -1,4 +1,4 @@
-"""How ``rosproxy status`` shows the routers for rmw_zenoh."""
+"""The routers for rmw_zenoh in ``rosproxy status``."""
 
 from rosproxy.admin.status_document import (
     ProxyStatus,

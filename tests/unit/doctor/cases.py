@@ -34,7 +34,7 @@ def make_master(
 
 
 def probes(*outcomes: tuple[str, str]) -> dict[str, Any]:
-    """What ``POST /probe`` returns for the lowest, the highest port."""
+    """The results of ``POST /probe`` for the lowest and the highest port."""
     ports = (45001, 45099)
     return {
         "probes": [

@@ -1,4 +1,4 @@
-"""What the doctor takes from an answer of a participant."""
+"""The doctor's reading of a participant's answer."""
 
 import struct
 

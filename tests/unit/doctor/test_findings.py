@@ -1,4 +1,4 @@
-"""How findings are shown."""
+"""The output of findings."""
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity, failed
 from rosproxy.doctor.presentation import as_json, render

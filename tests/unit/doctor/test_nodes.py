@@ -1,4 +1,4 @@
-"""What the doctor says of nodes."""
+"""The doctor's findings about nodes."""
 
 from typing import Any
 

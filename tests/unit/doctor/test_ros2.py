@@ -1,4 +1,4 @@
-"""What ``rosproxy doctor`` says of ROS 2."""
+"""The doctor's findings about ROS 2."""
 
 import pytest
 from msgspec.structs import replace

@@ -1,4 +1,4 @@
-"""What the doctor says about rmw_zenoh."""
+"""The doctor's findings about rmw_zenoh."""
 
 from typing import Any
 

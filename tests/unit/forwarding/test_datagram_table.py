@@ -89,7 +89,7 @@ def test_nothing_but_addresses_gets_into_a_document(host: str) -> None:
 
 
 def printed(without: str = "", **elements_of: Any) -> str:
-    """What ``nft -j list table`` prints."""
+    """The output of ``nft -j list table``."""
     names = ("hosts4", "hosts6", "ports", "sources4", "sources6", "received")
     objects: list[Any] = [{"metainfo": {"version": "1.0.6", "json_schema_version": 1}}]
     for name in names:

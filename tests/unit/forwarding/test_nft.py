@@ -43,7 +43,7 @@ def elements(document: str, verb: str) -> dict[str, list[str]]:
 
 
 def listing(document: str) -> str:
-    """What ``nft -j list table`` prints after a document that makes the whole table."""
+    """The output of ``nft -j list table`` after a document that makes the whole table."""
     elements_by_name = elements(document, "add")
     objects: list[Any] = [{"metainfo": {"version": "1.0.6"}}]
     for kind, name in re.findall(r"^  (map|set) (\w+) ", document, re.M):

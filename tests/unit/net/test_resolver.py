@@ -48,7 +48,7 @@ async def server(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[NameServer]:
 
 
 async def find(host: str, source: str = "") -> list[str]:
-    """What a name that is answered leads to, however busy the machine."""
+    """The addresses of a name that resolves, even on a busy machine."""
     async with asyncio.timeout(30):
         while not (addresses := await resolve(host, source)):
             pass

@@ -37,7 +37,7 @@ def every(count: int) -> list[PortRange]:
 
 
 def free(ports: PortRange, blocked: frozenset[int], ranges: list[PortRange]) -> bool:
-    """What is_free says, said more slowly."""
+    """A slow and simple version of is_free."""
     return not any(port in blocked or any(port in r for r in ranges) for port in ports.ports())
 
 

@@ -1,4 +1,4 @@
-"""When the loop looks, by a clock that jumps to the time for which everything waits.
+"""The times of looks, by a clock that jumps to the next awaited time.
 
 ``await asyncio.sleep(3600)`` takes no time then. Nothing may happen in threads or on sockets.
 """

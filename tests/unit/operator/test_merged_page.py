@@ -198,7 +198,7 @@ HUGE = "x;reboot\x1b" * 10_000
 
 
 def hostile(nodes: int = 10_000, links: int = 20_000) -> Document:
-    """What a proxy in hostile hands may send within the bytes that are read."""
+    """Documents that a hostile proxy may send within the limit of bytes."""
     document = {
         "proxy": {"master": MASTER, "host": HUGE},
         "nodes": {f"/n{n}": {"lane": "container", "state": "broken"} for n in range(nodes)},

@@ -1,4 +1,4 @@
-"""What each proxy may take, by the administrator's word."""
+"""The administrator's bounds of each proxy."""
 
 from dataclasses import fields, replace
 from typing import Any

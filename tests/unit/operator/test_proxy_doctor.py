@@ -1,4 +1,4 @@
-"""What a proxy's own doctor has printed, read by the operator's."""
+"""The output of proxies' doctors, in the operator's doctor."""
 
 import json
 from typing import cast

@@ -1,4 +1,4 @@
-"""What is made of a proxy's /status."""
+"""Facts from a proxy's /status."""
 
 from typing import Any
 

@@ -30,7 +30,7 @@ def facts(sent: int | None, got: int | None, at: float) -> DoctorFacts:
 
 
 def read(*rounds: tuple[float, int | None, int | None]) -> Measures:
-    """What is known after rounds of questions: when, and what both sides had counted."""
+    """The measures after some rounds, each with a time and the counts of both sides."""
     measures = Measures()
     for at, sent, got in rounds:
         measures.read_nodes(facts(sent, got, at), [KEY])

@@ -1,4 +1,4 @@
-"""What nodes answer to ``getBusStats``."""
+"""Replies to ``getBusStats``."""
 
 import xmlrpc.client
 from typing import Any

@@ -24,7 +24,7 @@ from tests.unit.ros2.discovery.domains import (
 
 @dataclass
 class Plane:
-    """What is asked of a plane for a port that the kernel may not forward."""
+    """The part of a plane for a port that the kernel may not forward."""
 
     user_plane: str = "copy"
 

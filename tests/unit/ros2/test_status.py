@@ -39,7 +39,7 @@ SUBSCRIPTIONS = 0x000004C2
 
 @dataclass
 class Served:
-    """What the status asks of a server."""
+    """The part of a server that the status needs."""
 
     domain: Domain
     lost: int = 0

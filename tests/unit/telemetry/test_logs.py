@@ -67,7 +67,7 @@ def test_an_exception_is_an_error() -> None:
 
 
 def raised(text: str, cause: str = "") -> Any:
-    """What a handler knows of an exception with that text."""
+    """The exception info of an exception with that text."""
     try:
         try:
             raise KeyError(cause)

@@ -1,4 +1,4 @@
-"""What was refused is counted each time, and told once in a while."""
+"""Refusals are counted each time, and reported now and then."""
 
 import pytest
 

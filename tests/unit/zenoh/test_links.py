@@ -1,4 +1,4 @@
-"""Which links of the hub are up."""
+"""The state of the hub's links."""
 
 import pytest
 

@@ -150,7 +150,7 @@ def observed(
 
 
 def inspection(body: Mapping[str, Any], image: str = IMAGE, **more: Any) -> dict[str, Any]:
-    """What the engine tells of a container that was made from the body of a call."""
+    """The engine's inspection of a container that was created with this body."""
     from_image = {"Entrypoint": ["rosproxy"], "Cmd": ["run"]}
     config = {key: body[key] for key in ("User", "Env", "Labels", *from_image) if key in body}
     host = {

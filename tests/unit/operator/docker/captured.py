@@ -1,4 +1,4 @@
-"""What an engine (20.10, API 1.41) says, cut down to the keys that are read."""
+"""Answers of an engine (20.10, API 1.41), reduced to the keys that the operator reads."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What labels may ask for: the administrator's word."""
+"""The administrator's bounds of labels."""
 
 from dataclasses import replace
 

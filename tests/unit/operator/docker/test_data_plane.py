@@ -61,7 +61,9 @@ def given(plan: DockerPlan) -> DataPlane:
 
 
 def made(actions: tuple[Action, ...]) -> tuple[list[bool], list[DataPlane]]:
-    """What sandboxes are created with, and what proxies."""
+    """Whether each created sandbox is for the kernel plane, and the data planes of created
+    proxies.
+    """
     boxes = [
         action.spec.data_plane == "kernel"
         for action in actions

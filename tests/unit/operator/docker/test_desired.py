@@ -1,4 +1,4 @@
-"""Which proxies there ought to be, on which networks, under which names, with how many ports."""
+"""The wanted proxies, with networks, names and numbers of ports."""
 
 import re
 from dataclasses import replace

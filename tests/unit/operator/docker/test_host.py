@@ -1,4 +1,4 @@
-"""What the operating system says of ports and addresses."""
+"""Ports and addresses from the operating system."""
 
 import socket
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a host's status says where a labelled container gets no proxy."""
+"""The status of a host: containers, proxies and problems."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

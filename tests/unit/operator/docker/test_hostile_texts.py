@@ -81,7 +81,7 @@ def host(labels: dict[str, str], variables: dict[str, str], name: str, alias: st
 
 
 def log_lines(plan: DockerPlan) -> Iterator[str]:
-    """What the log has of a plan."""
+    """The log lines of a plan."""
     for form in (TextLines(), JsonLines()):
         for action in plan.actions:
             yield form.format(record(action.log_fields, "%s", action))

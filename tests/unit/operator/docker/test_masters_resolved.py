@@ -1,4 +1,4 @@
-"""Where the masters are."""
+"""The addresses of masters."""
 
 import pytest
 

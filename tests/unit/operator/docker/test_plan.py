@@ -137,7 +137,7 @@ def test_nothing_is_to_be_done(seen: HostState) -> None:
 
 
 def test_a_controller_killed_after_any_step_goes_on() -> None:
-    """What is there already is not done again."""
+    """Completed steps are not repeated."""
     created = sandbox(networks=(), state="created", started_at="")
     started = sandbox(networks=())
     made = proxy(state="created", started_at="")

@@ -77,7 +77,7 @@ def look(state: HostState, settings: PlanSettings = SETTINGS) -> DockerPlan:
 
 
 def steps(state: HostState, settings: PlanSettings = SETTINGS) -> list[Action]:
-    """What is to be done for redirects alone."""
+    """The planned actions for redirects alone."""
     groups = look(state, settings).groups
     return [action for group in groups if group.subject for action in group.actions]
 

@@ -1,4 +1,4 @@
-"""What people read."""
+"""The texts for people."""
 
 import json
 from typing import Any

@@ -219,7 +219,7 @@ class ApiServer:
             self._watches.remove(entry)
 
     def watches(self, kind: str) -> int:
-        """How many watch a kind now."""
+        """The number of open watches of a kind."""
         return sum(entry[0] == kind for entry in self._watches)
 
     def close_watches(self) -> None:

@@ -162,7 +162,7 @@ def written(seen: ClusterSnapshot, plan: ClusterPlan | None = None) -> ClusterSn
 
 
 def done(plan: ClusterPlan) -> list[Action]:
-    """What a plan does to pods and Services."""
+    """The actions of a plan, without Events and statuses."""
     return [action for action in plan.actions if not isinstance(action, Emit | PatchStatus)]
 
 

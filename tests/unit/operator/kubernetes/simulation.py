@@ -96,7 +96,7 @@ def bound_to(pod: Object) -> str:
 
 @dataclass
 class State:
-    """What the API server holds."""
+    """The objects of the API server."""
 
     rosproxies: dict[Name, Object] = field(default_factory=dict)
     nodes: dict[str, Object] = field(default_factory=dict)
@@ -183,7 +183,7 @@ class Cluster:
         self.state.pods[name_of(pod)] = pod
 
     def delete_pod(self, pod: Object) -> None:
-        """What no kubelet knows of goes at once."""
+        """Delete a pod; at once without a kubelet."""
         if not node_of(pod) or node_of(pod) not in self.state.nodes:
             self.state.pods.pop(name_of(pod), None)
         meta(pod)["deletionTimestamp"] = STAMP
@@ -389,7 +389,7 @@ class Controller:
         self.old: State | None = None
 
     def remember(self) -> None:
-        """What is there now is what the next looks see, while ``old`` stays."""
+        """Let the next looks see the current state, as long as ``old`` stays."""
         self.old = self.old or copy.deepcopy(self.cluster.state)
 
     def look(self) -> ClusterPlan:

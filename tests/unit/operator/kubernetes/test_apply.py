@@ -1,4 +1,4 @@
-"""What is done to the cluster, through the real client, against an API server on loopback."""
+"""Actions on the cluster, through the real client, with an API server on loopback."""
 
 import copy
 from collections.abc import AsyncIterator

@@ -32,7 +32,7 @@ from tests.unit.operator.kubernetes.objects import (
 )
 
 OWN = ClusterSettings(image="rosproxy:1", network_policy=False)
-"""As the operator is without options."""
+"""The settings of an operator without options."""
 ROSCORE = Name("other", "roscore")
 THEIRS = MasterSpec(service=ROSCORE)
 

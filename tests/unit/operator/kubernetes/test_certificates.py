@@ -84,7 +84,7 @@ async def served(pair: KeyPair) -> AsyncIterator[tuple[int, ssl.SSLContext]]:
 
 
 def call(port: int, authorities: bytes, host: str = HOST) -> bytes:
-    """What a client that trusts these CAs alone gets, as an API server does."""
+    """The answer for a client, such as an API server, that trusts these CAs alone."""
     context = ssl.create_default_context(cadata=authorities.decode())
     with (
         socket.create_connection(("127.0.0.1", port), 5) as plain,

@@ -1,4 +1,4 @@
-"""Which parts are planned when: what has changed, what wanted to be, and now and then all."""
+"""The parts that are planned: changed parts, due parts, and now and then all."""
 
 from rosproxy_operator.kubernetes.plan_schedule import PlanSchedule
 from rosproxy_operator.kubernetes.planner.partition import Partition

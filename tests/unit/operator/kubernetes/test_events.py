@@ -1,4 +1,4 @@
-"""Which Kubernetes Events are made."""
+"""The Kubernetes Events of the operator."""
 
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,

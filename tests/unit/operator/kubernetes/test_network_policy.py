@@ -224,7 +224,7 @@ def test_pods_are_kept_to_their_proxies_on_demand() -> None:
 
 
 def seen_policies(of: RosProxy) -> dict[Name, ProxyPolicy]:
-    """What is there once all policies of a RosProxy have been made."""
+    """The policies of a RosProxy after their creation."""
     parsed = (
         objects.policy({**body, "metadata": {**body["metadata"], "uid": f"uid-{name}"}})
         for name, body in wanted_policies(of, ON).items()

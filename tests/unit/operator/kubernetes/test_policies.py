@@ -1,4 +1,4 @@
-"""Which policy each proxy is told."""
+"""The policy that each proxy gets."""
 
 from typing import Any
 

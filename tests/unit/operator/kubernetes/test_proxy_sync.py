@@ -1,4 +1,4 @@
-"""What is known of proxies that start, answer, fall silent and go."""
+"""Reports about proxies that start, answer, fall silent and go."""
 
 import asyncio
 from collections.abc import AsyncIterator, Collection, Iterable, Mapping, Sequence

@@ -87,7 +87,7 @@ def start(seen: Seen) -> None:
 
 
 async def begun(server: ApiServer, seen: Seen) -> ClusterSnapshot:
-    """What is seen once everything is watched."""
+    """Start, wait for all watches, and return the snapshot."""
     start(seen)
     await until(lambda: all(server.watches(kind) == 1 for kind in KINDS))
     return await seen.read()

@@ -1,4 +1,4 @@
-"""What is refused, or does not last, is tried again: soon, then ever later, never in a loop."""
+"""Refused or short-lived actions are repeated: soon, then ever later, never in a loop."""
 
 from msgspec.structs import replace
 

@@ -1,4 +1,4 @@
-"""Which pods a RosProxy takes."""
+"""The pods that a RosProxy selects."""
 
 import pytest
 from msgspec.structs import replace

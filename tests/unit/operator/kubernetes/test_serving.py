@@ -80,7 +80,7 @@ class Running:
         return await in_thread(get, f"http://127.0.0.1:{self.liveness}/healthz")
 
     async def admit(self, pod: dict[str, Any], **more: Any) -> dict[str, Any]:
-        """What the webhook answers for a pod."""
+        """The webhook's answer for a pod."""
         review = {
             "apiVersion": "admission.k8s.io/v1",
             "kind": "AdmissionReview",

@@ -88,7 +88,7 @@ def without_garbage_collection() -> Iterator[None]:
 
 
 def handshakes() -> int:
-    """How many of the server's TLS connections are in memory, 256 KiB each."""
+    """The number of the server's TLS connections in memory, 256 KiB each."""
     return sum(isinstance(thing, sslproto.SSLProtocol) for thing in gc.get_objects())
 
 

@@ -1,4 +1,4 @@
-"""What must always hold in a cluster with a controller, and what when nothing else happens."""
+"""Invariants of a cluster with a controller: at any moment, and at rest."""
 
 import copy
 from collections.abc import Iterator
@@ -188,7 +188,7 @@ class World:
                 self.may_move.add(ProxyPlace(proxy.of, proxy.node))
 
     def check(self) -> None:
-        """What holds at any moment."""
+        """Check the invariants of any moment."""
         self.note_conflicts()
         live_places: list[ProxyPlace] = []
         for pod, proxy in self.proxies():

@@ -1,4 +1,4 @@
-"""What the policy checks in a call, and what the proxy answers in the master's place."""
+"""The policy's checks of a call, and the proxy's answers in the master's place."""
 
 from dataclasses import replace
 

@@ -53,7 +53,7 @@ PLAIN = st.recursive(
     lambda inner: st.lists(inner, max_size=4),
     max_leaves=12,
 )
-"""What XmlRpc++ writes for ROS's own replies."""
+"""Values of ROS's own replies in XmlRpc++."""
 
 WORLD = make_addressing()
 NODE = add_node(WORLD)

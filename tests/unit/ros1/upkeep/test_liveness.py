@@ -1,4 +1,4 @@
-"""Which nodes are gone or have moved, as updates of containers say and the nodes themselves."""
+"""Nodes that are gone or have moved, by updates of containers and by answers of nodes."""
 
 from dataclasses import replace
 

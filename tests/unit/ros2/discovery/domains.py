@@ -128,20 +128,20 @@ def kept_number(
 
 
 def kept_halves(own: bytes, prefix: bytes, number: int, bits: int) -> bytes:
-    """What a participant answers both writers of the port store, or of the port proof."""
+    """A participant's answer to both writers of the port store, or of the port proof."""
     pairs = zip(WRITERS, halves(number, bits), strict=True)
     lower, upper = (kept_number(own, prefix, half, writer) for writer, half in pairs)
     return lower + upper[HEADER:]
 
 
 def kept_answer(domain: Domain, prefix: bytes, number: int) -> bytes:
-    """What a participant answers the port store of a domain."""
+    """A participant's answer to the port store of a domain."""
     port_store = domain.proxy_participants.port_store
     return kept_halves(port_store.prefix, prefix, number, port_store.port_bits)
 
 
 def proof_answer(domain: Domain, prefix: bytes, proof: int) -> bytes:
-    """What a participant answers the port proof of a domain with a secret."""
+    """A participant's answer to the port proof of a domain with a secret."""
     return kept_halves(domain.proxy_participants.port_store.proof_prefix, prefix, proof, HALF_BITS)
 
 
@@ -163,7 +163,7 @@ def meet(domain: Domain, prefix: bytes = A, address: str = INSIDE) -> list[Outgo
 
 
 def finished(domain: Domain, sent: Sequence[Outgoing], now: float = NOW) -> list[Outgoing]:
-    """What a change leads to, of which ``sent`` is the first part."""
+    """All datagrams of a change, beginning with ``sent``."""
     every = list(sent)
     while domain.is_busy:
         every += domain.go_on(now)

@@ -188,7 +188,7 @@ def test_who_is_not_named_has_not_been_met(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_port_that_can_not_be_had_now_may_be_had_later() -> None:
-    """Where there were no more sockets, the ports of that moment were never used again."""
+    """A lack of sockets must not block ports for ever."""
     domain = both_ways()
     port = stand_in(domain, TrafficKind.USER_DATA)
     domain.stand_ins.block(port, for_good=False)

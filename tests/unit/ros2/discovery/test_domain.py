@@ -627,7 +627,7 @@ def test_a_participant_with_other_locators_than_before_is_met_anew(count: int) -
 
 
 def test_a_proxy_that_retires_has_both_sides_forget_each_other() -> None:
-    """What goes on meets anew by a later proxy, and Fast DDS takes no number twice."""
+    """Participants rediscover each other by a later proxy, and Fast DDS takes no number twice."""
     domain = make_domain()
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)

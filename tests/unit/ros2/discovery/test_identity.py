@@ -43,7 +43,7 @@ def met() -> Domain:
 
 
 def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
-    """What goes on of what A says inside, and B outside, by each way that there is."""
+    """The forwarded datagrams of a message from A inside and from B outside, for each way."""
     (stand_in,) = domain.stand_ins.by_port
     (mapping,) = [
         le for le in domain.inside.by_prefix[A].mappings.values() if le.target.port == 7410

@@ -208,7 +208,7 @@ def at_a_range_port(domain: Domain, host: str, port: int) -> None:
 def test_no_stand_in_leads_to_a_port_of_the_proxy(
     way: Callable[[Domain, str, int], None], port: int
 ) -> None:
-    """Where the advertised host is the proxy's own machine: the range, and what inside uses."""
+    """If the advertised host is the proxy's machine: ports of the range, and of inside."""
     domain = make_domain(peers=(HOST,), both_ways=True)
     domain.settings.proxy_address_for = lambda _: HOST
     domain.stand_ins.by_port[20001] = []

@@ -99,7 +99,7 @@ def ports_of(domain: Domain, prefix: bytes) -> list[int]:
 
 
 def ends_of(prefix: bytes, sent: list[Outgoing], host: str) -> list[bytes]:
-    """What tells a host that a participant has ended."""
+    """The datagrams to a host that end a participant."""
     told = (d for d in to(sent, host) if source_prefix(d) == prefix)
     return [d for d in told if (spdp := read_discovery(d).of_participant) and spdp.ended]
 

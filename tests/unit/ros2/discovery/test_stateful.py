@@ -88,7 +88,7 @@ SAID = st.one_of(
     st.builds(fragmented, PREFIX, st.integers(1, 4), NUMBER, st.sampled_from([100, 128, 300])),
     st.builds(told, PREFIX, NUMBER),
 )
-"""What participants say, true or not."""
+"""Messages of participants, true or false."""
 
 
 @st.composite

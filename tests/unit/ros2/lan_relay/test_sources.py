@@ -1,4 +1,4 @@
-"""What the LAN relay reads of each source, while forged sources flood the LAN."""
+"""The share of each source at the LAN relay, while forged sources flood the LAN."""
 
 from rosproxy.ros2.lan_relay.sources import (
     BURST,

@@ -1,4 +1,4 @@
-"""Which rule of the policy a reader or writer is a case of."""
+"""The kind of rule for a reader or writer."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Which writer and reader match across the boundary, and why not."""
+"""Writers and readers that match across the boundary, and reasons against it."""
 
 from collections.abc import Callable
 

@@ -31,7 +31,9 @@ LARGE_DATA = bytes.fromhex(
     "8001380001000000e81c0000000000000000000000000000efff000158e3036b60fee3960100000000000000"
     "f4010000000000000000000000000000"
 )
-"""What Fast DDS 2.14 (Jazzy) at 10.9.0.1 announces with FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA."""
+"""An announcement of Fast DDS 2.14 (Jazzy) at 10.9.0.1 with
+FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA.
+"""
 
 SECURED = bytes.fromhex(
     "5254505302010110ecbaf160345e80d6580d4475090108005ee9036bd6f4c4771505dc010000100000000000"
@@ -47,8 +49,9 @@ SECURED = bytes.fromhex(
     "00000000efff000107803000000000002c00000000000000000000000000000016000000766d2f302e31302e"
     "322f4c696e75782f4c696e7578000000198004000000200001000000"
 )
-"""What Cyclone DDS 0.10 (Debian) at 10.9.0.1 announces with DDS Security: discovery is encrypted,
-messages are signed."""
+"""An announcement of Cyclone DDS 0.10 (Debian) at 10.9.0.1 with DDS Security: discovery is
+encrypted, messages are signed.
+"""
 READABLE = SECURED.replace(bytes.fromhex("0510080007000080"), bytes.fromhex("0510080000000080"))
 """The same with a governance that protects neither; as seen."""
 

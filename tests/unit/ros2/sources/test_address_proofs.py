@@ -410,7 +410,7 @@ def test_a_flood_of_forged_sources_holds_up_no_answer() -> None:
 
 
 def test_a_proven_address_repeats_no_answer_at_any_rate() -> None:
-    """What stood behind a repeated answer was read without an allowance."""
+    """Submessages behind a repeated answer need an allowance."""
     domain = make_domain(peers=())
     meet(domain)
     (asked,) = questions(hear(domain, B, LAPTOP), LAPTOP)

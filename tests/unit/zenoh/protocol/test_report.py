@@ -18,7 +18,7 @@ from rosproxy.zenoh.protocol.report import (
 ADMIN_SPACE = b"""{"routers": [{"zid": "e5e8", "locators": ["tcp/127.0.0.1:7448"], "sessions": [
   {"links": [{"dst": "tcp/172.18.0.3:60546", "src": "tcp/172.18.0.2:7448"}], "peer": "86c4",
    "shm": true, "weight": null, "whatami": "peer"}], "version": "v1.7.2"}]}"""
-"""What a router of zenoh 1.7.2 says of itself, in a report."""
+"""A report of a router of zenoh 1.7.2."""
 
 
 def test_what_a_router_says_of_itself_is_read() -> None:
