@@ -39,9 +39,7 @@ KERNEL = {"plane": "kernel", "port": 45050, "connections": 1, "sent_rate": 10.0}
 
 
 def judged(**changes: Any) -> JudgedFacts:
-    """The doctor's findings about a talker inside and a listener outside, with the topic as
-    a name.
-    """
+    """The doctor's findings about the topic of a talker inside and a listener outside."""
     facts = make_facts(names=("/chatter",), **changes)
     return judge(facts, judge(facts))
 
