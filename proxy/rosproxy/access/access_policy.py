@@ -1,8 +1,8 @@
-"""The policy in force: whoever is about to let something pass asks it, and it tells of denials.
+"""The policy in force: gives a verdict on each name, and reports denials.
 
-Layers come from three sources: the options, which stay; a file, which is read again when it
-changes; and an operator, whose word replaces what it said before. Whatever is denied, or would be
-by a layer in audit mode, is told in the log, the metrics and the status.
+Layers come from three sources. The layers of the options stay. The layer of the policy file changes
+with the file. New layers of an operator replace the earlier layers of the operator. The log, the
+metrics and the status report each denial, and what a layer in audit mode would deny.
 """
 
 import asyncio
@@ -26,14 +26,14 @@ from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, Refusals
 
 OUTWARDS = frozenset({RuleKind.PUBLISH, RuleKind.SERVE})
-"""What is enforced on the way of TCPROS connections from outside."""
+"""The kinds of rules that the proxy enforces on TCPROS connections from outside."""
 PARAMETERS = frozenset({RuleKind.GET_PARAM, RuleKind.SET_PARAM})
 
 
 class AccessPolicy:
     """The layers in force: of the options, of the policy file and of an operator.
 
-    ``version`` is another number after each change of them, ``empty`` whether there is no rule.
+    ``version`` grows by 1 with each change of the layers. ``empty``: there is no rule.
     """
 
     def __init__(
@@ -60,29 +60,33 @@ class AccessPolicy:
         return (*self._option_layers, *self._file_layers, *self._operator_layers)
 
     def use_file(self, layer: PolicyLayer) -> None:
-        """Take in what the file says now. Raises ValueError if that is too much."""
+        """Put the layer of the policy file in force. Raises ValueError as `check_bounds` does."""
         check_bounds((*self._option_layers, layer, *self._operator_layers))
         self._file_layers = (layer,)
         self._note_change()
 
     def use_operator_layers(self, layers: Sequence[PolicyLayer]) -> None:
-        """Take in what an operator says now. Raises ValueError if that is too much."""
+        """Put the layers of an operator in force. Raises ValueError as `check_bounds` does."""
         check_bounds((*self._option_layers, *self._file_layers, *layers))
         self._operator_layers = tuple(layers)
         self._note_change()
         self._operator_told.set()
 
     async def wait_for_operator(self, seconds: float) -> None:
-        """Wait until an operator has told its layers, once and for so many seconds at most."""
+        """Wait for the first layers of an operator, for so many seconds at most.
+
+        Only the first call waits.
+        """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self._operator_told.wait()
         self._operator_told.set()
 
     def judge(self, kind: RuleKind, name: str, callers: Sequence[str], address: str) -> Verdict:
-        """Whether a thing is allowed to all of the callers at a node inside; nothing is reported.
+        """Whether the policy allows a name to all callers at a node inside, without a report.
 
-        What only some of them may not have is denied: nobody can tell them apart at one URI.
+        ``address`` is the address of the node inside. Callers at one URI are indistinguishable, so
+        a denial for one caller is a denial for all.
         """
         if self.empty:
             return ALLOWED
@@ -97,13 +101,16 @@ class AccessPolicy:
         address: str,
         source: str = "",
     ) -> Verdict:
-        """The same, and a denial is reported; ``source`` is the address of who asks, if another."""
+        """Return the verdict of `judge`, and report a denial.
+
+        ``source``: the address that the report names, if not the address of the node inside.
+        """
         verdict = self.judge(kind, name, callers, address)
         subject = f"{name} of {callers[0]}" if callers else name
         return self.report(verdict, kind, subject, source or address)
 
     def judge_below(self, kind: RuleKind, prefix: str, caller: str, address: str) -> Verdict:
-        """Whether all is allowed whose name begins with a prefix; nothing is reported."""
+        """Whether the policy allows all names that begin with a prefix, without a report."""
         return decide_below(self._layers_for(kind), kind, prefix, caller, address)
 
     def report(self, verdict: Verdict, kind: RuleKind, subject: str, source: str) -> Verdict:
@@ -120,9 +127,9 @@ class AccessPolicy:
     def may_deny(
         self, kinds: Collection[RuleKind], callers: Collection[str], address: str | None
     ) -> bool:
-        """Whether an enforced rule may deny something of these kinds to one of these callers.
+        """Whether an enforced rule of these kinds may deny something to one of these callers.
 
-        ``address`` is that of the node inside; None: any.
+        Without callers: to any caller. ``address`` is the address of the node inside; None: any.
         """
         if self.empty:
             return False
@@ -134,7 +141,7 @@ class AccessPolicy:
         self.empty = not any(layer.rules for layer in self.layers)
 
     def _layers_for(self, kind: RuleKind) -> tuple[PolicyLayer, ...]:
-        """The layers with their rules of one kind; those without any are left out."""
+        """The layers that have rules of one kind, with these rules alone."""
         if kind not in self._by_kind:
             self._by_kind[kind] = of_kind(self.layers, kind)
         return self._by_kind[kind]

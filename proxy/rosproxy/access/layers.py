@@ -1,8 +1,8 @@
-"""Layers of rules: whose they are, whether they are enforced, and the nodes that they are for.
+"""Layers of rules: a layer has an author, a mode, and the nodes for which the rules hold.
 
-Each layer decides for itself, by its first rule that matches. Allowed is what every enforcing
-layer allows, so that one more layer can only narrow what the others leave. A layer in audit mode
-only tells what it would deny.
+In each layer the first rule that matches decides. The policy allows what all enforced layers allow,
+so a further layer can only deny more. A layer in audit mode denies nothing: the proxy reports what
+the layer would deny.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -15,20 +15,20 @@ from rosproxy.access.rules import MOST_RULES, Rule, RuleAction, RuleKind, parse_
 from rosproxy.net.addresses import parse_address
 
 MOST_LAYERS = 1024
-"""Layers of one proxy: one for each container that has rules of its own, and some besides."""
+"""Layers of a proxy: one for each container with rules, and a few for options and operator."""
 LONGEST_LAYER_NAME = 200
 """Characters of a layer's name."""
 
 
 class PolicyMode(Enum):
-    """Whether a layer's rules are enforced or only told."""
+    """Whether the proxy enforces the rules of a layer, or only reports what they would deny."""
 
     ENFORCE = "enforce"
     AUDIT = "audit"
 
 
 class PolicyLayer(msgspec.Struct, frozen=True):
-    """Rules of one author. ``addresses``: the nodes that they are for; None: all nodes inside."""
+    """Rules of one author, for the nodes inside at ``addresses``; None: for all nodes inside."""
 
     name: str
     rules: tuple[Rule, ...]
@@ -36,12 +36,12 @@ class PolicyLayer(msgspec.Struct, frozen=True):
     addresses: frozenset[str] | None = None
 
     def is_for(self, address: str) -> bool:
-        """Whether it is for the node inside at an address."""
+        """Whether the rules hold for the node inside at an address."""
         return self.addresses is None or address in self.addresses
 
 
 class WrittenLayer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A layer as JSON has it; `read_layer` says what is wrong in it."""
+    """A layer as decoded from JSON; `read_layer` checks the rules and addresses."""
 
     name: str
     rules: tuple[str, ...]
@@ -50,9 +50,9 @@ class WrittenLayer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """Whether something is allowed; ``rule`` of ``layer`` is what denied it.
+    """Whether the policy allows something, and the ``rule`` of ``layer`` that denies it.
 
-    Where it is allowed and there is a rule, a layer in audit mode would deny it by that.
+    ``allowed`` with a ``rule``: the layer is in audit mode, and the rule would deny.
     """
 
     allowed: bool = True
@@ -61,12 +61,12 @@ class Verdict(msgspec.Struct, frozen=True):
 
     @property
     def mode(self) -> PolicyMode:
-        """The mode of the layer that denied it, or would."""
+        """The mode of the layer with the rule."""
         return PolicyMode.AUDIT if self.allowed else PolicyMode.ENFORCE
 
     @property
     def reason(self) -> str:
-        """What denied it, as people are told: the rule and whose it is; empty if nothing did."""
+        """The layer and the rule, for messages; empty without a rule."""
         return f"policy of {self.layer}: {self.rule}" if self.rule else ""
 
 
@@ -76,7 +76,7 @@ ALLOWED = Verdict()
 def decide(
     layers: Iterable[PolicyLayer], kind: RuleKind, name: str, caller: str, address: str
 ) -> Verdict:
-    """Whether a thing is allowed to ``caller``, at the node inside that has the ``address``."""
+    """Whether the layers allow a name to ``caller``, for the node inside at ``address``."""
     return _verdict(
         (layer, next((rule for rule in layer.rules if rule.matches(kind, name, caller)), None))
         for layer in layers
@@ -87,10 +87,7 @@ def decide(
 def decide_below(
     layers: Iterable[PolicyLayer], kind: RuleKind, prefix: str, caller: str, address: str
 ) -> Verdict:
-    """Whether all things are allowed whose names begin with ``prefix``.
-
-    Denied as well where that can't be told for sure.
-    """
+    """Whether the layers allow all names that begin with ``prefix``; if uncertain, denied."""
     return _verdict(
         (layer, _first_below(layer, kind, prefix, caller))
         for layer in layers
@@ -99,13 +96,13 @@ def decide_below(
 
 
 def of_kind(layers: Iterable[PolicyLayer], kind: RuleKind) -> tuple[PolicyLayer, ...]:
-    """Layers with their rules of one kind alone, which decide the same for that kind."""
+    """The layers that have rules of one kind, with these rules alone: equivalent for that kind."""
     pairs = [(layer, tuple(rule for rule in layer.rules if rule.kind is kind)) for layer in layers]
     return tuple(msgspec.structs.replace(layer, rules=kept) for layer, kept in pairs if kept)
 
 
 def strictest(verdicts: Iterable[Verdict]) -> Verdict:
-    """The verdict that counts of several: a denial, else what would be denied."""
+    """The strictest of several verdicts: first a denial, then a would-be denial."""
     return min(verdicts, key=lambda verdict: (verdict.allowed, verdict.rule is None))
 
 
@@ -115,9 +112,9 @@ def may_deny(
     callers: Collection[str],
     address: str | None,
 ) -> bool:
-    """Whether an enforced rule may deny something of these kinds to one of these callers.
+    """Whether an enforced rule of these kinds may deny something to one of these callers.
 
-    No callers: to anybody. ``address`` is that of the node inside; None: any.
+    Without callers: to any caller. ``address`` is the address of the node inside; None: any.
     """
     return any(
         rule.action is RuleAction.DENY
@@ -130,7 +127,7 @@ def may_deny(
 
 
 def read_layer(written: WrittenLayer) -> PolicyLayer:
-    """A layer from what was written. Raises ValueError, which names layer and rule."""
+    """The layer that JSON describes. Raises ValueError, which names layer and rule."""
     shown = written.name[:40]
     if not written.name.strip() or len(written.name) > LONGEST_LAYER_NAME:
         text = f"the name of a layer must have 1 to {LONGEST_LAYER_NAME} characters"
@@ -144,7 +141,7 @@ def read_layer(written: WrittenLayer) -> PolicyLayer:
 
 
 def read_layers(value: object) -> tuple[PolicyLayer, ...]:
-    """The layers of decoded JSON: a list. Raises ValueError, which names what is wrong."""
+    """The layers of decoded JSON, a list. Raises ValueError, which names what is wrong."""
     try:
         written = msgspec.convert(value, tuple[WrittenLayer, ...])
     except msgspec.ValidationError as error:
@@ -166,7 +163,7 @@ def layers_as_json(layers: Iterable[PolicyLayer]) -> list[dict[str, Any]]:
 
 
 def check_bounds(layers: Sequence[PolicyLayer]) -> tuple[PolicyLayer, ...]:
-    """The layers, unless they are too many. Raises ValueError."""
+    """The layers. Raises ValueError for more than MOST_LAYERS layers or MOST_RULES rules."""
     if len(layers) > MOST_LAYERS:
         raise ValueError(f"the policy has {len(layers)} layers, at most {MOST_LAYERS} are accepted")
     count = sum(len(layer.rules) for layer in layers)
@@ -176,7 +173,10 @@ def check_bounds(layers: Sequence[PolicyLayer]) -> tuple[PolicyLayer, ...]:
 
 
 def _verdict(deciding_rules: Iterable[tuple[PolicyLayer, Rule | None]]) -> Verdict:
-    """What follows from the rule that decides in each layer: the first that is enforced denies."""
+    """The verdict of all layers, given the deciding rule of each: the first enforced denial.
+
+    Without an enforced denial, the verdict has the first denial in audit mode.
+    """
     verdict = ALLOWED
     for layer, rule in deciding_rules:
         if rule is None or rule.action is RuleAction.ALLOW:
@@ -189,7 +189,7 @@ def _verdict(deciding_rules: Iterable[tuple[PolicyLayer, Rule | None]]) -> Verdi
 
 
 def _first_below(layer: PolicyLayer, kind: RuleKind, prefix: str, caller: str) -> Rule | None:
-    """The first rule that allows all names below a prefix, or may deny one."""
+    """The first rule that allows all names below a prefix, or may deny a name there."""
     for rule in layer.rules:
         if not rule.is_about(kind, caller):
             continue

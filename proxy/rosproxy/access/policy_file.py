@@ -1,7 +1,7 @@
-"""The file of ``--policy-file``: rules, a line each, read again when it changes.
+"""The file of ``--policy-file``: a rule on each line. The proxy reads the file when it changes.
 
-A file that can't be read or holds a mistake leaves the rules in force that it had before, and is a
-problem in the status until it is mended.
+If the file can't be read or has a mistake, the rules that were read before stay in force, and the
+status has a problem until the file is correct.
 """
 
 import logging
@@ -16,14 +16,14 @@ from rosproxy.telemetry.problems import Problems
 log = logging.getLogger(__name__)
 
 LOOK_INTERVAL = 1.0
-"""Seconds between looks whether the file has changed."""
+"""Seconds between checks whether the file has changed."""
 LONGEST_FILE = 1024 * 1024
-"""Bytes of the file that are read at most."""
+"""Bytes that the file has at most."""
 OPTION = "--policy-file"
 
 
 class PolicyFile:
-    """The file, and its signature when it was read last."""
+    """The policy file, and the signature that the file had at the last read."""
 
     def __init__(
         self, path: str, mode: PolicyMode, policy: AccessPolicy, problems: Problems
@@ -35,10 +35,10 @@ class PolicyFile:
         self._last_signature: tuple[int, ...] | None = None
 
     def read(self) -> None:
-        """Take in what the file says. Raises ValueError, which says what is wrong with it."""
+        """Put the rules of the file in force. Raises ValueError, which names the fault."""
         try:
             with self._path.open("rb") as file:
-                # Taken first: what changes while it is read is read at the next look.
+                # Before the read: after a change during the read, the next check reads again.
                 self._last_signature = _signature(os.fstat(file.fileno()))
                 text = file.read(LONGEST_FILE + 1)
             if len(text) > LONGEST_FILE:
@@ -61,7 +61,7 @@ class PolicyFile:
             self.read()
         except ValueError as error:
             text = f"{error}. The rules that were read before stay in force"
-            # A file that can't be opened is tried at each look, and told of once.
+            # Each check tries a file that can't be opened again, but reports the fault once.
             if text not in (problem.text for problem in self._problems.all()):
                 log.error("%s: %s", OPTION, text)
                 self._problems.solved(OPTION)
@@ -72,5 +72,5 @@ class PolicyFile:
 
 
 def _signature(stat: os.stat_result) -> tuple[int, ...]:
-    """What differs once the file has changed, or another file has its name."""
+    """A value that differs after a change of the file, or if another file has the name."""
     return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns

@@ -1,13 +1,15 @@
 """One rule of a policy: ``ACTION KIND GLOB [by GLOB]``, such as ``deny publish /camera/*``.
 
-The first glob is on the name of what is asked for, the second on the node that asks (`RuleKind`
-says which node that is). In a glob ``*`` stands for any characters, ``/`` too, and ``?`` for one;
-nothing else is special, and case counts. Of several rules the first that matches decides; where
-none does, everything is allowed (`rosproxy.access.layers`).
+The first glob matches the name of a topic, service, parameter or method, the second the name of a
+node (`RuleKind` says which node). In a glob ``*`` stands for any characters, ``/`` included, and
+``?`` for a single character. All other characters stand for themselves, and case counts. Of several
+rules the first that matches decides. If none matches, everything is allowed
+(`rosproxy.access.layers`).
 
-A glob without ``?`` is matched by searches for its texts, which take no longer than the name. Any
-other is matched by an expression that never goes back behind a ``*`` (atomic groups), so that it
-takes no longer than its length times the name's.
+Nodes choose names, so the time of a match is bounded. For a glob without ``?``, the match searches
+for the texts between the ``*``, in a time linear in the length of the name. Other globs become a
+regular expression with atomic groups, which never goes back behind a ``*``. The time then grows
+with the length of the glob times the length of the name at most.
 """
 
 import re
@@ -18,7 +20,7 @@ from functools import lru_cache
 import msgspec
 
 LONGEST_GLOB = 256
-"""Characters of a glob. Names of large systems have a hundred."""
+"""Characters of a glob. Names in large systems have a hundred."""
 MOST_RULES = 1000
 """Rules of all layers together."""
 _LONGEST_SHOWN = 80
@@ -27,7 +29,7 @@ _EXAMPLE = "such as: deny publish /camera/* by /driver"
 
 
 class RuleAction(Enum):
-    """What a rule does with what it matches."""
+    """What a rule does with the names that match."""
 
     ALLOW = "allow"
     DENY = "deny"
@@ -36,8 +38,8 @@ class RuleAction(Enum):
 class RuleKind(Enum):
     """What a rule is about, as seen from the nodes inside.
 
-    ``by`` is on the name of the node inside; for SLAVE it is the name that a caller outside gives,
-    which proves nothing.
+    ``by`` matches the name of the node inside. For SLAVE, ``by`` matches the name that a caller
+    outside gives, which proves nothing.
     """
 
     PUBLISH = "publish"
@@ -53,7 +55,7 @@ class RuleKind(Enum):
     SET_PARAM = "set-param"
     """A parameter that a node inside sets or deletes."""
     SLAVE = "slave"
-    """A method of a node inside that somebody outside calls."""
+    """A method of a node inside that a caller outside calls."""
 
 
 _ACTIONS = {action.value: action for action in RuleAction}
@@ -61,7 +63,7 @@ _KINDS = {kind.value: kind for kind in RuleKind}
 
 
 class Rule(msgspec.Struct, frozen=True):
-    """A rule; ``str`` gives it as text, which `parse_rule` reads again."""
+    """A rule; ``str`` returns the text that `parse_rule` reads."""
 
     action: RuleAction
     kind: RuleKind
@@ -74,27 +76,34 @@ class Rule(msgspec.Struct, frozen=True):
         return f"{self.action.value} {self.kind.value} {self.glob}{by}"
 
     def is_about(self, kind: RuleKind, caller: str) -> bool:
-        """Whether it is for this kind of thing and this caller."""
+        """Whether the rule is for this kind and this caller, whatever the name."""
         return self.kind is kind and matches(self.by, caller)
 
     def matches(self, kind: RuleKind, name: str, caller: str) -> bool:
-        """Whether it is about a thing of that name."""
+        """Whether the rule is for this kind, this name and this caller."""
         return self.is_about(kind, caller) and matches(self.glob, name)
 
     def covers_below(self, prefix: str) -> bool:
-        """Whether it matches all names that begin with ``prefix``."""
+        """Whether the glob matches all names that begin with ``prefix``.
+
+        False is no proof: the method returns True only if the glob ends with ``*`` and matches
+        ``prefix``.
+        """
         return self.glob.endswith("*") and matches(self.glob, prefix)
 
     def may_match_below(self, prefix: str) -> bool:
-        """Whether it may match a name that begins with ``prefix``; at times though it can't."""
+        """Whether the glob may match a name that begins with ``prefix``.
+
+        True is no proof: the method compares only the text before the first ``*`` or ``?``.
+        """
         literal = re.split(r"[*?]", self.glob, maxsplit=1)[0]
         return literal.startswith(prefix) or (literal != self.glob and prefix.startswith(literal))
 
 
 def parse_rules(text: str) -> tuple[Rule, ...]:
-    """The rules of a text, separated by ``;`` or line ends; lines with ``#`` first are comments.
+    """The rules of a text, separated by ``;`` or line ends.
 
-    Raises ValueError, which names the rule.
+    Lines that begin with ``#`` are comments. Raises ValueError, which names the rule.
     """
     lines = (line for line in text.splitlines() if not line.lstrip().startswith("#"))
     rule_texts = (rule_text.strip() for line in lines for rule_text in line.split(";"))
@@ -102,7 +111,7 @@ def parse_rules(text: str) -> tuple[Rule, ...]:
 
 
 def parse_rule(text: str) -> Rule:
-    """A single rule. Raises ValueError, which names it."""
+    """Parse a single rule. Raises ValueError, which names the rule."""
     shown = text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
     try:
         return _parse(text.split())
@@ -111,7 +120,7 @@ def parse_rule(text: str) -> Rule:
 
 
 def format_rules(rules: tuple[Rule, ...]) -> str:
-    """Rules as one line, which `parse_rules` reads again."""
+    """Rules as a line that `parse_rules` reads."""
     return "; ".join(map(str, rules))
 
 
@@ -139,15 +148,15 @@ def _parse(tokens: list[str]) -> Rule:
         raise ValueError(f"a glob must have at most {LONGEST_GLOB} characters")
     globs = [by] if kind is RuleKind.SLAVE else [tokens[2], by]
     for glob in globs:
-        if glob[0] not in "/*?":  # it would never match: names that the master knows begin so
+        if glob[0] not in "/*?":  # names at the master begin with /: no other glob would match
             raise ValueError(f"{glob[:40]!r} must begin with /, * or ?, as ROS names do")
     return Rule(action, kind, tokens[2], by)
 
 
 def _has_texts(name: str, first: str, rest: Sequence[str]) -> bool:
-    """Whether a name begins with a text, and has the others after it, the last one at its end.
+    """Whether a name begins with ``first``, ends with the last of ``rest``, and has all in order.
 
-    Each is taken where it comes first: so all that follows has most room.
+    Each text in the middle takes its first place in the name, which leaves most room for the rest.
     """
     *middle, last = rest
     position = len(first)
@@ -164,9 +173,9 @@ def _has_texts(name: str, first: str, rest: Sequence[str]) -> bool:
 
 @lru_cache(maxsize=2 * MOST_RULES)
 def _expression(glob: str) -> re.Pattern[str]:
-    """The regular expression of a glob; each ``*`` takes as little as the next segment lets it.
+    """The regular expression of a glob; each ``*`` matches as few characters as possible.
 
-    That is right for all segments but the last, which has to be at the name's end.
+    The last ``*`` is the exception: the segment behind it has to be at the end of the name.
     """
     first, *rest = (_fixed(segment) for segment in re.sub(r"\*+", "*", glob).split("*"))
     if not rest:
@@ -177,5 +186,5 @@ def _expression(glob: str) -> re.Pattern[str]:
 
 
 def _fixed(segment: str) -> str:
-    """The expression of a glob's segment, which has no ``*``."""
+    """The regular expression of a segment between two ``*`` of a glob."""
     return ".".join(map(re.escape, segment.split("?")))
