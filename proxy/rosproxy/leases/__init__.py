@@ -1,1 +1,1 @@
-"""Ports of the range: which there are, which are free, and how outside sees them."""
+"""Ports of the range: listen and advertised range, free ports, and fast ports."""

@@ -1,8 +1,8 @@
-"""Fast ports: a second port for an endpoint's topics, from the part of the range that is spare.
+"""Fast ports: a second port for the topics of an endpoint, from the free part of the range.
 
-An endpoint's fast port follows from its lease by arithmetic, so that a proxy which has lost all
-memory gives every recovered endpoint the port that its subscribers are connected to. A fast port
-is only an acceleration: it is given back before a node is refused a lease.
+The lease of an endpoint determines the fast port by arithmetic. So after a restart the proxy gives
+each recovered endpoint the fast port to which its subscribers are connected. A fast port only makes
+topics faster: before the proxy refuses a node a lease, another endpoint loses its fast port.
 """
 
 from collections import ChainMap
@@ -14,19 +14,19 @@ from rosproxy.leases.ports import PortPool, PortRange
 
 
 class LeaseHolder(Protocol):
-    """Who has a port that the kernel may forward, as the kernel plane needs it.
+    """The holder of a port that the kernel may forward, as the kernel plane sees the holder.
 
     An endpoint or stand-in of ROS 1 (`rosproxy.ros1.registry`), or a port of ROS 2
-    (`rosproxy.ros2.ports.kernel_ports`), whose only port is its fast port as well.
+    (`rosproxy.ros2.ports.kernel_ports`). The only port of the latter is lease and fast port.
 
-    ``inside`` tells on which side its node is: who connects to it comes from the other one.
+    ``inside``: the node is inside, and its peers connect from outside. Otherwise the reverse.
     """
 
     inside: bool
 
     fast_port: int | None
     fast_peers: Mapping[str, int]
-    """How many connections the kernel forwards now, by the peer's address."""
+    """How many connections the kernel forwards now, by the address of the peer."""
 
     @property
     def port(self) -> int:
@@ -38,7 +38,7 @@ class LeaseHolder(Protocol):
 
     @property
     def label(self) -> str:
-        """How messages name it."""
+        """The name of the holder in messages."""
 
     @property
     def address(self) -> str:
@@ -46,19 +46,19 @@ class LeaseHolder(Protocol):
 
     @property
     def node_ports(self) -> Collection[int]:
-        """The ports that the node itself has named: those of TCPROS, or that of a locator."""
+        """The ports that the node itself has announced: TCPROS ports, or the port of a locator."""
 
     @property
     def trusted(self) -> bool:
-        """Whether the node has been heard since the proxy started."""
+        """Whether the proxy knows the node from more than the data of the master."""
 
     @property
     def is_down(self) -> bool:
-        """Whether the node is known not to answer."""
+        """Whether the proxy has found that the node does not answer."""
 
     @property
     def caller_ids(self) -> list[str]:
-        """The names of the nodes there; one, as a rule."""
+        """The names of the nodes at the port; usually a single name."""
 
 
 _H = TypeVar("_H", bound=LeaseHolder)
@@ -66,7 +66,7 @@ _H_co = TypeVar("_H_co", bound=LeaseHolder, covariant=True)
 
 
 class LeaseHolders(Protocol[_H_co]):
-    """All endpoints, and the range that their ports are of."""
+    """All endpoints, and the pool of the range to which the ports of the endpoints belong."""
 
     @property
     def pool(self) -> PortPool:
@@ -81,7 +81,7 @@ class LeaseHolders(Protocol[_H_co]):
 
 
 class BothSides:
-    """The endpoints inside and the stand-ins for nodes outside, which share no port."""
+    """The endpoints inside and the stand-ins for nodes outside; no port belongs to both."""
 
     def __init__(
         self, inside: LeaseHolders[LeaseHolder], outside: Mapping[int, LeaseHolder]
@@ -91,25 +91,26 @@ class BothSides:
 
     @property
     def by_port(self) -> Mapping[int, LeaseHolder]:
-        """All by their leases, or the ports that stand in for them."""
+        """Endpoints by lease, and stand-ins by port."""
         views = (self._inside.by_port, self._outside)
-        return ChainMap(*(cast(dict[int, LeaseHolder], view) for view in views))  # it is only read
+        # ChainMap asks for mutable mappings; the type of the result is read-only.
+        return ChainMap(*(cast(dict[int, LeaseHolder], view) for view in views))
 
     @property
     def pool(self) -> PortPool:
-        """The ports of the range, which are for the endpoints inside."""
+        """The ports of the range, from which only the endpoints inside get ports."""
         return self._inside.pool
 
     def __iter__(self) -> Iterator[LeaseHolder]:
-        """All; safe against changes while iterating."""
+        """All endpoints and stand-ins; safe against changes while iterating."""
         return chain(self._inside, list(self._outside.values()))
 
 
 def partner(ports: PortRange, port: int) -> int | None:
-    """The port of a range that goes with another one; an odd last port has none.
+    """The partner of a port; None for the last port of an odd number of ports.
 
-    Of n ports the first n // 2 go with the next n // 2, so that leases, which are handed out from
-    the first port on, meet fast ports as late as possible.
+    Of n ports, each of the first n // 2 has a partner in the next n // 2. The proxy gives leases
+    from the first port on, so leases need the ports of partners as late as possible.
     """
     half = len(ports) // 2
     index = port - ports.first
@@ -119,7 +120,7 @@ def partner(ports: PortRange, port: int) -> int | None:
 
 
 def claim(pool: PortPool, endpoint: LeaseHolder) -> bool:
-    """Give an endpoint its fast port; False if that is not free. One that has it keeps it."""
+    """Give an endpoint the fast port of its lease, unless it has the port; False if not free."""
     if endpoint.fast_port is not None:
         return True
     port = partner(pool.range, endpoint.port)
@@ -130,7 +131,7 @@ def claim(pool: PortPool, endpoint: LeaseHolder) -> bool:
 
 
 def give_back(pool: PortPool, endpoint: LeaseHolder, blocked: bool = False) -> None:
-    """Take an endpoint's fast port away; ``blocked``: another program holds that port."""
+    """Take the fast port of an endpoint away; ``blocked``: another program holds that port."""
     if endpoint.fast_port is None:
         return
     if blocked:
@@ -140,16 +141,16 @@ def give_back(pool: PortPool, endpoint: LeaseHolder, blocked: bool = False) -> N
 
 
 def least_used_holder(holders: Iterable[_H]) -> _H | None:
-    """The holder that loses its fast port first when the range is short: with fewest connections.
+    """The holder with the fewest connections, which loses its fast port first in a full range.
 
-    Those go on all the same: the kernel keeps forwarding what it has begun to forward.
+    The connections of that holder stay: the kernel continues to forward open connections.
     """
     candidates = [endpoint for endpoint in holders if endpoint.fast_port is not None]
     return min(candidates, key=lambda e: e.fast_connections, default=None)
 
 
 def why_no_fast_port(pool: PortPool, endpoint: LeaseHolder) -> str:
-    """Why an endpoint that could have a fast port has none."""
+    """The reason why an endpoint has no fast port, although the kernel could forward for it."""
     port = partner(pool.range, endpoint.port)
     if port is None:
         return f"port {endpoint.port} has no second port in the range for a fast port"
@@ -164,5 +165,5 @@ def fast_port_count(holders: Iterable[LeaseHolder]) -> int:
 
 
 def ports_left(pool: PortPool, holders: Iterable[LeaseHolder]) -> int:
-    """How many ports are left for nodes: those that are free, and fast ports."""
+    """How many ports nodes can still get: free ports and fast ports."""
     return pool.free + fast_port_count(holders)

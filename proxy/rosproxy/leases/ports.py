@@ -1,4 +1,4 @@
-"""The range of ports that the proxy listens on and how it maps to the advertised range."""
+"""The listen range of the proxy, the advertised range, and the free ports."""
 
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -30,17 +30,17 @@ class PortRange:
 
 @dataclass(frozen=True, slots=True)
 class PortMap:
-    """Listen range and advertised range, of the same length: port n stands for n + offset."""
+    """Listen range and advertised range, of the same length, with the same offset for all ports."""
 
     listen: PortRange
     advertise: PortRange
 
     def advertised(self, port: int) -> int:
-        """The port that outside sees for a port that the proxy listens on."""
+        """The advertised port of a port that the proxy listens on."""
         return port - self.listen.first + self.advertise.first
 
     def listening(self, advertised: int) -> int | None:
-        """The port behind an advertised one; None if it is not in the advertised range."""
+        """The listen port of an advertised port; None outside the advertised range."""
         if advertised not in self.advertise:
             return None
         return advertised - self.advertise.first + self.listen.first
@@ -49,9 +49,9 @@ class PortMap:
 class PortPool:
     """The free ports of a range.
 
-    A port given back goes to the end of the queue, so that it is used again as late as possible:
-    peers that still hold its old meaning find nobody there instead of somebody else. ``blocked``
-    are ports that another program on this machine holds.
+    A port that is given back goes to the end of the queue, so the next node gets it as late as
+    possible. A peer that still uses the port for the old node then finds no node there, instead of
+    a wrong node. ``blocked``: the ports that another program on this machine holds.
     """
 
     def __init__(self, ports: PortRange) -> None:
@@ -65,27 +65,27 @@ class PortPool:
         return len(self._free)
 
     def take(self, prefer: int | None = None) -> int | None:
-        """Take ``prefer`` if it is free, else the port that was free longest; None if none is."""
+        """Take ``prefer`` if free, else the port that was free longest; None if no port is free."""
         if prefer is not None and prefer in self._free:
             del self._free[prefer]
             return prefer
         return self._free.popitem(last=False)[0] if self._free else None
 
     def is_free(self, port: int) -> bool:
-        """Whether nobody has a port of the range."""
+        """Whether a port of the range is free."""
         return port in self._free
 
     def claim(self, port: int) -> bool:
-        """Take exactly this port; False if it is not free."""
+        """Take exactly this port; False if the port is not free."""
         return port in self._free and self.take(port) == port
 
     def give_back(self, port: int) -> None:
-        """Return a port that was taken."""
+        """Return a port that was taken; a blocked port stays blocked."""
         if port not in self.blocked:
             self._free[port] = None
 
     def unblock(self, port: int) -> None:
-        """Take a port back that another program has let go."""
+        """Make a port free that another program has released."""
         self.blocked.discard(port)
         self._free[port] = None
 
