@@ -1,1 +1,1 @@
-"""The admin endpoint: health, metrics, status, and what an operator tells the proxy."""
+"""The admin endpoint: health, metrics, status, and the calls of an operator."""

@@ -1,7 +1,7 @@
-"""Asking a running proxy's admin endpoint, for the commands ``status``, ``health``, ``doctor``.
+"""A client for the admin endpoint, for the commands ``status``, ``health``, ``doctor``.
 
-Plain http.client: it starts fast, and unlike urllib it heeds no ``http_proxy`` variable, which has
-no say in how a container asks itself.
+The client uses http.client, which imports fast. Unlike urllib, http.client ignores the variable
+``http_proxy``: a container has to reach its own proxy directly.
 """
 
 import http.client
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 DEFAULT_URL = "http://127.0.0.1:11312"
 MAX_REPLY = 64 * 1024 * 1024
-"""Longest reply in bytes that is read."""
+"""Bytes of a reply that the client reads at most."""
 _WILDCARD_TO_LOOPBACK = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 class AdminError(Exception):
-    """The admin endpoint can't be asked; the message is one line that says what to do."""
+    """The admin endpoint gave no usable answer; the message is a line that says what to do."""
 
 
 class AdminClient:
     """Calls the admin endpoint at ``url``, ``http://host:port`` or ``host:port``.
 
-    Raises ValueError if it is neither.
+    Raises ValueError for a ``url`` of another form.
     """
 
     def __init__(self, url: str) -> None:
@@ -45,11 +45,11 @@ class AdminClient:
         return self._ask("GET", path, within)
 
     def status_json(self) -> dict[str, Any]:
-        """What ``/status`` says, as it says it. Raises AdminError."""
+        """The decoded JSON of ``/status``. Raises AdminError."""
         return self._json(self.get("/status"), "settings")
 
     def status(self) -> "ProxyStatus":
-        """What ``/status`` says. Raises AdminError."""
+        """The status of the proxy. Raises AdminError."""
         from rosproxy.admin import status_document  # noqa: PLC0415 - health starts fast
 
         try:
@@ -58,17 +58,17 @@ class AdminClient:
             raise AdminError(f"{self.url}/status can't be read: {error}") from None
 
     def probe(self) -> "RangeProbe":
-        """Let the proxy find out whether its range can be reached. Raises AdminError."""
+        """Have the proxy test whether outside reaches the range. Raises AdminError."""
         from rosproxy.admin.requests import read_probe  # noqa: PLC0415
 
-        # With a master that answers it takes 15 s at most: twice two time-outs of 3 s
+        # If the master answers, the test takes 15 s at most: twice two time-outs of 3 s
         # (`range_probe`), and 3 s by UDP (`udp_probe`).
         return read_probe(self._json(self._ask("POST", "/probe", 20.0), "probes"))
 
     def page(self) -> str:
-        """Where a browser finds the live page; with a key, if a token is set. Raises AdminError."""
+        """The URL of the live page, with a key if a token is set. Raises AdminError."""
         if not _authorization():
-            # Only to find out whether the proxy answers: without a token the page needs no key.
+            # The page needs no key without a token: the call only tests whether the proxy answers.
             self.get("/healthz")
             return f"{self.url}/"
         return f"{self.url}/?key={self._json(self._ask('POST', '/page-key', 5.0), 'key')['key']}"
@@ -77,8 +77,8 @@ class AdminClient:
         connection = http.client.HTTPConnection(self.server.host, self.server.port, timeout=within)
         try:
             connection.connect()
-            # The address, and not the name: the endpoint refuses names that it does not know as its
-            # own (`rosproxy.admin.host_rule`).
+            # The address, not the name: the endpoint refuses unknown names
+            # (`rosproxy.admin.host_rule`).
             address, port = connection.sock.getpeername()[:2]
             headers = {"Host": str(HostPort(address, port)), **_authorization()}
             connection.request(method, path, headers=headers)
@@ -107,10 +107,10 @@ class AdminClient:
 
 
 def _authorization() -> dict[str, str]:
-    """The header that lets callers change things from elsewhere than the proxy's own loopback."""
+    """The header with the token, which callers that are not on loopback need for changes."""
     token = os.environ.get("ROSPROXY_ADMIN_TOKEN", "")
     # http.client raises ValueError for a header with other characters (putheader). Without the
-    # header the proxy answers 403, and says what it takes.
+    # header the proxy answers 403 and names the missing token.
     fits = token and token.isascii() and token.isprintable()
     return {"Authorization": f"Bearer {token}"} if fits else {}
 
@@ -118,7 +118,8 @@ def _authorization() -> dict[str, str]:
 def default_url(admin_bind: str | None = None) -> str:
     """The URL of the admin endpoint of the proxy in this container or shell.
 
-    It listens at ``admin_bind``, else where the variable says that tells the proxy to listen.
+    The address is ``admin_bind``, else the address in ROSPROXY_ADMIN_BIND, with loopback for a
+    wildcard address. Without both, or if the address is malformed: DEFAULT_URL.
     """
     bound = parse_host_port(admin_bind or os.environ.get("ROSPROXY_ADMIN_BIND", ""))
     if bound is None:

@@ -1,16 +1,19 @@
-"""The admin endpoint: health, readiness, metrics, status, and what an operator tells the proxy.
+"""The admin endpoint: health, readiness, metrics, status, live page, and the calls of an operator.
 
-GET only reads, and is open to whoever reaches the endpoint, which is on loopback by default; the
-live page, whose routes it is given, decides by itself whom it answers (`rosproxy.page`). POST
-changes things: it is for callers on loopback that are no web page, and for those that know the
-token, of which only the hash is held here. So is waiting for a change (`status_changes`). Each
-path of a POST has an action; actions wait for each other as far as they have to. No path answers a
-request by a name that a stranger may have registered (`host_rule`).
+The endpoint listens on loopback by default. Which callers it serves:
 
-Callers are few and friendly, so its bounds are tight and no options: a source with too many
-connections loses its oldest, and a caller that sends half a request or reads no reply is cut off.
-Status and metrics are costly: callers share what is made (`shared_document`), and take slots.
-/healthz and /readyz take none, and are always served.
+- GET only reads, and serves every caller that reaches the endpoint. The live page has a rule of its
+  own (`rosproxy.page`).
+- POST changes the proxy. Callers need the token, or call from loopback and are no web page. The
+  same rule holds for ``GET /status/changes`` (`status_changes`). The proxy holds only the hash of
+  the token.
+- No path answers a request that names the endpoint by a name which a stranger may have registered
+  (`host_rule`).
+
+Callers are few and friendly, so the bounds are tight, and no options change the bounds. A source
+with too many connections loses the oldest connection. The endpoint ends the connection of a caller
+that sends half a request or reads no reply. Status and metrics are costly: callers share the
+documents (`shared_document`) and need slots. /healthz and /readyz need no slots.
 """
 
 import asyncio
@@ -42,16 +45,16 @@ log = logging.getLogger(__name__)
 
 CHANGES = "/status/changes"
 MAX_BODY = 1024 * 1024
-"""Longest body in bytes of a POST."""
+"""Bytes in the body of a POST at most."""
 MOST_CONNECTIONS = 32
 """Connections from one address: an operator, a health check and Prometheus have one or two each."""
 MOST_REPLIES = 16
-"""Replies with the status or the metrics that are under way."""
+"""Replies with the status or the metrics that are under way at most."""
 MOST_REPLIES_EACH = 4
-"""The same to one address: an operator, Prometheus and a person have one each."""
+"""Replies with status or metrics to one address: operator, Prometheus and a user have one each."""
 JSON = {"Content-Type": "application/json; charset=utf-8"}
 BODY_TIMEOUT = 10.0
-"""Seconds in which the body of a POST must have arrived."""
+"""Seconds in which the whole body of a POST must arrive."""
 FORBIDDEN = (
     "rosproxy: {} is for callers on this host's loopback, and for those that send "
     "'Authorization: Bearer TOKEN' with the proxy's --admin-token (ROSPROXY_ADMIN_TOKEN){}\n"
@@ -59,18 +62,17 @@ FORBIDDEN = (
 
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 Action = Callable[[Any], Awaitable[dict[str, Any]]]
-"""Does what a POST asks for, given its JSON body. Raises BodyError, CallFailed."""
+"""Carries out a POST, given the decoded JSON body. Raises BodyError, CallFailed."""
 
 
 @dataclass(slots=True, eq=False)
 class AdminServer:
-    """Serves what people, orchestrators and the operator ask.
+    """Serves users, orchestrators and the operator.
 
-    ``status`` is the state; ``unready`` gives the reason why the proxy is not ready, None if it is;
-    ``actions`` are what paths do when something is posted there; ``token_hash``, a SHA-256 in hex
-    digits, is that of the token with which callers from elsewhere than loopback may post.
-    ``routes`` are served besides, by method and path; ``own_names`` are those that the proxy is
-    known by, in lower case.
+    ``status`` returns the state of the proxy. ``unready`` returns why the proxy is not ready; None
+    if ready. ``actions`` carry out POST calls, by path. ``token_hash`` is the SHA-256, in hex
+    digits, of the token; None: only callers on loopback may post. ``routes`` are further handlers,
+    by method and path. ``own_names`` are the host names of the proxy, in lower case.
     """
 
     _metrics: CollectorRegistry
@@ -87,7 +89,7 @@ class AdminServer:
     _replies: FairSlots = field(init=False)
 
     def __post_init__(self) -> None:
-        """Nobody asks yet."""
+        """Create the shared documents and the slots."""
         self._snapshots = SharedDocument(lambda: StatusSnapshot.take(self._status))
         self._exposition = SharedDocument(lambda: generate_latest(self._metrics))
         self._changes = StatusChanges(self._snapshots.newest)
@@ -99,12 +101,13 @@ class AdminServer:
         """Listen. Raises OSError."""
         self._runner = web.ServerRunner(BoundedServer(self._answer, MOST_CONNECTIONS))
         await self._runner.setup()
-        # A caller that finds the queue full tries again after 1 s: too late for a health check.
+        # With a full queue, TCP tries to connect again after 1 s: too late for a health check.
         await web.TCPSite(self._runner, listener.host, listener.port, backlog=BACKLOG).start()
 
     async def stop(self) -> None:
-        """Stop listening."""
-        # Else aiohttp waits for those handlers, up to a minute (web_runner.py, shutdown_timeout).
+        """Stop listening, and end all replies."""
+        # aiohttp waits up to a minute for open handlers (web_runner.py, shutdown_timeout), so the
+        # handlers that wait for a change or a document have to end first.
         self._changes.end()
         self._snapshots.close()
         self._exposition.close()
@@ -115,7 +118,7 @@ class AdminServer:
         method = "GET" if request.method == "HEAD" else request.method
         page = self._pages().get(request.path)
         route = self._routes.get((method, request.path))
-        if not self._answers_by_that_name(request, route):
+        if not self._answers_to_host(request, route):
             return web.Response(status=403, text=refusal(request.headers.get("Host", "")))
         if page is not None and method == "GET":
             return await page(request)
@@ -132,14 +135,14 @@ class AdminServer:
         text = "405: Method Not Allowed"
         return web.Response(status=405, text=text, headers={"Allow": methods})
 
-    def _answers_by_that_name(self, request: web.BaseRequest, route: Handler | None) -> bool:
-        """Whether the ``Host`` of a request is one to answer by; see `host_rule`.
+    def _answers_to_host(self, request: web.BaseRequest, route: Handler | None) -> bool:
+        """Whether the endpoint answers a request with this ``Host`` header; see `host_rule`.
 
-        Where a token is set the live page asks for it by itself, in a form and by any name.
+        If a token is set, the live page answers to any name: the page asks for the token itself.
         """
-        asks_itself = route is not None and self._token_hash is not None
+        page_asks_for_token = route is not None and self._token_hash is not None
         is_own = is_own_host(request.headers.get("Host", ""), self._own_names)
-        return is_own or asks_itself or self._knows_token(request)
+        return is_own or page_asks_for_token or self._knows_token(request)
 
     def _pages(self) -> dict[str, Handler]:
         return {
@@ -171,7 +174,7 @@ class AdminServer:
         return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
 
     async def _wait(self, request: web.BaseRequest) -> web.StreamResponse:
-        """Answer once the state is another one than the caller knows (``since``)."""
+        """Answer once the version of the state differs from ``since``, or ``within`` is over."""
         if not self._may_post(request):
             return self._forbidden(f"GET {CHANGES}")
         since = request.query.get("since", "")
@@ -216,8 +219,9 @@ class AdminServer:
     def _may_post(self, request: web.BaseRequest) -> bool:
         """Whether a caller may post.
 
-        A browser on this host is on loopback too. Its ``Origin`` says for which page it calls; an
-        image or a script of a page is asked for without one, but with ``Sec-Fetch-Site``.
+        A browser on this host calls from loopback, too, for any web page. The headers show that the
+        caller is a browser: a request of a page has ``Origin``, and a request for an image or
+        script has at least ``Sec-Fetch-Site``.
         """
         is_page = bool({"Origin", "Sec-Fetch-Site"} & request.headers.keys())
         return self._knows_token(request) or (is_loopback(request.remote or "") and not is_page)
@@ -226,7 +230,7 @@ class AdminServer:
         scheme, _, token = request.headers.get("Authorization", "").partition(" ")
         if not self._token_hash or scheme != "Bearer":
             return False
-        # aiohttp keeps bytes that are no UTF-8 as surrogates.
+        # aiohttp decodes bytes that are not UTF-8 as surrogates.
         token_hash = hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
         return hmac.compare_digest(token_hash, self._token_hash)
 
@@ -236,12 +240,12 @@ async def _tell_health(_request: web.BaseRequest) -> web.Response:
 
 
 def _address(request: web.BaseRequest) -> str:
-    """The address that a request comes from."""
+    """The source address of a request."""
     return plain_address(request.remote or "")
 
 
 def _read_json(body: bytes) -> Any:
-    """A body as JSON; an empty object if there is none. Raises BodyError."""
+    """The decoded JSON of a body; an empty object for an empty body. Raises BodyError."""
     try:
         return json.loads(body) if body.strip() else {}
     except (ValueError, RecursionError) as error:

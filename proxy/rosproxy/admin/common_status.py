@@ -1,4 +1,4 @@
-"""What ``/status`` tells of any proxy; each version of ROS adds what it knows."""
+"""The part of ``/status`` that every proxy has; `ros1`, `ros2` and `zenoh` add their parts."""
 
 import os
 import time
@@ -27,7 +27,7 @@ To find the rule that hides a name takes up to some microseconds.
 
 
 def common_status(runtime: Runtime) -> ProxyStatus:
-    """The state of a proxy as far as it depends on no version of ROS."""
+    """The state of a proxy, without the parts of ROS 1, ROS 2 and rmw_zenoh."""
     settings = runtime.settings
     ports = settings.ports
     return ProxyStatus(
@@ -75,7 +75,7 @@ def _layers(runtime: Runtime) -> PolicyStatus:
 
 
 def _problems(problems: Problems) -> tuple[ProblemStatus, ...]:
-    """The problems that were noted, each with how long ago."""
+    """The noted problems, with their ages."""
     # Not below 0, which readers refuse (`Seconds`): the clock may have been set back meanwhile.
     return tuple(
         ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text, p.holds)

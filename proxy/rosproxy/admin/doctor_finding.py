@@ -21,7 +21,7 @@ class Severity(IntEnum):
 
 
 UNKNOWN_NAME = "unknown name"
-"""The check that finds no node, topic or service of a name that was asked for."""
+"""The check of a finding that no node, topic or service has the name in the user's question."""
 
 
 class DoctorFinding(msgspec.Struct, frozen=True):
@@ -41,5 +41,5 @@ error = partial(DoctorFinding, Severity.ERROR)
 
 
 def failed(findings: Sequence[DoctorFinding]) -> bool:
-    """Whether anything is wrong."""
+    """Whether there is an ERROR among the findings."""
     return any(finding.severity is Severity.ERROR for finding in findings)

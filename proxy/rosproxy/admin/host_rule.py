@@ -1,11 +1,11 @@
-"""The rule about the ``Host`` of a request: no web page of a stranger may ask through a browser.
+"""The rule about the ``Host`` of a request: a stranger's web page may not call through a browser.
 
-A stranger's web page can let its own name lead to the admin endpoint (DNS rebinding). The browser
-then takes the endpoint for that page's own server, and lets the page read the replies. No header
-tells such a request from that of a program: a page of the same origin sends no ``Origin``, and over
-HTTP a browser sends no ``Sec-Fetch-Site``. But the browser names the host that the page has asked
-for. So a request must name an address, a name that no stranger can register, or a name that the
-proxy is known by. A request that has proved to know the token is a program's, whatever it names.
+The owner of a web page can let the name of the page lead to the admin endpoint (DNS rebinding). For
+the browser the endpoint is then the server of the page, so the page may read the replies. Other
+headers do not show such a request: a browser sends no ``Origin`` to the same origin, and no
+``Sec-Fetch-Site`` over HTTP. But ``Host`` has the name of the page. So a request must name an
+address, a name that no stranger can register, or a name of the proxy. A request with the token
+comes from a program, so any ``Host`` is allowed.
 """
 
 from collections.abc import Collection
@@ -14,17 +14,17 @@ from rosproxy.net.addresses import is_address, parse_authority
 from rosproxy.telemetry.text import brief
 
 LOCAL = (".localhost", ".local", ".internal", ".svc")
-"""Ends of names that are nobody's on the Internet. Service names of Kubernetes end in ``.svc`` or
-``.svc.cluster.local``."""
+"""Ends of names that no stranger can register on the Internet. Names of Kubernetes Services end in
+``.svc`` or ``.svc.cluster.local``."""
 LONGEST_SHOWN = 100
 """Characters of a refused name that the refusal repeats."""
 
 
 def is_own_host(host: str, own_names: Collection[str] = ()) -> bool:
-    """Whether the ``Host`` of a request is none that a stranger may have registered.
+    """Whether no stranger can have registered the ``Host`` of a request.
 
-    ``own_names`` are those that the proxy is known by, in lower case. A browser always sends a
-    ``Host``, so that a request without one is a program's.
+    ``own_names`` are the names of the proxy, in lower case. True for an empty ``Host``: browsers
+    always send ``Host``, so the request comes from a program.
     """
     host_port = parse_authority(f"//{host}")
     name = (host_port.host if host_port else host.partition(":")[0]).lower().rstrip(".")
@@ -34,7 +34,7 @@ def is_own_host(host: str, own_names: Collection[str] = ()) -> bool:
 
 
 def refusal(host: str) -> str:
-    """What a caller is told that has named a host of a stranger."""
+    """The text of the reply to a request with another ``Host``."""
     return (
         f"rosproxy: {brief(host, LONGEST_SHOWN)}: the admin endpoint does not answer by this name. "
         "Ask by an IP address, as localhost, by a name without a dot, by the proxy's "

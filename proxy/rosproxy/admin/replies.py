@@ -1,7 +1,8 @@
 """Replies of the admin endpoint and the live page whose bytes many readers share.
 
-A reader that takes nothing holds no copy: the bytes are written in pieces, each once the reader has
-taken most of the pieces before it, and a reader that is too slow is cut off.
+A reader that takes nothing causes no copy of the reply: the proxy writes the next piece once the
+reader has taken most of the earlier pieces. The proxy ends the connection of a reader that is too
+slow.
 """
 
 import asyncio
@@ -11,13 +12,13 @@ from collections.abc import Mapping, Sequence
 from aiohttp import web
 
 PIECE = 64 * 1024
-"""Bytes that are written at once; aiohttp waits for the reader after two of them at the latest."""
+"""Bytes of a piece; aiohttp waits for the reader after two pieces at the latest."""
 REPLY_TIMEOUT = 60.0
-"""Seconds in which a reader must have taken a reply: 1 MiB at 140 kbit/s."""
+"""Seconds in which a reader must take a reply: 1 MiB at 140 kbit/s."""
 
 
 async def write_pieces(response: web.StreamResponse, body: bytes) -> None:
-    """Write bytes no faster than the reader takes them. Raises ConnectionError."""
+    """Write bytes at the speed of the reader. Raises ConnectionError."""
     shared = memoryview(body)
     for start in range(0, len(shared), PIECE):
         await response.write(shared[start : start + PIECE])
@@ -26,7 +27,7 @@ async def write_pieces(response: web.StreamResponse, body: bytes) -> None:
 async def send_shared(
     request: web.BaseRequest, parts: Sequence[bytes], headers: Mapping[str, str]
 ) -> web.StreamResponse:
-    """Send a reply with these bytes, one part after the other."""
+    """Send a reply with these parts, in order; end the connection after REPLY_TIMEOUT."""
     response = web.StreamResponse(headers=headers)
     response.content_length = sum(map(len, parts))
     # A reader that has gone needs no reply.
@@ -44,6 +45,6 @@ async def send_shared(
 
 
 def unavailable(reason: object, headers: Mapping[str, str] | None = None) -> web.Response:
-    """The reply to a caller that can't be served now."""
+    """The reply to a caller that the proxy can't serve now: 503, with ``Retry-After``."""
     text = f"rosproxy: {reason}\n"
     return web.Response(status=503, text=text, headers={**(headers or {}), "Retry-After": "10"})

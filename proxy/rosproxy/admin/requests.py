@@ -1,7 +1,7 @@
-"""The bodies of the admin endpoint's POST calls, and of their answers.
+"""The bodies of the POST calls of the admin endpoint, and of the answers.
 
-Each body is a type; it is made from decoded JSON, or a BodyError says in one line which field is
-wrong and what it must be. Addresses come out in their plain form and host names in lower case.
+Each body has a type. `read_body` converts decoded JSON, or raises a BodyError, which names the
+wrong field and the expected value in a line. Addresses become plain, host names lower case.
 """
 
 import re
@@ -15,26 +15,26 @@ from rosproxy.setting_kinds import read_peer
 from rosproxy.telemetry.text import clean, shorten
 
 Body = TypeVar("Body", bound=msgspec.Struct)
-# Not the narrower rule of DNS: names of containers have underscores as well.
+# Wider than the rule of DNS: names of containers may have underscores.
 _NAME = re.compile(r"[\w.-]{1,253}")
 _PREFIX = re.compile(r"[0-9a-f]{2}(\.[0-9a-f]{2}){11}")
 """A GUID prefix as `/status` writes it."""
 MOST_PEERS = 1024
-"""Peers that a proxy can be told of: each is told of every participant inside."""
+"""Peers of a proxy at most: the proxy sends each peer the announcements of all participants."""
 _LONGEST = 150
-"""Characters of a message: it repeats what was sent."""
+"""Characters of a message at most, since messages repeat texts of the body."""
 
 
 class BodyError(ValueError):
-    """A body that can't be used; the message names the field and says what it must be."""
+    """A body with a wrong field; the message names the field and the expected value."""
 
 
 class EmptyBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The body of ``POST /probe`` and ``POST /retire``: none, or an empty object."""
+    """An empty object, or no body at all, as of ``POST /probe`` and ``POST /retire``."""
 
 
 class MasterAddress(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The body of ``POST /master-address``: where the master is looked for from now on."""
+    """The body of ``POST /master-address``: the IP address of the master from now on."""
 
     address: str
 
@@ -43,7 +43,7 @@ class MasterAddress(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ArrivedContainer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A container on an inside network: its IP address there, and the host names it goes by."""
+    """A container on an inside network: the IP address there, and the host names."""
 
     address: str
     names: frozenset[str] = frozenset()
@@ -57,14 +57,14 @@ class ArrivedContainer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ContainerUpdate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The body of ``POST /containers``: what has become of containers.
+    """The body of ``POST /containers``: changes of containers, callers and peers.
 
-    ``gone``: addresses that no container has any more. ``moved``: old address to new address.
-    ``arrived``: containers that may have nodes which registered before the proxy was there.
+    ``gone``: addresses that no container has any more. ``moved``: new addresses by old addresses.
+    ``arrived``: containers whose nodes may have registered before the start of the proxy.
     ``selected``: the addresses that may use the proxy as their master; None: unchanged.
-    ``peers`` are those of ROS 2, ``host`` or ``host:port``, instead of all before; None: unchanged.
-    ``former``: the ports, by GUID prefix, that participants had at a proxy with another address, or
-    with another range.
+    ``peers``: all peers of ROS 2, as ``host`` or ``host:port``; None: unchanged.
+    ``former``: ports by GUID prefix. Participants had these ports at a proxy with another address
+    or another range.
     """
 
     gone: tuple[str, ...] = ()
@@ -76,17 +76,17 @@ class ContainerUpdate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def former_ports(self) -> dict[bytes, tuple[int, ...]]:
-        """``former`` by the bytes of the prefix."""
+        """``former`` by GUID prefix, in bytes."""
         return {bytes.fromhex(text.replace(".", "")): ports for text, ports in self.former.items()}
 
     @property
     def ros2_peers(self) -> tuple[HostPort, ...] | None:
-        """The peers, parsed."""
+        """The parsed peers; None: unchanged."""
         return None if self.peers is None else tuple(map(read_peer, self.peers))
 
     @property
     def tells_events(self) -> bool:
-        """Whether it tells of anything that has happened to a container."""
+        """Whether a container has gone, moved or arrived."""
         return bool(self.gone or self.moved or self.arrived)
 
     def __post_init__(self) -> None:
@@ -113,13 +113,13 @@ class ContainerUpdate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PolicyUpdate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The body of ``POST /policy``: the layers of rules that replace those told before."""
+    """The body of ``POST /policy``: all layers of the operator. They replace earlier layers."""
 
     layers: tuple[WrittenLayer, ...]
 
 
 class EnforcementCounts(msgspec.Struct, frozen=True):
-    """What a change of the policy led to: registrations hidden and shown, connections cut."""
+    """The effects of a policy change: registrations hidden and shown, connections cut."""
 
     hidden: int = 0
     shown: int = 0
@@ -127,12 +127,12 @@ class EnforcementCounts(msgspec.Struct, frozen=True):
 
 
 class PortProbe(msgspec.Struct, frozen=True):
-    """How a port of the range was reached, by the proxy itself and by the master.
+    """The results when the proxy itself and the master tried to reach a port of the range.
 
-    ``from_proxy`` is ok, refused, silent, unreachable, unresolvable, closed (taken, but not passed
-    on to the proxy) or stranger (something else answers); ``from_master`` is ok, missed (the
-    master's call did not arrive) or unknown (the master could not be asked). ``transport`` is tcp,
-    or for ROS 2 udp, where nobody but the proxy itself can try.
+    ``from_proxy`` is ok, refused, silent, unreachable, unresolvable, closed (the connection is
+    accepted, but does not reach the proxy) or stranger (another program answers). ``from_master``
+    is ok, missed (the call of the master did not arrive) or unknown (the master could not be
+    asked). ``transport`` is tcp, or udp for ROS 2, where only the proxy itself can try.
     """
 
     port: int = 0
@@ -154,7 +154,7 @@ def is_guid_prefix(text: str) -> bool:
 
 
 def read_probe(answer: object) -> RangeProbe:
-    """The answer to ``POST /probe``; an empty one if it is of no use."""
+    """The answer to ``POST /probe``; without probes if the answer has another form."""
     try:
         return msgspec.convert(answer, RangeProbe)
     except msgspec.ValidationError:
@@ -162,15 +162,15 @@ def read_probe(answer: object) -> RangeProbe:
 
 
 def read_body(body: object, kind: type[Body]) -> Body:
-    """A decoded body as its type. Raises BodyError."""
+    """Convert a decoded body to its type. Raises BodyError."""
     try:
         return msgspec.convert(body, kind)
     except msgspec.ValidationError as error:
-        # For example: Expected `str`, got `int` - at `$.gone[0]`. A ValueError of __post_init__ is
-        # its cause and has named the field already.
+        # For example: Expected `str`, got `int` - at `$.gone[0]`. If __post_init__ has raised a
+        # ValueError, that is the cause, and its message names the field.
         fault, _, path = str(error).partition(" - at `$")
         field = path.removeprefix(".").removesuffix("`")
-        if error.__cause__ is None:  # msgspec's own, which does not begin with a field
+        if error.__cause__ is None:  # a message of msgspec, which does not begin with the field
             hint = "" if field else f"; known: {', '.join(kind.__struct_fields__) or 'none'}"
             text = f"{field or 'the body'}: {fault}" + (hint if "unknown field" in fault else "")
         else:

@@ -1,8 +1,7 @@
-"""Whether outside can reach a proxy as it was set up: its advertised host, its range, its ports.
+"""Whether outside can reach a proxy with its settings: advertised host, range, free ports.
 
-The same rules serve ``rosproxy doctor``, the proxy itself for its log and its status, and
-``rosproxy run --check --deep`` before anything runs. The first cause comes first, and what follows
-from it is not reported.
+These rules serve ``rosproxy doctor``, the log and the status of the proxy, and
+``rosproxy run --check --deep`` before a start. Findings name the first cause, not the consequences.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,14 +14,14 @@ from rosproxy.net.addresses import is_loopback
 from rosproxy.telemetry.text import listed, plural, quoted
 
 LOOPBACK_MEANING = "Other machines reach only themselves at this address"
-"""What a loopback address leads to, for findings."""
+"""The reason why a loopback address is wrong, for findings."""
 FEW_FREE = 0.1
 """Share of the range that should be free at least."""
 
 HOST = "advertised host"
 RANGE = "published range"
 _NO_WAY_BACK = ("refused", "silent", "unreachable")
-"""How the proxy's own try may end although outside gets through: NAT has no hairpin."""
+"""Results of the proxy's own try that prove no fault: NAT without hairpin causes the same."""
 TEXT_BY_OUTCOME = {
     "refused": (
         "connection refused. The range is not published, or the address is not that of this host"
@@ -49,9 +48,9 @@ def _of_this_host() -> str:
 
 
 def advertised_host(host: str, addresses: Sequence[str], all_here: bool) -> Iterator[DoctorFinding]:
-    """What is wrong with an advertised host that leads to these addresses here.
+    """The findings about an advertised host that resolves to these addresses on this machine.
 
-    ``all_here``: all that is outside is on this machine as well.
+    ``all_here``: all nodes outside are on this machine, too.
     """
     loopback = [address for address in addresses if is_loopback(address)]
     if is_loopback(host) and not all_here:
@@ -76,7 +75,7 @@ def published_range(probe: RangeProbe, host: str, ports: PortsStatus) -> Iterato
         outcomes.setdefault((trial.transport, trial.from_proxy, trial.from_master), []).append(port)
     for (transport, from_proxy, from_master), tried_ports in outcomes.items():
         target = f"{host}, port {' and '.join(tried_ports)}"
-        # If all tries ended alike, the whole range is out of reach, and not only a part of it.
+        # If all tries ended alike, the whole range is out of reach, not only a part.
         is_uniform = len({key for key in outcomes if key[0] == transport}) == 1
         if transport == "udp":
             yield _by_udp(host, ports, from_proxy, target)
@@ -87,9 +86,9 @@ def published_range(probe: RangeProbe, host: str, ports: PortsStatus) -> Iterato
 
 
 def probe_result(probe: RangeProbe) -> RangeProbeStatus | None:
-    """What tries at some ports of the range prove, in the sense of `published_range`.
+    """The worst result of the tries at some ports of the range; None without tries.
 
-    It is the worst of them; None if none was tried.
+    `published_range` makes findings from the same results.
     """
     results = [
         RangeProbeStatus(_is_reached(p), p.from_proxy, p.from_master, p.transport)
@@ -99,7 +98,7 @@ def probe_result(probe: RangeProbe) -> RangeProbeStatus | None:
 
 
 def _is_reached(trial: PortProbe) -> bool | None:
-    """Whether outside reaches a port; None where the proxy alone has tried and NAT may be why."""
+    """Whether outside reaches a port; None if only the proxy tried, and NAT may be the cause."""
     if trial.from_master != "unknown":
         return trial.from_master == "ok"
     if trial.from_proxy == "ok":
@@ -108,7 +107,7 @@ def _is_reached(trial: PortProbe) -> bool | None:
 
 
 def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
-    """How many ports are free, and how many other programs hold."""
+    """The findings about free ports, and about ports that other programs hold."""
     used = ports.used
     free = ports.free
     blocked = ports.blocked
@@ -137,7 +136,7 @@ def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
 
 
 def _reached(host: str, from_proxy: str, from_master: str, target: str) -> DoctorFinding:
-    """The finding where a try at free ports came through, the proxy's own or the master's."""
+    """The finding if the proxy or the master has reached the ports."""
     if from_master == "ok":
         aside = (
             "" if from_proxy == "ok" else f" (the proxy does not: {from_proxy}. This is no fault)"
@@ -181,10 +180,10 @@ def _not_reached(
 
 
 def _by_udp(host: str, ports: PortsStatus, from_proxy: str, target: str) -> DoctorFinding:
-    """The finding from a try by UDP; failing proves nothing where NAT has no way back.
+    """The finding from a try by UDP. A failure proves no fault: NAT without hairpin fails, too.
 
-    A participant outside that does not reach the range is reported once the proxy has heard its
-    announcement (`domain_problems`).
+    If a participant outside does not reach the range, `domain_problems` reports the participant
+    after its first announcement.
     """
     if from_proxy == "ok":
         return ok(RANGE, RANGE, f"the proxy reaches {target} by UDP")

@@ -1,10 +1,10 @@
-"""A document that is costly to make, made once for all callers that ask meanwhile.
+"""A document that is costly to make: callers that ask at the same time share a document.
 
-A caller always gets a document whose making began after the call. So a caller that asks after an
-action sees the effect of that action: a cache by age would answer with the state before it. What is
-bounded is how often the document is made: after each making there is a pause, so that the making
-takes no more than a share of the processor. Callers that ask in the pause wait for the next one,
-and all of them get the same bytes.
+A caller always gets a document that is made after the call. So a caller that asks after an action
+sees the effect of that action. A cache by age could answer with the earlier state. After each
+document there is a pause, so that documents take SHARE of the processor, or more if LONGEST_PAUSE
+cuts the pause short. Callers that ask in the pause wait for the next document, and all these
+callers get the same bytes.
 """
 
 import asyncio
@@ -13,14 +13,14 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 SHARE = 0.1
-"""Share of a processor that the making of a document may take."""
+"""Share of a processor that the documents take, as long as a pause is within LONGEST_PAUSE."""
 LONGEST_PAUSE = 1.0
-"""Seconds between two makings at most: an operator waits 3 s for an answer."""
+"""Seconds of a pause at most: an operator waits 3 s for an answer."""
 Document = TypeVar("Document")
 
 
 class SharedDocument(Generic[Document]):
-    """What ``make`` returns, anew for each caller, and seldom. ``clock`` measures the making."""
+    """The document that ``make`` returns. ``clock`` (seconds) measures how long ``make`` takes."""
 
     def __init__(
         self, make: Callable[[], Document], clock: Callable[[], float] = time.perf_counter
@@ -31,21 +31,21 @@ class SharedDocument(Generic[Document]):
         self._due = 0.0
 
     async def newest(self) -> Document:
-        """A document that is made from now on. Raises what ``make`` raises."""
+        """A document that is made after this call. Raises the exceptions of ``make``."""
         if self._next is None:
             self._next = asyncio.create_task(self._make_when_due())
-        # A caller that goes away takes the document from no other caller.
+        # Shielded: other callers may wait for the document of a caller that has gone.
         return await asyncio.shield(self._next)
 
     def close(self) -> None:
-        """End the pause: callers that wait are cancelled."""
+        """End the pause, and cancel the callers that wait."""
         if self._next is not None:
             self._next.cancel()
 
     async def _make_when_due(self) -> Document:
         loop = asyncio.get_running_loop()
         await asyncio.sleep(self._due - loop.time())
-        # The making has no await in it: a caller from now on gets the next document.
+        # `make` does not await: a caller from now on gets the next document.
         self._next = None
         began = self._clock()
         try:

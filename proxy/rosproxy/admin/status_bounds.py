@@ -1,12 +1,11 @@
-"""The bound of the document at ``/status``, whatever nodes and strangers call things.
+"""The bound of the document at ``/status``: MOST_BYTES of JSON, whatever names nodes choose.
 
-Nodes choose their names and how many names they register, and any address outside can add
-connections. The document has MOST_BYTES of JSON at most. A document within the bound stays as it
-is. Otherwise each source address gets an equal share, and an address that needs less than its share
-stays whole: no address hides what another address has.
+Nodes choose names and the number of names, and any address outside can add connections. A document
+within the bound stays the same. In a longer document each source address gets an equal share, and
+an address that needs less keeps all rows and lists. So no address can hide the rows of another.
 
-An address that needs more first keeps its rows (nodes, participants and so on) without their lists,
-then as much of each list as fits. Counters named ``left_out`` say how much is missing.
+An address that needs more first keeps rows (nodes, participants and so on) without lists, then as
+much of each list as fits. Counters named ``left_out`` count the missing entries.
 """
 
 import json
@@ -34,7 +33,7 @@ _COUNTER = 10
 _MOST_LISTS = 8
 """Lists of a row at most."""
 _COUNTERS = 4096
-"""The same for all counters that belong to no row."""
+"""Bytes by which all counters together may grow that belong to no row."""
 _FIRST = ("nodes", "inside", "outside", "sessions", "stand_ins", "udpros", "layers", "peers")
 """Tables whose rows an owner keeps before those of the other tables."""
 _NOT_COUNTED = "types"
@@ -43,13 +42,13 @@ _NOT_ASCII = re.compile(r"[^\x00-\x7f]+")
 Item = TypeVar("Item")
 Parent = TypeVar("Parent", bound=msgspec.Struct)
 Row = Any
-"""A struct, or a text."""
+"""A struct or a text."""
 VisitTable = Callable[[str, Sequence[Row], Callable[[Row], str]], tuple[Row, ...]]
-"""Gets the name of a table, its rows, and what gives a row's owner; returns the rows to show."""
+"""Takes a table: the name, the rows, and a function from row to owner. Returns the rows to show."""
 
 
 def bounded(status: ProxyStatus, most: int = MOST_BYTES) -> ProxyStatus:
-    """The status with so much of its tables that it has ``most`` bytes as JSON."""
+    """The status with tables short enough for ``most`` bytes of JSON."""
     excess = _size(status) - most
     if excess <= 0:
         return status
@@ -72,7 +71,7 @@ def bounded(status: ProxyStatus, most: int = MOST_BYTES) -> ProxyStatus:
 
 
 def left_out(status: ProxyStatus) -> int:
-    """How many rows and names the status lacks."""
+    """How many rows and names were left out of the status."""
     policy = status.policy or PolicyStatus()
     counts = [status.left_out, policy.left_out, policy.layers_left_out]
     counts += [node.left_out for node in status.nodes]
@@ -86,16 +85,19 @@ def left_out(status: ProxyStatus) -> int:
 
 
 def encode(value: object) -> bytes:
-    """A document, or a part of it, as JSON in ASCII: a terminal that shows it comes to no harm."""
+    """JSON in ASCII of a document or a part, which is harmless on a terminal."""
     encoded = msgspec.json.encode(value)
     if encoded.isascii():
         return encoded
-    # Outside of texts JSON is ASCII.
+    # Only strings in JSON have characters that are not ASCII.
     return _NOT_ASCII.sub(lambda run: json.dumps(run[0])[1:-1], encoded.decode()).encode()
 
 
 def fair_shares(wanted: Sequence[int], most: int) -> list[int]:
-    """How much each gets of ``most``: what it wants, or as much as all others that want more."""
+    """The fair shares of ``most``, in the order of ``wanted`` (max-min fairness).
+
+    Each share is the wanted amount, or the limit that is the same for all larger wants.
+    """
     shares = [0] * len(wanted)
     remaining = most
     by_size = sorted(range(len(wanted)), key=wanted.__getitem__)
@@ -106,7 +108,10 @@ def fair_shares(wanted: Sequence[int], most: int) -> list[int]:
 
 
 def fair_shares_by_owner(owners: Sequence[str], wanted: Sequence[int], most: int) -> list[int]:
-    """The same where several of them have one owner: owners get fair shares, then each one."""
+    """Fair shares of ``most`` for owners, then fair shares of these for the items of an owner.
+
+    The item ``i`` belongs to ``owners[i]`` and wants ``wanted[i]``. Returns the share of each item.
+    """
     by_owner: defaultdict[str, list[int]] = defaultdict(list)
     for index, owner in enumerate(owners):
         by_owner[owner].append(index)
@@ -119,7 +124,7 @@ def fair_shares_by_owner(owners: Sequence[str], wanted: Sequence[int], most: int
 
 
 def fair_choice(items: Iterable[Item], owner: Callable[[Item], str], most: int) -> list[Item]:
-    """The first items of each owner, ``most`` in all, in their order."""
+    """The first items of each owner, with fair shares of ``most``, in the order of ``items``."""
     every = list(items)
     if len(every) <= most:
         return every
@@ -133,7 +138,7 @@ def fair_choice(items: Iterable[Item], owner: Callable[[Item], str], most: int) 
 
 @dataclass(slots=True)
 class _Entry:
-    """A row of a table, its owner, and its bytes as JSON with the comma that follows."""
+    """A row of a table with the owner. ``size``: bytes as JSON, with a comma."""
 
     table: str
     owner: str
@@ -154,7 +159,7 @@ def _entries(status: ProxyStatus) -> list[_Entry]:
 
 
 def _visit_tables(status: ProxyStatus, visit: VisitTable) -> ProxyStatus:
-    """The status with what ``visit`` returns for each table that others can make long."""
+    """The status with the results of ``visit`` for each table that nodes or strangers lengthen."""
     policy = status.policy and _with_tables(
         status.policy,
         visit,
@@ -188,7 +193,7 @@ def _visit_tables(status: ProxyStatus, visit: VisitTable) -> ProxyStatus:
 
 
 def _with_tables(parent: Parent, visit: VisitTable, **owners: Callable[[Row], str]) -> Parent:
-    """The parent with the visited tables, and with what they lack added to its counters."""
+    """The parent with the visited tables, and with counters of the rows that were left out."""
     changes: dict[str, Any] = {}
     for name, owner in owners.items():
         rows = getattr(parent, name)
@@ -201,7 +206,7 @@ def _with_tables(parent: Parent, visit: VisitTable, **owners: Callable[[Row], st
 
 
 def _owners_of_mismatches(domain: DomainStatus) -> Callable[[Row], str]:
-    """What gives the address of the participant inside that a mismatch is about."""
+    """A function from a mismatch to the address of the participant inside."""
     addresses = {participant.guid_prefix: participant.address for participant in domain.inside}
     return lambda mismatch: addresses.get(mismatch.writer, addresses.get(mismatch.reader, ""))
 
@@ -212,7 +217,7 @@ def _host(uri: str) -> str:
 
 
 def _fit(entries: Sequence[_Entry], room: int) -> None:
-    """Shorten the rows of one owner, or leave them out, until they have ``room`` bytes."""
+    """Shorten the rows of one owner, or leave rows out, until ``room`` bytes are enough."""
     ranks = {table: rank for rank, table in enumerate(_FIRST)}
     ordered = sorted(entries, key=lambda entry: ranks.get(entry.table, len(ranks)))
     bare_sizes = [_size(_shortened(entry.row, 0)) + 1 + _COUNTER for entry in ordered]
@@ -230,7 +235,7 @@ def _fit(entries: Sequence[_Entry], room: int) -> None:
 
 
 def _shortened(row: Row, room: int) -> Row:
-    """A row with the first entries of its lists, as many as fit into ``room`` bytes."""
+    """A row with as many first entries of the lists as fit into ``room`` bytes in all."""
     lists: dict[str, Any] = {}
     left_out = 0
     for name in getattr(row, "__struct_fields__", ()):

@@ -1,7 +1,7 @@
-"""Waiting for a change of the proxy's state, so that nobody has to ask for it again and again.
+"""Waits for changes of the proxy's state, so that callers need not poll.
 
-The state is in many places, none of which knows who waits. So it is polled while somebody waits: at
-most twice a second, and seldom enough to cost a hundredth of a processor.
+The state is in many modules, which do not report changes. So the proxy polls the state for each
+waiting caller: twice a second at most, and seldom enough to take a hundredth of a processor.
 """
 
 import asyncio
@@ -18,20 +18,20 @@ from rosproxy.admin.status_version import version_of
 from rosproxy.net.fair_slots import FairSlots
 
 POLL_INTERVAL = 0.5
-"""Seconds between two looks at the state, at least."""
+"""Seconds between two polls of a caller at least."""
 SHARE = 0.01
-"""Share of a processor that polling may cost for each caller that waits."""
+"""Share of a processor that polling may take for each waiting caller."""
 LONGEST = 1800.0
 """Seconds that a caller may wait."""
 MOST_WAITING = 8
-"""Callers that may wait at the same time: operators, one after the other."""
+"""Callers that may wait at the same time: a single operator, or a few while operators restart."""
 MOST_WAITING_EACH = 4
-"""The same from one address."""
+"""Callers from one address that may wait at the same time."""
 
 
 @dataclass(frozen=True)
 class StatusSnapshot:
-    """The state at one moment, as JSON, and the seconds that it took to make it."""
+    """The state at one moment, with the JSON ``body``. ``took``: seconds to collect both."""
 
     status: ProxyStatus
     body: bytes
@@ -39,21 +39,21 @@ class StatusSnapshot:
 
     @classmethod
     def take(cls, state: Callable[[], ProxyStatus]) -> "StatusSnapshot":
-        """The state as it is now."""
+        """A snapshot of the current state."""
         began = time.perf_counter()
         status = state()
         return cls(status, encode(status), time.perf_counter() - began)
 
     @cached_property
     def version(self) -> str:
-        """What callers compare; see `version_of`."""
+        """The version of the state (`version_of`), which callers compare."""
         return version_of(self.status)
 
 
 class StatusChanges:
-    """Lets callers wait until the state differs from the one that they know.
+    """Lets callers wait until the state has another version.
 
-    ``newest`` gives the state as it is now; ``slots`` is what callers take while they wait.
+    ``newest`` returns a snapshot of the current state. Callers take one of ``slots`` while waiting.
     """
 
     def __init__(self, newest: Callable[[], Awaitable[StatusSnapshot]]) -> None:
@@ -64,15 +64,15 @@ class StatusChanges:
         )
 
     def end(self) -> None:
-        """Let nobody wait any longer."""
+        """Answer all waiting callers now, and later callers at once."""
         self._ending.set()
 
     async def after(
         self, since: str, within: float, connected: Callable[[], bool]
     ) -> StatusSnapshot:
-        """The state, once its version is another one than ``since``.
+        """Return the state once its version differs from ``since``.
 
-        Or after ``within`` seconds, or once the caller is no longer ``connected``.
+        Return earlier after ``within`` seconds, or when the caller is no longer ``connected``.
         """
         clock = asyncio.get_running_loop().time
         until = clock() + (min(within, LONGEST) if math.isfinite(within) else 0.0)

@@ -1,13 +1,15 @@
-"""The document at ``/status``: one definition for the proxy and for all who read it.
+"""The document at ``/status``: one definition for the proxy and for all readers.
 
-`rosproxy.admin.common_status` fills it in; ``rosproxy status``, ``rosproxy doctor`` and the
-operator read it with `parse_status` (text of an answer) or `read_status` (decoded JSON). It is made
-of what ROS nodes say of themselves and may come from another version of the proxy. So reading is
-tolerant: unknown keys are ignored, and what is missing or of another type gets its default. The
-proxy bounds the document as a whole (`rosproxy.admin.status_bounds`), and ``left_out`` counts what
-is missing. Another version may not, and texts may hold control characters.
+`rosproxy.admin.common_status` makes the common part. ``rosproxy status``, ``rosproxy doctor`` and
+the operator read the document with `parse_status` (text of an answer) or `read_status` (decoded
+JSON). ROS nodes choose the names in the document, and the document may come from another version of
+the proxy. So readers are tolerant: they ignore unknown keys, and use the default for a missing
+value or a value of another type. Texts may have control characters. The proxy bounds the document
+(`rosproxy.admin.status_bounds`), and ``left_out`` counts the missing entries. A document of another
+version may be longer.
 
-Times are in seconds, rates in bytes per second; ``sent`` is what went outside.
+Times are in seconds, rates in bytes per second. ``sent`` are bytes from inside to outside,
+``received`` bytes from outside to inside.
 """
 
 import json
@@ -18,32 +20,33 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import msgspec
 
-# json.loads accepts NaN, Infinity and integers of any length, none of which is within these bounds.
-# 2**63 - 1 is the largest one that msgspec takes.
+# json.loads accepts NaN, Infinity and integers of any length. These bounds exclude all three.
+# 2**63 - 1 is the largest bound that msgspec accepts.
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e15)]
 Rate = Annotated[float, msgspec.Meta(ge=0, le=1e18)]
 Names = tuple[str, ...]
 Document = TypeVar("Document", bound=msgspec.Struct)
 MOST_ROWS = 50_000
-"""JSON objects in a document that is read. One has 21 bytes at least, in a status of 1 MiB."""
+"""JSON objects in a document that a reader accepts. In a status of 1 MiB an object has 21 bytes at
+least."""
 
 
-# msgspec raises the latter for half of a surrogate pair, which json.loads takes.
+# msgspec raises UnicodeEncodeError for half of a surrogate pair, which json.loads accepts.
 _UNFIT = (msgspec.ValidationError, UnicodeEncodeError)
 
 
 class NotAStatus(ValueError):
-    """A text that is not the status of a rosproxy."""
+    """The text or JSON is not the status of a rosproxy."""
 
 
 class StatusSettings(msgspec.Struct, frozen=True):
-    """The settings that other programs have to know.
+    """The settings of the proxy that other programs have to know.
 
-    ``ros`` are the versions of ROS that it is for. ``inside_networks``: those in force, as CIDRs.
-    ``direction``: ``out``, or ``both`` where inside reaches outside through the proxy, too.
-    ``udp``: UDPROS from publishers outside can come in.
-    ``selected``: how many addresses an operator has selected; None: it has told of none yet.
+    ``ros``: the versions of ROS. ``inside_networks``: the inside networks in force, as CIDRs.
+    ``direction``: ``out``, or ``both`` if inside reaches outside through the proxy, too.
+    ``udp``: the proxy forwards UDPROS from publishers outside. ``selected``: the number of
+    addresses that an operator has selected; None: no operator has selected addresses yet.
     """
 
     ros: Names = ("1",)
@@ -60,14 +63,15 @@ class StatusSettings(msgspec.Struct, frozen=True):
 
     @property
     def for_ros1(self) -> bool:
-        """Whether it is for ROS 1."""
+        """Whether the proxy serves ROS 1."""
         return "1" in self.ros
 
 
 class MasterStatus(msgspec.Struct, frozen=True):
-    """The real master. ``pinned``: ``address`` was given and is not what its name leads to.
+    """The real master. ``pinned``: an option or the operator sets ``address``, not the host name.
 
-    Neither ``up`` nor an ``error``: it has not been asked yet. ``since``: how long it is so.
+    Neither ``up`` nor an ``error``: the proxy has not asked the master yet. ``since``: the age of
+    this state.
     """
 
     uri: str = ""
@@ -81,9 +85,10 @@ class MasterStatus(msgspec.Struct, frozen=True):
 
 
 class PortsStatus(msgspec.Struct, frozen=True):
-    """The range of ports, ``A-B`` here and as outside sees it; others hold ``blocked`` of them.
+    """The listen range and the advertised range, each as ``A-B``, and numbers of ports.
 
-    ``held_by``: the other proxies on this machine that have some of them.
+    ``blocked``: ports that other programs hold. ``held_by``: other proxies on this machine whose
+    range has some of these ports.
     """
 
     listen: str = ""
@@ -95,9 +100,9 @@ class PortsStatus(msgspec.Struct, frozen=True):
 
 
 class RangeProbeStatus(msgspec.Struct, frozen=True):
-    """How the last try at ports of the range ended, ``age`` ago: the worst of several ports.
+    """The worst result of the last try to reach ports of the range, ``age`` seconds ago.
 
-    ``reached``: outside gets in; None: not proven. The others are those of `PortProbe`.
+    ``reached``: outside reaches the ports; None: unknown. `PortProbe` explains the other fields.
     """
 
     reached: bool | None = None
@@ -108,7 +113,7 @@ class RangeProbeStatus(msgspec.Struct, frozen=True):
 
 
 class DataPlaneStatus(msgspec.Struct, frozen=True):
-    """How topics are forwarded: as ``mode`` says or, for a ``reason``, by another ``plane``."""
+    """The setting ``mode``, and the ``plane`` in use. ``reason``: why the kernel is not in use."""
 
     mode: str = ""
     plane: str = ""
@@ -116,7 +121,7 @@ class DataPlaneStatus(msgspec.Struct, frozen=True):
 
 
 class NodePlaneStatus(msgspec.Struct, frozen=True):
-    """What the kernel forwards for a node through its data ``port``; bytes of IP packets."""
+    """What the kernel forwards through the fast ``port`` of a node; bytes are of IP packets."""
 
     plane: str = ""
     port: Count | None = None
@@ -129,9 +134,9 @@ class NodePlaneStatus(msgspec.Struct, frozen=True):
 
 
 class StandInStatus(msgspec.Struct, frozen=True):
-    """A port that stands in for a node or service outside, which ``uri`` names.
+    """A stand-in: the ``port`` through which inside reaches the node or service at ``uri``.
 
-    ``connections`` and the rates are those of the proxy and of the kernel (``data_plane``).
+    ``connections`` and rates are the sums of the proxy and of the kernel (``data_plane``).
     """
 
     port: Count = 0
@@ -143,10 +148,10 @@ class StandInStatus(msgspec.Struct, frozen=True):
 
 
 class UdprosStatus(msgspec.Struct, frozen=True):
-    """A subscription by UDPROS that the proxy passes on: who, where from and to, and the bytes.
+    """A UDPROS subscription that the proxy forwards.
 
-    ``port`` is the proxy's UDP port, ``inward`` whether the subscriber is inside, ``dropped`` how
-    many datagrams came from others than the publisher.
+    ``port`` is the UDP port of the proxy. ``inward``: the subscriber is inside. ``bytes``:
+    forwarded bytes. ``dropped``: datagrams from other sources than the publisher.
     """
 
     topic: str = ""
@@ -159,7 +164,7 @@ class UdprosStatus(msgspec.Struct, frozen=True):
 
 
 class ConnectionStatus(msgspec.Struct, frozen=True):
-    """A relayed TCPROS connection: ``kind`` is topic or service, ``peer`` who came from outside."""
+    """A relayed TCPROS connection. ``kind``: topic or service. ``peer``: the source outside."""
 
     kind: str = ""
     name: str = ""
@@ -172,10 +177,11 @@ class ConnectionStatus(msgspec.Struct, frozen=True):
 
 
 class EndpointStatus(msgspec.Struct, frozen=True):
-    """What is registered with one slave URI: one node as a rule, several for nodelets.
+    """An endpoint of ROS 1, with all registrations of a slave URI: usually a single node.
 
-    ``nodes`` are their names, ``uri`` is what it calls itself and ``address`` where it was found.
-    ``state`` is one of `rosproxy.ros1.registry.endpoint.STATES`.
+    ``nodes``: the names of the nodes; nodelets share a slave URI. ``uri``: the slave URI that the
+    node has given. ``address``: the address at which the proxy reaches the node.
+    ``state`` is a member of `rosproxy.ros1.registry.endpoint.STATES`.
     """
 
     nodes: Names = ()
@@ -195,17 +201,17 @@ class EndpointStatus(msgspec.Struct, frozen=True):
 
     @property
     def given_up(self) -> bool:
-        """Whether the proxy has unregistered it, because it was gone."""
+        """Whether the proxy has unregistered the nodes, because they are gone."""
         return self.state == "cleaned" or self.has_ended
 
     @property
     def has_ended(self) -> bool:
-        """Whether an operator has told that its container is gone: it is no fault."""
+        """Whether an operator has reported the end of the container, which is no fault."""
         return self.state == "ended"
 
 
 class LayerStatus(msgspec.Struct, frozen=True):
-    """A layer of rules in force; ``addresses``: how many nodes' it is for, None: for all."""
+    """A layer of rules in force. ``addresses``: the number of addresses inside; None: all."""
 
     name: str = ""
     mode: str = ""
@@ -215,7 +221,7 @@ class LayerStatus(msgspec.Struct, frozen=True):
 
 
 class HiddenStatus(msgspec.Struct, frozen=True):
-    """What the policy keeps from the master: ``kind`` of rule, name, node, rule, the address."""
+    """A name that the policy hides. ``reason``: layer and rule; ``address``: that of the node."""
 
     kind: str = ""
     name: str = ""
@@ -234,7 +240,7 @@ class PolicyStatus(msgspec.Struct, frozen=True):
 
 
 class ProblemStatus(msgspec.Struct, frozen=True):
-    """What the user should know, of which subject, how long ago noted, and if it ``holds`` yet."""
+    """A problem that was noted ``age`` seconds ago. ``holds``: lasts until it is solved."""
 
     age: Seconds = 0.0
     subject: str = ""
@@ -243,11 +249,11 @@ class ProblemStatus(msgspec.Struct, frozen=True):
 
 
 class LocatorStatus(msgspec.Struct, frozen=True):
-    """A port and the locator of a participant that it leads to.
+    """A port of the proxy, and the locator ``where`` to which the port leads.
 
-    ``kind`` is metatraffic or data. ``plane``: who forwards, and where it is not the kernel, the
-    ``reason``. ``datagrams`` and ``bytes`` are those that the proxy has passed on; those of the
-    kernel are of IP packets.
+    ``kind`` is metatraffic or data. ``plane``: proxy or kernel forwards; ``reason``: why not the
+    kernel. ``datagrams`` and ``bytes`` count what the proxy has forwarded, ``kernel_datagrams`` and
+    ``kernel_bytes`` the IP packets that the kernel has forwarded.
     """
 
     port: Count = 0
@@ -263,21 +269,21 @@ class LocatorStatus(msgspec.Struct, frozen=True):
 
 
 class NamedTypeStatus(msgspec.Struct, frozen=True):
-    """A topic or service, and its type, as a participant announces it."""
+    """A topic or service with the type that a participant announces."""
 
     name: str = ""
     type: str = ""
 
 
 class ParticipantStatus(msgspec.Struct, frozen=True):
-    """A participant of ROS 2, inside or outside, with the topics and services that it announces.
+    """A participant of ROS 2, inside or outside, with the announced topics and services.
 
-    ``leases`` are ports of the range for one inside; for one outside its stand-ins, which inside
-    reaches. ``kept``: one inside keeps them for when the proxy starts again. ``proven``: one
-    outside gets in at ports of the range, or has not been known for long enough to tell.
-    ``problem``: what it lacks. ``domain``: that which it says it is in. ``security``,
-    ``locator_fault`` and ``shortage``, the kind of ``problem``, are of
-    `rosproxy.ros2.registry.participants`. ``types`` are those of the topics and services.
+    ``leases``: for a participant inside, the port mappings; for a participant outside, the
+    stand-ins. ``kept``: a participant inside remembers its ports for the next process of the proxy.
+    ``proven``: a participant outside reaches ports of the range, or the proxy does not know yet.
+    ``problem``: what the participant lacks. ``domain``: the announced domain. ``types``: the types
+    of the topics and services. `rosproxy.ros2.registry.participants` has the values of
+    ``security``, ``locator_fault`` and ``shortage``, which is the kind of ``problem``.
     """
 
     guid_prefix: str = ""
@@ -299,10 +305,10 @@ class ParticipantStatus(msgspec.Struct, frozen=True):
 
 
 class MismatchStatus(msgspec.Struct, frozen=True):
-    """A topic or service (``kind``) for which two participants don't match across the boundary.
+    """A topic or service (``kind``) whose reader and writer on the two sides do not match.
 
-    ``policy`` is the first for which they don't, with what the ``writer`` offers and the ``reader``
-    requests; these are GUID prefixes.
+    ``policy``: the first QoS policy, or the type, that differs. ``offered``: the value of the
+    writer. ``requested``: the value of the reader. ``writer`` and ``reader`` are GUID prefixes.
     """
 
     kind: str = ""
@@ -315,11 +321,12 @@ class MismatchStatus(msgspec.Struct, frozen=True):
 
 
 class DomainStatus(msgspec.Struct, frozen=True):
-    """A domain of ROS 2: its participants, and what became of datagrams.
+    """A domain of ROS 2: participants, counts of datagrams, and mismatches.
 
-    ``discovery`` is where outside announces itself to the proxy, ``direction`` that of the proxy.
-    ``dropped`` were refused, ``lost`` the kernel did not take; ``data_plane`` is for user data.
-    ``not_compared`` counts pairs of a reader and a writer of which nothing is known.
+    ``discovery``: the address at which the proxy receives discovery from outside. ``direction``:
+    the setting of the proxy. ``dropped``: refused datagrams. ``lost``: datagrams that the kernel
+    did not accept. ``data_plane`` is for user data. ``not_compared``: pairs of a reader and a
+    writer that the proxy has not compared.
     """
 
     domain: Count = 0
@@ -341,9 +348,9 @@ class DomainStatus(msgspec.Struct, frozen=True):
 
 
 class ZenohLinkStatus(msgspec.Struct, frozen=True):
-    """A link of the hub router to a router outside, ``peer``; ``since``: how long it is so.
+    """A link of the hub to the router outside at ``peer``. ``since``: the age of this state.
 
-    ``error``: why the link is not up, one of `rosproxy.zenoh.links.LinkFault`.
+    ``error``: why the link is not up, a value of `rosproxy.zenoh.links.LinkFault`.
     """
 
     peer: str = ""
@@ -353,9 +360,9 @@ class ZenohLinkStatus(msgspec.Struct, frozen=True):
 
 
 class ZenohSessionStatus(msgspec.Struct, frozen=True):
-    """A session of a router of the proxy: both addresses, and the mode of the other end.
+    """A session of a router of the proxy: both addresses, and the ``mode`` of the other end.
 
-    ``port`` is that of the router; None: the hub. ``mode``: client, peer or router.
+    ``port``: the port of the router; None: the hub. ``mode``: client, peer or router.
     """
 
     port: Count | None = None
@@ -380,7 +387,7 @@ class ZenohNodeStatus(msgspec.Struct, frozen=True):
 class ZenohStatus(msgspec.Struct, frozen=True):
     """The routers for rmw_zenoh: ports for containers, and the port ``listen`` for outside.
 
-    ``failure``: why the routers do not run. ``restarts``: how often they have ended.
+    ``failure``: why the routers do not run. ``restarts``: how often the child process has ended.
     """
 
     ports: str = ""
@@ -394,12 +401,11 @@ class ZenohStatus(msgspec.Struct, frozen=True):
 
 
 class ProxyStatus(msgspec.Struct, frozen=True):
-    """Everything that a proxy tells of itself.
+    """The whole status of a proxy.
 
-    ``instance`` differs after each start; ``retired``: it registers nothing any more;
-    ``range_probe`` is None before the first try; ``stand_ins`` are the ports that stand in for
-    nodes outside; ``udpros`` the subscriptions by UDPROS; ``domains`` those of ROS 2; ``zenoh`` the
-    routers for rmw_zenoh, None without any.
+    ``instance`` differs after each start. ``retired``: the proxy registers nothing any more.
+    ``range_probe`` is None before the first try. ``stand_ins`` are of ROS 1, ``domains`` of ROS 2.
+    ``zenoh``: the routers for rmw_zenoh; None without routers.
     """
 
     version: str = ""
@@ -423,7 +429,7 @@ class ProxyStatus(msgspec.Struct, frozen=True):
 
 
 def parse_status(text: str | bytes) -> ProxyStatus:
-    """The status in the text of an answer. Raises NotAStatus if that is not a rosproxy's."""
+    """The status in the text of an answer. Raises NotAStatus for the text of another program."""
     try:
         document = json.loads(text)
     except (ValueError, RecursionError):
@@ -434,7 +440,7 @@ def parse_status(text: str | bytes) -> ProxyStatus:
 
 
 def read_status(document: object) -> ProxyStatus:
-    """The status in decoded JSON. Raises NotAStatus if it has more than MOST_ROWS objects."""
+    """The status in decoded JSON. Raises NotAStatus for more than MOST_ROWS objects."""
     if _has_too_many_rows(document):
         raise NotAStatus(f"a status of more than {MOST_ROWS} objects")
     return _convert_leniently(document, ProxyStatus)
@@ -456,14 +462,14 @@ def _has_too_many_rows(document: object) -> bool:
 
 
 def to_json(document: msgspec.Struct) -> dict[str, Any]:
-    """A document as plain data to be encoded as JSON."""
+    """A document as dicts, lists and plain values, ready for JSON."""
     plain: dict[str, Any] = msgspec.to_builtins(document)
     return plain
 
 
 def _convert_leniently(value: object, kind: type[Document]) -> Document:
-    """A document with defaults in place of what does not fit."""
-    # Nearly always all of it fits, and one step in C is enough.
+    """Convert a document; a value that does not fit becomes the default."""
+    # Nearly always everything fits, and a single call of C code is enough.
     try:
         return msgspec.convert(value, kind)
     except _UNFIT:
@@ -476,11 +482,14 @@ def _convert_leniently(value: object, kind: type[Document]) -> Document:
 
 
 _fields = cache(msgspec.structs.fields)
-"""The fields of a struct: to find them takes a hundred times as long as to convert one."""
+"""The fields of a struct. Without the cache this takes a hundred times as long as a conversion."""
 
 
 def _convert_field(value: Any, kind: Any) -> Any:
-    """A value as a field's type; lists are of structs or of texts. Raises ValidationError."""
+    """Convert a value to the type of a field. Raises ValidationError.
+
+    Lists keep the items of the right kind: structs or texts.
+    """
     inner = get_args(kind)[0] if get_origin(kind) in (UnionType, tuple) else kind
     is_struct = isinstance(inner, type) and issubclass(inner, msgspec.Struct)
     if is_struct and isinstance(value, dict) and get_origin(kind) is not tuple:

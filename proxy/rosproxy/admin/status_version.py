@@ -1,6 +1,6 @@
-"""The version of a proxy's status: the same until nodes, ports or problems change, but no rates.
+"""The version of a proxy's status, which changes with nodes, ports and problems, not with rates.
 
-Callers that wait for a change (``/status/changes``) are answered when the version differs.
+``/status/changes`` answers waiting callers when the version differs.
 """
 
 import hashlib
@@ -12,7 +12,7 @@ from rosproxy.admin.status_document import DomainStatus, EndpointStatus, ProxySt
 
 
 def version_of(status: ProxyStatus) -> str:
-    """A text that stays the same until the status differs in what matters to an operator."""
+    """A hash of the parts of the status that matter to an operator."""
     told = (
         status.instance,
         status.retired,
