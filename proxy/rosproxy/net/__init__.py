@@ -1,1 +1,1 @@
-"""Sockets, HTTP, names and addresses: what every protocol that is proxied needs of the network."""
+"""Sockets, HTTP, names and addresses, for ROS 1, ROS 2 and rmw_zenoh."""

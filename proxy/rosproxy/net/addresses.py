@@ -1,7 +1,7 @@
 """IP addresses, hosts and ports as text.
 
 A host is a name or an IP address. An address is *plain* without an IPv4-in-IPv6 prefix and without
-a zone: the form in which addresses of peers are compared.
+a zone. The proxy compares plain addresses.
 """
 
 import re
@@ -21,7 +21,11 @@ _HOST = re.compile(r"[\w.-]+|[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%[\w.-]+)?")
 
 
 def cached(read: Callable[[str], _T]) -> Callable[[str], _T]:
-    """Cache how short texts are read: those of a graph come with every call, and anybody's, too."""
+    """Cache the results of a function of a short text.
+
+    Every call of the master's graph brings the same texts. Strangers may send long texts, so the
+    cache is only for texts of up to 200 characters.
+    """
     remembered = lru_cache(_MOST_CACHED)(read)
 
     @wraps(read)
@@ -44,20 +48,20 @@ class HostPort:
 
 
 class Route(NamedTuple):
-    """How packets go to an address: from which own address, and of how many bytes at most."""
+    """The route to an address: ``source`` is the own address, ``mtu`` the bytes of a packet."""
 
     source: str
     mtu: int
 
 
 def parse_host_port(text: str) -> HostPort | None:
-    """Parse ``host:port`` or ``[v6]:port``; None if there is no valid port or no host."""
+    """Parse ``host:port`` or ``[v6]:port``; None without a valid port or host."""
     return parse_authority(f"//{text}")
 
 
 @cached
 def as_ip(host: str) -> IPv4Address | IPv6Address | None:
-    """A host as an IP address; None if it is a name."""
+    """Parse a host as an IP address; None for a name."""
     try:
         return ip_address(host)
     except ValueError:
@@ -72,7 +76,7 @@ def is_address(host: str) -> bool:
 def is_loopback(host: str) -> bool:
     """Whether a host is ``localhost``, a loopback address or the unspecified address.
 
-    All of them mean another machine to everybody else.
+    On each machine such a host means that machine itself.
     """
     parsed = as_ip(plain_address(host))
     if parsed is not None:
@@ -81,16 +85,16 @@ def is_loopback(host: str) -> bool:
 
 
 def is_of_link(host: str) -> bool:
-    """Whether a host is an IPv6 address that means something on its own link alone."""
+    """Whether a host is a link-local IPv6 address, which other links can't reach."""
     parsed = as_ip(host)
     return parsed is not None and parsed.version == 6 and parsed.is_link_local
 
 
 @cached
 def subnet(address: str) -> str:
-    """An IPv4 address itself, and of an IPv6 address its network of 64 bits.
+    """The /64 network of an IPv6 address; an IPv4 address or name unchanged.
 
-    One machine has any number of the addresses in such a network (RFC 4291, 2.5.1; RFC 8981).
+    A machine may have any number of addresses in a /64 network (RFC 4291, 2.5.1; RFC 8981).
     """
     parsed = as_ip(address)
     if parsed is None or parsed.version == 4:
@@ -110,9 +114,9 @@ def plain_address(address: str) -> str:
 
 
 def parse_address(text: str) -> str | None:
-    """An IP address that something may be reached at, in its plain form; None if it is none.
+    """Parse a unicast IP address, and return the plain form; None for any other text.
 
-    The unspecified address, multicast and one with a zone are not.
+    None also for the unspecified address, and for an address with a zone.
     """
     parsed = as_ip(plain_address(text))
     if "%" in text or parsed is None:
@@ -122,18 +126,19 @@ def parse_address(text: str) -> str | None:
 
 @cached
 def parse_authority(uri: str) -> HostPort | None:
-    """Host and port of a URI of any scheme, or None if it has no valid port or no host."""
+    """Parse host and port of a URI of any scheme; None without a valid port or host."""
     try:
         split_uri = urlsplit(uri)
         port = split_uri.port
     except ValueError:
         return None
-    # `hostname` would be in lower case and without what stands before an @, which is refused here.
+    # `hostname` changes the host to lower case, and drops a user name before an @. Here an @ makes
+    # the URI invalid.
     host = split_uri.netloc.rpartition(":")[0].removeprefix("[").removesuffix("]")
     return HostPort(host, port) if port and _HOST.fullmatch(host) else None
 
 
 def is_inside(address: str, networks: Sequence[Network]) -> bool:
-    """Whether an IP address lies in one of some networks; a name lies in none."""
+    """Whether an IP address is in one of the networks; False for a name."""
     parsed = as_ip(address)
     return parsed is not None and any(parsed in network for network in networks)

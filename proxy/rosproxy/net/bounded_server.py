@@ -1,4 +1,4 @@
-"""An HTTP server for endpoints with few and friendly callers: a few connections of each address."""
+"""An HTTP server for few and friendly callers, with few connections from each address."""
 
 import asyncio
 import contextlib
@@ -10,28 +10,28 @@ from aiohttp import web
 from rosproxy.net.sockets import end_if_stalled
 
 SEND_BUFFER = 64 * 1024
-"""Bytes that the kernel keeps of a reply; Linux takes twice as many (socket(7), SO_SNDBUF).
+"""Bytes of a reply that the kernel buffers; Linux doubles the value (socket(7), SO_SNDBUF).
 
-By default it keeps up to 4 MB, whatever the reader takes.
+By default the kernel buffers up to 4 MB, even for a reader that takes nothing.
 """
 IDLE_TIMEOUT = 75.0
-"""Seconds in which the next request must have arrived, the first one as well."""
+"""Seconds in which the first request, and after a reply the next request, must arrive."""
 
 Answer = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 
 
 class BoundedServer(web.Server):
-    """Answers requests on ``most`` connections from one address at most."""
+    """Answers requests on at most ``most`` connections from each address."""
 
     def __init__(self, answer: Answer, most: int) -> None:
-        # Nothing is inflated: a small body may become a very large one.
+        # Compressed bodies stay compressed: a small body could expand to a very large body.
         super().__init__(
             answer, access_log=None, keepalive_timeout=IDLE_TIMEOUT, auto_decompress=False
         )
         self.most = most
 
     def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
-        """Take a connection in, and end the oldest one of its source if that has too many."""
+        """Accept a connection; if the source has too many, end the oldest of the source."""
         sock = transport.get_extra_info("socket")
         end_if_stalled(sock)
         with contextlib.suppress(OSError):
@@ -39,9 +39,10 @@ class BoundedServer(web.Server):
         source = _source(handler)
         same_source = [c for c in self.connections if _source(c) == source]
         open_connections = [c for c in same_source if c.transport is not None]
-        if len(open_connections) >= self.most:  # those that end stay until the next turn
+        # `connections` has closed connections until the next round of the event loop.
+        if len(open_connections) >= self.most:
             oldest = open_connections[0]
-            # Closing alone keeps what the reader has not taken until the kernel gives it up.
+            # After a mere close the kernel would keep bytes that the reader has not taken.
             if oldest.transport is not None:
                 oldest.transport.abort()
             oldest.force_close()
@@ -49,5 +50,5 @@ class BoundedServer(web.Server):
 
 
 def _source(handler: web.RequestHandler) -> object:
-    """The address that a connection comes from."""
+    """The source address of a connection."""
     return handler.peername[0] if handler.peername else None

@@ -1,19 +1,20 @@
-"""How much may be held at once, and how much of that by one source.
+"""Budgets: how much all sources together may hold at once, and how much each source.
 
-Pure bookkeeping, in bytes or in numbers of things. Whoever wants to hold something takes it from a
-budget first and gives it back in the end; what is over budget is refused at once, since whoever
-waits holds something as well. No source gets more than its share, so that none shuts out the rest.
+Pure bookkeeping, in bytes or in numbers of objects. A caller takes an amount from a budget before
+using memory, and gives the amount back at the end. The budget refuses too large an amount at once:
+a caller that waits would hold memory, too. Each source has a share, so that no source can use the
+budget of all others.
 """
 
 from types import TracebackType
 
 
 class OverBudget(Exception):
-    """A refusal: what is too much, in words."""
+    """The budget refuses an amount; the message names the bound."""
 
 
 class Budget:
-    """At most ``most`` at once, of which a source has at most ``share``; ``unit`` names them."""
+    """At most ``most`` at once, and at most ``share`` for each source; ``unit`` is for messages."""
 
     def __init__(self, most: int, share: int, unit: str) -> None:
         self.most = most
@@ -23,7 +24,7 @@ class Budget:
         self.used = 0
 
     def take(self, source: str, size: int) -> None:
-        """Take so much for a source. Raises OverBudget, and takes nothing."""
+        """Take an amount for a source. Raises OverBudget, and then takes nothing."""
         if self.used + size > self.most:
             raise OverBudget(f"at most {self.most} {self._unit} are accepted at once; try again")
         total = self._used_by_source.get(source, 0) + size
@@ -34,7 +35,7 @@ class Budget:
         self._used_by_source[source] = total
 
     def give(self, source: str, size: int) -> None:
-        """Give back what was taken."""
+        """Give back an amount that was taken for a source."""
         self.used -= size
         remaining = self._used_by_source.get(source, 0) - size
         if remaining:
@@ -44,7 +45,7 @@ class Budget:
 
 
 class Charge:
-    """What one piece of work holds of a budget; all of it is given back when the context ends."""
+    """The amount that a piece of work holds. The end of the context gives all back."""
 
     __slots__ = ("_budget", "_source", "taken")
 
@@ -54,12 +55,12 @@ class Charge:
         self.taken = 0
 
     def add(self, size: int) -> None:
-        """Hold more. Raises OverBudget."""
+        """Take more of the budget. Raises OverBudget."""
         self._budget.take(self._source, size)
         self.taken += size
 
     def __enter__(self) -> "Charge":
-        """Begin to hold something."""
+        """Enter the context, without taking anything yet."""
         return self
 
     def __exit__(
@@ -68,6 +69,6 @@ class Charge:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Give all of it back."""
+        """Give the whole amount back."""
         self._budget.give(self._source, self.taken)
         self.taken = 0

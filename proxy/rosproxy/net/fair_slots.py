@@ -1,4 +1,4 @@
-"""Slots for work that is under way: so many in all, and so many for one source address."""
+"""Slots for work that is under way, with a bound in all and a bound for each source address."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -6,13 +6,13 @@ from contextlib import contextmanager
 
 
 class NoSlot(Exception):
-    """All slots are taken; the message says how many there are, and what to do."""
+    """All slots are taken; the message says how many slots there are, and what to do."""
 
 
 class FairSlots:
-    """Counts what is under way. ``most`` in all, ``each`` for one source.
+    """Counts slots: at most ``most`` in all, and ``each`` for each source.
 
-    ``work`` says what takes the slots, in the plural; ``advice`` what a caller without one does.
+    For messages, ``work`` names the work in the plural, and ``advice`` says what to do instead.
     """
 
     def __init__(self, work: str, most: int, each: int, advice: str = "try again later") -> None:

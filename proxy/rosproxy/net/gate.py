@@ -1,9 +1,10 @@
-"""How many connections there may be: from one source, to one port, and silent ones.
+"""Bounds on the connections from a source, the connections to a port, and silent connections.
 
-A connection is counted from `Gate.enter` to `Gate.leave` by whoever holds it: who accepted it, then
-the HTTP server or the relay that it was handed to. One that has not said yet what it wants *waits*;
-of a source that has many such the one that has waited longest goes first. So a source that is full
-keeps those that it uses, and file descriptors are left for others.
+A connection counts from `Gate.enter` to `Gate.leave`: first while the acceptor holds the
+connection, then while the HTTP server or the relay does. A connection *waits* until the client has
+sent bytes. If a source has too many connections, the gate ends the connection of that source that
+has waited longest. So the source keeps the connections in use, and other sources get file
+descriptors.
 """
 
 from collections import Counter
@@ -14,19 +15,22 @@ from itertools import count
 from rosproxy.fixes import how_to_in_a_sentence
 
 MOST_WAITING = 512
-"""Connections of a source that have not said anything yet. In ROS clients speak first, at once."""
+"""Waiting connections of a source at most. In ROS 1 the client sends first, at once."""
 LEAST_PER_SOURCE = 64
-"""Connections that a source may have, however few file descriptors there are."""
+"""Connections that each source may have, even if there are few file descriptors."""
 SHARE = 4
-"""Of the file descriptors that the process may open a source gets one in so many connections: a
-connection that is relayed takes two, and up to four more while bulk flows."""
+"""A source may have a connection for every 4 file descriptors that the process may open. A relay
+takes two file descriptors, and up to four more for large transfers."""
 
 NoteRefusal = Callable[[str, str, str], None]
-"""Gets the reason of each refusal in one word, the source, and a text."""
+"""Takes the reason of a refusal in one word, the source, and a text."""
 
 
 class Gate:
-    """Counts connections and says which are too many."""
+    """Counts connections, and refuses or ends connections above the bounds.
+
+    ``per_source`` and ``per_port`` are the bounds.
+    """
 
     def __init__(self, per_source: int, per_port: int, note_refusal: NoteRefusal) -> None:
         self.per_source = per_source
@@ -39,14 +43,17 @@ class Gate:
         self._numbers = count()
 
     def bound(self, files: int) -> None:
-        """Never let one source have so many that so many open files run out."""
+        """Lower the bound of a source if the process may open only so many ``files``."""
         most = max(files // SHARE, LEAST_PER_SOURCE)
         if most < self.per_source:
             self.per_source = most
             self._few_files = files
 
     def admits(self, source: str, port: int) -> bool:
-        """Whether another connection may come in; makes room if one of the source waits."""
+        """Whether the acceptor may accept a connection from a source at a port.
+
+        If the source has too many, the gate ends its oldest waiting connection to make room.
+        """
         if self._by_port[port] >= self._per_port:
             text = f"port {port} already has {self._per_port} connections. "
             text += how_to_in_a_sentence("connections to a port")
@@ -69,7 +76,7 @@ class Gate:
         self._by_port[port] += 1
 
     def leave(self, source: str, port: int) -> None:
-        """Count it no more."""
+        """Stop counting a connection."""
         self._by_source[source] -= 1
         if not self._by_source[source]:
             del self._by_source[source]
@@ -78,9 +85,9 @@ class Gate:
             del self._by_port[port]
 
     def wait(self, source: str, end: Callable[[], None]) -> Callable[[], None]:
-        """Note a connection that has said nothing yet; ``end`` ends it.
+        """Note a waiting connection; ``end`` ends the connection.
 
-        Returns what is to be called when it has spoken, or is gone.
+        Return the function to call when the client has sent bytes, or the connection is gone.
         """
         number = next(self._numbers)
         connections = self._waiting.setdefault(source, {})
@@ -100,7 +107,7 @@ class Gate:
 
     @contextmanager
     def waiting(self, source: str, end: Callable[[], None]) -> Iterator[None]:
-        """The same for as long as the context lasts."""
+        """Note a waiting connection until the context ends; ``end`` ends the connection."""
         spoke = self.wait(source, end)
         try:
             yield
@@ -108,7 +115,7 @@ class Gate:
             spoke()
 
     def _end_oldest(self, source: str) -> bool:
-        """End the connection of a source that has waited longest; whether there was one."""
+        """End the oldest waiting connection of a source; False if no connection waits."""
         waiting = self._waiting.get(source)
         if not waiting:
             return False

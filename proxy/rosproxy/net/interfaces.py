@@ -1,4 +1,4 @@
-"""What the operating system knows of addresses: routes and interfaces."""
+"""Routes and interfaces of this machine, from the kernel."""
 
 import errno
 import socket
@@ -9,19 +9,19 @@ from rosproxy.net.addresses import Network, Route, is_loopback, plain_address
 
 _IP_MTU = 14
 _IPV6_MTU = 24
-"""Options of a connected socket (ip(7), ipv6(7)), which Python's module lacks."""
+"""Options of a connected socket (ip(7), ipv6(7)), which Python's module socket lacks."""
 _LOOPBACK_MTU = 65_536
 
 
 def address_towards(address: str) -> str:
-    """The address of this machine that connections to ``address`` come from."""
+    """The own source address of connections to ``address``."""
     return route_towards(address).source
 
 
 def route_towards(address: str) -> Route:
-    """How packets go to ``address``; by loopback if there is no way.
+    """The route to ``address``; the loopback route if there is no route.
 
-    Connecting a UDP socket only looks up the route; nothing is sent.
+    Connecting a UDP socket looks the route up, and sends no packet.
     """
     is_ipv6 = ":" in address
     with socket.socket(socket.AF_INET6 if is_ipv6 else socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -37,13 +37,13 @@ def route_towards(address: str) -> Route:
 
 
 def address_into(network: Network) -> str:
-    """The address of this machine that connections into a network come from."""
-    # Towards its first host; a network of one address has no other.
+    """The own source address of connections into a network."""
+    # To the first host of the network, or to the only address.
     return address_towards(str(network[min(1, network.num_addresses - 1)]))
 
 
 def interface_index(address: str) -> int:
-    """The index of the interface that has an own address of IPv6. Raises OSError if none has it."""
+    """The index of the interface with an own IPv6 address. Raises OSError for another address."""
     packed = socket.inet_pton(socket.AF_INET6, address).hex()
     for line in _lines("/proc/net/if_inet6"):
         digits, index, *_ = line.split()
@@ -53,17 +53,17 @@ def interface_index(address: str) -> int:
 
 
 def is_own(address: str) -> bool:
-    """Whether an IP address is this machine's own, so that a peer that has it is a program here.
+    """Whether an IP address belongs to this machine: a peer at the address is a program here.
 
-    The route to an own address begins at that address.
+    The source address of a route to an own address is the same address.
     """
     return is_loopback(address) or address_towards(address) == address
 
 
 def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
-    """The networks that this machine's own interfaces are in, without loopback.
+    """The networks of the interfaces of this machine, without loopback.
 
-    ``without_uplink``: nor those of the interface with the default route, if there are others.
+    ``without_uplink``: also without the interface of the default route, unless there is no other.
     """
     by_interface: dict[str, list[Network]] = {}
     uplink = ""
@@ -77,7 +77,7 @@ def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
     for line in _lines("/proc/net/if_inet6"):
         digits, _, prefix, _, _, interface = line.split()
         address = ip_address(bytes.fromhex(digits))
-        # Every interface is in fe80::/64, so that this network tells nothing.
+        # Every interface is in fe80::/64, so this network does not tell interfaces apart.
         if interface != "lo" and not address.is_link_local:
             network = ip_network(f"{address}/{int(prefix, 16)}", strict=False)
             by_interface.setdefault(interface, []).append(network)
@@ -87,7 +87,7 @@ def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
 
 
 def default_gateways() -> frozenset[str]:
-    """The gateways of this machine's default routes, of IPv4."""
+    """The gateways of the IPv4 default routes of this machine."""
     routes = [line.split() for line in _lines("/proc/net/route")[1:]]
     return frozenset(_quad(gateway) for _, target, gateway, *_ in routes if target == "00000000")
 

@@ -1,8 +1,9 @@
-"""Connections on which an answer is due that nobody waits for any more.
+"""Connections on which a peer still owes an answer, although no caller waits for the answer.
 
-A peer that finds its caller gone need not survive that: a node of roslisp ends when it can't write
-its answer (SBCL's debugger is disabled in programs). So whoever gives up waiting leaves the
-connection here, and it is closed when the answer has come, or when the peer has ended it.
+A node of roslisp ends when it can't write its reply (programs run with SBCL's debugger disabled).
+So a caller that stops waiting does not close the connection, but leaves the connection here. The
+connection is closed when the answer has arrived, when the peer has closed the connection, or after
+LATE_TIMEOUT.
 """
 
 import asyncio
@@ -10,24 +11,24 @@ import contextlib
 from collections.abc import Awaitable, Callable
 
 LATE_TIMEOUT = 60.0
-"""Seconds that an answer has to come."""
+"""Seconds in which a late answer must arrive."""
 MOST_LATE = 256
-"""Connections of one kind of peer; the one that was left first is closed for another."""
+"""Connections that a LateAnswers keeps; for a further connection the oldest is closed."""
 
 
 class LateAnswers:
-    """Waits for the answers on connections that were left."""
+    """Waits for the late answers on connections, and closes the connections."""
 
     def __init__(self) -> None:
         self._waiting: dict[asyncio.Task[None], None] = {}
         self._ended = False
 
     def __len__(self) -> int:
-        """How many there are."""
+        """How many connections wait for an answer."""
         return len(self._waiting)
 
     def wait(self, answer: Callable[[], Awaitable[object]], close: Callable[[], None]) -> None:
-        """Have ``close`` called, which closes a connection, once ``answer`` has come or failed."""
+        """Await ``answer`` in the background, then call ``close`` to close the connection."""
         if self._ended:
             close()
             return
@@ -45,7 +46,7 @@ class LateAnswers:
             oldest.cancel()
 
     async def end(self) -> None:
-        """Close all of them, for good."""
+        """Close all connections, and later connections at once."""
         self._ended = True
         waiting = list(self._waiting)
         for task in waiting:
@@ -54,6 +55,6 @@ class LateAnswers:
 
 
 async def _await_late(answer: Callable[[], Awaitable[object]]) -> None:
-    with contextlib.suppress(Exception):  # whatever it is, nobody wants it
+    with contextlib.suppress(Exception):  # no caller waits for the answer or the error
         async with asyncio.timeout(LATE_TIMEOUT):
             await answer()

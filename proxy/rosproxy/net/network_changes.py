@@ -1,7 +1,7 @@
-"""Notices that this machine's addresses or routes change: containers join networks at any time.
+"""Notices changes of the addresses and routes of this machine.
 
-To read the networks from /proc takes as long as a quarter of a call. So the kernel tells the event
-loop of changes (rtnetlink(7)).
+A container may join a network at any time. Reading the networks from /proc takes a quarter of the
+time of an XML-RPC call. So the kernel reports changes to the event loop (rtnetlink(7)).
 """
 
 import asyncio
@@ -9,17 +9,17 @@ import contextlib
 import socket
 
 LOOK_INTERVAL_S = 5.0
-"""How often the networks count as changed where the kernel does not tell."""
+"""Seconds after which the networks count as changed if the kernel does not report changes."""
 _ROUTE_FAMILY = 0  # NETLINK_ROUTE (linux/netlink.h), which Python's module lacks
 _GROUPS = 0x1 | 0x10 | 0x40 | 0x100 | 0x400
 """RTMGRP_LINK, RTMGRP_IPV4_IFADDR, RTMGRP_IPV4_ROUTE, RTMGRP_IPV6_IFADDR and RTMGRP_IPV6_ROUTE
-(linux/rtnetlink.h). Of routes that go with their link the kernel does not tell.
+(linux/rtnetlink.h). The kernel does not report the routes that disappear with a link.
 """
 _READ_BYTES = 64 * 1024
 
 
 class NetworkChanges:
-    """Says whether the networks may have changed; times are seconds of a monotonic clock."""
+    """Says whether the networks may have changed. Times are seconds of a monotonic clock."""
 
     def __init__(self) -> None:
         self._socket: socket.socket | None = None
@@ -37,7 +37,7 @@ class NetworkChanges:
         return True
 
     def close(self) -> None:
-        """Notice nothing any more."""
+        """Close the netlink socket."""
         if self._socket is not None:
             asyncio.get_running_loop().remove_reader(self._socket)
             self._socket.close()
@@ -55,7 +55,7 @@ class NetworkChanges:
 
 
 def _route_socket() -> socket.socket | None:
-    """A socket that the kernel tells of changes; None where it has none, as in gVisor."""
+    """A socket on which the kernel reports changes; None without netlink, as in gVisor."""
     with contextlib.suppress(OSError):
         sock = socket.socket(
             socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, _ROUTE_FAMILY

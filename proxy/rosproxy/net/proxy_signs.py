@@ -1,7 +1,8 @@
-"""Which other proxies there are on this machine: each puts up a sign.
+"""Signs of proxies: which other proxies are on this machine, and which ranges they hold.
 
-A port that is bound and does not listen is in none of the kernel's lists, so that nobody can tell
-who holds a range. A sign says it (`signs`), to people alone, and not too much of it.
+A socket that is bound but does not listen is in no list of the kernel, so no tool shows which
+program holds the ports of a range. The sign of a proxy (`signs`) shows users the range and the
+admin endpoint. The proxy does not trust signs.
 """
 
 import socket
@@ -13,13 +14,13 @@ from rosproxy.net import signs
 from rosproxy.net.addresses import HostPort, is_address, parse_host_port
 
 MOST = 8
-"""Proxies that are told of."""
+"""Proxies that a message names at most."""
 _SIGN = r"rosproxy/([12]{1,2})/(\d{1,5})-(\d{1,5})/([0-9A-Fa-z.:\[\]-]{1,60})"
 
 
 @dataclass(frozen=True, slots=True)
 class Sign:
-    """What a proxy says of itself: versions of ROS, first and last port, and its admin endpoint."""
+    """The sign of a proxy: versions of ROS, first and last port, and the admin endpoint."""
 
     ros: str
     first: int
@@ -27,7 +28,7 @@ class Sign:
     admin: str
 
     def __str__(self) -> str:
-        """Words for people, to be used after "held by"."""
+        """Text for users, after the words "held by"."""
         return (
             f"another rosproxy, with --port-range {self.first}-{self.last} "
             f"(rosproxy status --admin http://{self.admin})"
@@ -37,9 +38,9 @@ class Sign:
 def publish_sign(
     ros: Collection[str], first: int, last: int, admin: object
 ) -> socket.socket | None:
-    """Put up the sign of this process; it stays until the socket is closed.
+    """Publish the sign of this process until the returned socket is closed.
 
-    None where that is not possible: a sign only helps people.
+    None if that fails: the proxy works without a sign.
     """
     return signs.put_up(f"rosproxy/{''.join(sorted(ros))}/{first}-{last}/{admin}")
 
@@ -47,11 +48,11 @@ def publish_sign(
 def overlapping_proxies(
     ros: str, first: int, last: int, admin: HostPort | None = None
 ) -> list[Sign]:
-    """The other proxies on this machine, for a version of ROS, that have some of these ports.
+    """The other proxies of a version of ROS on this machine whose range has some of these ports.
 
-    ``admin`` is the own admin endpoint, which no other can have; None before the own sign is up. A
-    proxy that was started twice has the same one. MOST at most, and none whose admin endpoint is
-    not at an address: people are told to ask there.
+    ``admin``: the own admin endpoint, to leave the own sign out; None before the own sign exists.
+    Before that, a sign with the same admin endpoint is of the same proxy, started twice. At most
+    MOST signs, and only signs with an IP address, where users can ask.
     """
     proxies = (Sign(m[1], int(m[2]), int(m[3]), m[4]) for m in signs.read_all(_SIGN))
     overlapping = (

@@ -1,11 +1,12 @@
-"""Host names to addresses, without ever waiting long for a name server that does not answer.
+"""Resolves host names, with a short time-out for name servers that do not answer.
 
-``getaddrinfo`` can't be stopped and may take 40 s. It runs in daemon threads, one per name at most,
-so that look-ups that hang block neither other names nor the end of the process.
+``getaddrinfo`` can't be stopped and may take 40 s. So look-ups run in daemon threads, one for each
+name. A look-up that hangs blocks neither other names nor the end of the process.
 
-Threads are bounded, and nodes choose names: who gives names whose name server hangs, one after the
-other, would use up all threads. So a look-up is counted for whoever gave the name, its ``source``,
-who has a few at a time; and some are left for names of the proxy's own, as the master's.
+The number of threads is bounded, and nodes choose names. A node could use all threads by names
+whose name server hangs. So each look-up counts for the ``source`` that gave the name, and each
+source has a few look-ups at a time. Some look-ups are reserved for the proxy's own names, such as
+the master's host name.
 """
 
 import asyncio
@@ -21,31 +22,31 @@ log = logging.getLogger(__name__)
 RESOLVE_TIMEOUT = 1.0
 """Seconds after which a name counts as unresolvable."""
 MOST_LOOKUPS = 64
-"""Look-ups that may be under way at once; beyond that names count as unresolvable."""
+"""Look-ups that may be under way at once; above the bound a name counts as unresolvable."""
 MOST_FOR_OTHERS = 56
+"""Look-ups at once for all sources except the proxy itself."""
 MOST_FOR_ONE = 8
-"""Of these, how many for names that others gave, and that one other gave: the nodes of one machine
-give its name."""
+"""Look-ups at once for one source. Nodes usually give the name of their machine."""
 NODES = "nodes"
+"""The source of the names of nodes in the master's graph, which does not say who gave a name."""
 MOST_FOR_NODES = 32
-"""The source of names that the master has of nodes, since it does not say who gave them; and how
-many: they are as many as there are machines, and come all at once."""
+"""Look-ups at once for NODES. These names come all at once, a name for each machine."""
 
 _running: dict[str, tuple[str, Future[list[str]]]] = {}
-"""The look-ups under way, each with its source; an entry ends when its thread does."""
+"""The look-ups under way by host name, with the source. The end of a thread removes the entry."""
 
 
 async def resolve(host: str, source: str = "") -> list[str]:
-    """The addresses of a host name, IPv4 first; empty if it can't be resolved in time.
+    """The addresses of a host name, IPv4 first; empty if unresolvable in RESOLVE_TIMEOUT.
 
-    ``source`` is who gave the name: an address, or NODES; empty for the proxy's own names.
+    ``source``: the address of the node that gave the name, or NODES; empty for the proxy's names.
     """
     if is_address(host):
         return [plain_address(host)]
     _, lookup = _running.get(host) or ("", _start(host, source))
     try:
         async with asyncio.timeout(RESOLVE_TIMEOUT):
-            # Shielded, since others may wait for the same look-up.
+            # Shielded: other callers may wait for the same look-up.
             return await asyncio.shield(asyncio.wrap_future(lookup))
     except TimeoutError:
         return []
@@ -70,7 +71,7 @@ def _start(host: str, source: str) -> Future[list[str]]:
 
 
 def _may_start(source: str) -> bool:
-    """Whether there is a thread for one more look-up of a source's."""
+    """Whether a source may start another look-up."""
     sources = [source for source, _ in list(_running.values())]  # threads end at any time
     if not source:
         return len(sources) < MOST_LOOKUPS
@@ -83,7 +84,7 @@ def _look_up(host: str, lookup: "Future[list[str]]") -> None:
     try:
         infos = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
         addresses = list(dict.fromkeys(plain_address(str(info[4][0])) for info in infos))
-    except (OSError, ValueError):  # not to be found; nothing that could be (UnicodeError is one)
+    except (OSError, ValueError):  # not found, or not a host name (UnicodeError is a ValueError)
         pass
     finally:
         _end(host, lookup, addresses)

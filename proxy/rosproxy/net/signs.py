@@ -1,10 +1,9 @@
-"""Signs: what a process says of itself to all others on this machine.
+"""Signs: short texts that a process publishes to all processes on this machine.
 
-A sign is a Unix socket with an abstract name (unix(7)). Like ports it belongs to a network
-namespace, and the kernel takes it down when its process ends, however that ends. ``/proc/net/unix``
-lists all of them.
+A sign is a Unix socket with an abstract name (unix(7)). Like a port, a sign belongs to a network
+namespace, and the kernel removes the sign with the process. ``/proc/net/unix`` lists all signs.
 
-Anybody can put up a sign. So what is read is told to people, or tried, and proves nothing.
+Any process can publish any sign, so signs prove nothing. Use signs in messages, or check the text.
 """
 
 import contextlib
@@ -17,9 +16,9 @@ _LISTED = Path("/proc/net/unix")
 
 
 def put_up(text: str) -> socket.socket | None:
-    """Put up a sign, without blanks; it stays until the socket is closed.
+    """Publish a sign, a text without blanks, until the returned socket is closed.
 
-    Others may have the same text. None where that is not possible: a sign only helps.
+    Several processes may publish the same text. None if the kernel refuses the socket.
     """
     with contextlib.suppress(OSError):
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -33,7 +32,7 @@ def put_up(text: str) -> socket.socket | None:
 
 
 def read_all(text: str) -> list[re.Match[str]]:
-    """The signs in this network namespace whose text is like this regular expression."""
+    """The matches of a regular expression with all signs in this network namespace."""
     try:
         lines = _LISTED.read_text("utf-8", "replace").splitlines()
     except OSError:

@@ -1,8 +1,8 @@
-"""TCP sockets: bound, listening, accepted, connected, looked into and closed.
+"""TCP sockets: bind, reserve, listen, accept, connect, peek, read and close.
 
-Everything here is non-blocking and belongs to one event loop. A reserved socket refuses connections
-and keeps its port from everybody else until it listens (`reserve`, `listen_on`); `leases` builds on
-that.
+All sockets are non-blocking and belong to the event loop. A reserved socket refuses connections,
+and no other program can bind its port (`reserve`, `listen_on`). `rosproxy.ros1.leases` reserves the
+ports of the range.
 """
 
 import asyncio
@@ -21,19 +21,19 @@ from rosproxy.net.tasks import Tasks
 log = logging.getLogger(__name__)
 
 BACKLOG = 1024
-"""Connections that wait to be accepted: the client of one more waits a second and tries again."""
+"""Connections that wait to be accepted at most. The next client tries again after a second."""
 ACCEPTS_PER_TURN = 64
 CONNECT_TIMEOUT = 5.0
-"""Seconds that a peer has to accept a connection."""
+"""Seconds in which a peer must accept a connection."""
 WRITE_TIMEOUT = 30.0
-"""Seconds in which a reader has to take something of what is waiting for it."""
+"""Seconds in which a reader must take some of the bytes that wait for the reader."""
 SILENCE_TIMEOUT = 30.0
-"""Seconds in which a client has to send what is waited for before its connection is closed."""
+"""Seconds in which a client must send the expected bytes; then the proxy closes the connection."""
 
 Handler = Callable[[socket.socket, str], Awaitable[None]]
-"""Takes over an accepted socket; the second argument is the peer's address."""
+"""Takes over an accepted socket. The second argument is the address of the peer."""
 
-# struct linger (socket(7)): on, with a time of 0, for which close() sends a reset.
+# struct linger (socket(7)): on, with a time of 0, so that close() sends a reset.
 _LINGER_RESET = struct.pack("ii", 1, 0)
 
 
@@ -44,7 +44,7 @@ def bind(address: str, port: int) -> socket.socket:
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if family == socket.AF_INET6:
-            # `::` is for IPv4, too, whatever net.ipv6.bindv6only says (ipv6(7)).
+            # `::` accepts IPv4, too, with any value of net.ipv6.bindv6only (ipv6(7)).
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         sock.bind((address, port))
     except OSError:
@@ -55,14 +55,16 @@ def bind(address: str, port: int) -> socket.socket:
 
 
 def reserve(address: str, port: int) -> socket.socket:
-    """A bound socket that refuses connections, and whose port nobody else can bind. Raises OSError.
+    """A bound socket that refuses connections; no other program can bind the port. Raises OSError.
 
-    A socket that is only bound does not keep others out. It needs SO_REUSEADDR, or connections that
-    linger from a former process would be in its way; but with that option any number of sockets may
-    be bound to one port, as long as none listens. Linux asks both sockets for the option when the
-    second one is bound, so it is taken off once the port is had. Whether it is had shows when the
-    socket listens, since Linux then looks again who has the port. After ``shutdown`` the socket
-    listens no more and is still bound.
+    The socket needs SO_REUSEADDR: otherwise connections in TIME_WAIT, left by an earlier process,
+    prevent the bind. But with SO_REUSEADDR, any number of sockets may bind the same port as long as
+    no socket listens. So this function does more than bind:
+
+    1. ``listen`` fails if another process has reserved the port meanwhile: Linux checks again.
+    2. Without SO_REUSEADDR on this socket, no later socket can bind the port: Linux wants the
+       option on both sockets.
+    3. ``shutdown`` ends the listening. The socket stays bound.
     """
     sock = bind(address, port)
     try:
@@ -78,7 +80,8 @@ def reserve(address: str, port: int) -> socket.socket:
 def listen_on(sock: socket.socket) -> None:
     """Let a reserved socket listen. Raises OSError.
 
-    Its connections are to keep nobody from binding the port later, so they get SO_REUSEADDR.
+    Accepted connections inherit SO_REUSEADDR, so that a later process can bind the port although
+    such a connection still exists.
     """
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     sock.listen(BACKLOG)
@@ -92,10 +95,11 @@ def listen(address: str, port: int) -> socket.socket:
 
 
 class Acceptor:
-    """Accepts on a listening socket until it is closed; each connection has a task of its own.
+    """Accepts connections on a listening socket until `close`; each connection has a task.
 
-    The handler takes it over; an exception that ends the handler closes it. With a ``gate``, one
-    too many is reset, and each is counted until the handler has ended.
+    The handler owns the connection. If the handler raises, the connection is closed. A ``gate``
+    counts each connection until the handler ends. The acceptor resets a connection that the gate
+    refuses.
     """
 
     def __init__(
@@ -111,7 +115,7 @@ class Acceptor:
         self._listen()
 
     def close(self) -> None:
-        """Stop accepting, and close the socket; connections stay."""
+        """Close the listening socket; accepted connections stay open."""
         self._loop.remove_reader(self._sock)
         if self._pause is not None:
             self._pause.cancel()
@@ -140,7 +144,7 @@ class Acceptor:
         except OSError as error:
             if error.errno in (errno.EMFILE, errno.ENFILE):
                 log.error("out of file descriptors: raise the limit (ulimit -n) of the proxy")
-            # The socket would stay readable: look again later.
+            # The socket stays readable, and the loop would call again at once: pause.
             self._loop.remove_reader(self._sock)
             self._pause = self._loop.call_later(0.1, self._listen)
 
@@ -157,7 +161,7 @@ class Acceptor:
 
 
 def _close_if_cancelled(conn: socket.socket, task: asyncio.Task[None]) -> None:
-    """A task that is cancelled before it has begun never gets to close its connection."""
+    """Close the connection of a cancelled task: a task cancelled before its start can't do so."""
     if task.cancelled():
         conn.close()
 
@@ -167,9 +171,10 @@ def _leave(gate: Gate, source: str, port: int, _: asyncio.Task[None]) -> None:
 
 
 def begin_to_dial(target: HostPort) -> socket.socket:
-    """A non-blocking connection to an IP address and port, under way. Raises OSError.
+    """Begin a non-blocking connection to an IP address and port. Raises OSError.
 
-    What is sent before it is made raises BlockingIOError, or what has become of it.
+    Before the connection is established, ``send`` raises BlockingIOError, or the OSError of a
+    connection that has failed.
     """
     sock = socket.socket(_family(target.host), socket.SOCK_STREAM)
     sock.setblocking(False)
@@ -183,7 +188,7 @@ def begin_to_dial(target: HostPort) -> socket.socket:
 
 
 async def dial(target: HostPort, within: float = CONNECT_TIMEOUT) -> socket.socket:
-    """A non-blocking connection to an IP address and port. Raises OSError, TimeoutError."""
+    """Connect to an IP address and port, non-blocking. Raises OSError, TimeoutError."""
     sock = socket.socket(_family(target.host), socket.SOCK_STREAM)
     sock.setblocking(False)
     try:
@@ -196,10 +201,10 @@ async def dial(target: HostPort, within: float = CONNECT_TIMEOUT) -> socket.sock
 
 
 async def peek(conn: socket.socket, size: int) -> bytes:
-    """The first bytes of a connection, left where they are; fewer if it ends before.
+    """The first ``size`` bytes of a connection, which stay in the buffer; fewer at an early end.
 
-    The kernel wakes the reader only at that many bytes (SO_RCVLOWAT), however small the slices in
-    which they come. Raises TimeoutError after SILENCE_TIMEOUT, OSError.
+    The kernel wakes the reader only once ``size`` bytes have arrived (SO_RCVLOWAT), even if the
+    bytes arrive one by one. Raises TimeoutError after SILENCE_TIMEOUT, OSError.
     """
     conn.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, size)
     async with asyncio.timeout(SILENCE_TIMEOUT):
@@ -210,7 +215,7 @@ async def peek(conn: socket.socket, size: int) -> bytes:
 
 
 async def read_exactly(conn: socket.socket, size: int) -> bytes:
-    """So many bytes, taken off a connection. Raises EOFError if it ends before, OSError."""
+    """Read exactly ``size`` bytes. Raises EOFError if the connection ends earlier, OSError."""
     loop = asyncio.get_running_loop()
     chunks = []
     while size:
@@ -223,7 +228,7 @@ async def read_exactly(conn: socket.socket, size: int) -> bytes:
 
 
 def has_ended(conn: socket.socket) -> bool:
-    """Whether the peer of a non-blocking connection has closed it and nothing is left to read."""
+    """Whether a non-blocking connection is broken, or closed by the peer with all bytes read."""
     try:
         return not conn.recv(1, socket.MSG_PEEK)
     except BlockingIOError:
@@ -233,22 +238,22 @@ def has_ended(conn: socket.socket) -> bool:
 
 
 def reset_on_close(sock: socket.socket) -> None:
-    """Make closing a socket send a reset instead of an orderly end."""
+    """Make the close of a socket send a reset (RST) instead of a FIN."""
     with contextlib.suppress(OSError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_RESET)
 
 
 def hang_up(sock: socket.socket) -> None:
-    """End a connection that somebody waits for: it then reads as ended."""
+    """End a connection on which a task waits; the task then reads the end of the connection."""
     with contextlib.suppress(OSError):
         sock.shutdown(socket.SHUT_RDWR)
 
 
 def end_if_stalled(sock: socket.socket, after: float = WRITE_TIMEOUT) -> None:
-    """Have the kernel end a connection whose peer takes nothing of what it is sent, for so long.
+    """Have the kernel end a connection whose peer takes no bytes for ``after`` seconds.
 
-    One that reads slowly is left alone (tcp(7), TCP_USER_TIMEOUT). After the event loop has
-    written a reply nobody else sees that it never leaves.
+    A slow reader keeps the connection (tcp(7), TCP_USER_TIMEOUT). Only the kernel notices a reply
+    that stays in the send buffer after the event loop has written all bytes.
     """
     with contextlib.suppress(OSError):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(after * 1000))

@@ -9,20 +9,23 @@ log = logging.getLogger(__name__)
 
 
 class Tasks:
-    """The one place where background tasks are made: kept alive, logged when they fail."""
+    """Creates background tasks, keeps references to the tasks, and logs failures.
+
+    asyncio itself keeps only weak references to tasks.
+    """
 
     def __init__(self) -> None:
         self._tasks: set[asyncio.Task[Any]] = set()
 
     def spawn(self, work: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
-        """Run ``work`` in the background; ``name`` stands in the log if it fails."""
+        """Run ``work`` in the background; a failure is logged with ``name``."""
         task = asyncio.get_running_loop().create_task(work, name=name)
         self._tasks.add(task)
         task.add_done_callback(self._done)
         return task
 
     def repeat(self, step: Callable[[], Awaitable[None]], interval: float, name: str) -> None:
-        """Run ``step`` again and again, ``interval`` seconds apart, whatever becomes of it."""
+        """Run ``step`` for ever, with pauses of ``interval`` seconds, also after a failure."""
         self.spawn(self._repeat(step, interval, name), name)
 
     async def _repeat(
@@ -36,7 +39,7 @@ class Tasks:
             await asyncio.sleep(interval)
 
     async def cancel(self) -> None:
-        """Cancel everything and wait until it has ended."""
+        """Cancel all tasks except the current task, and wait for the end of all."""
         tasks = [task for task in self._tasks if task is not asyncio.current_task()]
         for task in tasks:
             task.cancel()
