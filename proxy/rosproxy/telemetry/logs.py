@@ -1,15 +1,14 @@
 """Logging to standard error, for people as text or for machines as one JSON object per line.
 
-A call says what it is about by ``extra=``: ``node``, ``port``, ``container`` or ``proxy``, where
-that is known, for example ``log.info("...", extra={"node": "/talker", "port": 45000})``. JSON lines
-have these as fields of their own beside ``time`` (ISO 8601, UTC), ``level``, ``logger``,
-``message`` and, with a traceback, ``error``; text lines have the message alone.
+A call may name its object by ``extra=`` (``node``, ``port``, ``container`` or ``proxy``), such as
+``log.info("...", extra={"node": "/talker", "port": 45000})``. JSON lines have these fields beside
+``time`` (ISO 8601, UTC), ``level``, ``logger``, ``message`` and, with a traceback, ``error``. Text
+lines have only the message.
 
-Messages quote what nodes, labels and documents say, and those may be hostile. So this is the one
-place that makes them harmless, whoever logs: a message is one line of at most LONGEST characters
-without anything that moves a cursor or reorders text (`harmless`); and who makes the proxy say the
-same again and again does not fill the disk (`LogRateLimit`). Tracebacks stay as they are, but for
-the texts of the exceptions in them.
+Messages quote nodes, labels and documents, which may be hostile. This module makes all messages
+harmless. A message is a line of at most LONGEST characters, without characters that move the cursor
+or reorder text (`harmless`). Repeated messages do not fill the disk (`LogRateLimit`). Tracebacks
+stay the same, except the texts of the exceptions.
 """
 
 import contextlib
@@ -27,27 +26,28 @@ from rosproxy.telemetry.problems import LONGEST_SUBJECT
 from rosproxy.telemetry.text import brief, clean
 
 LONGEST = 2000
-"""Characters of a message at most, and of each exception's text: the longest of the proxy's own
-has some 400."""
+"""Characters of a message at most, and of the text of an exception. The proxy's own messages have
+up to 400."""
 SUBJECT_BURST = 20
+"""Warnings and errors of one kind about one subject that are written in a burst. A real node causes
+a few messages a minute at most. An address may have several nodes with five topics each."""
 SUBJECT_INTERVAL = 5.0
-"""Warnings and errors of one kind about one subject that are written at once, and the seconds
-after which one more is. What is told of a real node changes a few times in a minute at most; where
-the subject is an address, there may be some nodes that each say the same of five topics."""
+"""Seconds after a burst until one more message of the subject is written."""
 KIND_BURST = 2000
+"""Messages of one kind that are written in a burst: a line for each of 1,000 nodes that start."""
 KIND_INTERVAL = 1.0
-"""The same for all messages of one kind: a thousand nodes that start at once have a line each."""
+"""Seconds after a burst until one more message of the kind is written."""
 USUAL = 200
-"""Characters of a message that counts as one; a longer one counts as several."""
+"""Characters of a message that counts as one message; a longer message counts several times."""
 MOST_BUCKETS = 1024
-"""Kinds and subjects that are remembered; of more the one that came last the longest ago goes."""
+"""Buckets of kinds and subjects. For a further bucket the one that was unused for longest goes."""
 
 _NAMES = {"levelname": "level", "name": "logger", "exc_info": "error"}
 
 
 @dataclass(slots=True)
 class _Bucket:
-    """Messages that may still be written, as of ``since``, and how many were left out."""
+    """A token bucket: ``remaining`` messages at the time ``since``, and messages left out."""
 
     remaining: float
     since: float
@@ -55,22 +55,22 @@ class _Bucket:
 
 
 class LogRateLimit(logging.Filter):
-    """Leaves out messages that come too often, and says in the next of their kind how many.
+    """Leaves out messages that come too often; the next message of the kind says how many.
 
-    Messages are of one kind if they come from the same call: logger, level and template are the
-    same; the subject is the template's first argument. Each kind has a bound, and warnings
-    and errors about one subject have a lower one; long messages use both up sooner. Debug messages
-    are for somebody who looks on: they are all written.
+    Messages of one kind come from the same call: logger, level and template are the same. The
+    subject is the first argument of the template. Each kind has a bound. Warnings and errors about
+    one subject have a lower bound. Long messages count several times. Debug messages have no bound:
+    a user reads along.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._clock = clock
-        self._lock = threading.Lock()  # relays log from threads of their own
+        self._lock = threading.Lock()  # the threads of relays log, too
         self._buckets: dict[Hashable, _Bucket] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether to write a record; it then has ``left_out``, if others were before it."""
+        """Whether to write a record. Sets ``left_out`` if records before it were left out."""
         if record.levelno < logging.INFO:
             return True
         kind = record.name, record.levelno, str(record.msg)[:LONGEST]
@@ -83,19 +83,19 @@ class LogRateLimit(logging.Filter):
             return _take(self._bucket(kind, KIND_BURST, KIND_INTERVAL), record, weight)
 
     def _bucket(self, key: Hashable, burst: int, every: float) -> _Bucket:
-        """What is left of a bound by now."""
+        """The bucket of a key, with the messages that the time has added; ``every`` is seconds."""
         now = self._clock()
         bucket = self._buckets.pop(key, None) or _Bucket(burst, now)
         if len(self._buckets) >= MOST_BUCKETS:
             del self._buckets[next(iter(self._buckets))]
-        self._buckets[key] = bucket  # the last, so that the first is unused for the longest time
+        self._buckets[key] = bucket  # at the end: the first bucket was unused for longest
         bucket.remaining = min(bucket.remaining + (now - bucket.since) / every, burst)
         bucket.since = now
         return bucket
 
 
 def _take(bucket: _Bucket, record: logging.LogRecord, weight: int) -> bool:
-    """Whether a bound allows one more record, which then tells what was left out before."""
+    """Whether a bucket allows a record. Moves the count of left-out messages to the record."""
     if bucket.remaining < 1:
         bucket.left_out += 1
         return False
@@ -107,13 +107,13 @@ def _take(bucket: _Bucket, record: logging.LogRecord, weight: int) -> bool:
 
 
 def _subject(record: logging.LogRecord) -> str:
-    """What a record is about: the first of its arguments; without any it is its template."""
+    """The subject of a record: the first argument; empty without arguments."""
     arguments = record.args if isinstance(record.args, tuple) else ()
     return brief(arguments[0], LONGEST_SUBJECT) if arguments else ""
 
 
 def harmless(record: logging.LogRecord) -> logging.LogRecord:
-    """A copy of a record whose message and traceback may be written as they are."""
+    """A copy of a record with a message and a traceback that are harmless on a terminal."""
     safe = copy.copy(record)
     safe.msg = brief(record.getMessage(), LONGEST)
     safe.args = None
@@ -137,7 +137,7 @@ class TextLines(logging.Formatter):
 
 
 class JsonLines(JsonFormatter):
-    """Formats a record as JSON, with the fields above."""
+    """Formats a record as a line of JSON, with the fields of the module's docstring."""
 
     def __init__(self) -> None:
         super().__init__(["levelname", "name", "message"], rename_fields=_NAMES, timestamp="time")
@@ -147,7 +147,7 @@ class JsonLines(JsonFormatter):
         return super().format(harmless(record))
 
     def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
-        """The fields, texts among them harmless, with the level in lower case."""
+        """The fields with harmless texts, and with the level in lower case."""
         fields = {
             name: brief(field, LONGEST) if isinstance(field, str) and name not in _SAFE else field
             for name, field in log_data.items()
@@ -156,28 +156,29 @@ class JsonLines(JsonFormatter):
 
 
 _SAFE = frozenset({"message", "error"})
-"""What `harmless` has made safe: a traceback has lines, the message may tell what was left out."""
+"""The fields that `harmless` has made harmless. A further `brief` would join the lines of a
+traceback, and could cut the count of left-out messages."""
 
 
 def set_up(form: str, level: str) -> None:
-    """Log to standard error in ``form`` (text or json) from ``level`` on."""
+    """Log to standard error in ``form`` (text or json), from ``level`` up."""
     handler = logging.StreamHandler()
     handler.setFormatter(JsonLines() if form == "json" else TextLines())
-    # At the handler: a logger's filter does not see what the loggers below it log.
+    # At the handler: the filter of a logger does not see the records of loggers below.
     handler.addFilter(LogRateLimit())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
-    # Strangers that speak no HTTP are not errors of ours.
+    # A stranger that sends no HTTP is not an error of the proxy.
     logging.getLogger("aiohttp.server").setLevel(logging.CRITICAL)
 
 
 def _traceback(record: logging.LogRecord) -> str | None:
-    """A record's traceback, in which the exceptions' texts begin no lines of their own."""
+    """The traceback of a record, with each exception text on a single line."""
     if not record.exc_info or record.exc_info[1] is None:
         return None
     text = logging.Formatter().formatException(record.exc_info)
     for error in _chain(record.exc_info[1]):
         message = ""
-        with contextlib.suppress(Exception):  # its own __str__ may fail; Python copes with that
+        with contextlib.suppress(Exception):  # __str__ may raise; the traceback then says so
             message = str(error)
         if message:
             text = text.replace(message, brief(message, LONGEST))
@@ -185,7 +186,7 @@ def _traceback(record: logging.LogRecord) -> str | None:
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception and all that led to it."""
+    """An exception, with its causes and contexts."""
     visited: set[int] = set()
     while error is not None and id(error) not in visited:
         visited.add(id(error))

@@ -1,8 +1,8 @@
-"""Prometheus metrics: the counters that the proxy keeps.
+"""Prometheus metrics: the counters of the proxy.
 
 `ros1.status` and `ros2.status` have the metrics of the proxy's state, with the bytes of
-connections. Counters with few outcomes begin with 0. Prometheus sees no increase in a series that
-begins with 1, so that an alert would miss the first event.
+connections. Counters with few label values begin with 0. In a series that begins with 1, Prometheus
+sees no increase, and an alert would miss the first event.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -27,7 +27,7 @@ disable_created_metrics()  # type: ignore[no-untyped-call]
 MOST_NAMES = 1000
 """Topics and services with separate byte counters; one counter has the bytes of all others.
 
-The same bound holds for the names of nodes that are down.
+Nodes that are down have the same bound of names (`NamedNodes`).
 """
 BOUNDS = (
     *("long_body", "slow_body", "compressed", "over_budget", "long_name", "too_many_names"),
@@ -42,8 +42,8 @@ STRANGERS = ("outside", "unselected")
 class Traffic:
     """Bytes relayed per topic or service, summed over ended connections.
 
-    ``sent`` went outside, ``received`` came from outside. Anonymous nodes bring new names without
-    end, so that only the first MOST_NAMES have separate sums.
+    ``sent`` went outside, ``received`` came from outside. Anonymous nodes bring ever new names, so
+    only the first MOST_NAMES names have separate sums.
     """
 
     def __init__(self) -> None:
@@ -59,20 +59,20 @@ class Traffic:
         self.received[key] = self.received.get(key, 0) + received
 
     def totals(self) -> Iterator[tuple[list[str], int]]:
-        """Kind, name and direction with the bytes."""
+        """Pairs of the labels (kind, name, direction) and the bytes."""
         for direction, sums in (("outward", self.sent), ("inward", self.received)):
             for key, size in sums.items():
                 yield [*key, direction], size
 
 
 class NamedNodes:
-    """Numbers of nodes by name; only the first MOST_NAMES have separate numbers."""
+    """Numbers of nodes by name; only the first MOST_NAMES names have separate numbers."""
 
     def __init__(self) -> None:
         self._names: set[str] = set()
 
     def tally(self, names: Iterable[str]) -> Mapping[str, int]:
-        """How often each name occurs."""
+        """How often each name occurs; ``other`` stands for all further names."""
         counts: dict[str, int] = {}
         for name in names:
             if len(self._names) < MOST_NAMES:

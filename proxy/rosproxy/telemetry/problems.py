@@ -1,7 +1,7 @@
-"""What the user should know: the problems that `rosproxy status` shows.
+"""The problems that a user should know, as `rosproxy status` shows them.
 
-Subjects are nodes' names and texts quote what nodes say, so that both are made harmless and
-bounded here, once for all modules that note a problem.
+Subjects and texts quote names that nodes have chosen. This module makes both harmless and bounds
+both, for all modules that note problems.
 """
 
 import time
@@ -11,18 +11,18 @@ import msgspec
 from rosproxy.telemetry.text import brief
 
 MOST = 50
-"""Problems that are kept."""
+"""Problems that are kept at most."""
 LONGEST_SUBJECT = 200
+"""Characters of a subject; a longer subject loses its middle. Names of nodes have some tens."""
 LONGEST_TEXT = 500
-"""Characters of a problem at most. Names of real nodes have some tens, the proxy's own texts up to
-300; what is longer loses its middle."""
+"""Characters of a text; a longer text loses its middle. The proxy's own texts have up to 300."""
 
 
 class NotedProblem(msgspec.Struct, frozen=True):
-    """A problem: when (Unix time), with which node, port or option, and what.
+    """A problem. ``when``: Unix time in seconds. ``subject``: a node, port or option.
 
-    ``port`` is the lease of the node concerned, if it is about one. ``holds``: it is so until it is
-    solved, and not only when it was noted.
+    ``port``: the lease of the node, if the problem concerns a node. ``holds``: the problem lasts
+    until `Problems.solved`; other problems are events.
     """
 
     when: float
@@ -33,16 +33,16 @@ class NotedProblem(msgspec.Struct, frozen=True):
 
 
 class Problems:
-    """The most recent problems, newest last; the same one again replaces the older entry.
+    """The last MOST problems, newest last. A repeated problem replaces the older entry.
 
-    Those that hold stay, however many others there are.
+    Above MOST the oldest event goes, and without events the oldest problem that holds.
     """
 
     def __init__(self) -> None:
         self._problems: list[NotedProblem] = []
 
     def add(self, subject: str, text: str, port: int | None = None, holds: bool = False) -> None:
-        """Note a problem. The caller has to call `solved` for a problem that ``holds``."""
+        """Note a problem. For a problem that ``holds``, the caller calls `solved` later."""
         subject = brief(subject, LONGEST_SUBJECT)
         text = brief(text, LONGEST_TEXT)
         remaining = [p for p in self._problems if (p.subject, p.text) != (subject, text)]
@@ -52,18 +52,18 @@ class Problems:
         self._problems = noted
 
     def solved(self, subject: str) -> None:
-        """Forget what was noted about a subject."""
+        """Remove the problems of a subject."""
         noted_subject = brief(subject, LONGEST_SUBJECT)
         self._problems = [p for p in self._problems if p.subject != noted_subject]
 
     def solved_at(self, port: int) -> None:
-        """Forget what was noted about the node of a lease."""
+        """Remove the problems of the node with a lease."""
         self._problems = [p for p in self._problems if p.port != port]
 
     def all(self) -> list[NotedProblem]:
-        """All problems."""
+        """All problems, newest last."""
         return self._problems
 
     def at(self, port: int) -> list[NotedProblem]:
-        """The problems of the node of a lease."""
+        """The problems of the node with a lease."""
         return [p for p in self._problems if p.port == port]

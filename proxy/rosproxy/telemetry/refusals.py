@@ -1,9 +1,9 @@
-"""What the proxy has refused because it was over a bound: counted, logged, and shown in the status.
+"""Refusals above a bound: counted, logged, and shown in the status.
 
-A metric counts every refusal by its reason, a word of those in docs/reference/limits.md. The log
-gets one line for each reason and source, then none for a while, and so many for each reason;
-`rosproxy status` shows the last one of each reason, until the proxy has refused nothing more for
-that reason for some minutes.
+A metric counts each refusal by reason (docs/reference/limits.md has the reasons). The log gets a
+line for a reason and source, then no such line for QUIET seconds. In the same time the log gets
+LINES lines for a reason at most. `rosproxy status` shows the last refusal of each reason until
+there was no refusal for OVER_AFTER seconds.
 """
 
 import logging
@@ -18,38 +18,38 @@ log = logging.getLogger(__name__)
 
 DENIED = "policy"
 WOULD_BE_DENIED = "policy_audit"
-"""The reasons of what a policy denies, or only tells of."""
+"""The reasons of denials by the policy, and of would-be denials in audit mode."""
 QUIET = 60.0
-"""Seconds in which a source is not logged again for the same reason."""
+"""Seconds after a line in the log without another line for the same source and reason."""
 OVER_AFTER = 300.0
-"""Seconds without a refusal after which the status shows the last one no longer."""
+"""Seconds without a refusal after which the status no longer shows the last refusal."""
 OF_STARTS = frozenset(
     {"not_a_peer", "hidden_source", "unproven", "unknown_participant", "no_locator"}
 )
-"""Reasons that nodes of ROS 2 give at each start, for a second or two: a datagram of a participant
-overtakes the announcement of that participant."""
+"""Reasons that occur at each start of a ROS 2 node, for a second or two: a datagram of a
+participant overtakes the announcement of that participant."""
 RATE = "rate"
-"""The reason that a source sends more discovery of ROS 2 than the proxy reads. Fast DDS sends a
-thousand heartbeats a second while participants meet, and a proxy without a free processor reads
-them a little later; participants repeat what is lost."""
+"""The reason if a source sends more discovery of ROS 2 than the proxy reads. Fast DDS sends a
+thousand heartbeats a second while participants discover each other. A busy proxy drops some, and
+participants send these again."""
 PATIENCE = 10.0
-"""Seconds that refusals for a reason of `OF_STARTS`, or for `RATE`, go on before the log and the
-status tell it."""
+"""Seconds that a span of a reason of `OF_STARTS`, or of `RATE`, lasts before the log and the status
+report a refusal."""
 PAUSE = 15.0
-"""Seconds without a refusal after which these begin anew. Cyclone DDS announces itself each 8 s."""
+"""Seconds without a refusal after which a new span begins. Cyclone DDS announces every 8 s."""
 LINES = 20
-"""Sources that are logged in that time for one reason: sources of datagrams may be forged."""
+"""Lines in the log for a reason in QUIET seconds: sources of datagrams may be forged."""
 MOST = 1000
-"""Sources and reasons that are remembered for that."""
+"""Pairs of reason and source whose last line is remembered."""
 MOST_SOURCES = 256
-"""Sources of a span that are remembered. A span with more sources ends by a pause alone."""
+"""Sources of a span that are remembered. Only a pause ends a span with more sources."""
 
 
 @dataclass(slots=True)
 class _Span:
-    """A time in which something was refused for one reason again and again, in seconds.
+    """A series of refusals for one reason. ``first`` and ``last`` are times in seconds.
 
-    ``sources`` are those of the refusals that have not settled.
+    ``sources``: the sources whose participants the proxy has not met since the refusal.
     """
 
     first: float
@@ -57,7 +57,7 @@ class _Span:
     sources: set[str] = field(default_factory=set)
 
     def extend(self, source: str, now: float) -> None:
-        """Take in a refusal; after a pause, or when all sources have settled, a span begins."""
+        """Add a refusal. A new span begins after a pause, or when all sources have settled."""
         if now - self.last > PAUSE:
             self.sources.clear()
         if not self.sources:
@@ -67,7 +67,7 @@ class _Span:
             self.sources.add(source)
 
     def settle(self, source: str) -> bool:
-        """Note that the participant of a source has been met; whether it was the last such one."""
+        """Note that the proxy has met the participant of a source; True for the last source."""
         if len(self.sources) >= MOST_SOURCES or source not in self.sources:
             return False
         self.sources.discard(source)
@@ -80,12 +80,12 @@ class _Span:
 
 
 def problem_subject(reason: str) -> str:
-    """The subject of the problem that tells the last refusal for a reason."""
+    """The subject of the problem for the last refusal of a reason."""
     return f"refused: {reason.replace('_', ' ')}"
 
 
 class Refusals:
-    """Tells of refusals; ``now`` is the monotonic clock."""
+    """Reports refusals. ``now`` returns seconds of a monotonic clock."""
 
     def __init__(self, metrics: Metrics, problems: Problems, now: Callable[[], float]) -> None:
         self._of_reason = cache(metrics.refused.labels)
@@ -96,7 +96,7 @@ class Refusals:
         self._spans: dict[str, _Span] = {}
 
     def note(self, reason: str, source: str, text: str) -> None:
-        """Tell that something from a source was refused, and why."""
+        """Report a refusal; ``text`` says what was refused, and why."""
         self._of_reason(reason).inc()
         now = self._now()
         key = reason, source
@@ -123,18 +123,18 @@ class Refusals:
         self._problems.add(subject, f"from {source}: {text}")
 
     def settle(self, source: str) -> None:
-        """Note that a participant has been met: what its start has brought is over.
+        """Note that the proxy has met the participant of a source, so that its start is over.
 
-        A node that crashes again and again starts each time. Beside a running robot a proxy may
-        refuse datagrams for longer than `PATIENCE`, until the robot announces itself again. So the
-        status does not tell a refusal any more once all its sources have been met.
+        Refusals of starts may last longer than `PATIENCE`: a node may crash and start repeatedly,
+        and after a start of the proxy a running robot announces itself late. So the status drops
+        such a refusal once the proxy has met the participants of all sources.
         """
         for reason in OF_STARTS & self._spans.keys():
             if self._spans[reason].settle(source):
                 self._problems.solved(problem_subject(reason))
 
     def end_old(self) -> None:
-        """End the problems that tell refusals which are over."""
+        """Remove the problems of reasons without a refusal for OVER_AFTER seconds."""
         now = self._now()
         for reason in [r for r, span in self._spans.items() if now - span.last >= OVER_AFTER]:
             del self._spans[reason]

@@ -1,8 +1,8 @@
 """Tables for a terminal, as lines of text.
 
-Laid out by rich, which is given each cell as ``Text``, in which nothing is markup. It takes a tenth
-of a second to import, and only what a user calls shows tables: a module of its own keeps it out of
-the proxy's start.
+rich makes the layout. Each cell is a ``Text``, in which rich reads no markup. The import of rich
+takes a tenth of a second, and only commands of users show tables. So this is a separate module,
+which the proxy does not import at the start.
 """
 
 import io
@@ -16,14 +16,14 @@ from rosproxy.telemetry.text import shorten, width
 
 GAP = "  "
 _CONSOLE = Console(file=io.StringIO(), color_system=None, width=80, height=25, legacy_windows=False)
-"""Lays out and prints nothing."""
+"""A console that makes layouts, and prints nothing."""
 
 
 def table(rows: Sequence[Sequence[str]], left: int, room: int) -> list[str]:
     """Lines of a table with its heading in the first row.
 
-    The first ``left`` cells stand left, the others right. The first cell gets ``room`` columns at
-    most and is shortened where it has more.
+    The first ``left`` columns are aligned left, the rest right. The first cell of each row gets
+    ``room`` terminal columns at most; a wider cell is shortened.
     """
     grid = Table.grid(padding=(0, len(GAP), 0, 0))
     for index in range(len(rows[0])):
@@ -36,5 +36,5 @@ def table(rows: Sequence[Sequence[str]], left: int, room: int) -> list[str]:
 
 
 def besides_first(rows: Sequence[Sequence[str]]) -> int:
-    """The columns that a table takes besides its first cells."""
+    """The terminal columns that a table needs besides its first column."""
     return sum(len(GAP) + max(map(width, cells)) for cells in [*zip(*rows, strict=True)][1:])

@@ -1,8 +1,8 @@
-"""Text for logs and a terminal: harmless whatever it holds, and as wide as it looks.
+"""Text for logs and terminals: harmless, and measured in terminal columns.
 
-Pure functions from values to text and to lines; `rosproxy.telemetry.tables` makes tables of them
-and `rosproxy.cli.terminal` prints them. Names of nodes and topics are whatever a node says they
-are, so that `clean` comes before everything else.
+Pure functions from values to text and lines. `rosproxy.telemetry.tables` makes tables, and
+`rosproxy.cli.terminal` prints lines. Nodes choose the names of nodes and topics, so call `clean`
+before all other functions here.
 """
 
 import shlex
@@ -13,17 +13,14 @@ from itertools import pairwise
 from rich.cells import cell_len
 
 LONGEST_QUOTED = 120
-"""Characters of a name in a fix. Five of them fit where a fix is shortened (`brief`), which would
-otherwise take a closing quote."""
+"""Characters of a quoted name in a fix. A fix with five such names is shorter than the bound of
+`brief`, which could otherwise cut a closing quote."""
 _TIMES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 _UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
 def clean(text: object) -> str:
-    """A text with everything escaped that could move the cursor, hide or reorder other text.
-
-    Node and topic names are whatever a node says they are.
-    """
+    """A text in which all characters are escaped that move the cursor, or hide or reorder text."""
     shown = str(text)
     if shown.isprintable():
         return shown
@@ -31,33 +28,33 @@ def clean(text: object) -> str:
 
 
 def brief(text: object, most: int) -> str:
-    """A clean text of at most ``most`` characters; a longer one without its middle, and marked.
+    """A clean text of at most ``most`` characters; a longer text has a mark for its middle.
 
-    For what is kept, sent or logged: how wide it looks does not matter there.
+    For texts that are kept, sent or logged. `shorten` bounds terminal columns instead.
     """
     shown = str(text)
-    if len(shown) > most:  # first, since cleaning takes time and may make ten characters of one
+    if len(shown) > most:  # before `clean`, which takes time and may make ten characters of one
         shown = _without_middle(shown, most)
     shown = clean(shown)
     return shown if len(shown) <= most else _without_middle(shown, most)
 
 
 def quoted(name: str) -> str:
-    """A name as one word of a shell: an engineer pastes commands that nodes have chosen names in.
+    """A name as a single word of a shell, for commands that users paste.
 
-    Names of real nodes and topics stay as they are. NAME stands for one that is too long.
+    Names of real nodes and topics stay unquoted. NAME stands for a name that is too long.
     """
     word = shlex.quote(clean(name))
     return word if len(word) <= LONGEST_QUOTED else "NAME"
 
 
 def width(text: str) -> int:
-    """How many columns a clean text takes: East Asian characters two, combining marks none."""
+    """The terminal columns of a clean text: 2 for East Asian characters, 0 for combining marks."""
     return cell_len(text)
 
 
 def shorten(text: str, most: int) -> str:
-    """The text in ``most`` columns: without its middle, since both ends tell names apart."""
+    """The text in ``most`` columns; a wider text loses its middle: names differ at the ends."""
     if width(text) <= most:
         return text
     room = max(most - 1, 0)
@@ -68,10 +65,10 @@ def shorten(text: str, most: int) -> str:
 def wrap(
     text: str, columns: int, indent: str, first: str = "", most: int | None = None
 ) -> list[str]:
-    """Lines of at most ``columns``, led by ``indent``; the first one by ``first`` if given.
+    """Lines of at most ``columns``, each with ``indent``; the first line with ``first`` if given.
 
-    Not more than ``most`` lines, the last of which then ends in an ellipsis. Words stay whole,
-    even those that are too long for a line: they may be commands to copy.
+    At most ``most`` lines; a shortened text ends in an ellipsis. Words stay whole, even if longer
+    than a line: users may copy commands.
     """
     return textwrap.wrap(
         text,
@@ -86,7 +83,7 @@ def wrap(
 
 
 def duration(seconds: float) -> str:
-    """A time in its two largest units: ``0.4 s``, ``12 s``, ``3 min``, ``2 h 5 min``."""
+    """A time in one or two units: ``0.4 s``, ``12 s``, ``3 min``, ``2 h 5 min``, ``1 d 3 h``."""
     if seconds < 10:
         return f"{max(seconds, 0.0):.1f} s"
     size, unit = next(row for row in _TIMES if seconds >= row[0])
@@ -114,14 +111,14 @@ def plural(count: int, noun: str) -> str:
 
 
 def listed(items: Iterable[str], most: int = 5) -> str:
-    """The first few items, and how many more there are."""
+    """The first ``most`` items, and the number of further items."""
     texts = list(items)
     left_out = len(texts) - most
     return ", ".join(texts[:most]) + (f" and {left_out} more" if left_out > 0 else "")
 
 
 def _head(text: str, room: int) -> str:
-    """As much of a text as fits."""
+    """The beginning of a text that fits into ``room`` columns."""
     end = 0
     for end, character in enumerate(text):
         room -= width(character)
@@ -131,6 +128,6 @@ def _head(text: str, room: int) -> str:
 
 
 def _without_middle(text: str, most: int) -> str:
-    """The two ends of a text, with a mark between them."""
+    """The two ends of a text, with a mark in between, in ``most`` characters."""
     tail = max(most - 1, 0) // 2
     return f"{text[: most - 1 - tail]}…{text[len(text) - tail :]}"
