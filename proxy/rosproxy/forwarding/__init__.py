@@ -1,1 +1,1 @@
-"""Moving the bytes of a connection: by splice in user space, or by the kernel alone."""
+"""Forwards the bytes of connections and datagrams: in user space, or by the kernel alone."""

@@ -1,9 +1,8 @@
-"""Passing datagrams on, one way: from a port of the proxy to one host and port.
+"""Datagram relays: from a port of the proxy to a single host and port, in one direction.
 
-UDP knows no end of a connection. A relay ends when its target refuses: the program there has ended,
-and its kernel says so (ICMP, port unreachable). Then the relay's own port refuses as well, by which
-the sender learns of it in the same way. Nothing is kept here: what the target's kernel does not
-take at once is lost, as datagrams are anywhere.
+UDP has no end of a connection. If the program at the target has ended, the kernel there answers
+with ICMP, port unreachable. The relay then ends, and its own port refuses, so the sender gets ICMP,
+too. The relay keeps no datagrams: a datagram that the kernel does not take at once is lost.
 """
 
 import asyncio
@@ -17,19 +16,19 @@ from rosproxy.net.addresses import HostPort, plain_address
 log = logging.getLogger(__name__)
 
 DATAGRAMS_PER_TURN = 64
-"""Passed on before the loop looks at anything else."""
+"""Datagrams that a relay forwards in a round of the event loop."""
 LARGEST_DATAGRAM = 65_536
 RECEIVE_BUFFER = 1024 * 1024
-"""Bytes that may wait while the loop is busy; Linux grants what its rmem_max allows."""
+"""Bytes that wait while the event loop is busy; Linux grants rmem_max at most."""
 
 
 def bind(address: str, port: int) -> socket.socket:
-    """A bound, non-blocking UDP socket; with port 0 at any free one. Raises OSError."""
+    """A bound, non-blocking UDP socket; port 0 stands for any free port. Raises OSError."""
     sock = _socket(address)
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         if sock.family == socket.AF_INET6:
-            # `::` is for IPv4, too, whatever net.ipv6.bindv6only says (ipv6(7)).
+            # `::` accepts IPv4, too, with any value of net.ipv6.bindv6only (ipv6(7)).
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         sock.bind((address, port))
     except OSError:
@@ -39,11 +38,11 @@ def bind(address: str, port: int) -> socket.socket:
 
 
 class DatagramRelay:
-    """Passes on what arrives at a bound socket, from some addresses to one target.
+    """Forwards the datagrams that some addresses send to a bound socket to a target.
 
-    ``sent`` are the bytes that were passed on, ``dropped`` the datagrams of others. ``ended`` is
-    called when the target refuses, and has to `close` the relay. Raises OSError if the target
-    can't be an address of UDP. Needs a running event loop.
+    ``sent`` counts forwarded bytes, ``dropped`` the datagrams of other sources. ``ended`` is called
+    when the target refuses, and has to `close` the relay. Raises OSError if the kernel refuses the
+    target. Needs a running event loop.
     """
 
     def __init__(
@@ -70,9 +69,9 @@ class DatagramRelay:
         self._loop.add_reader(self._out, self._read_error)
 
     def close(self) -> None:
-        """Stop, and let the port refuse."""
+        """Close both sockets, so that the port refuses."""
         for sock in (self._in, self._out):
-            with contextlib.suppress(AttributeError):  # not begun
+            with contextlib.suppress(AttributeError):  # `__init__` has failed before `_loop`
                 self._loop.remove_reader(sock)
             sock.close()
 
@@ -91,7 +90,7 @@ class DatagramRelay:
             self._note_error(error)
 
     def _read_error(self) -> None:
-        """A target says nothing, except that it refuses."""
+        """Read the socket to the target: the target sends no datagrams, only ICMP errors."""
         try:
             self._out.recv(LARGEST_DATAGRAM)
         except BlockingIOError:
@@ -100,7 +99,7 @@ class DatagramRelay:
             self._note_error(error)
 
     def _note_error(self, error: OSError) -> None:
-        """End if the target has refused; any other trouble of a network may pass."""
+        """End the relay if the target has refused; other errors of the network may pass."""
         log.debug("datagrams at port %d: %s", self.port, error)
         if isinstance(error, ConnectionRefusedError):
             self._ended()

@@ -1,8 +1,8 @@
-"""Moving bytes between two sockets: one blocking thread per direction.
+"""Relays: bytes between two sockets, with a blocking thread for each direction.
 
-On Linux bulk data moves by splice(2) through a pipe and never enters Python; messages below some
-8 KiB cost the same either way, and copying them needs no pipe. Back-pressure is the kernel's own:
-a thread that can't write doesn't read. The GIL is released in every call that blocks.
+On Linux large transfers move by splice(2) through a pipe, and never enter Python. For messages
+below some 8 KiB a copy costs the same, and needs no pipe. Back-pressure comes from the kernel: a
+thread that can't write doesn't read. Each call that blocks releases the GIL.
 """
 
 import contextlib
@@ -19,48 +19,49 @@ from rosproxy.net.sockets import reset_on_close
 log = logging.getLogger(__name__)
 
 COPY_SIZE = 16 * 1024
-"""Bytes read at once while copying; a full read switches the direction to splice.
+"""Bytes of a read while copying; a full read switches the direction to splice.
 
-From here on splice costs less, with the opening of a pipe counted in.
+From this size on splice costs less, the opening of a pipe included.
 """
 PIPE_SIZE = 1024 * 1024
-"""Bytes that a splice pipe should hold; the kernel may give an unprivileged process less."""
+"""Bytes of a splice pipe; the kernel may give an unprivileged process less."""
 LARGE_PIPES = 16
-"""Pipes of that size at the same time; with more streams the CPU is busy, and each turn shorter."""
+"""Pipes of PIPE_SIZE at the same time. With more streams the CPU is busy, and turns are shorter."""
 SHARED_PIPE = 256 * 1024
-"""Bytes that each further pipe should hold: an unprivileged user has 64 MiB for all of them."""
+"""Bytes of each further pipe: an unprivileged user has 64 MiB for all pipes together."""
 CROWD = 128
-"""Directions that move many bytes at the same time before they have to share memory."""
+"""Directions with large transfers at the same time before all of them share memory."""
 SHARED_RECEIVE = 128 * 1024
-SHARED_SEND = 208 * 1024
-"""Bytes of a socket's buffers in a crowd, of which Linux makes twice as much.
+"""Bytes of the receive buffer of a socket in a crowd; Linux doubles the value (socket(7)).
 
-Left alone each grows to several MiB; a thousand of them reach the limit of all TCP connections of
-the machine (tcp_mem), from where on Linux drops packets and sends by the page. The larger one is
-what Linux grants to anyone (wmem_max).
+By default each buffer grows to several MiB. A thousand such buffers reach the limit for all TCP
+connections of the machine (tcp_mem). From there on Linux drops packets and sends single pages.
 """
+SHARED_SEND = 208 * 1024
+"""Bytes of the send buffer in a crowd: the default of wmem_max, which every process may set."""
 LEAST_PIPE = 64 * 1024
-"""A pipe that holds fewer bytes is not spliced through."""
+"""Bytes of the smallest pipe that a direction uses for splice."""
 BLOCK_SIZE = 128 * 1024
-"""Bytes copied at once where there is no pipe; a buffer to keep would have to be zeroed first."""
+"""Bytes of a read without a pipe. Each read makes a new buffer: Python would zero a bytearray."""
 RESET_GRACE = 0.1
-"""Seconds that the other direction gets to notice a reset before its peer is shut down."""
+"""Seconds in which the other direction may end after SHUT_RD, before SHUT_WR follows."""
 
 Finished = Callable[["Relay"], None]
-"""Is told that a relay has ended."""
+"""Takes a relay that has ended."""
 WhenReadable = Callable[[socket.socket, Callable[[], object]], None]
-"""Has a function called, once, when a socket has bytes, has ended or has failed."""
+"""Calls a function once when a socket has bytes, has ended or has failed."""
 
 
 @dataclass(slots=True, eq=False)
 class Relay:
-    """One relayed connection.
+    """A relayed connection.
 
-    ``kind`` and ``name`` say of what; ``caller_id`` and ``peer`` who connected at ``port``:
-    somebody outside, or a node inside if ``inside_asks``. ``client_listens``: that one is expected
-    to say nothing more. ``sent`` are bytes towards outside, ``received`` bytes towards the inside
-    node; ``sent_rate`` and ``received_rate`` are in bytes per second, as of the last `sample`.
-    Without ``splice`` all bytes are copied.
+    ``kind`` (topic or service) and ``name`` say what the connection carries. ``caller_id`` and
+    ``peer`` are name and address of the client that has connected to ``port``: outside, or inside
+    if ``inside_asks``. ``client_listens``: the client probably sends nothing more.
+    ``sent`` are bytes towards outside, ``received`` bytes towards inside. ``sent_rate`` and
+    ``received_rate`` are in bytes per second, as of the last `sample`. Without ``splice`` all bytes
+    are copied.
     """
 
     port: int
@@ -87,7 +88,7 @@ class Relay:
     def start(self, finished: Finished, when_readable: WhenReadable) -> None:
         """Relay both directions in the background; ``finished`` is called from any thread.
 
-        The direction of a client that listens gets a thread when it says something.
+        If ``client_listens``, the direction from the client gets a thread once the client sends.
         """
         for sock in (self.outside, self.inside):
             _prepare(sock)
@@ -95,13 +96,13 @@ class Relay:
         request, reply = (0, 1) if self.inside_asks else (1, 0)
         if self._start_direction(reply, finished):
             if self.client_listens:
-                # The end of its connection counts as well: a socket that has ended is readable.
+                # The end of the connection starts the thread, too: the socket is then readable.
                 when_readable(client, lambda: self._start_direction(request, finished, second=True))
             else:
                 self._start_direction(request, finished, second=True)
 
     def end(self) -> None:
-        """End both directions; ``finished`` is called when that is done."""
+        """End both directions; ``finished`` is called once both have ended."""
         for sock in (self.outside, self.inside):
             with contextlib.suppress(OSError):
                 sock.shutdown(socket.SHUT_RDWR)
@@ -116,9 +117,9 @@ class Relay:
             self.received_rate = round((self.received - received) / elapsed, 1)
 
     def _start_direction(self, index: int, finished: Finished, second: bool = False) -> bool:
-        """Whether the direction could be started; if not, both sides are reset.
+        """Start the thread of a direction; on failure, reset both sides and return False.
 
-        ``second``: the other one runs already.
+        ``second``: the other direction already runs.
         """
         thread = threading.Thread(
             target=self._direction, args=(index, finished), name=f"relay {self.name}", daemon=True
@@ -140,7 +141,7 @@ class Relay:
         count = self._count_sent if index == 0 else self._count_received
         try:
             _Pump(*pair, count, self.splice).run()
-            # After `_pass_reset_on` the source only seems to have ended: no FIN before the reset.
+            # After `_pass_reset_on` the source seems to have ended: send no FIN before the reset.
             if not self.failed:
                 pair[1].shutdown(socket.SHUT_WR)
         except OSError as error:
@@ -155,10 +156,10 @@ class Relay:
         self.received += size
 
     def _pass_reset_on(self, index: int) -> None:
-        """Wake the other direction without a FIN on the wire, so that closing sends a reset."""
+        """Wake the other direction without a FIN on the wire, so that the close sends a reset."""
         self.failed = True
-        # SHUT_RD wakes a thread that reads, and sends nothing. One that can't write is woken by
-        # SHUT_WR alone, which sends a FIN: so that comes last.
+        # SHUT_RD wakes a thread that reads, and sends nothing. Only SHUT_WR wakes a thread that
+        # can't write, but SHUT_WR sends a FIN, so SHUT_WR comes last.
         for how in (socket.SHUT_RD, socket.SHUT_WR):
             for sock in (self.outside, self.inside):
                 with contextlib.suppress(OSError):
@@ -167,7 +168,7 @@ class Relay:
                 return
 
     def _finish(self, index: int, finished: Finished) -> None:
-        """Note that a direction has ended; the first thread to see both ended closes."""
+        """Note the end of a direction; the first thread that sees both ends closes the sockets."""
         self._done[index].set()
         with _END:
             if self._ended or not self._done[1 - index].is_set():
@@ -195,7 +196,10 @@ def _prepare(sock: socket.socket) -> None:
 
 
 class _Pump:
-    """One direction: from ``source`` to ``target`` until the source ends. Raises OSError."""
+    """A direction of a relay: from ``source`` to ``target`` until the source ends.
+
+    `run` raises OSError. ``count`` takes the number of bytes of each step.
+    """
 
     def __init__(
         self,
@@ -227,9 +231,9 @@ class _Pump:
         return False
 
     def _bulk(self) -> bool:
-        """Move many bytes at once until a read is small; False at the end.
+        """Move large amounts until a read is small; False at the end.
 
-        The pipe is held no longer than that: pipes are scarce for an unprivileged user.
+        Then the pipe is closed: an unprivileged user may have few pages of pipes.
         """
         with _CROWD.joined(self) as size:
             if not self._may_splice:
@@ -238,11 +242,11 @@ class _Pump:
                 return self._splice(*pipe) if pipe else self._copy_blocks()
 
     def share_memory(self) -> None:
-        """Bound what the kernel holds for this direction, for as long as it is open."""
+        """Bound the socket buffers of this direction, until the end of the connection."""
         if self._shares:
             return
         self._shares = True
-        with contextlib.suppress(OSError):  # closed in the meantime: another thread asks
+        with contextlib.suppress(OSError):  # called by another thread: may be closed by now
             self._source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SHARED_RECEIVE)
             self._target.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SHARED_SEND)
 
@@ -273,10 +277,10 @@ class _Pump:
 
 @contextlib.contextmanager
 def _pipe(size: int) -> Iterator[tuple[int, int] | None]:
-    """A pipe that is worth splicing through, or None.
+    """A pipe of ``size`` bytes if possible; None if the pipe is too small for splice.
 
-    An unprivileged user has pages for some pipes (pipe-user-pages-soft); beyond that they hold
-    two pages each, and copying is faster.
+    An unprivileged user has a number of pages for pipes (pipe-user-pages-soft, pipe(7)). Further
+    pipes get two pages each, and then copying is faster.
     """
     try:
         ends = os.pipe()
@@ -294,7 +298,7 @@ def _pipe(size: int) -> Iterator[tuple[int, int] | None]:
 
 
 class _BusyDirections:
-    """The directions that move many bytes at the moment."""
+    """The directions that make large transfers at the moment."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -302,11 +306,11 @@ class _BusyDirections:
 
     @contextlib.contextmanager
     def joined(self, pump: _Pump) -> Iterator[int]:
-        """How many there are with this one; in a crowd all of them share memory."""
+        """Add a direction for the context; return the number. In a crowd all share memory."""
         with self._lock:
             self._pumps.add(pump)
             size = len(self._pumps)
-            # All have to share when the crowd comes about, then each new one.
+            # The first direction beyond CROWD makes all share, each later direction only itself.
             sharers = list(self._pumps) if size == CROWD + 1 else [pump] * (size > CROWD)
         try:
             for sharer in sharers:

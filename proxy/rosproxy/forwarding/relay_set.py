@@ -1,4 +1,4 @@
-"""The relays of a service that are open."""
+"""The open relays of a server."""
 
 import asyncio
 import contextlib
@@ -12,13 +12,13 @@ from rosproxy.forwarding.relay import Relay
 log = logging.getLogger(__name__)
 
 STOP_TIMEOUT = 1.0
-"""Seconds that relays get to end when a service stops."""
+"""Seconds in which the relays may end when the server stops."""
 STARTS_PER_TURN = 64
-"""Threads started before the loop does other work, when many subscribers leave at once."""
+"""Threads that start in a round of the event loop, if many subscribers leave at once."""
 
 
 class OpenRelays:
-    """Relays from their start to their end. Needs a running event loop to start one."""
+    """The set of open relays. `start` needs a running event loop."""
 
     def __init__(self) -> None:
         self._open: set[Relay] = set()
@@ -31,7 +31,7 @@ class OpenRelays:
         return iter(list(self._open))
 
     def __len__(self) -> int:
-        """How many there are."""
+        """How many relays are open."""
         return len(self._open)
 
     def start(self, relay: Relay, ended: Callable[[Relay], None]) -> None:
@@ -51,7 +51,7 @@ class OpenRelays:
         relay.start(finished, self._quiet_sockets.when_readable)
 
     async def stop(self) -> None:
-        """End all of them."""
+        """End all relays, and wait for STOP_TIMEOUT at most."""
         for relay in self:
             relay.end()
         with contextlib.suppress(TimeoutError):
@@ -69,10 +69,10 @@ class OpenRelays:
 
 
 class _QuietSockets:
-    """Sockets that have nothing to say yet.
+    """Sockets of clients that have sent nothing yet, and a function for each.
 
-    The loop sees one descriptor for all of them: libuv makes non-blocking what it watches, and
-    relays block.
+    The event loop watches a single epoll descriptor for all sockets. libuv makes watched sockets
+    non-blocking, but relays need blocking sockets.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -88,7 +88,7 @@ class _QuietSockets:
         self._selector.close()
 
     def _look(self) -> None:
-        # Those that are left out stay readable, so that the loop calls this again.
+        # The other sockets stay readable, so the loop calls this function again.
         for key, _ in self._selector.select(0)[:STARTS_PER_TURN]:
             self._selector.unregister(key.fileobj)
             key.data()

@@ -1,1 +1,1 @@
-"""Connections that the kernel forwards: netfilter rules kept in step with the leases."""
+"""The kernel plane: netfilter rules for connections and datagrams, kept in step with the ports."""

@@ -1,4 +1,4 @@
-"""What the kernel has forwarded and forwards, by endpoint: bytes, and open connections."""
+"""Bytes and open connections that the kernel forwards, for each endpoint."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -9,15 +9,16 @@ from rosproxy.forwarding.kernel.nft import Counters, Counts
 from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
 
 SILENCE_WINDOW = 2.0
-"""Seconds at least that a port is watched to see whether anything goes back through it."""
+"""Seconds at least in which the proxy waits for bytes from the node behind a port."""
 
 
 @dataclass(slots=True)
 class Account:
-    """Bytes of IP packets of one node's connections: sent outside, and received from there.
+    """The traffic of an endpoint through the kernel; bytes are of IP packets.
 
-    ``packets`` are those that came to its port; ``rates`` are both in bytes per second, as of the
-    last count.
+    ``sent`` are bytes from inside to outside, ``received`` bytes from outside to inside.
+    ``packets``: the packets that peers sent to the port. ``rates``: sent and received bytes per
+    second, as of the last count.
     """
 
     sent: int = 0
@@ -27,13 +28,13 @@ class Account:
 
 
 class CounterDeltas:
-    """What was counted by port, from counters that begin anew when their table is made again."""
+    """Differences between readings of the counters, which begin at 0 in a new table."""
 
     def __init__(self) -> None:
         self._last_counters: Counters = {}
 
     def take(self, counters: Counters) -> dict[int, Counts]:
-        """What has been counted since the last time, by port; ports without anything left out."""
+        """The counts since the last call, by port, without the ports whose counts are all 0."""
         deltas = {}
         for port, current in counters.items():
             previous = self._last_counters.get(port, Counts())
@@ -45,10 +46,11 @@ class CounterDeltas:
 
 
 class UnansweredPorts:
-    """Ports through which something comes in and nothing goes back.
+    """Ports with packets to the node, but without packets from the node.
 
-    Connections that are dropped on the way never show up as such; their bytes do. A first packet
-    is sent again after one and after three seconds: two windows in a row see it.
+    If a filter drops a connection on the way, the kernel lists no connection, but the counters have
+    the bytes. TCP repeats a SYN after one and after three seconds, so two windows in a row have
+    bytes of the SYN.
     """
 
     def __init__(self) -> None:
@@ -57,7 +59,10 @@ class UnansweredPorts:
         self._silent_before: set[int] = set()
 
     def look(self, deltas: Counters, now: float) -> list[int]:
-        """The ports silent in two windows in a row; ``deltas`` were counted since the last look."""
+        """The ports without an answer in two windows in a row; empty within a window.
+
+        ``deltas`` are the counts since the last call, ``now`` is in seconds.
+        """
         for port, (sent, received, _) in deltas.items():
             total_sent, total_received = self._bytes.get(port, (0, 0))
             self._bytes[port] = total_sent + sent, total_received + received
@@ -72,11 +77,11 @@ class UnansweredPorts:
 
 
 class KernelAccounts:
-    """Whose the connections through the fast ports are, and what went through them.
+    """The owners of the fast ports, and the traffic through these ports.
 
-    A port that was given back stays its last holder's until somebody else holds it, or the holder
-    ends: the connections through it go on meanwhile. ``unanswered`` are ports behind which nobody
-    answered of late.
+    A port that an endpoint gave back still belongs to that endpoint until another endpoint gets the
+    port, or the endpoint ends: connections through the port continue. ``unanswered`` are the ports
+    whose node has lately sent nothing.
     """
 
     def __init__(self) -> None:
@@ -88,18 +93,18 @@ class KernelAccounts:
         self._counted_at = 0.0
 
     def note_owners(self, endpoints: LeaseHolders[LeaseHolder]) -> None:
-        """Take in who holds which fast port now."""
+        """Update the owners from the fast ports of all endpoints."""
         remaining = {p: e for p, e in self.owners.items() if endpoints.by_port.get(e.port) is e}
         self.owners = remaining | {e.fast_port: e for e in endpoints if e.fast_port is not None}
         holders = set(self.owners.values())
         self._accounts = {e: account for e, account in self._accounts.items() if e in holders}
 
     def owns(self, endpoint: LeaseHolder) -> bool:
-        """Whether an endpoint had a fast port when that was last looked at."""
+        """Whether an endpoint had a fast port at the last call of `note_owners`."""
         return any(owner is endpoint for owner in self.owners.values())
 
     def count(self, counters: Counters, now: float) -> list[tuple[str, Counts]]:
-        """Take in counters; what was sent and received since the last time, by node name."""
+        """Add a reading of the counters; return the counts since the last reading, by node name."""
         elapsed = now - self._counted_at
         self._counted_at = now
         for account in self._accounts.values():
@@ -109,7 +114,7 @@ class KernelAccounts:
         self.unanswered = self._silence.look(by_port, now)
         for port, (from_node, to_node, packets) in by_port.items():
             endpoint = self.owners.get(port)
-            # Where the node is outside, what it sends is what inside receives.
+            # Bytes from a node outside are bytes that inside receives.
             outwards = endpoint is not None and not endpoint.inside
             delta = Counts(*((to_node, from_node) if outwards else (from_node, to_node)), packets)
             if endpoint is not None:
@@ -119,10 +124,10 @@ class KernelAccounts:
         return by_name
 
     def note_peers(self, connections: OpenConnections) -> None:
-        """Take in all open connections that the kernel tracks now.
+        """Update the peers of all owners from the open connections that the kernel tracks.
 
-        Those to a node that is down don't count: if its host vanished without a word, the kernel
-        takes them for open for days.
+        Connections to a node that is down don't count. If the host of the node disappeared without
+        a FIN or RST, the kernel lists such connections as open for days.
         """
         by_owner: dict[LeaseHolder, Counter[str]] = {e: Counter() for e in self.owners.values()}
         for (port, node), counts in connections.items():
@@ -133,11 +138,11 @@ class KernelAccounts:
             endpoint.fast_peers = dict(counts)
 
     def account(self, endpoint: LeaseHolder) -> Account:
-        """What went through an endpoint's fast ports so far."""
+        """The traffic through the fast ports of an endpoint so far."""
         return self._accounts.get(endpoint, Account())
 
     def ports_of(self, endpoint: LeaseHolder) -> list[int]:
-        """The fast ports that connections to an endpoint may go through."""
+        """The fast ports of an endpoint, ports that were given back included."""
         return [port for port, owner in self.owners.items() if owner is endpoint]
 
     def _add(self, endpoint: LeaseHolder, delta: Counts, elapsed: float) -> None:

@@ -8,7 +8,7 @@ connections that are being ended. ``inward`` has the ports of nodes outside, and
   node. New connections have a limit, and those over the limit stay with the proxy's own socket;
 - postrouting: the connection leaves with this machine's address, so that replies come back;
 - forward: bytes of IP packets are counted, in each direction. The chain stands before any filter,
-  so that the proxy knows of packets that a filter drops.
+  so that the proxy also counts packets that a filter drops later.
 """
 
 from collections.abc import Collection, Mapping
@@ -26,12 +26,12 @@ NEW_BURST = 2000
 
 A forged SYN costs its sender nothing. The kernel tracks an unanswered connection for 120 s
 (nf_conntrack_tcp_timeout_syn_sent), and a half-open connection for 60 s. Masquerade gives each
-connection to a node another one of 64,512 ports. With these limits forged SYNs take at most 26,000.
+connection to a node another of 64,512 ports. With these limits forged SYNs take at most 26,000.
 The proxy's own socket gets the connections over the limit, and there the kernel uses SYN cookies.
 """
 
-# Chains of type nat see only the first packet of a connection (nft(8)), so its port is kept in the
-# connection's mark.
+# Chains of type nat see only the first packet of a connection (nft(8)), so the mark of the
+# connection keeps the port.
 _CHAINS = Template("""\
 table inet $name {
   map marks { type inet_service : mark; }
@@ -64,7 +64,7 @@ $limit    fib daddr type local dnat ip to tcp dport map @hosts4 : tcp dport map 
   }
 }
 """)
-# A port that nothing is forwarded from has no mark, and uses up nothing of the limit.
+# A port without a forward has no mark, and uses nothing of the limit.
 _LIMIT = Template(
     "    meta l4proto tcp ct mark & 0xffff0000 == $mark "
     "limit rate over $rate/second burst $burst packets ct mark set 0 return\n"
@@ -79,7 +79,7 @@ add rule inet $name forward ct status dnat ct direction original ct mark @sent r
 
 
 class Marks(msgspec.Struct, frozen=True):
-    """The marks of a table's connections: its number above, the port below."""
+    """The marks of a table's connections: the number of the table times 65,536, plus the port."""
 
     number: int
 
@@ -88,24 +88,24 @@ class Marks(msgspec.Struct, frozen=True):
         return self.number << 16 | port
 
     def port(self, mark: int) -> int | None:
-        """The port of a mark; None if it is none of this table's."""
+        """The port of a mark; None for a mark of another table."""
         return mark & 0xFFFF if mark >> 16 == self.number else None
 
     @property
     def table_selector(self) -> str:
-        """All marks of the table, as conntrack's ``--mark`` takes it."""
+        """The argument of conntrack's ``--mark`` for all marks of the table."""
         return f"{self.of(0):#x}/0xffff0000"
 
     def port_selector(self, port: int) -> str:
-        """The mark of one port, as conntrack's ``--mark`` takes it."""
+        """The argument of conntrack's ``--mark`` for a port."""
         return f"{self.of(port):#x}/0xffffffff"
 
 
 class ConnectionTable(Table):
     """The table ``rosproxy-NUMBER``; the number is the master port.
 
-    ``leases`` are the ports whose forwards lead to nodes inside; all others lead outside.
-    ``limits_new`` tells whether new connections have a limit, for which Linux needs a module.
+    ``leases`` are the ports whose forwards lead to nodes inside; other ports lead outside.
+    ``limits_new``: new connections have a limit, for which Linux needs the module nft_limit.
     """
 
     maps = ("marks", "hosts4", "hosts6", "ports")
@@ -126,7 +126,7 @@ class ConnectionTable(Table):
         return _CHAINS.substitute(name=self.name, limit=limit if self.limits_new else "")
 
     def counter_key(self, port: int) -> int:
-        """Bytes are counted by mark."""
+        """The mark of a port, by which the table counts."""
         return self.marks.of(port)
 
     def counted_port(self, key: int) -> int | None:
@@ -153,13 +153,13 @@ class ConnectionTable(Table):
         return flushed + self.element_document("add", by_set)
 
     def cut(self, ports: Collection[int], verb: str = "add") -> str:
-        """Return the document that resets connections to these ports; "delete" ends that."""
+        """Return the document that resets connections to these ports; "delete" ends the resets."""
         marks = [str(self.marks.of(port)) for port in sorted(ports)]
         return self.element_document(verb, {"cut": marks})
 
     def ended(self) -> str:
-        """Return the document that forwards nothing any more and resets connections.
+        """Return the document that ends all forwards and resets all connections.
 
-        rospy connects again only when its connection has ended.
+        Without the reset, rospy would not connect again.
         """
         return _END_DOCUMENT.substitute(name=self.name)

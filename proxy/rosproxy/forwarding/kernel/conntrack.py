@@ -1,10 +1,11 @@
-"""The connections of a proxy, counted from what ``conntrack -L`` prints: one connection a line.
+"""The connections of a proxy, counted from the output of ``conntrack -L``: one line a connection.
 
     tcp 6 431999 ESTABLISHED src=A dst=B sport=1 dport=2 src=C dst=D sport=3 dport=4 [ASSURED]
     mark=5 use=1
 
-The first four addresses are of the connection as it came, the others of its answers. A flood makes
-tens of thousands of lines. So a `Survey` takes the list piece by piece, and keeps little of it.
+The first two addresses and ports are of packets from the peer, the last two of replies from the
+node. A flood makes tens of thousands of lines. So a `Survey` reads the list piece by piece, and
+keeps only counts and a few connections.
 """
 
 import re
@@ -16,14 +17,14 @@ from rosproxy.forwarding.kernel.connection_table import Marks
 from rosproxy.net.addresses import HostPort
 
 MOST_PEERS = 256
-"""Addresses of peers that are told apart for one port; connections of all others are added up."""
+"""Addresses of peers of a port that have separate counts; OTHERS counts all further connections."""
 OTHERS = "others"
-"""The name of all other peers."""
+"""The name of all further peers."""
 MOST_WAITING = 64
-"""Connections of one port that are watched until the node answers; one is enough to judge by."""
+"""Unanswered connections of a port that are watched at most; a single one proves the fault."""
 
-# All other states are of a connection that begins or ends. The numbers have the digits of a port,
-# and of 32 bits.
+# Other states are of connections that begin or end. The patterns bound the digits: 5 for a port,
+# 10 for a mark of 32 bits.
 _LINE = re.compile(
     r"^tcp +6 [0-9]+ (ESTABLISHED|SYN_SENT) src=(\S+) dst=\S+ sport=([0-9]{1,5}) "
     r".*?src=(\S+) dst=\S+ sport=([0-9]{1,5}) .*?mark=([0-9]{1,10})",
@@ -31,7 +32,7 @@ _LINE = re.compile(
 )
 
 OpenConnections = Mapping[tuple[int, str], Mapping[str, int]]
-"""How many connections each peer has, by the peer's address, for each port and node address."""
+"""Numbers of connections by peer address, for each pair of port and node address."""
 
 
 class Flow(msgspec.Struct, frozen=True):
@@ -43,10 +44,10 @@ class Flow(msgspec.Struct, frozen=True):
 
 
 class Survey:
-    """The connections of one proxy, by its marks.
+    """The connections of a proxy, selected by the marks of its table.
 
-    ``open`` counts those that both sides have agreed to. ``waiting`` are those that the node has
-    not answered yet, at most `MOST_WAITING` of each port.
+    ``open`` counts established connections. ``waiting`` are connections that the node has not
+    answered yet, at most `MOST_WAITING` for each port.
     """
 
     def __init__(self, marks: Marks) -> None:
@@ -56,7 +57,7 @@ class Survey:
 
     @property
     def open(self) -> OpenConnections:
-        """The open connections."""
+        """The numbers of open connections."""
         return self._open
 
     @property
@@ -65,7 +66,7 @@ class Survey:
         return [flow for flows in self._waiting.values() for flow in flows]
 
     def add(self, lines: str) -> None:
-        """Add whole lines of the list. A malformed line is left out."""
+        """Add whole lines of the list; malformed lines don't count."""
         for state, peer, peer_port, node, node_port, mark in _LINE.findall(lines):
             port = self._marks.port(int(mark))
             if port is None:
@@ -95,6 +96,6 @@ class Watch:
         self._since: dict[Flow, float] = {}
 
     def look(self, waiting: Iterable[Flow], now: float) -> list[Flow]:
-        """Return them, of the unanswered connections at a time."""
+        """Return these connections, given all unanswered connections at the time ``now``."""
         self._since = {flow: self._since.get(flow, now) for flow in waiting}
         return [flow for flow, since in self._since.items() if now - since >= self._patience]

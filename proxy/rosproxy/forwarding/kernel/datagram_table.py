@@ -1,17 +1,17 @@
-"""The table for UDP: the kernel rewrites each datagram by itself, and keeps no record of senders.
+"""The table for UDP: the kernel rewrites each datagram separately, without connection tracking.
 
-User data of RTPS goes one way. A reader answers to the locators that discovery has told, and never
-to the source of a datagram. So a datagram needs no way back, and no entry among the connections
-that the kernel tracks. Forged sources could fill such a table: masquerade gives each source one of
-some 64,500 ports for half a minute.
+User data of RTPS goes one way. A reader answers to the locators that discovery has announced, never
+to the source of a datagram. So a datagram needs no way back, and no entry in the kernel's table of
+connections. Forged sources could fill that table: masquerade gives each source one of some 64,500
+ports for half a minute.
 
-- prerouting: the kernel does not track packets to a port of the range. The chain rewrites target
-  address and port where the maps have them, and counts. Connection tracking joins fragments before
-  that (priority -400, ``NF_IP_PRI_CONNTRACK_DEFRAG``), as long as any rule of this network
-  namespace uses ``ct``. The kernel divides the datagram again on its way out.
+- prerouting: the kernel does not track packets to a port of the range. If the maps have the port,
+  the chain rewrites target address and port, and counts the datagram. Connection tracking joins
+  fragments earlier (priority -400, ``NF_IP_PRI_CONNTRACK_DEFRAG``), as long as any rule of this
+  network namespace uses ``ct``. The kernel divides the datagram again on the way out.
 - forward: the datagram gets an address of this machine as its source, which a node accepts without
-  a route to outside. Prerouting is too early: Linux drops packets that arrive with one of its own
-  addresses as the source (``net/ipv4/fib_frontend.c``, ``__fib_validate_source``).
+  a route to outside. Prerouting is too early: Linux drops packets that arrive with an own address
+  as the source (``net/ipv4/fib_frontend.c``, ``__fib_validate_source``).
 """
 
 from string import Template
@@ -20,8 +20,8 @@ from rosproxy.forwarding.kernel.decisions import Forwards
 from rosproxy.forwarding.kernel.nft import Surroundings, Table, checked
 from rosproxy.leases.ports import PortRange
 
-# Packets of this machine to itself arrive by loopback with their route, which a rule here can't
-# change. The proxy's socket at the same port takes them.
+# Packets from this machine to itself arrive by loopback and already have a route, which a rule here
+# can't change. The proxy's socket at the same port receives these packets.
 # A checksum of 0 stands for no checksum (RFC 768). nft changes the field whenever nft writes the
 # port, and the node's kernel would drop the datagram. IPv6 has no datagrams without a checksum.
 _CHAINS = Template("""\
@@ -49,7 +49,7 @@ table inet $name {
   }
 }
 """)
-# The port is written last, since every lookup is by the port. A rule ends at a map that lacks it.
+# Every lookup is by the port, so the port is written last. A rule ends at a map without the port.
 _LEAD = Template(
     "$family daddr set udp dport map @$hosts udp dport @received udp dport set udp dport map @ports"
 )
@@ -76,7 +76,7 @@ class DatagramTable(Table):
         )
 
     def counter_key(self, port: int) -> int:
-        """Datagrams are counted by port."""
+        """The port itself, by which the table counts."""
         return port
 
     def counted_port(self, key: int) -> int | None:
@@ -89,7 +89,7 @@ class DatagramTable(Table):
         for target in forwards.values():
             source = surroundings.sources[target.host]
             name = "sources6" if ":" in target.host else "sources4"
-            # After a restart two ports may lead to one locator, which is one key here.
+            # After a restart two ports may lead to the same locator, which is a single key here.
             by_map[name][f"{checked(target.host)} . {target.port}"] = checked(source)
         flushed = "".join(f"flush map inet {self.name} {name}\n" for name in by_map)
         elements = {

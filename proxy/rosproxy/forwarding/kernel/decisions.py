@@ -1,8 +1,8 @@
-"""The kernel plane: which ports the kernel forwards to where, and why it doesn't.
+"""Decisions of the kernel plane: the target of each port, or the reason against a forward.
 
-Plain decisions; `syncer` reads and changes the kernel's table. A forward never sees a connection
-header. Should a policy ever need one (who may subscribe to what), `destination` is the place to
-answer why such an endpoint stays in user space.
+`syncer` reads and changes the kernel's table. The kernel reads no connection headers. So an
+endpoint gets no fast port if a rule may deny a topic or service of the node
+(`rosproxy.ros1.policy.checks`, may_bypass).
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -13,16 +13,16 @@ from rosproxy.leases.fast_ports import LeaseHolder
 from rosproxy.net.addresses import HostPort, Route, is_loopback
 
 Forwards = Mapping[int, HostPort]
-"""Ports with the addresses of the nodes that they are forwarded to."""
+"""The address and port of the target for each forwarded port."""
 
 FIRST_PAUSE = 5.0
+"""Seconds of the first pause of a forward whose node has not answered; each failure doubles it."""
 LONGEST_PAUSE = 3600.0
-"""Seconds for which a forward behind which nobody answered is not made again; the first and the
-longest time, it doubles from one to the other."""
+"""Seconds of a pause at most."""
 
 
 class HostForwarding(msgspec.Struct, frozen=True):
-    """What the kernel can do here: forward IPv4, forward IPv6.
+    """Whether the kernel forwards IPv4 and IPv6 in this network namespace.
 
     ``longest_packet`` is the largest MTU of this network namespace's interfaces, in bytes.
     """
@@ -35,11 +35,11 @@ class HostForwarding(msgspec.Struct, frozen=True):
 def destination(
     endpoint: LeaseHolder, host: HostForwarding, route: Route, has_connections: bool
 ) -> HostPort | str:
-    """Where an endpoint's fast port may be forwarded to, or why it may not.
+    """The target for the fast port of an endpoint, or the reason why the kernel may not forward.
 
-    The address is the one that the proxy found the node at, and ``route`` leads there; the port is
-    the one that the node itself named: a forged registration can't make the kernel forward to
-    another host.
+    The target has the address at which the proxy has found the node, and the port that the node
+    itself has named. So a forged registration can't make the kernel forward to another host.
+    ``route`` is the route to that address.
     """
     ports = endpoint.node_ports
     if endpoint.is_down or not endpoint.trusted:
@@ -55,8 +55,8 @@ def destination(
 def _obstacle(
     address: str, host: HostForwarding, route: Route, has_connections: bool
 ) -> str | None:
-    """What keeps the kernel from forwarding to an address; None if nothing does."""
-    # What is led to an own address passes no forward hook, where the table's chain would see it.
+    """The reason why the kernel can't forward to an address; None if the kernel can."""
+    # Packets to an own address do not pass the forward hook, where the table has a chain.
     if is_loopback(address) or route.source == address:
         return "the node runs in the network namespace of the proxy itself"
     if not (host.ipv6 if ":" in address else host.ipv4):
@@ -64,9 +64,9 @@ def _obstacle(
         return f"{missing} is not 1 in the proxy's network namespace"
     if is_loopback(route.source):
         return f"the proxy has no route to {address}: add the proxy to the node's network"
-    # Linux tells the sender of a packet that is too long for the way inside (ICMP). Connection
-    # tracking translates such a message. Without tracking it names an address that is not known
-    # outside, and the sender goes on to send packets of that length.
+    # If a packet is too long for the way inside, Linux sends ICMP to the sender. Connection
+    # tracking translates the addresses in this ICMP message. Without tracking, the message has an
+    # address that outside does not know, and the sender continues with packets of that length.
     if not has_connections and route.mtu < host.longest_packet:
         return (
             f"the route to {address} takes packets of at most {route.mtu} bytes, and packets of "
@@ -78,10 +78,10 @@ def _obstacle(
 def forwards_to_keep(
     current: Forwards, endpoints: Iterable[LeaseHolder], recovered: bool
 ) -> dict[int, HostPort]:
-    """The forwards from before a restart that nothing is known against yet.
+    """The forwards of the earlier process that stay for now.
 
-    Until the registry is rebuilt these are all; after that those of endpoints whose node has not
-    been heard yet, if they lead to the address where it is looked for.
+    Until the registry is rebuilt (``recovered``), all forwards stay. Afterwards a forward stays if
+    the proxy has not heard the node yet, and the forward leads to the address of the endpoint.
     """
     if not recovered:
         return dict(current)
@@ -92,7 +92,7 @@ def forwards_to_keep(
 def unchanged_forwards(
     current: Forwards, owners: Mapping[int, LeaseHolder], changed: Collection[LeaseHolder]
 ) -> dict[int, HostPort]:
-    """The forwards of all endpoints that still have them, without those that have changed."""
+    """The forwards whose endpoints still have the fast port and are not among ``changed``."""
     owned = ((port, target, owners.get(port)) for port, target in current.items())
     return {
         port: target
@@ -102,44 +102,47 @@ def unchanged_forwards(
 
 
 class Changes(msgspec.Struct, frozen=True):
-    """What is to be taken out of the kernel's maps, and then put in."""
+    """Forwards to remove from the kernel's maps, and forwards to add afterwards."""
 
     removed: Mapping[int, HostPort] = {}
     added: Mapping[int, HostPort] = {}
 
     def __bool__(self) -> bool:
-        """Whether there is anything to do."""
+        """Whether there is a forward to remove or to add."""
         return bool(self.removed or self.added)
 
 
 def changes(current: Forwards, wanted: Forwards) -> Changes:
-    """What turns the ``current`` forwards into those that are ``wanted``."""
+    """The changes from the ``current`` forwards to the ``wanted`` forwards."""
     return Changes(_difference(current, wanted), _difference(wanted, current))
 
 
 def _difference(forwards: Forwards, subtracted: Forwards) -> dict[int, HostPort]:
-    """The forwards that are not in ``subtracted``; identity first: nearly all of them are."""
+    """The forwards that are not in ``subtracted``.
+
+    Compares by identity first, which is fast: nearly all targets are the same object.
+    """
     triples = ((p, t, subtracted.get(p)) for p, t in forwards.items())
     return {p: t for p, t, s in triples if t is not s and t != s}
 
 
 class Pauses:
-    """Forwards that are not made for a while, since nobody answered behind them."""
+    """Pauses of forwards after the node has not answered through the kernel."""
 
     def __init__(self) -> None:
         self._until: dict[tuple[int, HostPort], tuple[float, float, str]] = {}
 
     def note(self, port: int, target: HostPort, why: str, now: float) -> None:
-        """Note that a forward failed at a time; for longer each time."""
+        """Note a failure at the time ``now``; each further pause is twice as long."""
         _, pause, _ = self._until.get((port, target), (0.0, FIRST_PAUSE / 2, ""))
         pause = min(2 * pause, LONGEST_PAUSE)
         self._until[port, target] = now + pause, pause, why
 
     def why(self, port: int, target: HostPort, now: float) -> str | None:
-        """Why a forward is not made now; None if it may be."""
+        """The reason for the pause of a forward; None without a pause."""
         until, _, why = self._until.get((port, target), (now, 0.0, ""))
         return why if now < until else None
 
     def keep(self, ports: Collection[int]) -> None:
-        """Forget what was noted about all other ports."""
+        """Forget the failures of all other ports."""
         self._until = {key: value for key, value in self._until.items() if key[0] in ports}

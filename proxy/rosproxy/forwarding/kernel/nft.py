@@ -1,10 +1,10 @@
-"""nftables: the common parts of the proxy's tables, and their state as nft prints it.
+"""nftables: the common parts of the proxy's tables, and the state of a table as nft prints it.
 
-A proxy has one table per transport: `ConnectionTable` for TCP (ROS 1), `DatagramTable` for UDP
+A proxy has a table for each transport: `ConnectionTable` for TCP (ROS 1), `DatagramTable` for UDP
 (ROS 2). A table has maps from port to address and port, and sets that count bytes. The chains never
-change, so that a packet costs the same for any number of forwards.
+change, so a packet costs the same for any number of forwards.
 
-Documents are in nft's own language (nft(8)), output is JSON (libnftables-json(5)).
+Documents are in the language of nft (nft(8)), output is JSON (libnftables-json(5)).
 """
 
 import json
@@ -21,13 +21,13 @@ Json = Any
 Near = Sequence[Network]
 """Networks that may use the fast ports of nodes outside, IPv4 and IPv6, without overlaps."""
 Elements = dict[str, list[str]]
-"""Elements as nft takes them, by the name of their map or set."""
+"""Elements in the language of nft, by the name of the map or set."""
 
 
 class Counts(NamedTuple):
-    """Bytes of IP packets from the node to its peers, and back; the number of packets back.
+    """Bytes of IP packets from a node to its peers (``sent``), and from the peers (``received``).
 
-    A packet of UDP is a datagram.
+    ``packets``: the number of packets from the peers. A packet of UDP is a datagram.
     """
 
     sent: int = 0
@@ -36,22 +36,22 @@ class Counts(NamedTuple):
 
 
 Counters = Mapping[int, Counts]
-"""What was counted, by port."""
+"""Counts by port."""
 
 
 class NftError(ValueError):
-    """What nft printed is not what was expected."""
+    """nft printed other output than expected."""
 
 
 class TableState(msgspec.Struct, frozen=True):
-    """What the kernel has in a proxy's table."""
+    """The forwards and counters of a proxy's table in the kernel."""
 
     forwards: Forwards = {}
     counters: Counters = {}
 
 
 class Surroundings(msgspec.Struct, frozen=True):
-    """Facts beside the forwards that a table depends on.
+    """Facts that a table needs besides the forwards.
 
     ``near`` are the networks that may use the forwards to nodes outside. ``sources`` has the
     address of this machine from which packets go to each host, by the host's address.
@@ -62,12 +62,12 @@ class Surroundings(msgspec.Struct, frozen=True):
 
 
 class Table(ABC):
-    """A table of a proxy, with a name that no other table in the network namespace has."""
+    """A table of a proxy. The name is unique in the network namespace."""
 
     maps: ClassVar[tuple[str, ...]]
-    """The maps that tell where a port leads."""
+    """The names of the maps with the targets of ports."""
     counted_sets: ClassVar[tuple[str, ...]]
-    """The sets that count."""
+    """The names of the sets that count."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -83,7 +83,7 @@ class Table(ABC):
 
     @abstractmethod
     def counted_port(self, key: int) -> int | None:
-        """The port of such an element; None if the element is not of this table."""
+        """The port of an element of a counting set; None for an element of another table."""
 
     @abstractmethod
     def adapted(self, forwards: Forwards, surroundings: Surroundings) -> str:
@@ -92,18 +92,18 @@ class Table(ABC):
     def made(
         self, forwards: Forwards, surroundings: Surroundings, counted: Collection[int] = ()
     ) -> str:
-        """The document that makes the whole table, in place of one that may be there.
+        """The document that makes the whole table, and replaces an earlier table of this name.
 
-        ``counted`` are further ports that are counted, though nothing new is forwarded.
+        ``counted`` are further ports that the table counts, because open connections remain.
         """
-        # The first line makes sure that there is a table to delete: nft fails otherwise.
+        # The first line ensures that a table exists: otherwise nft fails to delete the table.
         document = f"add table inet {self.name}\ndelete table inet {self.name}\n{self.chains}"
         document += self._counting({*counted, *forwards})
         document += self._forwarding("add", forwards)
         return document + self.adapted(forwards, surroundings)
 
     def changed(self, change: Changes) -> str:
-        """The document that takes forwards out and puts others in."""
+        """The document that removes forwards and adds forwards."""
         removed = self._forwarding("delete", change.removed)
         return removed + self._counting(change.added) + self._forwarding("add", change.added)
 
@@ -112,7 +112,7 @@ class Table(ABC):
         return f"delete table inet {self.name}\n"
 
     def read(self, text: str) -> TableState:
-        """The table as ``nft -j list table`` prints it. Raises NftError."""
+        """Read the table from the output of ``nft -j list table``. Raises NftError."""
         elements = {
             str(body.get("name")): body.get("elem")
             for kind in ("map", "set")
@@ -133,11 +133,11 @@ class Table(ABC):
         return TableState(forwards, self._counters(elements))
 
     def is_whole(self, port: int, elements: Mapping[str, Json]) -> bool:
-        """Whether a port has all other elements that the proxy makes for a forward."""
+        """Whether a port has all further elements that the proxy makes for a forward."""
         return True
 
     def elements(self, forwards: Forwards) -> Elements:
-        """The elements that forwards have in maps and sets."""
+        """The elements of forwards, by map or set."""
         targets = {port: (checked(target.host), target.port) for port, target in forwards.items()}
         hosts = {port: host for port, (host, _) in targets.items()}
         return {
@@ -176,14 +176,14 @@ _NOTHING = 0, 0
 
 
 def checked(host: str) -> str:
-    """A host that is an address; for "?", in place of any other, nft refuses the whole document."""
+    """A host that is an address; "?" for any other host, so that nft refuses the whole document."""
     return host if is_address(host) and "%" not in host else "?"
 
 
 def dropping_chains(text: str) -> list[str]:
-    """The chains at hook forward that drop by policy, in what ``nft -j list chains`` prints.
+    """The chains at hook forward with policy drop, in the output of ``nft -j list chains``.
 
-    What such a chain lets through can't be told from outside. Raises NftError.
+    The proxy can't tell which packets the rules of such a chain accept. Raises NftError.
     """
     return [
         f"{body.get('family')} {body.get('table')} {body.get('name')}"
@@ -202,23 +202,23 @@ def _objects(text: str, kind: str) -> list[dict[str, Json]]:
 
 
 def pairs(elements: Json) -> dict[int, Json]:
-    """Return the elements of a map; a malformed one is left out."""
+    """Return the elements of a map, without malformed elements."""
     items = elements if isinstance(elements, list) else []
     couples = (item for item in items if isinstance(item, list) and len(item) == 2)
     return {key: value for key, value in couples if isinstance(key, int)}
 
 
 def _counted(elements: Json) -> dict[int, tuple[int, int]]:
-    """Bytes and packets by mark."""
+    """Bytes and packets of a counting set, by element: a mark or a port."""
     counted = {}
     for item in elements if isinstance(elements, list) else []:
         body = _dict(_dict(item).get("elem"))
         counter = _dict(body.get("counter"))
-        mark = body.get("val")
+        key = body.get("val")
         size = counter.get("bytes", 0)
         count = counter.get("packets", 0)
-        if isinstance(mark, int) and isinstance(size, int) and isinstance(count, int):
-            counted[mark] = size, count
+        if isinstance(key, int) and isinstance(size, int) and isinstance(count, int):
+            counted[key] = size, count
     return counted
 
 

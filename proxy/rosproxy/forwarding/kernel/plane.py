@@ -1,13 +1,14 @@
-"""What the kernel forwards, as the rest of the proxy sees it: started, asked, looked at.
+"""The kernel plane, as the other packages of the proxy use the plane.
 
-An endpoint's *fast port* (`rosproxy.leases.fast_ports`) is what the kernel may forward straight to
-the node's TCPROS port; for ROS 2 a lease's own port, straight to a participant's locator. Where to
-is up to `decisions`, `syncer` keeps the kernel's `table` so, and `accounting` tells what went
-through it. It is an acceleration only: whatever the kernel does not forward arrives at the socket
-of the same port, and is relayed.
+The kernel forwards the *fast port* of an endpoint (`rosproxy.leases.fast_ports`) directly to the
+TCPROS port of the node. For ROS 2, the kernel forwards a port mapping directly to a locator of the
+participant. `decisions` chooses the target, `syncer` keeps the kernel's `table` up to date, and
+`accounting` counts. The plane only makes traffic faster: if the kernel does not forward, the socket
+at the same port receives the bytes, and the proxy relays.
 
-There is a plane for TCP and one for UDP, alike but for this: nobody answers a datagram. So nothing
-tells that a filter on the way drops what is forwarded, and nobody has to be told of an end.
+There is a plane for TCP and a plane for UDP. The difference: UDP has no replies and no end of a
+connection. So the plane for UDP does not notice a filter that drops forwarded datagrams, and resets
+no connections.
 """
 
 import logging
@@ -32,16 +33,17 @@ from rosproxy.telemetry.problems import Problems
 log = logging.getLogger(__name__)
 
 LOOK_INTERVAL = 3.0
-"""Seconds between looks at the kernel's counters and connections."""
+"""Seconds between readings of the kernel's counters and connections."""
 UNANSWERED_PATIENCE = 3.0
-"""Seconds after which a connection that the node does not answer is taken back to user space."""
+"""Seconds after which user space takes over a connection that the node does not answer."""
 
 
 class KernelPlane:
-    """What the kernel forwards for the endpoints, and why it doesn't.
+    """The kernel plane of a transport: forwards, counts and reasons.
 
-    ``traffic`` are the bytes of IP packets by node, ``total`` is what was counted in all. ``near``
-    tells who may use the forwards that lead outside. ``user_plane`` is what forwards all else.
+    ``traffic`` has the bytes of IP packets by node, ``total`` the sum. ``near`` returns the
+    networks that may use the forwards to outside. ``user_plane`` is the plane for the rest: splice
+    or copy.
     """
 
     def __init__(
@@ -71,10 +73,10 @@ class KernelPlane:
         self.user_plane = "copy" if copies else "splice"
 
     async def start(self) -> None:
-        """Make the table if that is possible; to be called before any port listens.
+        """Make the table if possible. Call this before any port listens.
 
-        The kernel has to see every connection to a fast port from its beginning. Forwards that a
-        former process left stay until it is known whose they are.
+        The kernel has to see each connection to a fast port from the first packet. Forwards of an
+        earlier process stay until the registry knows the endpoints.
         """
         mode = self._settings.data_plane
         self.syncer.look_around()
@@ -91,10 +93,7 @@ class KernelPlane:
             self._tasks.repeat(self.look, LOOK_INTERVAL, "reading the kernel's counters")
 
     async def stop(self) -> None:
-        """Take the table away, and what the kernel knows of connections through it.
-
-        To be called when no task runs any more.
-        """
+        """Remove the table, and the tracked connections. Call this after the end of all tasks."""
         was_usable = self.syncer.usable
         self.syncer.why_not = "the proxy has stopped"
         await self._table.tools.settled()
@@ -103,13 +102,13 @@ class KernelPlane:
 
     @property
     def forwards(self) -> Forwards:
-        """What the kernel forwards now, as far as is known."""
+        """The forwards of the kernel, as of the last change or reading."""
         return self._table.forwards if self.syncer.usable else {}
 
     def recovered(self, endpoints: Sequence[LeaseHolder]) -> None:
-        """Note that the registry is rebuilt; what it holds gets the fast ports that it had.
+        """Note that the registry is rebuilt, and give the endpoints their earlier fast ports.
 
-        Also where the kernel may not forward now: subscribers may be connected to them.
+        Do so even if the kernel may not forward now: subscribers may use the fast ports.
         """
         if self._is_wanted:
             for endpoint in endpoints:
@@ -118,7 +117,7 @@ class KernelPlane:
         self.syncer.note_change()
 
     def cut(self, endpoint: LeaseHolder) -> None:
-        """Have the kernel forget an endpoint's connections; who sends next gets a reset."""
+        """Have the kernel end the connections of an endpoint; the next packet gets a reset."""
         ports = self._accounts.ports_of(endpoint)
         ipv6 = ":" in endpoint.address
         if self.syncer.usable and ports:
@@ -126,7 +125,7 @@ class KernelPlane:
             self._tasks.spawn(work, f"cutting {endpoint.label}")
 
     async def look(self) -> None:
-        """Take in the kernel's counters and connections, and put right what is not as wanted."""
+        """Read the kernel's counters and connections, and correct the forwards."""
         self.syncer.look_around()
         if not self.syncer.usable:
             if await self.syncer.regain():
@@ -136,17 +135,17 @@ class KernelPlane:
         self.syncer.note_change()
 
     def status(self) -> dict[str, Any]:
-        """The plane as a whole, as JSON."""
+        """The state of the plane, as the fields of DataPlaneStatus."""
         plane = "kernel" if self.syncer.usable else self.user_plane
         mode = self._settings.data_plane
         return {"mode": mode, "plane": plane, "reason": self.syncer.why_not or ""}
 
     def status_of(self, endpoint: LeaseHolder) -> dict[str, Any]:
-        """The plane of one endpoint's topics, as JSON; bytes of IP packets."""
+        """The plane of an endpoint, as the fields of NodePlaneStatus; bytes are of IP packets."""
         account = self._accounts.account(endpoint)
         reason = self.syncer.reason(endpoint)
         port = endpoint.fast_port
-        # Ports of nodes outside are for inside alone: they are not published, and have no offset.
+        # Only inside uses the ports of nodes outside: unpublished ports, without an offset.
         return {
             "plane": self.user_plane if reason else "kernel",
             "port": self._settings.ports.advertised(port) if endpoint.inside and port else port,

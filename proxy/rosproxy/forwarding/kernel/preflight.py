@@ -1,4 +1,4 @@
-"""Whether the kernel plane may be used in the network namespace that the proxy runs in."""
+"""Whether the proxy may use the kernel plane in its network namespace."""
 
 import sys
 from collections.abc import Iterator
@@ -16,17 +16,17 @@ _IPV6 = Path("/proc/sys/net/ipv6/conf/all/forwarding")
 
 
 def read_forwarding() -> HostForwarding:
-    """What this network namespace forwards."""
+    """Read which IP versions this network namespace forwards, and the largest MTU."""
     return HostForwarding(
         ipv4=_read(_IPV4) == "1", ipv6=_read(_IPV6) == "1", longest_packet=_longest_packet()
     )
 
 
 async def find_obstacle(mode: DataPlane, tools: Tools) -> str | None:
-    """What is in the way of the kernel plane, and what to do about it; None if nothing is seen.
+    """The reason against the kernel plane, with advice; None without a reason.
 
-    ``auto`` stays away from what looks like a host's own network: there a table of the proxy
-    would concern everybody's connections.
+    ``auto`` does not use the kernel plane in the network of a host: there the table of the proxy
+    would see the connections of all programs.
     """
     for reason in _reasons(mode):
         return reason
@@ -58,7 +58,7 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
             "net.ipv4.ip_forward is not 1 in the proxy's network namespace: set it (sysctls: "
             "net.ipv4.ip_forward: 1; for nodes with IPv6 addresses net.ipv6.conf.all.forwarding: 1)"
         )
-    # nft lists nothing of iptables-legacy, so that `dropping_chains` can't see its policy.
+    # nft does not list the chains of iptables-legacy, so `dropping_chains` can't see their policy.
     if "filter" in _read(_LEGACY_TABLES).split():
         yield (
             "iptables-legacy has a filter table in this network namespace, which may drop "
@@ -68,12 +68,12 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
 
 
 def _hardware() -> str | None:
-    """A network interface that is a device: containers have only virtual ones."""
+    """The name of a hardware network interface; containers have only virtual interfaces."""
     return next((path.name for path in _interfaces() if (path / "device").exists()), None)
 
 
 def _longest_packet() -> int:
-    """Return the largest MTU of the interfaces but loopback, in bytes; 0 if there are none."""
+    """Return the largest MTU of the interfaces in bytes, loopback aside; 0 without interfaces."""
     texts = (_read(path / "mtu") for path in _interfaces() if path.name != "lo")
     return max((int(text) for text in texts if text), default=0)
 
@@ -86,7 +86,7 @@ def _interfaces() -> list[Path]:
 
 
 def _read(path: Path) -> str:
-    """A file's text; nothing if there is none, or it is not for this user."""
+    """The text of a file; empty if the file is missing or unreadable."""
     try:
         return path.read_text(encoding="ascii").strip()
     except OSError:

@@ -1,14 +1,14 @@
-"""What the kernel forwards, kept as the endpoints want it.
+"""Keeps the forwards of the kernel in step with the endpoints.
 
-Level-triggered: `ForwardSyncer.note_change` only says that something may have changed. One worker
-at a time (`run_once`) compares what is wanted with what the kernel has, and changes it in one
-transaction. All endpoints are gone through every few seconds; in between only those that changed,
-so that a thousand that come one by one don't make a million.
+Level-triggered: `ForwardSyncer.note_change` only says that an endpoint may have changed. A single
+worker (`run_once`) compares the wanted forwards with the forwards of the kernel, and applies the
+difference in a transaction. Every few seconds the worker compares all endpoints, in between only
+the changed endpoints. Otherwise a thousand endpoints, each new in turn, would take a million steps.
 
-Where an endpoint may be forwarded to is decided in `decisions`. What that depends on is kept here:
-what this network namespace forwards, the routes to nodes, forwards that failed of late, and why the
-kernel may forward nothing at all (``why_not``). That is changed by `begin`, by a table that can't
-be made any more, by `plane` when it starts and stops, and by nothing else.
+`decisions` decides the target of an endpoint. This module keeps the input: what this network
+namespace forwards, the routes to nodes, recent failures, and the reason against all forwards
+(``why_not``). Only three events set ``why_not``: `begin`, a failure to make the table again, and
+the start or stop of `plane`.
 """
 
 import asyncio
@@ -37,21 +37,21 @@ Clock = Callable[[], float]
 """Seconds of the monotonic clock."""
 SUBJECT = "data plane"
 RETRY_LOST = 30.0
-"""Seconds between attempts to get a kernel plane back that was lost."""
+"""Seconds between attempts to make a lost table again."""
 
 SYNC_PATIENCE = 1.0
-"""Seconds that a subscriber's requestTopic waits at most for its forward."""
+"""Seconds for which the requestTopic of a subscriber waits for the forward at most."""
 ROUTE_TTL = 60.0
-"""Seconds for which the routes to nodes are remembered."""
+"""Seconds after which the routes to nodes are read again."""
 
 
 class ForwardSyncer:
-    """The one worker that changes and reads the kernel's table.
+    """The only worker that changes and reads the kernel's table.
 
-    ``why_not`` tells why the kernel may forward nothing at all; None while it may. ``recovered``
-    is False until the registry is rebuilt: what a former process left then stays. ``near`` tells
-    who may use the forwards that lead outside. ``traffic`` is what is forwarded; ``subject`` is
-    that of the problems with it.
+    ``why_not``: the reason against all forwards; None if the kernel may forward. ``recovered`` is
+    False until the registry is rebuilt: until then the forwards of an earlier process stay.
+    ``near`` returns the networks that may use the forwards to outside. ``traffic`` names what the
+    table forwards, for messages. ``subject`` is the subject of problems.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class ForwardSyncer:
         self._host = HostForwarding()
         self._pauses = decisions.Pauses()
         self._routes: dict[str, Route] = {}
-        # inf: what was not possible at the start is not tried again, only a table that was lost.
+        # inf: only a lost table is made again, not a table that failed at the start.
         self._retry_at = float("inf")
         self._routes_until = 0.0
         self._logged: dict[LeaseHolder, str] = {}
@@ -88,11 +88,11 @@ class ForwardSyncer:
 
     @property
     def usable(self) -> bool:
-        """Whether the kernel may forward at all."""
+        """Whether the kernel may forward."""
         return self.why_not is None
 
     async def begin(self) -> None:
-        """Make the table; ``why_not`` tells if that is not possible."""
+        """Make the table, and set ``why_not`` to the reason of a failure, or to None."""
         async with self._lock:
             try:
                 await self._table.begin(self._surroundings)
@@ -102,7 +102,7 @@ class ForwardSyncer:
                 self.why_not = None
 
     async def regain(self) -> bool:
-        """Try, now and then, to make a table that was lost; whether that has worked."""
+        """Make a lost table again, if RETRY_LOST is over; return whether that succeeded."""
         if self._clock() < self._retry_at:
             return False
         await self.begin()
@@ -110,7 +110,7 @@ class ForwardSyncer:
         return self.usable
 
     def look_around(self) -> None:
-        """Take in which endpoints there are, what is forwarded here, and at times the routes."""
+        """Read what this network namespace forwards, and drop old routes and ended endpoints."""
         endpoints = set(self._endpoints)
         self._logged = {e: why for e, why in self._logged.items() if e in endpoints}
         self._host = read_forwarding()
@@ -119,26 +119,26 @@ class ForwardSyncer:
             self._routes_until = self._clock() + ROUTE_TTL
 
     def note_change(self, endpoint: LeaseHolder | None = None) -> None:
-        """Note that an endpoint has changed, or any."""
+        """Note that an endpoint may have changed; None: any endpoint."""
         if endpoint is None or not self.usable:
             self._all_changed = True
         elif endpoint.fast_port is None and not self._accounts.owns(endpoint):
-            return  # nothing of it is forwarded, nor may be
+            return  # no forward exists, and none is possible
         else:
             self._changed.add(endpoint)
         self._wake.set()
 
     async def run_once(self) -> None:
-        """Wait for a change, and have the kernel forward what is wanted then."""
+        """Wait for a change, and bring the kernel's forwards up to date."""
         await self._wake.wait()
         await self._sync()
 
     def may_forward(self, endpoint: LeaseHolder) -> bool:
-        """Whether an endpoint's topics could be forwarded if it had a fast port."""
+        """Whether the kernel could forward the topics of an endpoint through a fast port."""
         return isinstance(self._target(endpoint), HostPort)
 
     def reason(self, endpoint: LeaseHolder) -> str:
-        """Why an endpoint's topics are not forwarded by the kernel; nothing if they are."""
+        """The reason why the kernel does not forward for an endpoint; empty if the kernel does."""
         target = self._target(endpoint)
         if isinstance(target, str):
             return target
@@ -148,14 +148,17 @@ class ForwardSyncer:
         return "" if is_forwarded else "the kernel's table is being updated"
 
     def log_reason(self, endpoint: LeaseHolder) -> None:
-        """Log why an endpoint's topics are not forwarded, if that has not been said yet."""
+        """Log why the kernel does not forward for an endpoint, unless the reason is the same."""
         why = self.reason(endpoint)
         if why and self.usable and self._logged.get(endpoint) != why:
             self._logged[endpoint] = why
             log.info("%s: the proxy forwards the topics, not the kernel: %s", endpoint.label, why)
 
     async def forwards(self, endpoint: LeaseHolder, node_port: int) -> bool:
-        """Whether an endpoint's fast port leads to a TCPROS port of its node; waits a moment."""
+        """Whether the fast port of an endpoint leads to a TCPROS port of the node.
+
+        Waits for the forward for SYNC_PATIENCE at most.
+        """
 
         def leads() -> bool:
             target = HostPort(endpoint.address, node_port)
@@ -168,11 +171,11 @@ class ForwardSyncer:
         return leads()
 
     async def cleared(self, port: int) -> None:
-        """Wait a moment until a port is not forwarded any more."""
+        """Wait until the kernel no longer forwards a port, for SYNC_PATIENCE at most."""
         await self._wait_until(lambda: not self.usable or port not in self._table.forwards)
 
     async def read_kernel(self) -> tuple[Counters, Survey | None] | None:
-        """The kernel's counters and connections; None if the table had to be made again."""
+        """Read the kernel's counters and connections; None if the table had to be made again."""
         async with self._lock:
             self._accounts.note_owners(self._endpoints)
             ipv6 = any(":" in endpoint.address for endpoint in self._accounts.owners.values())
@@ -185,7 +188,7 @@ class ForwardSyncer:
         return None
 
     async def take_back(self, ports: Collection[int]) -> None:
-        """Let user space serve the connections through ports behind which no node answers."""
+        """Let user space serve the connections through ports whose node does not answer."""
         for port in ports:
             target = self._table.forwards.get(port)
             if target is not None:
@@ -194,18 +197,18 @@ class ForwardSyncer:
         if ports:
             self._all_changed = True
             await self._sync()
-            # Connections that the node has answered go on through the kernel.
+            # Only unanswered connections: the others continue through the kernel.
             families = itertools.product(ports, (False, True))
             await self._table.forget(families, "SYN_SENT")
 
     async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
-        """End the connections through ports, each of IPv6 or not."""
-        # First: a forward that is not wanted any more would take those who connect again.
+        """End the connections through ports, which are pairs of a port and True for IPv6."""
+        # Before the cut: an old forward would take new connections of the same peers.
         await self._sync()
         await self._table.cut(ports)
 
     def _target(self, endpoint: LeaseHolder) -> HostPort | str:
-        """Where an endpoint's topics may be forwarded to, or why they may not."""
+        """The target for the fast port of an endpoint, or the reason against a forward."""
         if self.why_not is not None:
             return self.why_not
         route = self._route(endpoint.address)
@@ -217,7 +220,7 @@ class ForwardSyncer:
 
     def _route(self, address: str) -> Route:
         route = self._routes.get(address) or route_towards(address)
-        # The proxy may join the network of a node just after the node's first sign.
+        # Without a route, look again: the proxy may join the network of a node later.
         if not is_loopback(route.source):
             self._routes[address] = route
         return route
@@ -227,7 +230,7 @@ class ForwardSyncer:
         return Surroundings(self._near(), {host: self._route(host).source for host in hosts})
 
     async def _wait_until(self, condition: Callable[[], bool]) -> None:
-        """Wait a moment for the worker to make a condition true."""
+        """Wait until the worker has made a condition true, for SYNC_PATIENCE at most."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(SYNC_PATIENCE):
                 while not condition():
@@ -240,7 +243,7 @@ class ForwardSyncer:
             self._pauses.keep(self._accounts.owners)
             if self.usable:
                 await self._change()
-            # Each round has an event of its own, which wakes all who wait for it once.
+            # Each round has a new event, which wakes all waiting tasks once.
             synced = self._synced
             self._synced = asyncio.Event()
             synced.set()

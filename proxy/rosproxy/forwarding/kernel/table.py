@@ -1,4 +1,4 @@
-"""The proxy's table in the kernel: read, changed in transactions, made anew, removed."""
+"""The proxy's table in the kernel: make, read, change in transactions, remove."""
 
 import asyncio
 import logging
@@ -11,18 +11,18 @@ from rosproxy.forwarding.kernel.nft import Counters, NftError, Surroundings, Tab
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 
 RESET_TIME = 0.3
-"""Seconds for which connections are reset before the kernel forgets them."""
+"""Seconds for which the table resets connections before the kernel forgets these connections."""
 
 log = logging.getLogger(__name__)
 
 
 class KernelTable:
-    """What the kernel has, as far as is known: ``forwards``, and the ports that are ``counted``."""
+    """The table as of the last change or reading: ``forwards``, and the ``counted`` ports."""
 
     has_connections = False
-    """Whether the kernel tracks what it forwards: answered, and ended by a reset."""
+    """Whether the kernel tracks connections: knows whether a node has answered, and resets."""
     weakness = ""
-    """What the table lacks although it forwards, and what to do about that; mostly nothing."""
+    """A fault of a table that forwards nonetheless, with advice; usually empty."""
 
     def __init__(self, table: Table, tools: Tools) -> None:
         self.table = table
@@ -32,9 +32,9 @@ class KernelTable:
         self._surroundings = Surroundings()
 
     async def begin(self, surroundings: Callable[[Forwards], Surroundings]) -> None:
-        """Make the table with what a former process left in it. Raises ToolError.
+        """Make the table, with the forwards that an earlier process left. Raises ToolError.
 
-        ``surroundings`` tells those of forwards.
+        ``surroundings`` returns the surroundings of forwards.
         """
         try:
             former = await self._read()
@@ -45,12 +45,12 @@ class KernelTable:
         await self.make(former.forwards, surroundings(former.forwards))
 
     async def make(self, wanted: Forwards, surroundings: Surroundings) -> None:
-        """Put the whole table in place of the one that may be there. Raises ToolError."""
+        """Make the whole table, and replace an earlier table. Raises ToolError."""
         self._surroundings = surroundings
         await self._apply(self.table.made(wanted, surroundings, self.counted), wanted)
 
     async def change(self, wanted: Forwards, surroundings: Surroundings) -> Changes:
-        """Have it forward what is wanted, and tell what that changed. Raises ToolError."""
+        """Change the table to the wanted forwards, and return the changes. Raises ToolError."""
         change = changes(self.forwards, wanted)
         if change or surroundings != self._surroundings:
             self._surroundings = surroundings
@@ -59,7 +59,7 @@ class KernelTable:
         return change
 
     async def look(self, ipv6: bool) -> tuple[Counters, Survey | None]:
-        """Take in what the kernel really has: what was counted by port, and connections.
+        """Read the table: update ``forwards``, and return the counters, without a survey.
 
         Raises ToolError, NftError.
         """
@@ -101,11 +101,11 @@ class TrackedTable(KernelTable):
         self._connections = table
 
     async def begin(self, surroundings: Callable[[Forwards], Surroundings]) -> None:
-        """Make the table with what a former process left in it. Raises ToolError.
+        """Make the table, with the forwards that an earlier process left. Raises ToolError.
 
-        Connections under way go on: the kernel has noted for each of them where it leads.
+        Open connections continue: the kernel has the target of each tracked connection.
         """
-        # Only to see, before anything is forwarded, whether conntrack can be run.
+        # A test before the first forward: raises ToolError if conntrack can't run.
         await self._list_flows(lambda lines: None, False)
         self._connections.limits_new = True
         self.weakness = ""
@@ -120,7 +120,7 @@ class TrackedTable(KernelTable):
             )
 
     async def look(self, ipv6: bool) -> tuple[Counters, Survey | None]:
-        """Take in what the kernel really has: what was counted by port, and connections.
+        """Read the table: update ``forwards``, and return the counters and the connections.
 
         Raises ToolError, NftError.
         """
@@ -131,18 +131,23 @@ class TrackedTable(KernelTable):
         return counters, survey
 
     async def forget(self, ports: Iterable[tuple[int, bool]], state: str = "") -> None:
-        """Forget connections through ports, each of IPv6 or not; those of one state if given."""
+        """Have the kernel forget connections through ports.
+
+        ``ports`` are pairs of a port and True for IPv6. ``state``: only connections in this state
+        of conntrack, such as SYN_SENT.
+        """
         state_options = ("--state", state) if state else ()
         for port, ipv6 in ports:
             selector = self._connections.marks.port_selector(port)
             await self._forget(ipv6, "--mark", selector, *state_options)
 
     async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
-        """End the connections through ports, each of IPv6 or not, so that both ends learn of it.
+        """End the connections through ports with resets.
 
-        Who connected gets a reset for what it sends next, even if that only confirms what came: a
-        subscriber says nothing else, and some (rospy) try again only when they see their connection
-        end. After that whoever sends gets one, since the kernel knows the connection no more.
+        ``ports`` are pairs of a port and True for IPv6. For RESET_TIME, the next packet of the peer
+        gets a reset. A mere acknowledgement is enough: a subscriber sends nothing else, and rospy
+        connects again only after the end of its connection. Then the kernel forgets the
+        connections, and a packet from either end gets a reset.
         """
         numbers = {port for port, _ in ports}
         try:
@@ -154,7 +159,7 @@ class TrackedTable(KernelTable):
             log.warning("the connections through the kernel can't be ended: %s", error)
 
     async def remove(self) -> None:
-        """End what goes through the table, remove it, and forget all connections through it."""
+        """Reset the connections through the table, remove the table, and forget the connections."""
         if self.forwards:
             try:
                 await self.tools.nft("-f", "-", document=self._connections.ended())
@@ -166,7 +171,7 @@ class TrackedTable(KernelTable):
             await self._forget(ipv6, "--mark", self._connections.marks.table_selector)
 
     async def _list_flows(self, take: Callable[[str], None], ipv6: bool) -> None:
-        """Pass the table's connections to ``take``, as conntrack prints them. Raises ToolError."""
+        """Pass conntrack's list of the table's connections to ``take``. Raises ToolError."""
         selector = self._connections.marks.table_selector
         await self.tools.list_flows(take, ipv6, "--mark", selector)
 

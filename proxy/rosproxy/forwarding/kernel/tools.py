@@ -1,7 +1,6 @@
 """The two programs that change and read the kernel's tables: nft and conntrack.
 
-In the image they are copies that carry the capability to do so as a file capability, for a user
-who is not root.
+The image has copies of both with a file capability, so that a user other than root may use both.
 """
 
 import asyncio
@@ -14,17 +13,17 @@ from pathlib import Path
 from typing import cast
 
 IMAGE_FOLDER = Path("/usr/libexec/rosproxy")
-"""Where the image has them; searched before the PATH."""
+"""The folder of the programs in the image; searched before the PATH."""
 SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
-"""Where they are outside of an unprivileged user's PATH."""
+"""Folders of the programs that are not in the PATH of an unprivileged user."""
 TIMEOUT = 5.0
-"""Seconds that one of them may take."""
+"""Seconds that a run of a program may take."""
 LONGEST_LIST = 16 * 1024 * 1024
-"""Bytes of a list of connections that are read, some 95,000 lines."""
+"""Bytes of a list of connections that the proxy reads: some 95,000 lines."""
 PIECE = 16 * 1024
-"""Bytes of a list that are read at once, some hundred lines."""
+"""Bytes of a list that the proxy reads at once: some hundred lines."""
 ENVIRONMENT = {"LC_ALL": "C"}
-"""The proxy looks into messages of the programs, in English."""
+"""English messages of the programs: the proxy looks for words in these messages."""
 REMEDY = (
     "give the proxy's container the capability NET_ADMIN (cap_add: NET_ADMIN) and run it without "
     "no-new-privileges"
@@ -33,29 +32,29 @@ _PACKAGES = {"nft": "nftables", "conntrack": "conntrack"}
 
 
 class ToolError(Exception):
-    """One of the programs could not do what it was asked to; the text says why."""
+    """A program has failed, or could not run; the text says why."""
 
 
 class Tools:
-    """nft and conntrack, wherever they are."""
+    """Runs nft and conntrack."""
 
     def __init__(self) -> None:
         self._running: set[asyncio.Future[str]] = set()
 
     async def settled(self) -> None:
-        """Wait for runs whose tasks were cancelled: what they began they finish."""
+        """Wait for the end of all runs. A run continues after its task was cancelled."""
         if self._running:
             await asyncio.wait(self._running)
 
     async def nft(self, *arguments: str, document: str = "") -> str:
-        """Run nft, with a document on its standard input; what it prints. Raises ToolError."""
+        """Run nft with a document on standard input; return the output. Raises ToolError."""
         return await self._run("nft", *arguments, document=document)
 
     async def list_flows(self, take: Callable[[str], None], ipv6: bool, *options: str) -> None:
         """Pass the tracked TCP connections that options select to ``take``. Raises ToolError.
 
-        ``take`` gets whole lines, in pieces that keep the event loop for a moment only, and no more
-        than `LONGEST_LIST` bytes in all. The run ends with the task that called.
+        ``take`` gets whole lines in pieces of some PIECE bytes, so that other tasks run in between,
+        and at most LONGEST_LIST bytes in all. The program ends with the calling task.
         """
         command = [_find("conntrack"), "-L", *_selection(ipv6), *options]
         try:
@@ -80,11 +79,11 @@ class Tools:
             raise _failure(command[0], complaint.decode("utf-8", "replace"))
 
     async def forget_flows(self, ipv6: bool, *options: str) -> None:
-        """Delete the same. Raises ToolError."""
+        """Delete the tracked TCP connections that options select. Raises ToolError."""
         try:
             await self._run("conntrack", "-D", *_selection(ipv6), *options)
         except ToolError as error:
-            # conntrack fails if there was nothing to delete; kube-proxy looks for the same text
+            # conntrack fails without a connection to delete; kube-proxy looks for the same text
             # (pkg/proxy/conntrack, noConnectionToDelete).
             if "0 flow entries" not in str(error):
                 raise
@@ -94,12 +93,15 @@ class Tools:
         run = loop.run_in_executor(None, _run, [_find(name), *arguments], document)
         self._running.add(run)
         run.add_done_callback(self._ended)
-        # Not `await run`, which would cancel it together with its task.
+        # Not `await run`, which would cancel the run together with its task.
         await asyncio.wait({run})
         return run.result()
 
     def _ended(self, run: asyncio.Future[str]) -> None:
-        """Forget a run, and take its failure for known: its task may have been cancelled."""
+        """Remove a run, and read its exception: after a cancellation no task reads the exception.
+
+        asyncio would log an exception that was never read.
+        """
         self._running.discard(run)
         if not run.cancelled():
             run.exception()
@@ -140,7 +142,7 @@ def _run(command: list[str], document: str) -> str:
 
 
 async def _pass_lines(stream: asyncio.StreamReader, take: Callable[[str], None]) -> bool:
-    """Pass lines to ``take`` as they come; whether the list ended within `LONGEST_LIST`."""
+    """Pass lines to ``take`` as they arrive; False if the list is longer than LONGEST_LIST."""
     rest = b""
     count = 0
     while piece := await stream.read(PIECE):
