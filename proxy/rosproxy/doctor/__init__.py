@@ -1,1 +1,1 @@
-"""``rosproxy doctor``: why can A not hear B? Facts are collected, then judged by rules."""
+"""``rosproxy doctor``: why can't A hear B? `collect` gathers facts, and rules judge the facts."""

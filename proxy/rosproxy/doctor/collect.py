@@ -1,12 +1,12 @@
-"""Gathering the facts for ``rosproxy doctor``: asks the proxy, the master and the nodes.
+"""Gathers the facts for ``rosproxy doctor``.
 
-First the proxy (`AdminClient`), which knows its nodes and whether its ports can be reached; then
-the master and nodes of ROS 1 (`graph_survey`). For ROS 2 it asks the participants on the networks
-inside (`domain_survey`). The rules judge the facts.
+The doctor first asks the proxy (`AdminClient`), which knows its nodes, and whether outside reaches
+its ports. Then the doctor asks the master and the nodes of ROS 1 (`graph_survey`), and for ROS 2
+the participants on the networks inside (`domain_survey`). The rules judge the facts.
 
-It changes nothing, apart from the short-lived parameter by which the proxy has the master try its
-ports (see `range_probe`). Names and addresses are tried from where it runs; that should be where
-the proxy runs.
+The doctor changes nothing, except for a short-lived parameter at the master. With this parameter,
+the proxy has the master try the ports of the range (`range_probe`). The doctor tries names and
+addresses from the place where the doctor runs, which should be the place of the proxy.
 """
 
 import asyncio
@@ -30,11 +30,12 @@ async def collect(
     names: tuple[str, ...] = (),
     master_address: str | None = None,
 ) -> DoctorFacts:
-    """Ask the proxy, the master, the nodes and the participants, and change nothing.
+    """Ask the proxy, the master, the nodes and the participants.
 
-    Without ``admin`` no proxy is asked, as from an outside machine. ``master_uri``,
-    ``advertise_host`` and ``master_address`` count where the proxy doesn't answer; the last is the
-    IP address at which the master's host is reached, whatever its name leads to.
+    Without ``admin`` the doctor asks no proxy, as on an outside machine. ``names``: the nodes,
+    topics and services that the user asks for. ``master_uri``, ``advertise_host`` and
+    ``master_address`` count only without an answer of the proxy. ``master_address``: the IP address
+    of the master's host, to use instead of the host name.
     """
     addresses = await resolve(advertise_host) if advertise_host else ()
     facts = DoctorFacts(
@@ -63,11 +64,12 @@ async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
     )
     if status.domains:
         heard = await _survey(status)
-        status = await asyncio.to_thread(admin.status)  # by now it has heard those just started
+        # Again: meanwhile the proxy has heard participants that started just before.
+        status = await asyncio.to_thread(admin.status)
         facts = replace(facts, heard_participants=heard, status=status)
     address = master.address if master.pinned else None
     uri = master.uri if status.settings.for_ros1 else ""
-    # The proxy tries its range meanwhile; each of the two may take some seconds.
+    # At the same time, the proxy tries the range; both may take some seconds.
     graph_task = asyncio.create_task(ask_graph(facts, uri, address))
     probe = None
     reason = ""
@@ -80,7 +82,7 @@ async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
 
 
 def _all_here(status: ProxyStatus) -> bool:
-    """Whether a proxy serves ROS 2 only, and outside has only peers on loopback."""
+    """Whether the proxy does not serve ROS 1, has no LAN relay, and has only peers on loopback."""
     peers = [peer for domain in status.domains for peer in domain.peers]
     hosts = [target.host if (target := parse_host_port(peer)) else peer for peer in peers]
     lan_relays = [domain.lan_relay for domain in status.domains if domain.lan_relay]
@@ -90,10 +92,10 @@ def _all_here(status: ProxyStatus) -> bool:
 async def collect_running(
     status: ProxyStatus, admin: str, choose: Callable[[SystemState], tuple[str, ...]]
 ) -> DoctorFacts:
-    """The facts that may be asked again and again: of the master, of all nodes, and of some names.
+    """Gather the facts for the live page, which may ask repeatedly.
 
-    ``choose`` picks the names from what the master knows. The range is not tried, and only a few
-    nodes are asked at once. Nodes also say how much they have counted (``getBusStats``).
+    ``choose`` picks the names to examine from the state of the master. The range is not tried, and
+    only a few questions to nodes are under way at once.
     """
     host = status.settings.advertise_host
     master = status.master
@@ -108,7 +110,7 @@ async def collect_running(
 
 
 async def _survey(status: ProxyStatus) -> tuple[HeardParticipant, ...]:
-    """The participants on the networks inside, each one once."""
+    """The participants on all networks inside, without duplicates."""
     domains = [domain.domain for domain in status.domains]
     networks = status.settings.inside_networks
     surveys = (asyncio.to_thread(ask_participants, network, domains) for network in networks)

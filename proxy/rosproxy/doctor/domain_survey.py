@@ -1,12 +1,12 @@
-"""The participants on the networks inside, in all domains: each is asked to announce itself.
+"""Finds the participants on the networks inside, in all domains.
 
-The proxy hears what is announced to the group of its own domain. It can't hear a participant of
-another one, nor one that announces itself to its own machine alone
-(``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST``). Yet both answer at once when they hear a new
-participant. So the doctor is a new participant for a moment: it announces itself to the groups of
-all domains, and to all hosts (224.0.0.1, ff02::1) at the well-known ports of the proxy's domains.
-It collects the answers, and ends with a dispose message. The doctor has no reader and no writer, so
-it receives nothing else.
+The proxy hears announcements to the multicast group of its own domains. The proxy hears neither a
+participant in another domain, nor a participant that announces itself only to its own machine
+(``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST``). But each participant answers the announcement of a
+new participant at once. So the doctor becomes a participant for WITHIN seconds. The doctor
+announces itself to the groups of all domains, and to all hosts (224.0.0.1, ff02::1) at the
+well-known ports of the proxy's domains. The doctor collects the answers, and ends with a dispose
+message. The doctor has no reader and no writer, so participants send nothing else.
 """
 
 import contextlib
@@ -35,21 +35,23 @@ from rosproxy.ros2.rewriting.discovery import Announcement, read_discovery
 from rosproxy.ros2.servers.groups import family_of, groups_of, send_through
 
 DOMAINS = 233
-"""Those whose ports exist: 0 to 232."""
+"""The number of domains: 0 to 232. The ports of further domains would exceed 65535."""
 ALL_HOSTS = {socket.AF_INET: "224.0.0.1", socket.AF_INET6: "ff02::1"}
 WITHIN = 2.0
 """Seconds in which participants answer."""
-# Seconds after which participants forget the doctor if its dispose message does not arrive.
 LEASE = 5.0
+"""The lease duration of the doctor in seconds. Participants that miss the dispose message forget
+the doctor after this time."""
 MOST_HEARD = 200
+"""Participants on a network that the doctor collects at most."""
 
 
 def ask_participants(network: str, domains: Collection[int]) -> list[HeardParticipant]:
-    """The participants that answer on a network (CIDR) of this machine; takes WITHIN.
+    """The participants that answer on a network (CIDR) of this machine. Takes WITHIN seconds.
 
-    ``domains``: in these, participants that don't hear the group are asked as well.
+    ``domains``: in these domains, the doctor also asks participants that don't hear the group.
     """
-    with contextlib.suppress(ValueError, OSError):  # no network; gone, or without multicast
+    with contextlib.suppress(ValueError, OSError):  # no valid network; gone, or no multicast
         inside_network = ip_network(network)
         own_address = address_into(inside_network)
         if is_inside(own_address, (inside_network,)):
@@ -58,7 +60,7 @@ def ask_participants(network: str, domains: Collection[int]) -> list[HeardPartic
 
 
 def heard_participant(datagram: bytes, source: str) -> HeardParticipant | None:
-    """The participant that announces itself in a datagram; None without one or its domain."""
+    """The participant that announces itself in a datagram; None without participant or domain."""
     try:
         message = read_discovery(datagram)
         prefix = message.prefix
@@ -74,11 +76,10 @@ def heard_participant(datagram: bytes, source: str) -> HeardParticipant | None:
 
 
 def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
-    """The participants that answer on the network of this own address. Raises OSError."""
+    """The participants that answer on the network of an own address. Raises OSError."""
     by_prefix: dict[str, HeardParticipant] = {}
     with contextlib.closing(datagrams.bind(own_address, 0)) as sock:
-        # Not heard on this machine: the proxy, which hears the groups, would take the doctor for
-        # a participant.
+        # Without multicast loop: the proxy on this machine would count the doctor as a participant.
         send_through(sock, own_address, loop=False)
         prefix = os.urandom(PREFIX)
         targets = list(_targets(own_address, domains))
@@ -101,7 +102,7 @@ def _targets(own_address: str, domains: Collection[int]) -> Iterator[tuple[str, 
             yield group, SPDP_MULTICAST + PORTS_PER_DOMAIN * domain
     for domain in domains:
         first = SPDP_UNICAST + PORTS_PER_DOMAIN * domain
-        # Every second port: the others are those of user data.
+        # Every second port: the ports in between are for user data.
         for port in range(first, min(first + 2 * PARTICIPANTS_TRIED, 65536), 2):
             yield ALL_HOSTS[family_of(own_address)], port
 
@@ -113,7 +114,7 @@ def _send(sock: socket.socket, datagram: bytes, targets: Iterable[tuple[str, int
 
 
 def _domain(announced: Announcement, datagram: bytes, source: str) -> int | None:
-    """The domain that a participant says it is in, or else that of its well-known port."""
+    """The domain that a participant announces, else the domain of its well-known port, or None."""
     domain = traits(announced, datagram, source).domain
     if domain is not None:
         return domain

@@ -1,9 +1,9 @@
-"""What the doctor has gathered, before any judgement.
+"""The facts that the doctor gathers, before the rules judge.
 
-`rosproxy.doctor.collect` fills in a `DoctorFacts`, and the rules read it. What could not be found
-out is None, empty or ``UNTRIED``: rules say nothing about it. What does not fit in the replies of
-the master and of nodes is dropped. `scope` finds out which nodes and which pairs of publisher and
-subscriber the names mean that the user asked for.
+`rosproxy.doctor.collect` makes a `DoctorFacts`, which the rules read. A fact is None, empty or
+``UNTRIED`` if unknown, and then the rules make no finding. The functions here drop malformed parts
+of replies. `scope` resolves the names in the user's question to nodes, services, and pairs of
+publisher and subscriber.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,15 +40,16 @@ class Attempt(msgspec.Struct, frozen=True):
 
     @property
     def failed(self) -> bool:
-        """Whether it was tried in vain."""
+        """Whether the attempt was made, and got no proper answer."""
         return self.reach not in (ReachOutcome.ANSWERED, ReachOutcome.UNTRIED)
 
 
 class MasterFacts(msgspec.Struct, frozen=True):
-    """The master as the doctor found it.
+    """The facts about the master.
 
-    ``at_root``: it does answer at the path ``/``. ``is_this_proxy``: what answers is this very
-    proxy.
+    ``addresses``: the addresses of the host. ``at_root``: the master answers at the path ``/``,
+    although not at the path of ``uri``. ``is_this_proxy``: ``uri`` leads back to the proxy.
+    ``round_trip``: seconds of a call.
     """
 
     uri: str
@@ -60,11 +61,11 @@ class MasterFacts(msgspec.Struct, frozen=True):
 
 
 class SlaveReport(msgspec.Struct, frozen=True):
-    """What a node says of itself: topics with types, and its connections.
+    """The topics of a node with types, and the connections of the node.
 
-    ``peers`` are (direction, topic, peer) of open connections, the direction ``i`` or ``o``; the
-    peer of an outgoing one is a node's name, of an incoming one a slave URI. ``counts`` are the
-    bytes and messages of those for which the node counts them, ``at`` (monotonic seconds).
+    ``peers``: the open connections as (direction, topic, peer). For direction ``o`` (outgoing) the
+    peer is the name of a node, for ``i`` (incoming) a slave URI. ``counts``: bytes and messages of
+    the connections for which the node counts both. ``at``: monotonic seconds of the counts.
     """
 
     publishes: Mapping[str, str] = {}
@@ -77,10 +78,10 @@ class SlaveReport(msgspec.Struct, frozen=True):
 def slave_report(
     publications: Any, subscriptions: Any, bus: Any, stats: Any = None, at: float = 0.0
 ) -> SlaveReport:
-    """The replies to ``getPublications``, ``getSubscriptions``, ``getBusInfo``, ``getBusStats``.
+    """Read the replies to getPublications, getSubscriptions, getBusInfo and getBusStats.
 
-    A row of ``getBusInfo`` is ``[id, peer, direction, transport, topic, connected, ...]``; booleans
-    of XML-RPC are read as their text.
+    A row of ``getBusInfo`` is ``[id, peer, direction, transport, topic, connected, ...]``. Booleans
+    of XML-RPC arrive as text.
     """
     rows = [row for row in _items(bus) if isinstance(row, list) and len(row) > 5]
     rows = [row for row in rows if row[5] not in (0, "0")]
@@ -97,7 +98,7 @@ def slave_report(
 
 
 def data_port(answer: Any) -> HostPort | None:
-    """The reply to ``requestTopic``: where to connect to, None if that is no TCPROS address."""
+    """Read the TCPROS address in the reply to ``requestTopic``; None for another reply."""
     match answer:
         case ["TCPROS", str(host), int(port)] if 0 < port < 65536:
             return HostPort(host, port)
@@ -111,9 +112,9 @@ def _items(value: Any) -> list[Any]:
 class NodeFacts(msgspec.Struct, frozen=True):
     """A node that the master knows.
 
-    ``uri`` is what the master says, empty if it says nothing. ``inside`` is where the node is, if
-    it registered through a rosproxy, as that one has the master remember it. A ``report`` is only
-    there for nodes that were asked for and could be asked.
+    ``uri``: the slave URI at the master; empty if unknown. ``inside``: the inside address of a node
+    behind any rosproxy, which that proxy stores at the master. ``addresses``: the addresses of the
+    host in ``uri``. ``report``: only for a node in the scope that has answered.
     """
 
     name: str
@@ -125,12 +126,12 @@ class NodeFacts(msgspec.Struct, frozen=True):
 
     @property
     def slave(self) -> HostPort | None:
-        """Host and port of its URI."""
+        """Host and port of the slave URI."""
         return parse_slave_uri(self.uri)
 
 
 class SystemState(msgspec.Struct, frozen=True):
-    """The master's state: the publishers, subscribers and providers by name."""
+    """The state of the master: publishers and subscribers by topic, providers by service."""
 
     publishers: dict[str, list[str]] = {}
     subscribers: dict[str, list[str]] = {}
@@ -146,13 +147,13 @@ class SystemState(msgspec.Struct, frozen=True):
         return [*self.publishers.get(topic, ()), *self.subscribers.get(topic, ())]
 
     def names(self) -> set[str]:
-        """All nodes."""
+        """The names of all nodes."""
         tables = (self.publishers, self.subscribers, self.services)
         return {name for table in tables for names in table.values() for name in names}
 
 
 def system_state(state: Any) -> SystemState:
-    """The reply to ``getSystemState``: publishers, subscribers, services."""
+    """Read the reply to ``getSystemState``: publishers, subscribers, services."""
     system = SystemState()
     tables = (system.publishers, system.subscribers, system.services)
     for table, rows in zip(tables, _items(state), strict=False):
@@ -164,10 +165,11 @@ def system_state(state: Any) -> SystemState:
 
 
 class Scope(msgspec.Struct, frozen=True):
-    """What the names that the user asked for lead to.
+    """The objects to examine for the names in the user's question.
 
-    ``named_nodes`` are the nodes among the names, ``nodes`` all that have to be looked at;
-    ``pairs`` are (topic, publisher, subscriber), ``one_sided_topics`` topics that lack one side.
+    ``named_nodes``: the nodes among the names. ``nodes``: all nodes to examine. ``pairs``: (topic,
+    publisher, subscriber). ``one_sided_topics``: topics without publisher or without subscriber.
+    ``unknown``: names without node, topic or service.
     """
 
     named_nodes: Sequence[str] = ()
@@ -181,9 +183,10 @@ class Scope(msgspec.Struct, frozen=True):
 def scope(graph: SystemState, names: Sequence[str]) -> Scope:
     """Resolve names of nodes, topics and services.
 
-    One node means all of its topics (without ``/rosout``, which every node has), several nodes
-    what they have in common, topics their publishers and subscribers. A name that is both a
-    node's and a topic's means the topic.
+    - A single node stands for all topics of the node, except ``/rosout``, which every node has.
+    - Several nodes stand for the topics between these nodes.
+    - A topic stands for all publishers and subscribers of the topic.
+    - A name of both a node and a topic stands for the topic.
     """
     all_topics = graph.topics
     all_nodes = graph.names()
@@ -213,12 +216,12 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
 
 
 def _is_asked_for(pair: set[str], nodes: set[str]) -> bool:
-    """Whether a pair is asked for: both its ends, or one of them if only one node is named."""
+    """Whether the user asks for a pair: by both nodes, or by a single node that is in the pair."""
     return pair <= nodes if len(nodes) > 1 else nodes <= pair
 
 
 class HeardParticipant(msgspec.Struct, frozen=True):
-    """A participant of ROS 2 on a network inside that has answered when it was asked."""
+    """A participant of ROS 2 on a network inside that has answered the doctor."""
 
     domain: int
     guid_prefix: str
@@ -227,15 +230,17 @@ class HeardParticipant(msgspec.Struct, frozen=True):
 
 
 class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
-    """Everything gathered.
+    """All facts.
 
-    ``admin`` is the admin endpoint's URL, ``admin_error`` why it could not be asked; ``status`` and
-    ``probe`` are what it said. ``advertised_addresses`` is what the advertised host resolves to
-    here. ``service_uris`` are the master's, by service. ``uses_simulated_time``: nodes are told to
-    use simulated time. ``names`` are the nodes, topics and services that the user asked for;
-    ``data_ports`` tells, by publisher and topic, where its subscribers have to connect to and
-    whether that was reached from here. ``heard_participants`` are participants on the networks
-    inside. ``is_all_local``: all participants outside are on this machine.
+    ``admin``: the URL of the admin endpoint. ``admin_error``: why the endpoint gave no answer.
+    ``status`` and ``probe``: the answers of the endpoint; ``probe_error``: why there is no probe.
+    ``advertised_addresses``: the addresses of the advertised host, resolved here.
+    ``published_master``: the attempt to reach the master at ``--publish-master``.
+    ``service_uris``: URIs at the master by service. ``services``: attempts by service.
+    ``uses_simulated_time``: the parameter /use_sim_time is true. ``names``: the nodes, topics and
+    services in the user's question. ``data_ports``: by publisher and topic, the TCPROS address for
+    subscribers, and the attempt to reach this address. ``heard_participants``: participants on the
+    networks inside. ``is_all_local``: all participants outside are on this machine.
     """
 
     admin: str = ""
@@ -259,31 +264,31 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
 
     @property
     def proxy(self) -> ProxyStatus:
-        """What the proxy said, and its defaults where it could not be asked."""
+        """The status of the proxy; defaults if the proxy gave no answer."""
         return self.status or ProxyStatus()
 
     @property
     def system(self) -> SystemState:
-        """What the master said, and an empty state where it did not say any."""
+        """The state of the master; empty if the master gave no answer."""
         return self.graph or SystemState()
 
     @cached_property
     def scope(self) -> Scope:
-        """What the names asked for lead to."""
+        """The scope of ``names``."""
         return scope(self.system, self.names)
 
     @cached_property
     def leases(self) -> dict[int, EndpointStatus]:
-        """The nodes of ``status`` by the port that outside sees."""
+        """The endpoints in ``status``, by advertised port."""
         slaves = ((parse_slave_uri(n.advertised_uri), n) for n in self.proxy.nodes)
         return {slave.port: node for slave, node in slaves if slave}
 
     def lease(self, host_port: HostPort | None) -> EndpointStatus | None:
-        """The node behind an address from the master, if this proxy gave that address."""
+        """The endpoint at an address from the master, if the address belongs to this proxy."""
         return self.leases.get(host_port.port) if host_port and self.is_ours(host_port) else None
 
     def is_ours(self, host_port: HostPort | None) -> bool:
-        """Whether an address from the master is one that this proxy gives to inside nodes."""
+        """Whether an address has the advertised host and an advertised port of this proxy."""
         first, _, last = self.proxy.ports.advertise.partition("-")
         if host_port is None or not (first.isdecimal() and last.isdecimal()):
             return False

@@ -1,8 +1,9 @@
-"""What the master and the nodes of ROS 1 say: the graph, and which nodes answer.
+"""The survey of ROS 1: the graph at the master, and which nodes answer.
 
-The master is asked for all publishers, subscribers and services (``getSystemState``,
-``lookupNode``); then every node whether it answers; then, where names were given, those nodes for
-their topics and connections (``getBusInfo``) and their data ports.
+1. Ask the master for all publishers, subscribers and services (``getSystemState``, ``lookupNode``).
+2. Ask every node, or the nodes in the scope, whether the node answers (``getPid``).
+3. Ask the nodes in the scope for topics and connections (``getBusInfo``), and try the TCPROS ports
+   of unconnected pairs.
 """
 
 import asyncio
@@ -36,18 +37,18 @@ from rosproxy.ros1.registry.remembered_leases import NAMESPACE, lease_at
 from rosproxy.telemetry.metrics import Metrics
 
 PARALLEL = 32
-"""Questions under way at once; fewer than the look-ups of names that are allowed."""
+"""Questions under way at once; fewer than the look-ups of names (`rosproxy.net.resolver`)."""
 FEW_PARALLEL = 4
-"""The same for questions that are asked again and again."""
+"""Questions under way at once for the live page, which asks repeatedly."""
 WITHIN = 3.0
-"""Seconds that a node has to answer."""
+"""Seconds in which a node must answer."""
 
 Key = TypeVar("Key")
 Result = TypeVar("Result")
 
 
 async def look_at_master(uri: str, name: str, address: str | None) -> MasterFacts:
-    """The master, asked in the name of a proxy; at an IP address if one is given."""
+    """Ask the master, as the proxy with the instance ``name``. ``address`` replaces the host."""
     client = MasterClient(uri, name, Metrics(), address)
     try:
         return await _Collector(client, client).master()
@@ -61,10 +62,11 @@ async def ask_graph(
     address: str | None = None,
     choose: Callable[[SystemState], tuple[str, ...]] | None = None,
 ) -> DoctorFacts:
-    """What the master and the nodes say.
+    """Add the facts about the master and the nodes.
 
-    The master is asked in the proxy's name, so that a proxy that is its own master shows itself;
-    nodes are not, since those behind the proxy are asked through it.
+    The doctor calls the master in the name of the proxy's instance. So a proxy whose master URI
+    leads to itself refuses the call as a loop. The doctor calls nodes in another name, since calls
+    to nodes behind the proxy pass the proxy.
     """
     if not uri:
         return facts
@@ -84,7 +86,7 @@ async def ask_graph(
 
 
 class _Collector:
-    """Questions to the master and to nodes, a bounded number at once."""
+    """Asks the master and the nodes, with a bounded number of questions to nodes at once."""
 
     def __init__(
         self,
@@ -98,7 +100,7 @@ class _Collector:
         self._limit = asyncio.Semaphore(FEW_PARALLEL if choose else PARALLEL)
 
     async def master(self) -> MasterFacts:
-        """Look at the master: its name, its answer, its path, and whether it is the proxy."""
+        """Examine the master: host name, answer, path, and whether the URI leads to the proxy."""
         uri = self._master.master_uri
         addresses = tuple(await self._master.master_addresses())
         if not addresses:
@@ -106,11 +108,11 @@ class _Collector:
         started = time.monotonic()
         attempt, _ = await _attempt(self._master.call_master("getPid"))
         trip = time.monotonic() - started
-        # The words of a proxy that is called by itself (`MasterApi._refuse_loop`).
+        # The words of a proxy that has received its own call (`MasterApi._refuse_loop`).
         looped = "leads back to the proxy" in attempt.reason
         master = MasterFacts(uri, attempt, addresses, is_this_proxy=looped, round_trip=trip)
-        # rosmaster answers at / and /RPC2 alone (xmlrpc.server, rpc_paths): a URI with another path
-        # looks as if no master was there.
+        # rosmaster answers only at / and /RPC2 (xmlrpc.server, rpc_paths). At another path the
+        # answer is HTTP 404, as if no master ran there.
         root = parse_slave_uri(uri)
         if attempt.reach is ReachOutcome.STRANGER and root and urlsplit(uri).path not in ("", "/"):
             at_root = await self._ask_pid(root)
@@ -118,12 +120,12 @@ class _Collector:
         return master
 
     async def published_master(self, facts: DoctorFacts) -> Attempt:
-        """Try the master as outside is offered it (``--publish-master``)."""
+        """Try the master at the advertised host and the port of ``--publish-master``."""
         port = facts.proxy.settings.publish_master
         return await self._ask_pid(HostPort(facts.advertise_host, port)) if port else Attempt()
 
     async def master_state(self, facts: DoctorFacts) -> DoctorFacts:
-        """What the master knows, and which nodes answer. Raises Unreachable, MasterError."""
+        """Add the graph, and which nodes answer. Raises Unreachable, MasterError."""
         graph = system_state(await self._master.call_master("getSystemState"))
         names = sorted(graph.names())
         uris = await self._master.look_up("lookupNode", names)
@@ -143,7 +145,7 @@ class _Collector:
         return await self._examine_named(facts) if facts.names else facts
 
     async def _examine_named(self, facts: DoctorFacts) -> DoctorFacts:
-        """Ask the nodes and services that the user named."""
+        """Add the answers of the nodes, pairs and services in the scope."""
         scope = facts.scope
         nodes = facts.nodes
         asked_nodes = await _gather(scope.nodes, lambda name: self._ask_node(facts, nodes[name]))
@@ -161,14 +163,15 @@ class _Collector:
 
     async def _simulated_time(self) -> bool:
         _, answer = await _attempt(self._master.call_master("getParam", "/use_sim_time"))
-        # A boolean is read as its text; the parameter may have been set as a text or a number, too.
+        # A boolean arrives as text. The parameter may also be a text or a number.
         return answer in ("1", "true", 1)
 
     async def _try_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
-        """Try a node at its address; one behind this proxy is the proxy's to judge.
+        """Try a node at its address; the proxy itself knows whether a node behind it answers.
 
-        A node at a port of this proxy that no node here holds may be behind another proxy that
-        advertises the same: it is tried at that port, and at its address inside.
+        If a node has a port of this proxy, but the proxy has no such node, the node may be behind
+        another proxy with the same advertised host and range. Then the doctor tries that port, and
+        the inside address of the node.
         """
         slave = node.slave
         if slave is None or facts.lease(slave):
@@ -192,7 +195,7 @@ class _Collector:
         return Attempt(ReachOutcome.STRANGER, "the answer is not that of a node")
 
     async def _ask_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
-        """What a node says of itself, asked through the proxy if it is behind it."""
+        """Add the report of a node; the doctor asks a node behind the proxy through the proxy."""
         slave = _reached_at(facts, node.slave)
         ask = self._nodes.call_node
         if slave is None or node.attempt.failed:
@@ -202,7 +205,7 @@ class _Collector:
             async with self._limit:
                 pubs, subs, bus = [await ask(slave, WITHIN, method) for method in methods]
                 at = time.monotonic()
-                # Not every library counts; a node that does not is asked for nothing else.
+                # Last: some client libraries do not answer getBusStats.
                 _, stats = await _attempt(ask(slave, WITHIN, "getBusStats"))
         except (Unreachable, MasterError):
             return node
@@ -211,7 +214,7 @@ class _Collector:
     async def _try_data_port(
         self, facts: DoctorFacts, publisher: str, topic: str
     ) -> tuple[str, Attempt]:
-        """Where a publisher serves a topic, and whether a subscriber gets through to there."""
+        """The TCPROS address of a publisher for a topic, and the attempt to connect."""
         node = facts.nodes[publisher]
         slave = _reached_at(facts, node.slave)
         if slave is None or node.report is None:
@@ -224,12 +227,12 @@ class _Collector:
             return "", attempt
         if target is None:
             return "", Attempt(ReachOutcome.STRANGER, "no TCPROS address")
-        # That port is the proxy's own, which the try of the range has judged; NAT may have no way
-        # back to it from here.
+        # The port belongs to the proxy, and the try of the range covers the port. From here, NAT
+        # without hairpin may block the port.
         if facts.is_ours(node.slave):
             return str(target), Attempt()
-        # Any type will do (roscpp Publication::validateHeader; rospy tcpros_pubsub.py,
-        # topic_connection_handler): the way is tried here, and types are compared elsewhere.
+        # "*" matches any type (roscpp Publication::validateHeader; rospy tcpros_pubsub.py,
+        # topic_connection_handler). This only tries the connection; a rule compares the types.
         header = {"callerid": CALLER_ID, "topic": topic, "type": "*", "md5sum": "*"}
         return str(target), await _shake_hands(self._nodes.reach(target), header)
 
@@ -246,9 +249,10 @@ class _Collector:
 
 
 def _reached_at(facts: DoctorFacts, target: HostPort | None) -> HostPort | None:
-    """Where to ask a target; one behind this proxy at the proxy's own port, past the host's NAT.
+    """The address at which the doctor asks a node or service.
 
-    None if no node holds that port.
+    For a node behind this proxy: the listen port at the proxy itself, which avoids the NAT of the
+    host. None if no node holds that port.
     """
     if not facts.is_ours(target):
         return target
@@ -261,7 +265,7 @@ def _reached_at(facts: DoctorFacts, target: HostPort | None) -> HostPort | None:
 
 
 async def _shake_hands(target: HostPort, header: Mapping[str, str]) -> Attempt:
-    """Exchange TCPROS connection headers."""
+    """Try a TCPROS address by an exchange of connection headers."""
     addresses = await resolve(target.host)
     if not addresses:
         return Attempt(ReachOutcome.UNRESOLVABLE)
@@ -292,7 +296,7 @@ async def _exchange(target: HostPort, header: Mapping[str, str]) -> dict[str, st
 
 
 def _node_facts(name: str, uri: str, leases: object) -> NodeFacts:
-    """A node as the master tells of it; ``leases`` is what all proxies remember there."""
+    """The facts about a node at the master. ``leases``: what proxies store in a parameter there."""
     slave = parse_slave_uri(uri)
     lease = lease_at(leases, slave) if slave else None
     inside = parse_inside_path(uri) or (lease.node if lease else None)
@@ -300,7 +304,7 @@ def _node_facts(name: str, uri: str, leases: object) -> NodeFacts:
 
 
 async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
-    """How a question ended, and the answer, None unless a node or master gave one."""
+    """How a question ended, and the answer; None without an answer."""
     try:
         return Attempt(ReachOutcome.ANSWERED), await question
     except (Unreachable, MasterError) as error:
@@ -309,7 +313,7 @@ async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
         # The failure of the connection (`_failures_of`).
         if isinstance(error.__cause__, aiohttp.ClientOSError | TimeoutError):
             return Attempt(ReachOutcome.SILENT), None
-        # Without the name of the node or master, which comes first; the finding has it already.
+        # Without the name of the node or master at the beginning: the finding names the object.
         reason = str(error).partition("\n")[0].partition(": ")[2][:200]
         return Attempt(ReachOutcome.STRANGER, reason or "the answer can't be read"), None
 
@@ -317,6 +321,6 @@ async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
 async def _gather(
     keys: Iterable[Key], work: Callable[[Key], Awaitable[Result]]
 ) -> dict[Key, Result]:
-    """The results of ``work`` on each key, all at the same time."""
+    """The results of ``work`` for each key; all run concurrently."""
     wanted = list(keys)
     return dict(zip(wanted, await asyncio.gather(*map(work, wanted)), strict=True))

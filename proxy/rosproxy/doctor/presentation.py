@@ -1,4 +1,4 @@
-"""What ``rosproxy doctor`` has found, as text and as JSON."""
+"""The findings of ``rosproxy doctor``, as text and as JSON."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -9,7 +9,7 @@ from rosproxy.admin.doctor_finding import DoctorFinding, Severity, failed
 from rosproxy.telemetry.text import clean, plural, wrap
 
 MOST_ALIKE = 10
-"""Findings of one check with the same mending that are shown one by one."""
+"""Findings of the same check with the same fix that are shown in full."""
 INDENT = " " * 9
 
 
@@ -22,13 +22,13 @@ _WORDS = {
 
 
 def as_json(findings: Sequence[DoctorFinding]) -> dict[str, Any]:
-    """The findings as plain data."""
+    """The findings as dicts and lists, ready for JSON."""
     rows = [{**msgspec.structs.asdict(f), "severity": f.severity.name.lower()} for f in findings]
     return {"ok": not failed(findings), "findings": rows}
 
 
 def render(findings: Sequence[DoctorFinding], columns: int) -> str:
-    """The findings as text, the worst last, where the eye is when the command has ended."""
+    """The findings as text. The worst are last, next to the prompt."""
     lines: list[str] = []
     for severity in Severity:
         lines += _grouped([f for f in findings if f.severity is severity], columns)
@@ -36,7 +36,7 @@ def render(findings: Sequence[DoctorFinding], columns: int) -> str:
 
 
 def _grouped(findings: Sequence[DoctorFinding], columns: int) -> Iterator[str]:
-    """Findings of one kind that are mended alike stand together, and what mends them once."""
+    """The lines of findings, grouped by check and fix; the fix follows the group."""
     alike: dict[tuple[str, str], list[DoctorFinding]] = {}
     for finding in findings:
         alike.setdefault((finding.check, finding.fix), []).append(finding)
@@ -58,7 +58,7 @@ def _summary(findings: Sequence[DoctorFinding]) -> str:
         return "Nothing wrong was found."
     counts = f"{plural(errors, 'error')}, {plural(warnings, 'warning')}."
     worst = [f for f in findings if f.severity is max(severities)]
-    # With one fix for all there is nothing to begin with.
+    # A single fix for all findings needs no advice where to begin.
     if len({f.fix for f in findings if f.severity >= Severity.WARNING}) == 1:
         return counts
     first = clean(worst[0].subject or worst[0].check)

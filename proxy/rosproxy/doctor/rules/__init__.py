@@ -7,7 +7,7 @@ from rosproxy.doctor.rules import proxy as proxy_rules
 
 
 def diagnose(facts: DoctorFacts) -> list[DoctorFinding]:
-    """All findings: about the proxy, the nodes, and the names asked for."""
+    """All findings: about the proxy, the nodes, and the names in the user's question."""
     domains = [*participant.check(facts), *zenoh.check(facts)]
     if not facts.proxy.settings.for_ros1:
         return [*proxy_rules.alive(facts), *proxy_rules.setup(facts), *domains]
@@ -15,12 +15,12 @@ def diagnose(facts: DoctorFacts) -> list[DoctorFinding]:
 
 
 def diagnose_running(facts: DoctorFacts) -> list[DoctorFinding]:
-    """The findings of a running proxy that are made again and again, without pairs and domains."""
+    """The findings for the live page, which are made repeatedly: without pairs and domains."""
     if not facts.proxy.settings.for_ros1:
         return []
     return [*proxy_rules.running(facts), *node.check(facts)]
 
 
 def unknown_variable(name: str, text: str) -> DoctorFinding:
-    """A variable that is set where the doctor runs and that nothing reads."""
+    """The finding about an environment variable of the doctor that no option reads."""
     return warning("variable", name, text, f"unset {name}, and set the variable that was meant")

@@ -1,4 +1,4 @@
-"""The nodes: those behind the proxy, and those that the master knows."""
+"""Rules about nodes: the nodes behind the proxy, and the nodes at the master."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -22,14 +22,15 @@ STALE = "stale registration"
 TWO_PROXIES = "two proxies"
 _ENDED = ("refused", "silent", "failing", "cleaned")
 FIRST_NODE = 10.0
-"""Seconds after the proxy's start in which no node is missed: an operator starts it with them."""
+"""Seconds after the start of the proxy in which a proxy without nodes is no fault: an operator
+starts the proxy and the nodes at the same time."""
 CLEANUP = "run rosnode cleanup (answer y)"
-# The host name of a container that was given none (moby daemon/container.go).
+# The default host name of a container (moby daemon/container.go).
 _CONTAINER_ID = re.compile(r"[0-9a-f]{12}")
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """All findings about nodes; about those asked for only, if there are names."""
+    """All findings about nodes; with names, only the findings about the nodes in the scope."""
     findings = _cause_first(
         [*_inside(facts), *_registered(facts), *_services(facts), *_clock(facts)]
     )
@@ -40,7 +41,10 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def _cause_first(findings: list[DoctorFinding]) -> list[DoctorFinding]:
-    """Findings that advise no clean-up while two proxies take each other's nodes away."""
+    """The findings, without the advice to clean up if two proxies share host and ports.
+
+    A clean-up would then unregister nodes that are alive.
+    """
     first = [f for f in findings if f.check == TWO_PROXIES]
     if not first:
         return findings
@@ -72,10 +76,10 @@ def _counts(facts: DoctorFacts, findings: list[DoctorFinding]) -> Iterator[Docto
 def _present_and_ended(
     nodes: Sequence[EndpointStatus],
 ) -> tuple[list[EndpointStatus], list[EndpointStatus]]:
-    """The nodes that are there, or ought to be, and those that have ended as nodes do.
+    """The nodes that are present or should be, and the nodes that have ended properly.
 
-    A node has ended if its container is gone, if it has nothing registered any more, or if it is
-    back under the same name at another address. An ended node has its port for a while.
+    A node has ended if its container is gone, if the node has no registrations any more, or if a
+    node with the same name answers at another address. An ended node keeps its port for a while.
     """
     answering = {name for node in nodes if node.state in ("ok", "new") for name in node.nodes}
     ended = [
@@ -132,14 +136,14 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
 
 
 def _only_on_loopback(node: EndpointStatus) -> bool:
-    """Whether a node gives a loopback address, and is somewhere else than the proxy."""
+    """Whether a node gives a loopback address, but is not on the loopback of the proxy."""
     claimed = parse_slave_uri(node.uri)
     actual = parse_host_port(node.address)
     return bool(claimed and actual and is_loopback(claimed.host) and not is_loopback(actual.host))
 
 
 def _namesakes(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterator[DoctorFinding]:
-    """Another node of the same name took over at the master."""
+    """The finding if another node of the same name is registered at the master."""
     registered = facts.nodes.get(name)
     if registered and registered.uri and registered.uri != node.advertised_uri:
         text = (
@@ -155,7 +159,7 @@ def _registered(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
-    """A node whose address is in this proxy's range."""
+    """The findings about a node whose address is in the range of this proxy."""
     lease = facts.lease(node.slave)
     if lease is None and _is_of_another_proxy(facts, node):
         text = (
@@ -192,7 +196,7 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     elif node.attempt.failed and node.inside:
         text = f"registered through a rosproxy as {node.uri}: {reach.value}"
         yield error(OUTSIDE, node.name, text, _fix_proxied(facts, node, slave))
-    # With the master on loopback, too, all of ROS is on this machine, where that is right.
+    # A loopback address is right if the master is on loopback, too: all nodes are on this machine.
     elif is_loopback(slave.host) and not (local_master(facts) and not node.attempt.failed):
         text = f"registered as {node.uri}, a loopback address. {LOOPBACK_MEANING}"
         fix = (
@@ -232,7 +236,10 @@ def _unresolvable(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> Docto
 
 
 def _fix_proxied(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> str:
-    """Cleaning up would lose nodes that a proxy takes back when it starts again."""
+    """The fix for a node behind a proxy that does not answer.
+
+    A clean-up is the last resort: a proxy that starts again takes its nodes back.
+    """
     host = quoted(slave.host)
     if node.attempt.reach is ReachOutcome.UNRESOLVABLE:
         address = how_to("advertised host")
@@ -255,7 +262,7 @@ def _past_the_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
     if facts.master is None:
         return False
     networks = [ip_network(text) for text in facts.proxy.settings.inside_networks]
-    # Where the master is in an inside network, nodes there may well be meant to be outside.
+    # If the master is in an inside network, nodes there may be outside nodes on purpose.
     apart = [n for n in networks if not any(is_inside(a, [n]) for a in facts.master.addresses)]
     return any(is_inside(address, apart) for address in node.addresses)
 
@@ -265,12 +272,12 @@ def _start_inside(facts: DoctorFacts, nodes: str = "the node") -> str:
 
 
 def _services(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """Services that are registered with a port of this proxy that no node holds."""
+    """The findings about services at a port of this proxy that no node holds."""
     for service, uri in facts.service_uris.items():
         provider = parse_service_uri(uri)
         if facts.is_ours(provider) and not facts.lease(provider):
             subject = next(iter(facts.system.services.get(service, ())), service)
-            # `_leased` tells of the other proxy already.
+            # `_leased` has reported the other proxy.
             if subject in facts.nodes and _is_of_another_proxy(facts, facts.nodes[subject]):
                 continue
             text = f"the service {service} is registered as {uri}, a port that no node holds"

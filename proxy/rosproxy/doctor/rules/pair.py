@@ -1,4 +1,4 @@
-"""The names asked for: which publisher and subscriber are not connected, and why."""
+"""Rules about the names in the user's question: which pairs are not connected, and why."""
 
 from collections.abc import Iterator
 from difflib import get_close_matches
@@ -16,7 +16,7 @@ ANY = "*"
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """All findings about the names asked for."""
+    """All findings about the names in the user's question."""
     if not facts.names:
         return
     if facts.graph is None:
@@ -40,7 +40,7 @@ def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
     graph = facts.system
     names = sorted(graph.names() | graph.topics | {*graph.services})
     alike = get_close_matches(name, names, 3, 0.7)
-    # /scan was asked for, and there is /robot/scan: a namespace was left out.
+    # The user asked for /scan, and there is /robot/scan: the namespace was missing.
     alike += [n for n in names if n.endswith(name) and n not in alike][:3]
     hint = f"; similar names: {listed(alike)}" if alike else ""
     text = f"the master knows no node, topic or service of this name{hint}"
@@ -65,7 +65,7 @@ def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
 
 
 def judge_pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) -> DoctorFinding:
-    """Whether a publisher and a subscriber are connected, else why not."""
+    """The finding whether a publisher and a subscriber are connected, or why not."""
     publisher_node = facts.nodes[publisher]
     subscriber_node = facts.nodes[subscriber]
     label = f"{topic} from {publisher} to {subscriber}"
@@ -78,10 +78,10 @@ def judge_pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) 
 
 
 def is_connected(topic: str, publisher: NodeFacts, subscriber: NodeFacts) -> bool:
-    """Whether a publisher says that a subscriber is connected.
+    """Whether the report of a publisher has a connection to a subscriber.
 
-    The publisher knows best: a subscriber lists connections that it only tries to make. Where the
-    publisher can't be asked, the subscriber's word has to do.
+    A subscriber also lists connections that are not established yet. So the report of the
+    subscriber counts only without a report of the publisher.
     """
     if publisher.report is not None:
         return ("o", topic, subscriber.name) in publisher.report.peers
@@ -101,15 +101,15 @@ def _traffic(facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: N
 def _why(
     facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: NodeFacts
 ) -> tuple[str, str]:
-    """Why a pair is not connected, the most certain reason first, and what mends it."""
+    """Reason and fix for an unconnected pair; the most certain reason first."""
     for node in (publisher, subscriber):
         if _unreachable(facts, node):
             return (
                 f"{node.name} can't be reached from here",
                 f"see the finding about {quoted(node.name)}",
             )
-    # A node that could not be asked is taken to fit. A subscriber to any type has * as its
-    # type (rospy.AnyMsg).
+    # Without a report, the types count as equal. A subscriber of any type has the type *
+    # (rospy.AnyMsg).
     offered = publisher.report.publishes.get(topic) if publisher.report else ANY
     wanted = subscriber.report.subscribes.get(topic) if subscriber.report else ANY
     if offered is None:
@@ -170,7 +170,7 @@ def _why_no_transport(
 def _why_not_from_inside(
     facts: DoctorFacts, address: str, publisher: NodeFacts, subscriber: NodeFacts
 ) -> tuple[str, str]:
-    """Why a subscriber behind the proxy has not connected to a publisher that is well."""
+    """Reason and fix if a subscriber behind the proxy has not connected to a sound publisher."""
     text = (
         f"{publisher.name} has no fault. {subscriber.name}, behind the proxy, has not connected to"
     )

@@ -1,7 +1,7 @@
-"""Rules about ROS 2: whether participants of both sides discover each other, as the proxy sees it.
+"""Rules about ROS 2: whether participants of both sides discover each other.
 
-Most of it the proxy knows itself (`rosproxy.ros2.domain_problems`). The doctor also knows the
-participants inside that the proxy does not hear, and the topics and services that were asked for.
+The proxy itself finds most faults (`rosproxy.ros2.domain_problems`). The doctor adds the
+participants inside that the proxy does not hear, and the names in the user's question.
 """
 
 from collections.abc import Iterator
@@ -15,10 +15,10 @@ from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, partic
 from rosproxy.telemetry.text import listed, plural
 
 RECENT = 120.0
-"""Seconds for which something that was refused is told; what goes on is noted again sooner."""
+"""Seconds for which the doctor reports a refusal. Lasting refusals are noted again sooner."""
 SETTLED = 10.0
-"""Seconds after its start in which the proxy may still ask those that it has heard for their ports
-(`rosproxy.ros2.discovery.domain`), and does not tell of them yet."""
+"""Seconds after the start of the proxy in which the status may lack participants. The proxy may
+still ask these participants for their former ports (`rosproxy.ros2.ports.former_ports`)."""
 OTHER_DOMAIN = "domain"
 """The check for a participant on a network inside that is in another domain."""
 OWN_MACHINE = "range"
@@ -38,7 +38,7 @@ _REFUSED = {
         "to see the participants, {status}; docs/reference/limits.md lists the bounds"
     ),
 }
-"""The fix for what the proxy has refused, by the subject of the problem, with keys of `how_to`."""
+"""The fix for refusals, by the subject of the problem, with keys of `how_to` in braces."""
 
 
 def check(facts: DoctorFacts) -> list[DoctorFinding]:
@@ -95,7 +95,7 @@ def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
 
 
 def _silence(domain: DomainStatus) -> Iterator[DoctorFinding]:
-    """The places outside where no participant has been heard: a peer, or all."""
+    """The findings about peers, or all of outside, without a participant that was heard."""
     fix = (
         "start a participant there with the same ROS_DOMAIN_ID, and "
         f"{how_to('publish for UDP')}. Cyclone DDS with multicast takes ports that the proxy does "
@@ -111,7 +111,7 @@ def _silence(domain: DomainStatus) -> Iterator[DoctorFinding]:
     for peer in domain.peers:
         target = parse_host_port(peer)
         host = target.host if target else peer
-        # A name may have an address of each family, and be heard by one of them.
+        # A peer with addresses of both families may announce itself by one family alone.
         is_main_family = (":" in host) == domain.discovery.startswith("[")
         if host not in heard and is_main_family:
             yield note("outside", f"peer {peer}", "no participant at this peer has been heard", fix)
@@ -146,7 +146,7 @@ def _heard(
 
 
 def _name_in_domains(name: str, domains: tuple[DomainStatus, ...]) -> Iterator[DoctorFinding]:
-    """The participants that have a topic or service, and whether the two sides match."""
+    """The findings about a topic or service: participants, and whether the two sides match."""
     participants = [p for domain in domains for side in _sides(domain) for p in side]
     if not any(name in (*p.publishes, *p.subscribes, *p.services) for p in participants):
         text = "no participant has a topic or service of this name"

@@ -1,4 +1,4 @@
-"""The proxy itself: its admin endpoint, its master, its advertised address and its ports."""
+"""Rules about the proxy itself: admin endpoint, master, advertised host, range and ports."""
 
 from collections.abc import Iterator
 from urllib.parse import urlsplit
@@ -24,7 +24,7 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def setup(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """Whether it is set up as it has to be, the first cause first."""
+    """Findings about the settings: master, advertised host, range and ports, first cause first."""
     if facts.proxy.settings.for_ros1:
         yield from _master(facts)
     for rule in (_advertised_host, _range, _ports):
@@ -32,13 +32,13 @@ def setup(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def running(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """Rules that run again and again, without a try of the range (`rosproxy.app.self_check`)."""
+    """Findings for the live page, without a try of the range (`rosproxy.app.self_check` tries)."""
     yield from _master(facts)
     yield from _ports(facts)
 
 
 def alive(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """Whether the proxy answers."""
+    """The finding whether the proxy answers."""
     if facts.status is not None:
         up = duration(facts.status.uptime)
         yield ok("admin", "proxy", f"rosproxy {facts.status.version} at {facts.admin}, up {up}")
@@ -76,7 +76,7 @@ def _master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def _unanswered(master: MasterFacts) -> tuple[str, str]:
-    """What is wrong with a master that does not answer as one, and what mends it."""
+    """Fault and fix of a master that does not answer, or does not answer as a master."""
     uri = master.uri
     split_uri = urlsplit(master.uri)
     host = split_uri.hostname or ""
@@ -115,9 +115,9 @@ def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         return
     probes = facts.probe.probes if facts.probe else ()
     if not is_loopback(host) and any(probe.from_master == "ok" for probe in probes):
-        return  # others find this host by it, whatever it means here
-    # A loopback address is right where the master is on this machine, which is not known yet
-    # while there is no master to look at.
+        return  # the master reaches the host by this name, whatever the name means here
+    # A loopback address is right if the master is on this machine. Without facts about the master
+    # this is unknown.
     if facts.master or not facts.proxy.settings.for_ros1 or not is_loopback(host):
         all_here = facts.is_all_local or local_master(facts)
         yield from advertised_host(host, facts.advertised_addresses, all_here)
@@ -139,7 +139,7 @@ def _range(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         return
     is_resolvable = bool(facts.advertised_addresses)
     for finding in published_range(facts.probe, facts.advertise_host, facts.proxy.ports):
-        if is_resolvable or finding.severity is Severity.OK:  # else told already: unknown host
+        if is_resolvable or finding.severity is Severity.OK:  # else `_advertised_host` has reported
             yield finding
 
 

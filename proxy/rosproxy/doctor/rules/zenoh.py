@@ -1,4 +1,4 @@
-"""Rules about rmw_zenoh: the routers of the proxy, and the topics that the user asked for."""
+"""Rules about rmw_zenoh: the routers of the proxy, and the names in the user's question."""
 
 from collections.abc import Iterator
 
@@ -51,7 +51,7 @@ def _nodes(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
 
 
 def _about(zenoh: ZenohStatus, name: str) -> Iterator[DoctorFinding]:
-    """The nodes of a name, and those with a topic or service of this name."""
+    """Findings about the nodes with a name, and about the topic or service with this name."""
     for node in zenoh.nodes:
         if node.name == name:
             yield ok("node", name, f"connected from {node.address or 'outside'}")
