@@ -1,4 +1,4 @@
-"""The LAN relay as a program: started, and stopped by a signal."""
+"""The program ``rosproxy lan-relay``, which runs a LAN relay until a signal."""
 
 import asyncio
 import logging
@@ -11,7 +11,7 @@ log = logging.getLogger(__name__)
 
 
 def run_lan_relay(settings: LanRelaySettings) -> None:
-    """Run it until a signal ends it. Raises SettingError if a port is taken."""
+    """Run a LAN relay until SIGINT or SIGTERM. Raises SettingError if the port is taken."""
     asyncio.run(_run(settings))
 
 

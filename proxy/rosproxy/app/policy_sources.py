@@ -1,7 +1,8 @@
-"""The policy in a running proxy: where its rules come from, and who applies a change of them.
+"""The sources of the policy in a running proxy: options, policy file, operator.
 
-The options' rules stay. A file's and an operator's may change at any time: ROS 1 and ROS 2 look
-for that by themselves; what an operator posts they apply before it is answered.
+The rules of the options stay. The rules of the file and of the operator may change at any time. The
+stacks of ROS 1 and ROS 2 look for changes of the file themselves. When an operator posts rules, the
+stacks apply the rules before the proxy answers.
 """
 
 import logging
@@ -26,18 +27,18 @@ from rosproxy.telemetry.refusals import Refusals
 log = logging.getLogger(__name__)
 
 OPERATOR_POLICY = "the operator's policy"
-"""The subject of the problem that it was refused, which the proxy's status shows."""
+"""The subject of the problem that the proxy has refused a policy of the operator."""
 
 
 class PolicySources:
-    """Takes in rules while the proxy runs."""
+    """Puts the rules of the policy file and of the operator in force."""
 
     def __init__(self, runtime: Runtime, stacks: Sequence[Stack]) -> None:
         self._runtime = runtime
         self._stacks = stacks
 
     def start(self) -> None:
-        """Read the file, and look at it from now on. Raises SettingError."""
+        """Read the policy file, and check the file for changes from now on. Raises SettingError."""
         runtime = self._runtime
         settings = self._runtime.settings
         if not settings.policy_file:
@@ -49,7 +50,7 @@ class PolicySources:
         runtime.tasks.repeat(file.look, LOOK_INTERVAL, "checking the policy file")
 
     async def post(self, body: Any) -> dict[str, Any]:
-        """``POST /policy``: how many registrations are hidden and shown now, and what was cut.
+        """``POST /policy``: put the layers in force, and return the EnforcementCounts as JSON.
 
         Raises BodyError, CallFailed.
         """
@@ -57,19 +58,19 @@ class PolicySources:
         try:
             self._use_operator_layers(body)
         except BodyError as error:
-            # A former refusal has another text, and would be kept beside this one (`Problems.add`).
+            # `Problems.add` would keep an earlier refusal, which has another text.
             problems.solved(OPERATOR_POLICY)
             problems.add(OPERATOR_POLICY, f"refused: {error}. The previous policy stays in force")
             log.warning("%s refused: %s", OPERATOR_POLICY, error)
             raise
         problems.solved(OPERATOR_POLICY)
         counts = Counter[str]()
-        for stack in reversed(self._stacks):  # ROS 1 may fail, where its master is away
+        for stack in reversed(self._stacks):  # ROS 1 last: may fail while the master is away
             counts.update(to_json(await stack.apply_policy()))
         return dict(counts)
 
     def _use_operator_layers(self, body: Any) -> None:
-        """Take in the rules of a post. Raises BodyError."""
+        """Put the layers of a body in force. Raises BodyError."""
         written = read_body(body, PolicyUpdate).layers
         if written and self._runtime.settings.for_zenoh:
             raise BodyError("layers: rules have no effect on rmw_zenoh. Send no layers")
@@ -80,9 +81,9 @@ class PolicySources:
 
 
 def read_policy_file(settings: Settings) -> None:
-    """Read the policy's file, if there is one, to check it. Raises SettingError.
+    """Check the policy file of the settings, if any. Raises SettingError.
 
-    Its rules count together with those of the options, as they do in a running proxy.
+    The bounds hold for the rules of file and options together, as in a running proxy.
     """
     if settings.policy_file:
         metrics = Metrics()

@@ -1,4 +1,4 @@
-"""One proxy: for ROS 1, ROS 2, rmw_zenoh, or several of these, with one admin endpoint."""
+"""The process of a proxy for ROS 1, ROS 2, rmw_zenoh, or several, with a single admin endpoint."""
 
 import asyncio
 import contextlib
@@ -37,7 +37,7 @@ with contextlib.suppress(ImportError):
 
 
 class App:
-    """One proxy. `start` it in a running event loop, `stop` it in the same."""
+    """A proxy. Call `start` and `stop` in the same running event loop."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -74,13 +74,13 @@ class App:
         return Page(Feed(runtime.tasks, look), visitors)
 
     async def start(self) -> None:
-        """Bind all ports and begin. Raises SettingError if a port is taken."""
+        """Bind all ports, and start all stacks. Raises SettingError if a port is taken."""
         settings = self.settings
-        # Any free port: an address that this host does not have is the fault of --bind, and would
-        # otherwise look as if all ports of the range were taken.
+        # Bind any free port, so that an address which this host does not have is an error of
+        # --bind. Otherwise all ports of the range would seem taken.
         with setting_error_if_taken("--bind", settings.bind):
             sockets.bind(settings.bind, 0).close()
-        # Before any node can register, or a former process's nodes are found again.
+        # Before a node registers, and before the recovery finds the nodes of an earlier process.
         self._policy.start()
         for stack in self.stacks:
             await stack.start()
@@ -93,10 +93,10 @@ class App:
         log.info("listening: %s", "; ".join(stack.greeting for stack in self.stacks))
 
     async def stop(self) -> None:
-        """End everything."""
+        """Stop the live page, the admin endpoint and all stacks."""
         if self._sign:
             self._sign.close()
-        # The page's streams end first: aiohttp waits up to a minute for handlers under way
+        # The streams of the page end first: aiohttp waits up to a minute for open handlers
         # (web_runner.py, shutdown_timeout).
         await self.page.close()
         await self._admin.stop()
@@ -104,11 +104,11 @@ class App:
             await stack.stop()
 
     def status(self) -> dict[str, Any]:
-        """The state as JSON."""
+        """The state of the proxy, ready for JSON."""
         return to_json(self.state())
 
     def state(self) -> ProxyStatus:
-        """The state, within the bound of the status."""
+        """The state of the proxy, within the bound of `status_bounds`."""
         self.runtime.refusals.end_old()
         status = replace(common_status(self.runtime), range_probe=self._check.result)
         for stack in self.stacks:
@@ -116,9 +116,9 @@ class App:
         return bounded(status)
 
     def _actions(self) -> dict[str, Action]:
-        """What posts at the admin endpoint do: in ROS 1 and ROS 2 where both know them.
+        """The POST actions of all stacks, by path; several stacks may have an action for a path.
 
-        ROS 2 goes first: ROS 1 may fail, where its master is away.
+        The action of ROS 2 goes first: the action of ROS 1 may fail while the master is away.
         """
         action_maps = [stack.actions for stack in reversed(self.stacks)]
         paths = {path for actions in action_maps for path in actions}
@@ -129,13 +129,13 @@ class App:
 
 
 def _own_names(settings: Settings) -> frozenset[str]:
-    """The names that the proxy is known by, in lower case."""
+    """The advertised host and the host name of the proxy, in lower case."""
     names = {settings.advertise_host.lower(), socket.gethostname().lower()}
     return frozenset(names - {""})
 
 
 def _together(actions: list[Action]) -> Action:
-    """Does several actions one after the other; their counts are added up."""
+    """An action that carries out several actions in order, and adds up the counts."""
     if len(actions) == 1:
         return actions[0]
 
@@ -149,9 +149,9 @@ def _together(actions: list[Action]) -> Action:
 
 
 def run(settings: Settings, remarks: Mapping[str, str]) -> None:
-    """Run a proxy until a signal ends it; ``remarks`` are problems that its status is to tell.
+    """Run a proxy until SIGINT or SIGTERM. Raises SettingError if a port is taken.
 
-    Raises SettingError if a port is taken.
+    ``remarks``: problems for the status of the proxy, texts by subject.
     """
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(_run_until_signal(settings, remarks))
@@ -171,11 +171,11 @@ async def _run_until_signal(settings: Settings, remarks: Mapping[str, str]) -> N
 
 
 def _raise_file_limit() -> None:
-    """Have as many open files as the system lets this process have at most (``ulimit -Hn``).
+    """Raise the limit of open files to the hard limit of this process (``ulimit -Hn``).
 
-    Each relayed connection takes up to six: two sockets and two pipes.
+    A relayed connection takes up to six file descriptors: two sockets, and two pipes with two each.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    # Where that is refused the proxy runs as well, with fewer connections.
+    # If the system refuses, the proxy runs with fewer connections.
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

@@ -1,13 +1,16 @@
-"""What a proxy finds out about itself: whether outside can reach it as it is told to.
+"""The self-check of a proxy: whether outside reaches the advertised host and the range.
 
-At its start the advertised host is looked up first. Then, once the rush of a start is over and the
-master answers, the range is tried from outside (`rosproxy.ros1.range_probe`; of ROS 2 by UDP, which
-can prove that all is well, and not that it is not). Only after that the log says ``ready``. What is
-wrong is told in the log and in ``rosproxy status``, in the doctor's words, and tried again at times
-until it is mended. What was proven is tried again when it may have changed: the master was away or
-is elsewhere now, or the advertised host's name leads to other addresses. None of this keeps
-anything from working: who can reach the proxy does. How the last try ended is a field of the status
-of its own (``range_probe``).
+1. At the start, the proxy resolves the advertised host.
+2. After SETTLE_TIME, and once the master answers, the proxy tests whether outside reaches the range
+   (`rosproxy.ros1.range_probe`). For ROS 2 the proxy tries by UDP: success proves that outside
+   reaches the range, failure proves nothing.
+3. Then the log says ``ready``, or reports the faults.
+
+The log and ``rosproxy status`` report faults in the words of the doctor. The proxy tests again
+until a test proves that outside reaches the range. Later changes cause another test: the master was
+away or has another address, or the advertised host resolves to other addresses. A fault blocks
+nothing: the proxy serves all connections that arrive. The field ``range_probe`` of the status has
+the last result.
 """
 
 import asyncio
@@ -36,16 +39,16 @@ from rosproxy.runtime import Runtime
 log = logging.getLogger(__name__)
 
 SETTLE_TIME = 3.0
-"""Seconds after which the range is tried at the earliest: nodes that come back go first."""
+"""Seconds before the first test of the range, so that nodes can register again first."""
 RETRY_INTERVAL = 300.0
-"""Seconds between tries while something is wrong. A master that does not get through holds one of
-its three threads for two minutes."""
+"""Seconds between tests without a proof. If the call of the master does not arrive, one of the
+master's three threads waits for two minutes."""
 LEAST_INTERVAL = 30.0
-"""Seconds between tries however often something changes."""
+"""Seconds between two tests at least, even if there are many changes."""
 
 
 class SelfCheck:
-    """Looks into the setting-up of a running proxy and notes what is wrong."""
+    """Tests the settings of a running proxy, and reports faults."""
 
     def __init__(self, runtime: Runtime, stacks: Sequence[Stack]) -> None:
         self._runtime = runtime
@@ -59,23 +62,23 @@ class SelfCheck:
 
     @property
     def findings(self) -> list[DoctorFinding]:
-        """What is wrong, as far as is known."""
+        """The current faults."""
         return [finding for findings in self._findings.values() for finding in findings]
 
     @property
     def result(self) -> RangeProbeStatus | None:
-        """How the last try at the range ended; None if there was none."""
+        """The result of the last test of the range; None before the first test."""
         if self._result is None:
             return None
         return replace(self._result, age=round(self._runtime.now() - self._tried_at, 1))
 
     async def start(self) -> None:
-        """Look at the advertised host, and try the range in a moment."""
+        """Check the advertised host, and start to test the range in the background."""
         await self._look_at_host()
         self._runtime.tasks.spawn(self._keep_trying(), "trying the range from outside")
 
     async def probe(self, body: Any) -> dict[str, Any]:
-        """``POST /probe``: how some ports of the range were reached."""
+        """``POST /probe``: test some ports of the range, and return the results as JSON."""
         return to_json(await self._try_range(or_fast=True))
 
     async def _keep_trying(self) -> None:
@@ -86,12 +89,12 @@ class SelfCheck:
             self._runtime.outside_changed.clear()
             try:
                 await self._try_range(or_fast=False)
-            except OSError as error:  # a port that was free a moment ago
+            except OSError as error:  # another program has just taken a free port
                 log.debug("the proxy could not try the range: %s", error)
             await self._until_due()
 
     async def _until_due(self) -> None:
-        """Wait until it is time for another try."""
+        """Wait until the next test: after a change, or after RETRY_INTERVAL without a proof."""
         changed = self._runtime.outside_changed
         while True:
             with contextlib.suppress(TimeoutError):
@@ -105,7 +108,7 @@ class SelfCheck:
 
     @property
     def _is_proven(self) -> bool:
-        """Whether outside was seen to get in, and nothing is wrong."""
+        """Whether the last test has proven that outside reaches the range, without a fault."""
         return not self.findings and self._result is not None and self._result.reached is True
 
     async def _look_at_host(self) -> None:
@@ -117,26 +120,26 @@ class SelfCheck:
         self._note(HOST, advertised_host(host, self._addresses, all_here))
 
     async def _all_here(self) -> bool:
-        """Whether the proxy knows of nobody outside but on loopback: a trial on one machine."""
+        """Whether master and peers are all on loopback, as in a trial on a single machine."""
         settings = self._runtime.settings
         hosts = [peer.host for peer in settings.ros2_peer] if settings.for_ros2 else []
         if settings.for_ros1:
             master = parse_authority(settings.master_uri)
             hosts += [settings.master_address or (master.host if master else "")]
-        # A host name that can't be resolved counts as one of another machine.
+        # An unresolvable host name counts as another machine.
         resolved = [await resolve(host) or [host] for host in hosts]
         return bool(resolved) and all(any(map(is_loopback, addresses)) for addresses in resolved)
 
     async def _try_range(self, or_fast: bool) -> RangeProbe:
-        """Try ports of the range, and note what is wrong. Raises OSError if one was just taken."""
+        """Test ports of the range, and note faults. Raises OSError if a port was just taken."""
         async with self._probing:
             probes = [await stack.probe(or_fast) for stack in self._stacks]
         probed = RangeProbe(tuple(probe for of_stack in probes for probe in of_stack))
         settings = self._runtime.settings
         ports = PortsStatus(str(settings.ports.listen), str(settings.ports.advertise))
         result = probe_result(probed)
-        # Where no port was free, what was found before holds. Where the host's name leads nowhere,
-        # that is reported.
+        # If no port was free, the last result stays. If the advertised host is unresolvable,
+        # `_look_at_host` has reported that fault.
         if self._addresses and result is not None:
             self._result = result
             self._tried_at = self._runtime.now()
@@ -146,13 +149,13 @@ class SelfCheck:
         return probed
 
     def _tell_ready(self, findings: Sequence[DoctorFinding]) -> None:
-        """Log once, when nothing is wrong for the first time, how far outside was seen to get."""
+        """Log ``ready`` with the results, once, after the first test without a fault."""
         if not self._is_ready and not self.findings:
             self._is_ready = True
             log.info("ready: %s", "; ".join(finding.text for finding in findings))
 
     def _note(self, subject: str, findings: Iterable[DoctorFinding]) -> None:
-        """Report what is wrong, once for as long as it is."""
+        """Report the faults of a subject, once until the faults change."""
         wrong = [f for f in findings if f.severity >= Severity.WARNING]
         previous = self._findings.get(subject, [])
         self._findings[subject] = wrong

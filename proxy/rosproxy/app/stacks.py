@@ -1,6 +1,7 @@
-"""The versions of ROS that a proxy is for, and what it knows of each of them.
+"""The stacks of a proxy: ROS 1, ROS 2 and rmw_zenoh.
 
-This is where one is plugged in: everything else here, and the admin endpoint, knows a `Stack`.
+Only `make_stacks` names the stacks. The process, the policy sources, the self-check and the admin
+endpoint use the protocol `Stack`.
 """
 
 from collections.abc import Mapping
@@ -16,47 +17,47 @@ from rosproxy.zenoh.stack import Zenoh
 
 
 class Stack(Protocol):
-    """One version of ROS in a proxy."""
+    """The part of a proxy for ROS 1, ROS 2 or rmw_zenoh."""
 
     @property
     def greeting(self) -> str:
-        """How nodes use it, for the log."""
+        """How nodes use the stack, for the log."""
 
     @property
     def actions(self) -> Mapping[str, Action]:
-        """What posts at the admin endpoint do, by their paths."""
+        """The POST actions of the admin endpoint, by path."""
 
     @property
     def retired(self) -> bool:
-        """Whether it has ended its work, and registers nothing any more."""
+        """Whether the stack was retired (``POST /retire``), and registers nothing any more."""
 
     async def start(self) -> None:
-        """Bind all ports and begin. Raises SettingError if one is taken that has to be had."""
+        """Bind all ports, and start. Raises SettingError if a necessary port is taken."""
 
     async def stop(self) -> None:
-        """End everything, and all tasks."""
+        """Stop the stack, and all tasks of the runtime."""
 
     async def settle(self) -> None:
-        """Wait until its ports can be probed."""
+        """Wait until `probe` gives useful results, for example until the master answers."""
 
     async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
-        """How some of its ports are reached from outside; ``or_fast``: see `probe_range`."""
+        """Test whether outside reaches some ports; ``or_fast``: see `probe_range`."""
 
     async def try_ports(self) -> tuple[PortProbe, ...]:
-        """Instead of a start: take all ports, probe them, and let go. Raises SettingError."""
+        """Bind all ports, test the ports, and close all, without a start. Raises SettingError."""
 
     async def apply_policy(self) -> EnforcementCounts:
-        """Make everything fit the policy. Raises CallFailed."""
+        """Enforce the current policy on registrations and connections. Raises CallFailed."""
 
     def unready(self) -> str | None:
-        """Why nodes can't use it now; None if they can."""
+        """The reason why nodes can't use the stack now; None if nodes can."""
 
     def add_to(self, status: ProxyStatus) -> ProxyStatus:
-        """The status of the proxy, with what there is to tell of this version of ROS."""
+        """The status of the proxy, with the parts of this stack."""
 
 
 def make_stacks(runtime: Runtime) -> tuple[Stack, ...]:
-    """Those that the settings ask for."""
+    """The stacks that the settings ask for."""
     stacks: list[Stack] = []
     if runtime.settings.for_ros1:
         stacks.append(Ros1(runtime))
