@@ -1,8 +1,8 @@
-"""The file of ``--config``: options by their names, in TOML.
+"""The file of ``--config``: options by name, in TOML.
 
-It only stands in for what neither the command line nor a variable gives. Its values are read as the
-option's own text would be, so that they are checked alike. A key that is no option is a mistake, as
-it is on the command line.
+The command line and the variables override the file. The program parses and checks a value of the
+file as a text of the option on the command line. An unknown key is an error, as on the command
+line.
 """
 
 import difflib
@@ -14,15 +14,16 @@ from typing import Any
 import click
 
 LONGEST_FILE = 1024 * 1024
-"""Bytes of the file that are read at most."""
+"""Bytes that the file has at most."""
 _COMMAND_LINE_ONLY = frozenset({"config", "check", "deep", "once", "help", "version"})
-"""Options that say what is to be done now."""
+"""Options that choose what a single run does, so that a file may not have them."""
 
 
 def read_config(path: str, options: Mapping[str, click.Option]) -> dict[str, Any]:
-    """The values in a file, by the parameters of the options that it names.
+    """Read the values in a file, by the parameter names of the options.
 
-    ``options`` are by their names. Raises ValueError, which says what is wrong.
+    ``options`` maps option names, without ``--``, to options. Raises ValueError, which says what is
+    wrong.
     """
     try:
         with Path(path).open("rb") as file:
@@ -53,7 +54,7 @@ def _unknown(key: str, options: Mapping[str, click.Option]) -> str:
 
 
 def _value(label: str, value: Any, option: click.Option) -> Any:
-    """A value as the option takes it. Raises ValueError."""
+    """Convert a TOML value for the option. Raises ValueError."""
     if option.is_flag:
         if not isinstance(value, bool):
             raise ValueError(f"{label} must be true or false")

@@ -1,8 +1,8 @@
-"""``rosproxy run --check --deep``: would a proxy with these settings be reached?
+"""``rosproxy run --check --deep``: whether outside would reach a proxy with these settings.
 
-It takes the ports, as the proxy would, looks up the hosts, asks the master, and has the range tried
-from outside; then it lets all go. Nothing is registered, and no node is looked for. It says what
-the doctor would.
+The command binds the ports as the proxy does, resolves the hosts, asks the master, tests whether
+outside reaches the range, and closes all ports. The command registers nothing and asks no nodes.
+The findings are the findings of the doctor.
 """
 
 import asyncio
@@ -38,7 +38,7 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
         advertise_host=host,
         advertised_addresses=tuple(await resolve(host)) if host else (),
         is_all_local=not settings.for_ros1 and all(is_loopback(p.host) for p in settings.ros2_peer),
-        # The master is not asked for its graph here; None would be reported as its silence.
+        # The check does not ask for the graph. None would mean that the master has not answered.
         graph=SystemState(),
         status=ProxyStatus(
             settings=StatusSettings(ros=settings.ros, advertise_host=host),
@@ -56,8 +56,8 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
     try:
         facts = replace(facts, probe=await _try_ports(runtime))
     except SettingError as failure:
-        # An empty one is not reported; None would be, as a range that was not tried. How many
-        # ports are free means nothing once some can't be had.
+        # An empty probe makes no finding; None would mean that the range was not tried. The number
+        # of free ports means nothing if a port can't be bound.
         facts = replace(facts, probe=RangeProbe())
         findings = [f for f in rules.setup(facts) if f.check != "ports"]
         return [*findings, error("ports", "ports", str(failure))]
@@ -67,7 +67,7 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
 
 
 async def _try_ports(runtime: Runtime) -> RangeProbe:
-    """Take all ports, and have the range tried. Raises SettingError if they can't be had."""
+    """Bind all ports, and test the range. Raises SettingError if a port can't be bound."""
     settings = runtime.settings
     probes = [await stack.try_ports() for stack in make_stacks(runtime)]
     ports = {"--master-port": settings.master_port, "--publish-master": settings.publish_master}
@@ -81,7 +81,7 @@ async def _try_ports(runtime: Runtime) -> RangeProbe:
 
 
 async def _own_address(host: str) -> str:
-    """Where to listen. Raises SettingError for a name that leads nowhere."""
+    """The address of the admin endpoint. Raises SettingError for an unresolvable name."""
     addresses = await resolve(host)
     if not addresses:
         raise SettingError("--admin-bind", f"the host name {host} can't be resolved here")

@@ -1,4 +1,4 @@
-"""The domains of ROS 2 in ``rosproxy status``: a line for each, and its participants in a table."""
+"""The domains of ROS 2 in ``rosproxy status``: a line and a table of participants for each."""
 
 from collections.abc import Iterator
 
@@ -8,20 +8,21 @@ from rosproxy.telemetry.text import clean, listed, plural, size, wrap
 
 HEADING = ("PARTICIPANT", "SIDE", "ADDRESS", "VENDOR", "PUB", "SUB", "SRV", "PORTS", "IN", "RATE")
 MOST_LINES = 3
-"""Lines that the topics or services of a participant may take, each."""
+"""Lines for the topics of a participant at most; the same for services and ports."""
 INDENT = "    "
 KERNEL = "kernel"
 
 
 def domain_lines(domain: document.DomainStatus, columns: int) -> Iterator[str]:
-    """A domain and its participants, with what they publish and serve."""
+    """The lines for a domain and its participants, with topics and services."""
     yield ""
     yield from wrap(_summary(domain), columns, INDENT)
     participants = [*domain.inside, *domain.outside]
     if not participants:
         yield "No participant has been heard yet."
         return
-    # With participants inside, an outside participant sends to the range; nothing has come yet.
+    # If there are participants inside, a participant outside should send to the range. Until
+    # then the table has a question mark.
     unheard = "outside?" if domain.inside else "outside"
     sides = ["inside"] * len(domain.inside)
     sides += ["outside" if p.proven else unheard for p in domain.outside]
@@ -96,7 +97,7 @@ def _details(
 
 
 def _kernel(participant: document.ParticipantStatus) -> str:
-    """What the kernel forwards to a participant; which user data it does not, and why."""
+    """What the kernel forwards to a participant, and why not the other ports for user data."""
     forwarded = [lease for lease in participant.leases if lease.plane == KERNEL]
     ports = listed(str(lease.port) for lease in forwarded)
     datagrams = plural(sum(lease.kernel_datagrams for lease in forwarded), "datagram")

@@ -1,6 +1,6 @@
 """The commands ``rosproxy run`` and ``rosproxy lan-relay``; `questions` has the other commands.
 
-Commands import what they need when they run, so that a health check starts fast.
+Commands import other modules when they run, so that a health check starts fast.
 """
 
 import os
@@ -61,7 +61,7 @@ def run(check: bool, deep: bool, log_format: str, log_level: str, **given: Any) 
 
 
 def _check(settings: Any, deep: bool) -> None:
-    """Print what is wrong with settings before anything runs. Raises SettingError."""
+    """Check the policy file, and with ``deep`` print findings and exit. Raises SettingError."""
     from rosproxy.app.policy_sources import read_policy_file
 
     read_policy_file(settings)

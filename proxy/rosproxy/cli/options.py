@@ -1,8 +1,8 @@
-"""What the command lines of the proxy and of the operator share: kinds of values, and usage errors.
+"""Kinds of values and usage errors, for the command lines of the proxy and of the operator.
 
-Each kind of value is a click type, so that a bad one is told before anything starts, from the
-command line and from the environment alike. All usage errors are one line, for logs of containers:
-the program, the option, what is wrong and what would be right. The exit status is 2.
+Each kind of value is a click type. So the program reports a bad value before the start, from the
+command line and from the environment alike. A usage error is a single line, for logs of containers:
+the program, the option, what is wrong, and a valid value. The exit status is 2.
 """
 
 import contextlib
@@ -27,9 +27,10 @@ GROUP_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 10
 
 
 class Parsed(click.ParamType):  # type: ignore[type-arg] # no generic type before click 8.4
-    """A kind of value that a pure function reads from text; help shows its name in capitals.
+    """A kind of value that the pure function ``read`` parses from a text.
 
-    ``read`` raises ValueError, whose message says what is wrong with the text and gives an example.
+    Help texts show ``name``. ``read`` raises ValueError. The message says what is wrong with the
+    text, and gives an example.
     """
 
     def __init__(self, name: str, read: Callable[[str], Any], separable: bool = True) -> None:
@@ -45,13 +46,13 @@ class Parsed(click.ParamType):  # type: ignore[type-arg] # no generic type befor
             self.fail(str(error), param, ctx)
 
     def split_envvar_value(self, rv: str) -> Sequence[str]:
-        """The values of a variable, where several may be given."""
-        # click splits at spaces, which the rules of a policy contain.
+        """Split the text of a variable into values, for a repeatable option."""
+        # click splits at spaces, but the rules of a policy contain spaces.
         return super().split_envvar_value(rv) if self._separable else [rv]
 
 
 class Seconds(click.FloatRange):
-    """A time of at most a day."""
+    """A time in seconds, of at most a day."""
 
     name = "s"
 
@@ -69,7 +70,7 @@ class Seconds(click.FloatRange):
 
 
 def click_type(kind: kinds.Text | kinds.Number) -> click.ParamType:  # type: ignore[type-arg]
-    """A kind of value, for click."""
+    """The click type of a kind of value."""
     if isinstance(kind, kinds.Text):
         return Parsed(kind.form, kind.read, kind.separable)
     if kind.seconds:
@@ -80,13 +81,13 @@ def click_type(kind: kinds.Text | kinds.Number) -> click.ParamType:  # type: ign
 
 
 def settings_options(*settings: type) -> Callable[[Command], Command]:
-    """The options of classes whose fields are annotated with an `Option` each."""
+    """A decorator that adds the options of classes whose fields have an `Option`."""
     described = [setting for kind in settings for setting in declared(kind)]
     return lambda command: with_options(command, [click_option(s) for s in described])
 
 
 def click_option(setting: Setting, prefix: str = "") -> Callable[[Command], Command]:
-    """The option of a setting; with ``prefix``, before its name, that of a program for others."""
+    """A decorator that adds the option of a setting; ``prefix`` stands before the name."""
     option = setting.option
     form = _form(setting)
     if setting.default not in (None, "", ()):
@@ -95,7 +96,7 @@ def click_option(setting: Setting, prefix: str = "") -> Callable[[Command], Comm
     return click.option(
         f"{name}/--no-{name.removeprefix('--')}" if setting.default is True else name,
         envvar=list(option.variables) or None,
-        allow_from_autoenv=not option.variables,  # click reads that of the name besides
+        allow_from_autoenv=not option.variables,  # click would also read the automatic variable
         multiple=option.repeatable,
         required=setting.required,
         help=plain(option.help),
@@ -104,20 +105,20 @@ def click_option(setting: Setting, prefix: str = "") -> Callable[[Command], Comm
 
 
 def _form(setting: Setting) -> dict[str, Any]:
-    """What its kind, or its type alone, says of an option: one of several words, or a flag."""
+    """The arguments of `click.option` for the kind: a click type, a choice of words, or a flag."""
     if setting.option.kind:
         return {"type": click_type(setting.option.kind)}
-    words = [word for word in setting.words if word]  # an empty one only stands for the default
+    words = [word for word in setting.words if word]  # an empty word stands for the default
     return {"type": click.Choice(words)} if words else {"is_flag": True}
 
 
 def plain(markdown: str) -> str:
-    """A text without its links and marks of code."""
+    """A Markdown text without links and code marks."""
     return re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", markdown).replace("`", "")
 
 
 class OneLineError(click.ClickException):
-    """A mistake on the command line of ``program``, told in one line."""
+    """A usage error of ``program``, printed as a single line."""
 
     exit_code = 2
 
@@ -126,15 +127,15 @@ class OneLineError(click.ClickException):
         self.program = program
 
     def show(self, file: Any = None) -> None:
-        """Print it."""
+        """Print the error."""
         click.echo(f"{self.program}: {self.format_message()}", file, err=True)
 
 
 class CommandShowingVariables(click.Command):
-    """A command, or group, whose help names the variable of each option that has one."""
+    """A command or group whose help names the variables of the options."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        """Its options and arguments."""
+        """The options and arguments of the command."""
         params = super().get_params(ctx)
         for param in params:
             if isinstance(param, click.Option) and variables_of(param, ctx.auto_envvar_prefix):
@@ -143,18 +144,21 @@ class CommandShowingVariables(click.Command):
 
 
 def variables_of(option: click.Option, prefix: str | None) -> list[str]:
-    """The variables that an option is read from, of a command whose own begin with ``prefix``."""
+    """The variables from which click reads an option; ``prefix`` is the prefix of the command."""
     if option.envvar:
         return [option.envvar] if isinstance(option.envvar, str) else list(option.envvar)
-    # As click does by itself (core.py, Option.resolve_envvar_value); --help and --version, which
-    # expose no value, have none.
+    # The same rule as click's (core.py, Option.resolve_envvar_value). --help and --version expose
+    # no value, and have no variable.
     automatic = prefix and option.allow_from_autoenv and option.expose_value
     automatic = automatic or (prefix and option.name == "config")
     return [f"{prefix}_{option.name}".upper().replace("-", "_")] if automatic else []
 
 
 class Commands(CommandShowingVariables, click.Group):
-    """Commands whose usage errors are one line, led by the program's name; click prints four."""
+    """Commands whose usage errors are a single line that begins with the name of the program.
+
+    click prints four lines.
+    """
 
     program = "rosproxy"
     command_class = CommandShowingVariables
@@ -165,20 +169,20 @@ class Commands(CommandShowingVariables, click.Group):
             return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Parse the command's words and run it. Raises OneLineError."""
+        """Parse the words of the command, and run the command. Raises OneLineError."""
         with _in_one_line(self.program):
             return super().invoke(ctx)
 
 
 def with_options(command: Command, options: Sequence[Callable[[Command], Command]]) -> Command:
-    """A command with these options, which its help shows in this order."""
+    """A command with these options, in the order of the help text."""
     for option in reversed(options):
         command = option(command)
     return command
 
 
 def log_options(command: Command) -> Command:
-    """The options ``--log-format`` and ``--log-level``."""
+    """A decorator that adds the options ``--log-format`` and ``--log-level``."""
     form = click.option(
         "--log-format",
         type=click.Choice(["text", "json"]),
@@ -195,11 +199,11 @@ def log_options(command: Command) -> Command:
 
 
 def config_option(command: Command) -> Command:
-    """The option ``--config``: a file that the command line and the variables override."""
+    """A decorator that adds ``--config``: command line and variables override this file."""
     return click.option(
         "--config",
         metavar="FILE",
-        # Read before the others, which look into context.default_map that it fills.
+        # Eager: this option fills context.default_map, which the other options read.
         is_eager=True,
         expose_value=False,
         callback=_use_config,
@@ -219,7 +223,10 @@ def _use_config(context: click.Context, option: click.Parameter, path: str | Non
 
 
 def unknown_variables(*groups: click.Command, log: bool = True) -> list[UnknownVariable]:
-    """The variables of this environment that no option of some programs reads; may log them."""
+    """The variables of this environment that no option of the programs reads.
+
+    ``log``: log a warning for each.
+    """
     known_names = {name for group in groups for name in _variable_names(group, None)}
     known_names.add(VARIABLE)
     unknown = variables.unknown(os.environ, known_names)
@@ -229,20 +236,20 @@ def unknown_variables(*groups: click.Command, log: bool = True) -> list[UnknownV
 
 
 def _variable_names(command: click.Command, prefix: str | None) -> Iterator[str]:
-    """The variables of a command and of those below it."""
+    """The variables of a command and of its subcommands."""
     prefix = command.context_settings.get("auto_envvar_prefix", prefix)
     for param in command.params:
         if isinstance(param, click.Option):
             yield from variables_of(param, prefix)
     if isinstance(command, click.Group):
         for name, subcommand in command.commands.items():
-            # As click puts it together (core.py, Context.__init__).
+            # The same rule as click's (core.py, Context.__init__).
             yield from _variable_names(subcommand, f"{prefix}_{name}".upper() if prefix else None)
 
 
 @contextlib.contextmanager
 def setting_errors() -> Iterator[None]:
-    """Tell a SettingError, which comes up when options are put together, as a usage error."""
+    """Turn a SettingError in the context into a usage error of click."""
     try:
         yield
     except SettingError as error:
@@ -254,13 +261,13 @@ def _in_one_line(program: str) -> Iterator[None]:
     try:
         yield
     except click.UsageError as error:
-        if "\n" in error.format_message():  # the help, for want of a command
+        if "\n" in error.format_message():  # the help text, if there is no command
             raise
         raise OneLineError(error, program) from None
 
 
 def _usage_text(error: click.UsageError) -> str:
-    """What is wrong, led by the option; an example if the option has a default."""
+    """The option and what is wrong, with the default as an example if it is a number."""
     option = error.param if isinstance(error, click.BadParameter) else None
     if not isinstance(option, click.Option):
         return error.format_message()

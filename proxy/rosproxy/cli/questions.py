@@ -1,6 +1,6 @@
 """The commands that ask a running proxy: ``rosproxy status``, ``health`` and ``doctor``.
 
-Commands import what they need when they run, so that a health check starts fast.
+Commands import other modules when they run, so that a health check starts fast.
 """
 
 import os
@@ -30,7 +30,7 @@ def _admin_client(context: click.Context, option: click.Parameter, url: str | No
 
 
 def _bound_by_file() -> str | None:
-    """The ``admin-bind`` in the file of ROSPROXY_CONFIG; None or empty if there is none."""
+    """The ``admin-bind`` in the file of ROSPROXY_CONFIG; None or empty if missing."""
     path = os.environ.get("ROSPROXY_CONFIG")
     if not path:
         return None
@@ -40,7 +40,7 @@ def _bound_by_file() -> str | None:
         with open(path, "rb") as file:
             return str(tomllib.load(file).get("admin-bind", ""))
     except (OSError, ValueError):
-        return None  # `rosproxy run` reports what is wrong with the file
+        return None  # `rosproxy run` reports the fault of the file
 
 
 _admin_option = click.option(
@@ -188,7 +188,7 @@ def doctor(
 
 
 def print_findings(diagnosis: Any, as_json: bool) -> NoReturn:
-    """Print findings, and exit with 1 if one of them is an error."""
+    """Print findings, and exit with 1 if there is an error, else with 0."""
     import json
 
     from rosproxy.admin.doctor_finding import failed
@@ -203,7 +203,7 @@ def print_findings(diagnosis: Any, as_json: bool) -> NoReturn:
 
 
 def _or_exit(ask: Callable[[], object]) -> None:
-    """Call a function; if no proxy answers, print that in one line and exit with 1."""
+    """Call a function; on an AdminError, print the message and exit with 1."""
     from rosproxy.admin.admin_client import AdminError
 
     try:

@@ -1,8 +1,8 @@
-"""``/status`` as text for people: the proxy first, then a table of the nodes behind it.
+"""``/status`` as text: first the proxy, then a table of the nodes behind the proxy.
 
-Below each node's row stand its topics, services and connections. A narrow terminal gets the nodes'
-addresses in lines of their own; a short one (``--watch``) loses the details first. Everything that
-nodes say of themselves passes through `clean`.
+Below the row of a node are topics, services and connections. A narrow terminal has the addresses
+of nodes in separate lines. A short terminal (``--watch``) may have no details. `clean` makes all
+texts harmless that nodes have chosen.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,18 +17,21 @@ from rosproxy.telemetry.text import clean, duration, listed, plural, size, wrap
 
 HEADING = ("NODE", "INSIDE", "OUTSIDE", "STATE", "PUB", "SUB", "SRV", "CONN", "OUT", "IN")
 LEAST_NAME = 20
-"""Columns for names; where the addresses leave less, they get a line of their own."""
+"""Columns for names at least. If the addresses leave fewer, the addresses get separate lines."""
 MOST_LINES = 3
-"""Lines that the topics, services or connections of one node may take, each."""
+"""Lines for the topics of a node at most; the same for services and for connections."""
 MOST_CONNECTIONS = 8
 MOST_HIDDEN = 20
-"""Hidden names that are listed."""
+"""Hidden names that are listed at most."""
 INDENT = "    "
 
 
 def render(status: document.ProxyStatus, columns: int, lines: int | None = None) -> str:
-    """The whole status in ``columns``; in ``lines`` what matters most if there is a bound."""
-    # Each line of the head begins with a label of nine characters, below which it goes on.
+    """The status as text, wrapped to ``columns``. ``lines``: the bound; None: no bound.
+
+    A text above the bound loses details first, then the last lines.
+    """
+    # Each line of the head begins with a label of nine characters. Further lines are indented.
     head = [line for row in _head(status) for line in wrap(row[9:], columns, " " * 9, row[:9])]
     problems = [*_problems(status, columns)]
     hidden = [*_hidden(status, columns)]
@@ -42,7 +45,7 @@ def render(status: document.ProxyStatus, columns: int, lines: int | None = None)
     full = [*head, *nodes, *domains, *hidden, *problems]
     if lines is None or len(full) <= lines:
         return "\n".join(full)
-    # The end is cut off where even this is too long, so problems come before nodes.
+    # The end may be cut off, so problems come before nodes.
     short = [*head, *problems, *brief, *domains]
     if len(short) > lines:
         short[lines - 1 :] = [f"… {plural(len(short) - lines + 1, 'line')} more: rosproxy status"]
@@ -116,14 +119,14 @@ def _ports(status: document.ProxyStatus) -> str:
 
 
 def _reached(probe: document.RangeProbeStatus | None) -> str:
-    """Whether outside gets in, as far as that is known."""
+    """Whether outside reaches the range; empty if unknown."""
     if probe is None or probe.reached is None:
         return ""
     return ", reached from outside" if probe.reached else ", NOT reached from outside"
 
 
 def _policy(policy: document.PolicyStatus) -> str:
-    """Whose rules there are, and how many names they hide."""
+    """The layers, with numbers of rules, and the number of hidden names."""
     layers = (
         f"{clean(layer.name)}: {plural(len(layer.rules), 'rule')}"
         + (" (audit only)" if layer.mode == "audit" else "")
@@ -213,7 +216,7 @@ def _details(
 
 
 def _kernel(node: document.EndpointStatus, data_plane: document.DataPlaneStatus | None) -> str:
-    """What the kernel forwards for a node; why nothing, where it does for others."""
+    """What the kernel forwards for a node, or the reason if the kernel plane is in use."""
     plane = node.data_plane
     if plane is None or data_plane is None or data_plane.plane != "kernel":
         return ""
@@ -236,7 +239,7 @@ def _connection(connection: document.ConnectionStatus) -> str:
 
 
 def _hidden(status: document.ProxyStatus, columns: int) -> Iterator[str]:
-    """What outside does not see, and by which rule."""
+    """The names that outside does not see, each with the rule."""
     hidden = status.policy.hidden if status.policy else ()
     if hidden:
         yield from ("", "hidden from outside:")
@@ -250,7 +253,7 @@ def _hidden(status: document.ProxyStatus, columns: int) -> Iterator[str]:
 
 
 def _problems(status: document.ProxyStatus, columns: int) -> Iterator[str]:
-    """All problems but the master's, which its own line tells."""
+    """All problems except the problem of the master, which has a line in the head."""
     problems = [problem for problem in status.problems if problem.subject != "master"]
     if problems:
         yield from ("", "problems (run rosproxy doctor to examine them):")

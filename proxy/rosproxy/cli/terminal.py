@@ -1,8 +1,8 @@
-"""The terminal: a text printed once, or drawn again and again (``--watch``).
+"""The terminal: prints a text once, or draws a text repeatedly (``--watch``).
 
-rich finds out what standard output is: a terminal gets colours for the words that matter, unless
-NO_COLOR is set, and ``--watch`` its own screen there; a pipe or a file gets the bare text. What the
-encoding lacks is escaped. Nothing in a text is markup.
+On a terminal, rich colours important words, unless NO_COLOR is set, and ``--watch`` uses a separate
+screen. A pipe or a file gets the plain text. Characters that the encoding lacks are escaped. rich
+reads no markup in a text.
 """
 
 import io
@@ -21,12 +21,12 @@ from rosproxy.admin.admin_client import AdminClient, AdminError
 from rosproxy.cli.status_table import render
 
 WATCH_INTERVAL = 2.0
-"""Seconds between two drawings; the proxy measures rates as often."""
+"""Seconds between two drawings, and between two measurements of rates in the proxy."""
 WIDTH_WITHOUT_TERMINAL = 120
 
 
 class _StatusHighlighter(RegexHighlighter):
-    """Highlights words that say how things are; groups are named for their style."""
+    """Highlights headings and states. The name of a group is the style."""
 
     highlights = (
         r"(?m)^(?P<bold>(NODE|PROXY|CONTAINER) .*)$",
@@ -45,7 +45,7 @@ def show_status(admin: AdminClient, as_json: bool) -> None:
 
 
 def watch_status(admin: AdminClient) -> None:
-    """Draw the status again and again until interrupted, also while no proxy answers."""
+    """Draw the status every WATCH_INTERVAL until Ctrl-C, also while no proxy answers."""
 
     def draw(columns: int, lines: int | None) -> str:
         try:
@@ -57,7 +57,10 @@ def watch_status(admin: AdminClient) -> None:
 
 
 def watch(draw: Callable[[int, int | None], str]) -> None:
-    """Show what ``draw`` returns for so many columns and lines, anew each time, until Ctrl-C."""
+    """Show the text of ``draw`` every WATCH_INTERVAL until Ctrl-C.
+
+    ``draw`` takes columns and lines; without a terminal, lines are None.
+    """
     console = _console()
     live = Live(console=console, screen=True, auto_refresh=False)
     with suppress(KeyboardInterrupt), live if console.is_terminal else nullcontext():
@@ -66,18 +69,18 @@ def watch(draw: Callable[[int, int | None], str]) -> None:
             if console.is_terminal:
                 live.update(text, refresh=True)
             else:
-                # Into a pipe or a file: one after the other, with an empty line between.
+                # Into a pipe or a file: all texts, with an empty line after each.
                 console.print(text, "", sep="\n", soft_wrap=True)
             time.sleep(WATCH_INTERVAL)
 
 
 def write(text: str) -> None:
-    """Print a text; lines that are too long stay whole."""
+    """Print a text; long lines stay whole."""
     _console().print(text, soft_wrap=True)
 
 
 def size() -> tuple[int, int | None]:
-    """Columns and lines to use; as many lines as needed where there is no terminal."""
+    """Columns and lines of the terminal; without a terminal, lines are None."""
     columns, lines = shutil.get_terminal_size((WIDTH_WITHOUT_TERMINAL, 0))
     return columns, lines if sys.stdout.isatty() and lines > 5 else None
 

@@ -1,4 +1,4 @@
-"""Environment variables that are meant for this program, and that no option reads."""
+"""Environment variables that are meant for rosproxy, but that no option reads."""
 
 import difflib
 import re
@@ -9,32 +9,32 @@ import msgspec
 _PREFIX = "ROSPROXY_"
 _NEAR = 0.5
 _VERY_NEAR = 0.85
-"""How alike a name has to be: one that begins as ours do, and any other that begins with ROS."""
+"""Similarity (difflib) for a suggestion: _NEAR after the prefix ROSPROXY_, else _VERY_NEAR."""
 _SERVICE_LINK = re.compile(r"_SERVICE_(HOST|PORT(_\w+)?)$|_PORT_\d+_(TCP|UDP|SCTP)(_\w+)?$")
-"""What Kubernetes and Docker set for a service of the name rosproxy, or one that begins so."""
+"""Variables that Kubernetes and Docker set for a service whose name begins with rosproxy."""
 
 
 class UnknownVariable(msgspec.Struct, frozen=True):
-    """A variable that nobody reads, and the one that was probably meant, if any is like it."""
+    """A variable that no option reads. ``suggestion``: a similar known variable, or empty."""
 
     name: str
     suggestion: str = ""
 
     @property
     def text(self) -> str:
-        """What is wrong, in words that follow the name."""
+        """What is wrong, for a message that begins with the name."""
         hint = f"; did you mean {self.suggestion}?" if self.suggestion else ""
         return f"is not a variable of rosproxy and is ignored{hint}"
 
 
 def unknown(environment: Mapping[str, str], known_names: Collection[str]) -> list[UnknownVariable]:
-    """The variables of an environment that look as if they were meant for an option."""
+    """The variables of an environment that are probably meant for an option, but unknown."""
     variables = []
     for name, value in sorted(environment.items()):
         upper = name.upper()
         prefixed = name.upper().startswith(_PREFIX)
-        # NAME_PORT=tcp://10.96.0.7:11311 is of a service, too (pkg/kubelet/envvars/envvars.go,
-        # makeLinkVariables); without a URL it is judged as any other.
+        # Kubernetes sets NAME_PORT=tcp://10.96.0.7:11311 for a Service, too
+        # (pkg/kubelet/envvars/envvars.go, makeLinkVariables). Without a URL, NAME_PORT counts.
         linked = _SERVICE_LINK.search(upper) or (upper.endswith("_PORT") and "://" in value)
         if name in known_names or linked or not upper.startswith("ROS"):
             continue
@@ -45,7 +45,7 @@ def unknown(environment: Mapping[str, str], known_names: Collection[str]) -> lis
 
 
 def _nearest(name: str, known_names: Collection[str]) -> str:
-    """The variable that is most like a name; that both begin with our prefix does not count."""
+    """The known variable most similar to a name, without the common prefix; empty if none is."""
     if not name.startswith(_PREFIX):
         return next(iter(difflib.get_close_matches(name, known_names, 1, _VERY_NEAR)), "")
     name_by_suffix = {n.removeprefix(_PREFIX): n for n in known_names if n.startswith(_PREFIX)}

@@ -9,7 +9,7 @@ from rosproxy.telemetry.text import clean, duration, listed, plural, wrap
 SESSIONS_HEADING = ("REMOTE", "MODE", "LOCAL", "ROUTER")
 NODES_HEADING = ("NODE", "DOMAIN", "ADDRESS", "PUB", "SUB", "SRV")
 MOST_LINES = 3
-"""Lines that the topics or services of a node may take, each."""
+"""Lines for the topics of a node at most; the same for services."""
 INDENT = "    "
 
 
