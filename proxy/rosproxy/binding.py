@@ -1,4 +1,4 @@
-"""Ports and addresses that can't be bound, told by the option that names them, and who has them."""
+"""Errors for ports and addresses that can't be bound, with the option and the likely holder."""
 
 import contextlib
 import errno
@@ -21,9 +21,9 @@ PORTS = "ports"
 def setting_error_if_taken(
     option: str, subject: object, holders: Collection[object] = ()
 ) -> Iterator[None]:
-    """While ``subject`` is bound; raises SettingError instead of OSError.
+    """A context in which the caller binds ``subject``. Raises SettingError in place of OSError.
 
-    ``holders`` are those who are likely to have it, if somebody has.
+    ``holders``: the programs that probably hold ``subject``, for the message.
     """
     try:
         yield
@@ -39,7 +39,7 @@ def report_taken_ports(
 ) -> None:
     """Report taken ports in the log and as a problem, for one version of ROS.
 
-    Raises SettingError if no port is left: it would be a proxy that no node can use.
+    Raises SettingError if all ports of the range are taken: no node could use the proxy.
     """
     ports = settings.ports.listen
     if not taken:
@@ -51,7 +51,7 @@ def report_taken_ports(
     if len(taken) == len(ports):
         letter = "t" if ros == "1" else "u"
         show = f"ss -l{letter}np 'sport >= :{ports.first} and sport <= :{ports.last}'"
-        cause = f"held by {holders}: {fix}" if proxies else f"all are taken: {show} shows by whom"
+        cause = f"held by {holders}: {fix}" if proxies else f"other programs hold all: run {show}"
         raise SettingError(RANGE_OPTION, f"no port of {ports} can be bound; {cause}")
     text = f"{port_kind} of the range {ports} held by other programs: {list(taken)}"
     if proxies:

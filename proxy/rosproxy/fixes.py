@@ -1,8 +1,7 @@
-"""What users set to correct a fault: options of a proxy, or what an operator reads in their place.
+"""Fixes: the options that correct a fault, or the labels and fields that an operator reads instead.
 
-A proxy and its doctor speak for the program that has started the proxy. The operators name
-themselves in the variable VARIABLE of their proxies. Without this variable, the proxy was started
-by hand.
+The fix depends on the program that has started the proxy. An operator sets the variable VARIABLE of
+its proxies. Without this variable, a user has started the proxy by hand.
 """
 
 from enum import IntEnum
@@ -12,7 +11,7 @@ VARIABLE = "ROSPROXY_OPERATOR"
 
 
 class Operator(IntEnum):
-    """What has started a proxy; the value is the column of `Fix`."""
+    """The program that has started a proxy; the value is the index in `Fix`."""
 
     NONE = 0
     DOCKER = 1
@@ -188,7 +187,7 @@ FIXES = {
         "run kubectl exec POD -- rosproxy status --json",
     ),
 }
-"""The fixes by what is to be set or run."""
+"""The fixes by a key, which names what to set or to run."""
 
 _speaks_for = [Operator.NONE]
 
@@ -205,6 +204,6 @@ def how_to(key: str, **fields: object) -> str:
 
 
 def how_to_in_a_sentence(key: str, **fields: object) -> str:
-    """The same with a capital."""
+    """What to do, an imperative with a capital letter, without a full stop."""
     text = how_to(key, **fields)
     return text[:1].upper() + text[1:]

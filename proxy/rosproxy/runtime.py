@@ -1,6 +1,6 @@
-"""What all parts of a running proxy share, of ROS 1 and of ROS 2: clock, tasks, what is told.
+"""What ROS 1, ROS 2 and rmw_zenoh share in a running proxy: settings, clock, tasks, reports.
 
-Made once, before the parts.
+The process creates the runtime once, before the stacks.
 """
 
 import asyncio
@@ -15,11 +15,11 @@ from rosproxy.telemetry.refusals import Refusals
 
 
 class Runtime:
-    """The tools of one proxy; needs a running event loop.
+    """The shared objects of a proxy. Needs a running event loop.
 
-    ``instance`` is a random name of this process. ``refusals`` tells what is over some bound;
-    ``policy``: what outside may see and do. ``outside_changed`` is to be set when what was proven
-    of the way from outside may not hold any more.
+    ``instance`` is a random name of this process. ``refusals`` reports refusals above a bound.
+    ``policy``: what outside may see and do. ``outside_changed``: set the event when the last proof
+    that outside reaches the range may no longer hold. The proxy then tests again.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -37,9 +37,9 @@ class Runtime:
         )
 
     def now(self) -> float:
-        """Seconds of the event loop's clock, which never goes back: timers go by the same."""
+        """Seconds of the event loop's monotonic clock, which timers use, too."""
         return self._loop.time()
 
     def uptime(self) -> float:
-        """Seconds since it was made."""
+        """Seconds since the start of the proxy."""
         return self.now() - self._started

@@ -1,6 +1,6 @@
-"""Options: what is told of each, what kinds of values there are, and how they are read from a text.
+"""Options: the description of an option, the kinds of values, and functions that parse values.
 
-``read_…`` raises ValueError, whose message says what is wrong with the text and gives an example.
+``read_…`` raises ValueError. The message says what is wrong with the text, and gives an example.
 """
 
 import hashlib
@@ -28,11 +28,11 @@ from rosproxy.net import addresses
 from rosproxy.net.addresses import HostPort, Network, parse_host_port
 
 DataPlane = Literal["auto", "kernel", "splice", "copy"]
-"""How topics' bytes are forwarded: by the kernel, spliced, or copied; auto: the best possible."""
+"""How the bytes of topics are forwarded: by the kernel, by splice, by copies, or the best way."""
 Direction = Literal["out", "both"]
-"""Who reaches the other side through the proxy: outside alone, or the nodes inside, too."""
+"""Which side reaches the other through the proxy: out: outside reaches inside. both: both sides."""
 SlaveControl = Literal["any", "master"]
-"""Who may call shutdown, publisherUpdate and paramUpdate at inside nodes."""
+"""Which callers outside may call shutdown, publisherUpdate and paramUpdate at inside nodes."""
 DAY = 86400
 ZENOH_PORT = 7447
 """The port at which rmw_zenohd listens by default."""
@@ -46,9 +46,9 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A kind of value that ``read`` makes of a text. Help calls it ``form``.
+    """A kind of value that ``read`` parses from a text. ``form`` is the name in help texts.
 
-    ``separable``: where several may be given, spaces in a variable separate them.
+    ``separable``: spaces in a variable separate the values of a repeatable option.
     """
 
     form: str
@@ -58,7 +58,7 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """An integer, or with ``seconds`` a time, within bounds. Help calls it ``form``."""
+    """An integer within bounds, or a time with ``seconds``. ``form`` is the name in help texts."""
 
     form: str
     least: float
@@ -68,13 +68,14 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """How a setting is given.
+    """How a user gives a setting.
 
-    ``help`` is what it means, in Markdown; command lines show it without marks and links. ``kind``
-    says what its texts are; without one, its type does: a flag, or one of several words. ``name``
-    is that on the command line and ``variables`` those of the environment where they are not made
-    of the field's. ``repeatable``: several may be given. ``default`` tells what is done without it,
-    where its value does not. ``note`` tells how several are written in the variable.
+    ``help``: the meaning in Markdown; command lines show ``help`` without marks and links.
+    ``kind``: the kind of the text; without a kind, the type of the field decides: a flag, or a
+    choice of words. ``name``: the option on the command line, and ``variables``: the environment
+    variables, if the name of the field does not determine both. ``repeatable``: the option may
+    occur several times. ``default``: the effect without the option, if the default value does not
+    say so. ``note``: how to write several values in the variable.
     """
 
     help: str
@@ -87,7 +88,7 @@ class Option:
 
 
 class Setting(NamedTuple):
-    """A field that is annotated with an `Option`; ``words``: those that it may be."""
+    """A field that is annotated with an `Option`. ``words``: the choices, if the type has any."""
 
     field: str
     option: Option
@@ -96,27 +97,27 @@ class Setting(NamedTuple):
 
     @property
     def required(self) -> bool:
-        """Whether it has to be given."""
+        """Whether the user has to give the setting."""
         return self.default is None and not self.option.default
 
     @property
     def name(self) -> str:
-        """What it is called on the command line."""
+        """The name of the option on the command line."""
         return self.option.name or f"--{self.field.replace('_', '-')}"
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """The variables of the environment that give it."""
+        """The environment variables of the setting."""
         return self.option.variables or (f"ROSPROXY_{self.parameter.upper()}",)
 
     @property
     def parameter(self) -> str:
-        """The same as a name in Python."""
+        """The name of the option as a Python identifier."""
         return self.name.removeprefix("--").replace("-", "_")
 
 
 def declared(settings: type) -> list[Setting]:
-    """The settings of a dataclass or struct, in its order; a field without an `Option` is none."""
+    """The settings of a dataclass or struct, in order: all fields with an `Option`."""
     hints = get_type_hints(settings, include_extras=True)
     parameters = signature(settings).parameters
     return [
@@ -127,7 +128,7 @@ def declared(settings: type) -> list[Setting]:
 
 
 def make_settings(settings: type[_Value], given: Mapping[str, Any], **other: Any) -> _Value:
-    """The settings of what was given for their options, and of ``other`` fields."""
+    """Make settings from the ``given`` values, by parameter, and from ``other`` fields."""
     by_field = {setting.field: given[setting.parameter] for setting in declared(settings)}
     values = {field: value for field, value in by_field.items() if value is not None}
     return settings(**values, **other)
@@ -142,7 +143,7 @@ def _setting(field: str, hint: Any, default: Any) -> Setting:
 
 
 class SettingError(ValueError):
-    """A setting that can't be used. ``option`` names it as on the command line."""
+    """A setting has an unusable value. ``option`` is the name on the command line."""
 
     def __init__(self, option: str, problem: str) -> None:
         super().__init__(f"{option}: {problem}")
@@ -150,12 +151,12 @@ class SettingError(ValueError):
 
 
 def time(least: float) -> Number:
-    """A time of at most a day."""
+    """A kind of value: a time of ``least`` seconds to a day."""
     return Number("S", least, DAY, seconds=True)
 
 
 def read_range(text: str) -> PortRange:
-    """A range of ports, ``first-last``. Raises ValueError."""
+    """Parse a range of ports, ``first-last``. Raises ValueError."""
     match = _RANGE.fullmatch(text)
     if match is None:
         raise ValueError(f"{text[:_LONGEST]!r} is not a range such as 11000-11099")
@@ -167,7 +168,7 @@ def read_range(text: str) -> PortRange:
 
 
 def read_host(text: str) -> str:
-    """A host name or address, which comes out without brackets. Raises ValueError."""
+    """Parse a host name or address, and return the host without brackets. Raises ValueError."""
     bare = text.strip("[]")
     if parse_host_port(f"[{bare}]:1" if ":" in bare else f"{bare}:1") != HostPort(bare, 1):
         raise ValueError(
@@ -177,7 +178,7 @@ def read_host(text: str) -> str:
 
 
 def read_address(text: str) -> str | None:
-    """An IP address in its plain form; None for no text. Raises ValueError."""
+    """Parse an IP address, and return the plain form; None for an empty text. Raises ValueError."""
     address = addresses.parse_address(text)
     if text and address is None:
         raise ValueError(f"{text[:_LONGEST]!r} is not an IP address such as 192.0.2.7")
@@ -185,7 +186,7 @@ def read_address(text: str) -> str | None:
 
 
 def read_bind_address(text: str) -> str:
-    """An IP address to listen on, also the unspecified one. Raises ValueError."""
+    """Parse an IP address to listen on; the unspecified address is valid. Raises ValueError."""
     try:
         return str(ip_address(text))
     except ValueError:
@@ -194,7 +195,7 @@ def read_bind_address(text: str) -> str:
 
 
 def read_host_port(text: str, example: str = "127.0.0.1:11312") -> HostPort:
-    """``host:port`` or ``[v6]:port``. Raises ValueError."""
+    """Parse ``host:port`` or ``[v6]:port``. Raises ValueError, with the example."""
     target = parse_host_port(text)
     if target is None:
         raise ValueError(f"{text[:_LONGEST]!r} is not of the form {example}")
@@ -202,7 +203,7 @@ def read_host_port(text: str, example: str = "127.0.0.1:11312") -> HostPort:
 
 
 def read_peer(text: str) -> HostPort:
-    """A peer of ROS 2: a host, or ``host:port``; without a port it is 0. Raises ValueError."""
+    """Parse a peer of ROS 2: ``host:port``, or a host, which gets port 0. Raises ValueError."""
     try:
         return HostPort(read_host(text), 0)
     except ValueError:
@@ -210,7 +211,7 @@ def read_peer(text: str) -> HostPort:
 
 
 def read_zenoh_peer(text: str) -> HostPort:
-    """A zenoh router: a host, or ``host:port``; without a port 7447. Raises ValueError."""
+    """Parse a zenoh router: ``host:port``, or a host, which gets port 7447. Raises ValueError."""
     try:
         return HostPort(read_host(text), ZENOH_PORT)
     except ValueError:
@@ -218,7 +219,7 @@ def read_zenoh_peer(text: str) -> HostPort:
 
 
 def read_network(text: str) -> Network:
-    """A network as CIDR. Raises ValueError."""
+    """Parse a network in CIDR notation. Raises ValueError."""
     try:
         return ip_network(text)
     except ValueError as error:
@@ -227,16 +228,16 @@ def read_network(text: str) -> Network:
 
 
 def read_master_uri(text: str) -> str:
-    """The URI of a ROS master. Raises ValueError."""
+    """Check the URI of a ROS master, and return the URI. Raises ValueError."""
     if not text.startswith("http://") or addresses.parse_authority(text) is None:
         raise ValueError(f"{text[:_LONGEST]!r} is not of the form http://host:11311")
     return text
 
 
 def read_token(text: str) -> str | None:
-    """What travels in a header: printable ASCII without spaces; None for no text.
+    """Check a token for an HTTP header: printable ASCII without spaces; None for an empty text.
 
-    Raises ValueError, which does not repeat it.
+    Raises ValueError, which does not repeat the token.
     """
     if text and not _TOKEN.fullmatch(text):
         raise ValueError(
@@ -247,7 +248,7 @@ def read_token(text: str) -> str | None:
 
 
 def read_token_hash(text: str) -> str | None:
-    """A SHA-256 in hex digits, in lower case; None for no text. Raises ValueError."""
+    """Parse a SHA-256 in hex digits, in lower case; None for an empty text. Raises ValueError."""
     digits = text.strip().lower()
     if digits and not _HASH.fullmatch(digits):
         raise ValueError(
@@ -257,7 +258,7 @@ def read_token_hash(text: str) -> str | None:
 
 
 def read_policy_layers(text: str) -> tuple[PolicyLayer, ...]:
-    """The layers of a policy as JSON; none for no text. Raises ValueError."""
+    """Parse the layers of a policy from JSON; empty for an empty text. Raises ValueError."""
     try:
         return read_layers(json.loads(text)) if text.strip() else ()
     except RecursionError:
@@ -265,17 +266,17 @@ def read_policy_layers(text: str) -> tuple[PolicyLayer, ...]:
 
 
 def hash_token(token: str) -> str:
-    """The SHA-256 of a token, in 64 hex digits, as ``--admin-token-hash`` takes it."""
+    """The SHA-256 of a token in 64 hex digits, for ``--admin-token-hash``."""
     return hashlib.sha256(token.encode()).hexdigest()
 
 
 def parse_range(option: str, text: str) -> PortRange:
-    """Like `read_range`. Raises SettingError that names ``option``."""
+    """Parse a range as `read_range` does. Raises SettingError, which names ``option``."""
     return _named(option, read_range, text)
 
 
 def parse_host(option: str, text: str) -> str:
-    """Like `read_host`. Raises SettingError that names ``option``."""
+    """Parse a host as `read_host` does. Raises SettingError, which names ``option``."""
     return _named(option, read_host, text)
 
 
@@ -287,14 +288,14 @@ def _named(option: str, read: Callable[[str], _Value], text: str) -> _Value:
 
 
 def host_port(example: HostPort) -> Text:
-    """``host:port``, for which a message gives an example."""
+    """A kind of value: ``host:port``, with ``example`` for messages."""
     return Text("ADDRESS:PORT", lambda text: read_host_port(text, str(example)))
 
 
 PORT = Number("PORT", 1, 65535)
 MEBIBYTES = Number("MiB", 1, 65536)
 CONNECTIONS = Number("N", 16, 1_000_000)
-# RTPS's ports of a domain begin at 7400 + 250 * ID: those of 233 would exceed 65535.
+# The RTPS ports of a domain begin at 7400 + 250 * ID. For 233 the ports would exceed 65535.
 DOMAIN = Number("ID", 0, 232)
 PORT_RANGE = Text("A-B", read_range)
 HOST = Text("HOST", read_host)

@@ -431,7 +431,7 @@ class Settings:
         if len(self.port_range) < LEAST_PER_DOMAIN * count:
             text = f"{self.port_range} is too small: each of {count} domains needs"
             raise SettingError("--port-range", f"{text} {LEAST_PER_DOMAIN} ports")
-        # An announcement need not name its domain, so that one port can serve one domain alone.
+        # An announcement may lack the domain, so a port can serve only a single domain.
         fix = "start a proxy for each domain"
         if self.ros2_lan_relay and count > 1:
             raise SettingError("--ros2-lan-relay", f"a LAN relay is for one domain: {fix}")
