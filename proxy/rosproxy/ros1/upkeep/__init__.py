@@ -1,33 +1,39 @@
-"""What happens by the clock or by an event rather than by a node's call.
+"""What the proxy does at intervals or after an event, rather than because a node called.
 
-Data goes one way: an answer of the master or a node is read by a client, a module of `decisions`
-says what follows (pure: of what is seen, and the time), and the `Registrar` makes the calls, or a
-port opens or refuses. Nothing below knows who asked for it.
+Data flows one way. A client reads the answer of the master or of a node. A module of `decisions`
+(pure: data and time in, data out) says what follows. Then the `Registrar` calls the master, or a
+port opens or refuses connections.
 
-    when                    who                looks at           decided by      what is done
+    when                    module             reads              decided by      result
     ----------------------  -----------------  -----------------  --------------  --------------
-    the master answers      recovery           the master's       recovery        leases as
-    first                                      graph, its nodes                   before
+    first answer of the     recovery           the master's       recovery_       leases as before
+    master                                     graph, the nodes   claims
     --master-interval       master_monitor     the master's pid                   the next row
-    its pid is new, or      registrar          the master's       registration    what it lost
-    every fifth time                           graph                              is registered
+    new pid, or every       registrar          the master's       registration    lost
+    fifth look                                 graph                              registrations
+                                                                                  made again
     PROBE_TICK; each node:  prober             the node's pid     liveness        ports refuse,
-    --probe-interval                                                              nodes and
-                                                                                  leases end
-    RESUBSCRIBE_TICK,       resubscriber       the graph, nodes'  resubscription  they are told
-    until nobody is missed                     connections                        es
-    ENFORCE_TICK, once the  policy_enforcer    the registry,      Ros1Policy      hidden, shown,
-    policy has changed                         connections                        cut
-    TIDY_INTERVAL           stand_in_ports     problems with                      those of ended
-                                               nodes outside                      nodes go
-    COUNT_TICK, while the   message_counter    what nodes count   topic_growth    added to the
+    --probe-interval                                                              nodes and leases
+                                                                                  end
+    RESUBSCRIBE_TICK,       resubscriber       the graph, the     resubscription  publisherUpdate
+    after an outage                            nodes'                             to subscribers
+                                               connections                        without
+                                                                                  connection
+    ENFORCE_TICK, after a   policy_enforcer    the registry,      Ros1Policy      registrations
+    change of the policy                       connections                        hidden or shown,
+                                                                                  connections cut
+    TIDY_INTERVAL           stand_in_ports     problems with                      problems of ended
+                                               nodes outside                      nodes removed
+    COUNT_TICK, while the   message_counter    the nodes' counts  topic_growth    sums in the
     metrics are read                                                              metrics
-    RETRY_BLOCKED           leases             ports that others                  they open
-                                               had
-    POST /containers        containers         the nodes there    liveness        unregistered,
+    RETRY_BLOCKED           leases             ports that other                   ports open
+                                               programs held
+    POST /containers        containers         the nodes there    liveness        nodes
+                                                                                  unregistered,
                                                                                   moved, adopted
-    a node registers that   adopter            the node, the      adoption        registered
-    did around the proxy                       master                             anew
-    what is hidden changes  publisher_updates  the registry                       they are told
-                                                                                  again
+    a node registers that   adopter            the node, the      adoption        node registered
+    registered directly                        master                             anew
+    before
+    hidden registrations    publisher_updates  the registry                       publisherUpdate
+    change
 """

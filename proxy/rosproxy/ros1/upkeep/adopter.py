@@ -1,9 +1,14 @@
-"""A node that registered around the proxy: making the master know it through the proxy.
+"""Adopt nodes that registered at the real master directly, not through the proxy.
 
-There are three occasions. A container has arrived whose nodes may have registered before
-(`adopt`); a node that did registers something through the proxy (`take_over`); the master wants a
-node shut down that has registered around the proxy once more (`absorb_shutdown`). Each ends with
-`Registrar.reclaim`, which registers anew what the master has by the node's own URI.
+There are three occasions:
+
+- A container has arrived whose nodes may have registered directly (`adopt`).
+- A node that registered directly now registers through the proxy (`take_over`).
+- The master calls ``shutdown`` for a node that has registered directly once more
+  (`absorb_shutdown`).
+
+In all cases `Registrar.reclaim` takes back what the master has by the node's own URI, and registers
+the same through the proxy.
 """
 
 import asyncio
@@ -31,13 +36,13 @@ from rosproxy.ros1.upkeep.verifier import Verifier
 log = logging.getLogger(__name__)
 
 SHUTDOWN_TIMEOUT = 2.0
-"""Seconds in which the master must say where a node is that is to be shut down."""
+"""Seconds within which the master must tell the URI of a node for a ``shutdown``."""
 NO_PORT = "registered directly at the master, and can't be adopted: no port of the range is left"
 
 
 @dataclass(slots=True, eq=False)
 class Adopter:
-    """Finds nodes that registered around the proxy, and makes the master know them through it."""
+    """Adopts nodes that registered at the real master directly."""
 
     _context: Context
     _leases: Leases
@@ -46,15 +51,15 @@ class Adopter:
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def adopt(self, arrived: Sequence[Container]) -> int:
-        """Adopt the nodes of containers that have arrived.
+        """Adopt the nodes of containers that have arrived; return the number of names.
 
-        A node is adopted if one answers at the container's address and the port that it gave,
-        and bears out what is registered for it. The others are left as they are. Returns how many
-        were adopted. Raises Unreachable, MasterError.
+        The proxy adopts a node if a node answers at the address of the container and the port of
+        the URI, and confirms the registrations. All other nodes stay as they are. Raises
+        Unreachable, MasterError.
         """
         context = self._context
         inside: list[Container] = []
-        for address, names in arrived:  # published ports lead nowhere else than inside
+        for address, names in arrived:  # published ports must lead to addresses inside only
             if is_inside(address, context.addressing.networks):
                 inside.append((address, names))
             else:
@@ -73,11 +78,11 @@ class Adopter:
             return await self._take_in(located, infos)
 
     async def take_over(self, endpoint: Endpoint, caller_id: str) -> None:
-        """Before a name registers: take back what the same node registered around the proxy.
+        """Take back direct registrations of a name before the node registers through the proxy.
 
-        The master would else call shutdown at the node's own URI. Raises Unreachable.
+        Otherwise the master would call shutdown at the node's own URI. Raises Unreachable.
         """
-        # It is known here and keeps to the proxy: the master is not asked at each registration.
+        # The name is known and has never bypassed the proxy, so the master is not asked each time.
         if caller_id in endpoint.caller_ids and not endpoint.has_registered_directly:
             return
         uri = await self._look_up(caller_id)
@@ -88,14 +93,14 @@ class Adopter:
             try:
                 async with self._lock:
                     await self._registrar.reclaim({caller_id: (endpoint, uri)})
-            except MasterError as error:  # the caller is answered as if the master were away
+            except MasterError as error:  # the caller gets the same answer as without a master
                 raise Unreachable(str(error)) from error
 
     async def absorb_shutdown(self, endpoint: Endpoint, caller_id: str, reason: str) -> bool:
-        """Keep a ``shutdown`` from a node that no other has replaced; whether that is so.
+        """Keep a needless ``shutdown`` from a node; return whether it was needless.
 
-        What the node registered around the proxy is then registered anew. A ``shutdown`` for a
-        name that it never had is kept from it, too: another node had this port before.
+        The proxy then registers anew what the node registered directly. The proxy also keeps back a
+        ``shutdown`` for a name that the node never had, because another node had this port before.
         """
         name = decisions.renamed_node(caller_id, reason)
         if name is None:
@@ -106,7 +111,7 @@ class Adopter:
             async with asyncio.timeout(SHUTDOWN_TIMEOUT):
                 uri = await self._look_up(name)
         except (TimeoutError, Unreachable):
-            return False  # it is not known whether it is needless, so it is passed on
+            return False  # the call may be justified, so it is passed on
         advertised = self._context.addressing.advertised_uri(endpoint)
         if not decisions.has_name_still(endpoint, uri, advertised):
             return False
@@ -117,7 +122,7 @@ class Adopter:
         return True
 
     async def _reclaim(self, endpoint: Endpoint, former: FormerUris) -> None:
-        """Reclaim names once more, and register what the master has by neither URI by now."""
+        """Reclaim names once more, and repair the effects of direct calls."""
         try:
             async with self._lock:
                 await self._registrar.reclaim(former)
@@ -126,14 +131,14 @@ class Adopter:
             log.warning("%s. The proxy makes the missing registrations later", error)
 
     async def _inspect(self, slaves: set[HostPort]) -> dict[HostPort, NodeInfo]:
-        """What the nodes at slave addresses say of themselves, where one answers."""
+        """What the nodes at slave addresses say about themselves, for addresses with a node."""
         answers = await asyncio.gather(*map(self._context.nodes.inspect, slaves))
         return {slave: info for slave, info in zip(slaves, answers, strict=True) if info}
 
     async def _verify(
         self, nodes: Sequence[DirectNode], infos: Mapping[HostPort, NodeInfo]
     ) -> set[tuple[str, HostPort]]:
-        """The names with the slave addresses at which their nodes bear out what is registered."""
+        """The names that are confirmed, each with the slave address of the node."""
         judge = Verifier(self._context.nodes).judge
         tried = [(node, slave) for node in nodes for slave in node.slaves if slave in infos]
         borne_out = await asyncio.gather(
@@ -148,7 +153,7 @@ class Adopter:
     async def _take_in(
         self, located: Mapping[HostPort, list[DirectNode]], infos: Mapping[HostPort, NodeInfo]
     ) -> int:
-        """Give each node a port and register all anew; how many names were adopted."""
+        """Give each node a port and register the node anew; return the number of adopted names."""
         former: dict[str, tuple[Endpoint, str]] = {}
         endpoints: dict[Endpoint, NodeInfo] = {}
         try:
@@ -176,9 +181,10 @@ class Adopter:
     async def _make_endpoint(
         self, slave: HostPort, nodes: Sequence[DirectNode], info: NodeInfo
     ) -> Endpoint | None:
-        """The endpoint of nodes at a slave address, with what they registered; it is ``pending``.
+        """Make the endpoint of nodes at a slave address, with their registrations.
 
-        So what they registered is registered anew even if that fails at first.
+        The caller has to decrement ``pending``. The registry has the registrations from the start,
+        so the proxy repeats the calls to the master if these fail at first.
         """
         uri = nodes[0].uri
         own_slave = parse_slave_uri(uri) or slave
@@ -194,7 +200,7 @@ class Adopter:
         now = self._context.now()
         known_pid = endpoint.health.pid
         endpoint.mark_alive(info.pid, info.topic_ports, now)
-        # The endpoint was that of another process: the prober takes back what that one left.
+        # The endpoint was that of another process: the prober takes back what this process left.
         if known_pid not in (None, info.pid):
             endpoint.health.suspect()
         self._leases.open(endpoint)

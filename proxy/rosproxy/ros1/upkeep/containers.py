@@ -1,8 +1,9 @@
-"""What an operator tells of containers, and the end of a proxy: ``POST /containers``, ``/retire``.
+"""Act on reports of an operator about containers (``POST /containers``) and retire (``/retire``).
 
-*gone*: nodes at these addresses that don't answer are unregistered at once, and their ports refuse.
-*moved*: nodes that answer at the new address keep their ports, and subscribers are told. *arrived*:
-nodes that registered around the proxy before it could be reached are adopted (`adopter`).
+- *gone*: the proxy unregisters nodes at these addresses at once if they do not answer, and the
+  ports refuse connections.
+- *moved*: nodes that answer at the new address keep their ports, and the proxy tells subscribers.
+- *arrived*: the proxy adopts nodes that registered at the real master directly (`adopter`).
 """
 
 import asyncio
@@ -32,18 +33,18 @@ from rosproxy.ros1.upkeep.verifier import Verifier
 log = logging.getLogger(__name__)
 
 GONE_TIMEOUT = 0.5
-"""Seconds that a node has to answer at an address that is said to be gone."""
+"""Seconds within which a node must answer at an address that the operator reports as gone."""
 YOUNG_NODE_AGE = 3.0
-"""Seconds since its last registration in which a silent node gets a second chance."""
+"""Age of the last registration, in seconds, up to which a silent node gets a second chance."""
 SECOND_CHANCE = 1.0
-"""Seconds after which a silent node gets its second chance."""
+"""Seconds after which the proxy probes a silent node a second time."""
 RETIRE_TIMEOUT = 3.0
-"""Seconds that registrations under way get to end before a proxy retires."""
+"""Seconds that the proxy waits for pending registrations before it retires."""
 
 
 @dataclass(slots=True)
 class ContainerEvents:
-    """Acts on what an operator knows of containers before any time-out can tell."""
+    """Acts on reports of an operator, which knows of changes before any time-out ends."""
 
     context: Context
     leases: Leases
@@ -58,12 +59,12 @@ class ContainerEvents:
     async def handle(
         self, gone: Collection[str], moved: Mapping[str, str], arrived: Sequence[Container]
     ) -> dict[str, int]:
-        """``POST /containers``: how many nodes were unregistered, moved and adopted.
+        """``POST /containers``: return how many nodes were unregistered, moved and adopted.
 
-        ``moved``: old address to new address. All of it may safely be sent again. Raises
-        Unreachable, MasterError, once all has been tried.
+        ``moved`` maps old addresses to new addresses. An operator may safely send the same report
+        again. Raises Unreachable or MasterError after all steps were tried.
         """
-        # In this order: a node that has moved is not at an address any more that is gone as well.
+        # In this order: after the move, no moved node is left at an address that is also gone.
         steps = {
             "moved": partial(self._move, moved),
             "unregistered": partial(self._remove, gone),
@@ -84,11 +85,11 @@ class ContainerEvents:
         return counts
 
     async def retire(self) -> int:
-        """``POST /retire``: how many nodes were unregistered; nothing is registered any more.
+        """``POST /retire``: unregister all nodes, and register none from now on.
 
-        Raises Unreachable, MasterError.
+        Returns the number of node names. Raises Unreachable, MasterError.
         """
-        self.context.retired = True  # before the wait: nobody registers meanwhile
+        self.context.retired = True  # before the wait: no node registers meanwhile
         async with self._lock:
             await self.recovery.ensure()
             end = self.context.now() + RETIRE_TIMEOUT
@@ -104,12 +105,15 @@ class ContainerEvents:
         return count
 
     async def _remove(self, addresses: Collection[str]) -> int:
-        """Unregister the nodes at addresses that are gone; those that answer live on."""
+        """Unregister the nodes at addresses that are gone, unless the nodes answer."""
         endpoints = [e for e in self.context.registry if e.location.address in addresses]
         return await self._remove_dead(endpoints, self.context.now() - YOUNG_NODE_AGE)
 
     async def _remove_dead(self, endpoints: Sequence[Endpoint], since: float) -> int:
-        """Unregister nodes that don't answer; silent ones that registered ``since`` then, later."""
+        """Unregister nodes that do not answer; probe silent nodes with newer registrations later.
+
+        ``since``: the time from which registrations count as new.
+        """
         probe = self.context.nodes.probe
         answers = await asyncio.gather(*(probe(e.slave, GONE_TIMEOUT) for e in endpoints))
         outcomes = {e: answer.probe for e, answer in zip(endpoints, answers, strict=True)}
@@ -118,14 +122,14 @@ class ContainerEvents:
             self._close(endpoint)
         alive = [endpoint for endpoint in endpoints if endpoint not in dead]
         for endpoint in alive:
-            endpoint.health.probe_soon()  # another process may have the address by now
+            endpoint.health.probe_soon()  # another process may have the address meanwhile
         silent = [e for e in alive if outcomes[e] is ProbeResult.SILENT]
         if silent:
             self.context.tasks.spawn(self._remove_later(silent), "probing silent nodes again")
         return await self._unregister(e for e in dead if not e.health.cleaned)
 
     async def _remove_later(self, silent: Sequence[Endpoint]) -> None:
-        """Probe silent nodes again; the prober unregisters those that can't be unregistered now."""
+        """Probe silent nodes again. If this fails, the prober unregisters the nodes later."""
         await asyncio.sleep(SECOND_CHANCE)
         async with self._lock:
             current = [e for e in silent if self.context.registry.by_port.get(e.port) is e]
@@ -133,7 +137,7 @@ class ContainerEvents:
                 await self._remove_dead(current, float("inf"))
 
     async def _move(self, moved: Mapping[str, str]) -> int:
-        """Take in that containers have other addresses now; how many nodes that concerns."""
+        """Move endpoints to the new addresses of their containers; return the number of nodes."""
         registry = self.context.registry
         addressing = self.context.addressing
         candidates = liveness.movable(registry, moved, addressing.networks)
@@ -145,9 +149,9 @@ class ContainerEvents:
         for endpoint in relocated:
             self._settle(endpoint, former_uris[endpoint], infos[endpoint])
         await self.registrar.resettle(relocated)
-        await self.resubscriber.announce(relocated)  # their URI is as before, their connections not
+        await self.resubscriber.announce(relocated)  # the URIs are unchanged, connections are lost
         for endpoint in set(infos) - set(relocated):
-            # The node has registered from its new address already, and holds another port there.
+            # The node has already registered from its new address, and holds another port there.
             slave = HostPort(locations[endpoint].address, endpoint.node.port)
             successor = registry.by_slave.get(slave)
             self._close(endpoint)
@@ -157,7 +161,7 @@ class ContainerEvents:
         return sum(len(endpoint.caller_ids) for endpoint in relocated)
 
     async def _inspect(self, endpoint: Endpoint, address: str) -> NodeInfo | None:
-        """What the node of an endpoint says, if it is the one that answers at another address."""
+        """What the node of an endpoint says at another address, if the same node answers there."""
         registrations = list(endpoint.registrations.values())
         slave = HostPort(address, endpoint.node.port)
         ports = list(endpoint.service_ports)
@@ -168,7 +172,7 @@ class ContainerEvents:
         return info
 
     def _settle(self, endpoint: Endpoint, former_uri: str, info: NodeInfo) -> None:
-        """Serve a node at its new address; the master still has the former URI."""
+        """Serve a node at its new address. The master still has the former URI."""
         endpoint.note_moved(former_uri, self.context.addressing.advertised_uri(endpoint))
         endpoint.mark_alive(info.pid, info.topic_ports, self.context.now())
         self._cut(endpoint)
@@ -179,21 +183,21 @@ class ContainerEvents:
         log.info("%s moved to %s", endpoint.label, address, extra=fields)
 
     async def _unregister(self, endpoints: Iterable[Endpoint]) -> int:
-        """Unregister nodes; how many names that were."""
+        """Unregister nodes; return the number of node names."""
         registered = [endpoint for endpoint in endpoints if endpoint.registrations]
         await asyncio.gather(*map(self.registrar.clean_up, registered))
         return sum(len(endpoint.caller_ids) for endpoint in registered)
 
     def _close(self, endpoint: Endpoint) -> None:
-        """Let a port refuse whose node has ended, and end what is still connected to it."""
+        """Make the port of an ended node refuse connections, and cut the open connections."""
         endpoint.health.end(self.context.now())
         if self.context.registry.by_port.get(endpoint.port) is not endpoint:
-            return  # while the node was asked, a living one got the port of this dead one
+            return  # during the probe, a live node got the port of this dead node
         self.leases.close(endpoint)
         self._cut(endpoint)
         self.context.problems.solved_at(endpoint.port)
 
     def _cut(self, endpoint: Endpoint) -> None:
-        """End the connections to a node, also those that the kernel forwards."""
+        """End the connections to a node, also connections that the kernel forwards."""
         self.tcpros.cut(endpoint.port)
         self.plane.cut(endpoint)

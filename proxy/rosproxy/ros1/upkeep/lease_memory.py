@@ -1,10 +1,10 @@
-"""Having the master keep what is to outlast the proxy: where the node of each lease is.
+"""A parameter at the master that outlasts the proxy: where the node of each lease is.
 
-It is written before a node is registered for the first time, and before a service's registration is
-answered: whatever the master knows of, the next process of the proxy can find. All who wait at once
-are served by one write. Once in a while it is looked after: the master may have lost it, and what
-nobody needs any more is taken back. What is kept, and how:
-`rosproxy.ros1.registry.remembered_leases`.
+The proxy writes the parameter before a node is registered for the first time, and before the answer
+to the registration of a service. So the next process of the proxy can find every node that the
+master knows. A single write serves all callers that wait at the same time. From time to time the
+proxy compares the parameter with the leases: the master may have lost the parameter, and ended
+leases have to go. Contents and format: `rosproxy.ros1.registry.remembered_leases`.
 """
 
 import asyncio
@@ -32,18 +32,18 @@ class LeaseMemory:
         self.parameter = remembered_leases.parameter_of(settings.advertise_host, settings.ports)
         self._written_changes = -1
         self._stored: object = None
-        """What the master has, as far as is known."""
+        """The value of the parameter at the master, as far as the proxy knows."""
 
     async def read(self) -> Mapping[int, RememberedLease]:
-        """What a former process has left, by port. Raises Unreachable."""
+        """What a former process of the proxy has stored, by port. Raises Unreachable."""
         self._stored = await self._read()
         return remembered_leases.read_leases(self._stored, self._context.settings.ports)
 
     async def write(self) -> None:
-        """Have the master keep what is known of all leases, unless it does. Raises Unreachable."""
+        """Store changed leases at the master. Raises Unreachable."""
         registry = self._context.registry
         while self._written_changes != registry.lease_changes:
-            async with self._lock:  # whoever has waited here finds the write done, as a rule
+            async with self._lock:  # a caller that has waited here usually finds the write done
                 changes = registry.lease_changes
                 if self._written_changes != changes:
                     await self._write(
@@ -52,7 +52,7 @@ class LeaseMemory:
                     self._written_changes = changes
 
     async def look(self) -> None:
-        """Write it again if the master has lost it, or if somebody else has written there.
+        """Write the parameter again if the master has lost or another program has changed it.
 
         Raises Unreachable.
         """
@@ -66,7 +66,7 @@ class LeaseMemory:
     async def _read(self) -> object:
         try:
             return await self._context.upstream.call_master("getParam", self.parameter)
-        except MasterError:  # it has none
+        except MasterError:  # the parameter is not set
             return ""
 
     async def _write(self, text: str) -> None:
@@ -81,6 +81,6 @@ class LeaseMemory:
             else:
                 await upstream.call_master("deleteParam", self.parameter)
         except MasterError as error:
-            if text:  # nothing else depends on it; to delete what is not there is refused as well
+            if text:  # the master also refuses to delete a missing parameter, which is no problem
                 problems.add(self.parameter, REFUSED.format(error))
-        self._stored = text  # if it was refused, `look` finds the difference and tries again
+        self._stored = text  # if the master refused, `look` finds the difference and tries again

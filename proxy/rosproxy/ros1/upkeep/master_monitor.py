@@ -1,9 +1,9 @@
-"""Watching the real master: is it there, is it still the same, does it still know our nodes?
+"""Watch the real master: does it answer, is it the same process, does it know the nodes inside?
 
-Every ``--master-interval`` the master is asked for its pid. When it answers for the first time the
-registry is rebuilt from it (`recovery`); when it answers again, or as another process, and every
-few looks besides, what it has lost of our nodes is registered again. Plain ROS 1 nodes can't do
-that for themselves.
+At each ``--master-interval`` the proxy asks the master for the pid. After the first answer the
+proxy rebuilds the registry from the master (`recovery`). After an outage, after a change of the
+pid, and at every few looks besides, the proxy makes the registrations again that the master has
+lost. Nodes of ROS 1 do not notice such a loss.
 """
 
 import asyncio
@@ -21,20 +21,20 @@ from rosproxy.ros1.upkeep.registrar import Registrar
 log = logging.getLogger(__name__)
 
 LOOK_TIMEOUT = 5.0
-"""Seconds in which a sound master answers getPid."""
+"""Seconds within which a healthy master answers getPid."""
 LOOKS_PER_CHECK = 5
-"""How many looks at the master go by between two checks of what it knows."""
+"""Looks at the master from one check of the registrations to the next."""
 
 
 MASTER_PATHS = ("", "/", "/RPC2")
-"""Where ROS masters answer: both XML-RPC libraries of ROS 1 take no other."""
+"""Paths at which ROS masters answer. Both XML-RPC libraries of ROS 1 refuse all other paths."""
 
 
 class MasterMonitor:
-    """Polls the master, and has restored what it has lost.
+    """Polls the master, and starts the repair of lost registrations.
 
-    ``up`` is None before the first look; ``since`` is the time of the last change, ``round_trip``
-    in seconds. ``answered`` is set once the master has answered.
+    ``up`` is None before the first look. ``since`` is the time of the last change, ``round_trip``
+    the duration of the last getPid in seconds. ``answered`` is set after the first answer.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class MasterMonitor:
         self.since = context.now()
 
     async def look(self) -> None:
-        """Ask the master for its pid; recover or restore where that is due."""
+        """Ask the master for its pid; recover the registry or restore registrations if due."""
         started = self._context.now()
         try:
             async with asyncio.timeout(LOOK_TIMEOUT):
@@ -65,7 +65,7 @@ class MasterMonitor:
             self._looks += 1
             await self._memory.write()
             if restarted or self._looks % LOOKS_PER_CHECK == 0:
-                await self._memory.look()  # first: what is registered next needs it
+                await self._memory.look()  # first: `register_lost` needs the parameter
                 await self._registrar.register_lost()
             self._mark(True)
         except (Unreachable, MasterError) as error:
@@ -75,7 +75,7 @@ class MasterMonitor:
             self._mark(False, f"master {uri}: no answer in {LOOK_TIMEOUT:g} s")
 
     def _path_hint(self, error: Exception) -> str:
-        """What to do where something answers, but not at the path that was given."""
+        """What to do if a program answers, but not at the path of the master URI."""
         uri = urlsplit(self._context.settings.master_uri)
         if uri.path in MASTER_PATHS or "HTTP status 404" not in str(error):
             return ""
@@ -87,7 +87,7 @@ class MasterMonitor:
         if up != self.up:
             self.since = self._context.now()
             if up:
-                if self.answered.is_set():  # it was away, and may be elsewhere, as may this host
+                if self.answered.is_set():  # after an outage, hosts may have moved
                     self._context.outside_changed.set()
                 self.answered.set()
                 log.info("master %s answers (pid %s)", self._context.settings.master_uri, self.pid)
@@ -100,7 +100,7 @@ class MasterMonitor:
 
 
 def _port_hint(error: Exception) -> str:
-    """What to do where no program listens."""
+    """What to do if no program listens at the port."""
     if isinstance(error, Unreachable) and error.probe is ProbeResult.REFUSED:
         return ". No roscore listens there. Check the port; roscore listens on 11311 by default"
     return ""

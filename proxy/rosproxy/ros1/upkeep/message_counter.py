@@ -1,8 +1,9 @@
-"""Messages by topic, for whoever reads the metrics: nodes are asked what they have counted.
+"""Messages by topic, for the metrics: the proxy asks the nodes for their own counts.
 
-Neither the relay nor the kernel reads messages, but nodes count their own. While the metrics are
-read, those that are well are asked for it (``getBusStats``), so many a second at most; when nobody
-reads them, nobody is asked. What a node counts before it is asked for the first time is not added.
+Neither the relay nor the kernel reads messages, but nodes count the messages of their connections.
+While a program reads the metrics, the proxy asks the healthy nodes for these counts
+(``getBusStats``), at most `MOST_ASKED` nodes a second. Messages before the first answer of a node
+do not count.
 """
 
 import asyncio
@@ -26,31 +27,31 @@ from rosproxy.ros1.upkeep.decisions.topic_growth import (
 log = logging.getLogger(__name__)
 
 COUNT_TICK = 1.0
-"""Seconds between two looks at who is to be asked."""
+"""Seconds between two rounds of questions."""
 MOST_ASKED = 20
-"""Nodes that are asked in one look at most."""
+"""The highest number of nodes that the proxy asks in a round."""
 AT_ONCE = 4
-"""Answers that are waited for at once: they may all come in the same moment, and long."""
+"""Answers that the proxy awaits at the same time. All may arrive at once, and be long."""
 EVERY = 10.0
-"""Seconds after which a node is asked again."""
+"""Seconds after which the proxy asks a node again."""
 AFTER_SILENCE = 30.0
-"""Seconds after which one is asked again that has not answered in time."""
+"""Seconds after which the proxy asks a node again that gave no answer."""
 PATIENCE = 300.0
-"""Seconds after which one is asked again that does not count, or has counted too far to tell."""
+"""Seconds after which the proxy asks a node again that answered with an error or too much."""
 READ_LATELY = 180.0
-"""Seconds for which it goes on after the metrics were read: Prometheus comes each minute or so."""
+"""Seconds for which the questions go on after a read: Prometheus reads about once a minute."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
-    """What a node has said last, and when it is asked again."""
+    """The last answer of a node, and the time of the next question."""
 
     ask_at: float
     stats: BusStats | None = None
 
 
 class MessageCounter:
-    """Sums up what the nodes inside count."""
+    """Sums up the messages that the nodes inside have counted."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -60,12 +61,12 @@ class MessageCounter:
         self._limit = asyncio.Semaphore(AT_ONCE)
 
     def read(self) -> TopicSums:
-        """The sums, for somebody who reads the metrics."""
+        """The sums, for a program that reads the metrics. Keeps the questions going."""
         self._read_at = self._context.now()
         return self._sums
 
     async def look(self) -> None:
-        """Ask those that are due, if somebody reads the metrics."""
+        """Ask the nodes that are due, if a program has read the metrics lately."""
         now = self._context.now()
         if self._context.retired or now - self._read_at > READ_LATELY:
             self._answers.clear()
@@ -96,16 +97,16 @@ class MessageCounter:
             self._answers[endpoint] = self._after_failure(former, error)
             return
         if endpoint.slave != slave:
-            return  # it has moved meanwhile, and who has answered may be somebody else
+            return  # the node has moved meanwhile: another node may have answered
         stats = registered_stats(endpoint, read_bus_stats(reply))
         self._answers[endpoint] = _Answer(self._context.now() + EVERY, stats)
-        # Of the first answer it is not known since when: counting begins there.
+        # The proxy does not know since when the first answer counts, so the sums start there.
         since = stats if former.stats is None else former.stats
         for (direction, topic), count in growth(since, stats).items():
             self._sums.add(topic, SIDES[direction], count)
 
     def _after_failure(self, former: _Answer, error: Exception) -> _Answer:
-        """What is known of a node that gave no counts: those it told before are not lost."""
+        """The record of a node without counts. After silence, the last counts stay the base."""
         now = self._context.now()
         if isinstance(error, Unreachable) and error.probe is not ProbeResult.ANSWERED:
             return _Answer(now + AFTER_SILENCE, former.stats)

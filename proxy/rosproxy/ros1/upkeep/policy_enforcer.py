@@ -1,10 +1,16 @@
-"""A policy that has changed: registrations are hidden and shown, connections are cut.
+"""Enforce a changed policy: hide and show registrations, and cut connections.
 
-What is denied now is taken back at the master and hidden; the nodes inside that use it stay
-connected. What is allowed again is registered. Connections from outside to what outside may not
-have are cut, and a node of which anything may be denied loses its fast port, as do all stand-ins
-for nodes outside where a rule is about those: what the kernel forwards is not checked. Nothing
-else is touched, so that it may be done at any time, and is done again until it has worked.
+- The proxy takes back denied registrations at the master and hides them. Nodes inside that use
+  these registrations stay connected.
+- The proxy registers what the policy allows again.
+- The proxy cuts connections to denied topics and services: connections from outside, and
+  connections from inside through stand-ins.
+- A node loses its fast port if the policy may deny a part of the node, because the proxy does not
+  check what the kernel forwards. If a rule concerns nodes outside, all stand-ins lose their fast
+  ports.
+
+All the rest stays as it is. So the proxy may enforce a policy at any time, and repeats this until
+all steps have worked.
 """
 
 import asyncio
@@ -26,12 +32,12 @@ from rosproxy.ros1.upkeep.registrar import Registrar
 log = logging.getLogger(__name__)
 
 ENFORCE_TICK = 0.5
-"""Seconds between looks whether the policy has changed."""
+"""Seconds between two checks whether the policy has changed."""
 
 
 @dataclass(slots=True, eq=False)
 class PolicyEnforcer:
-    """Makes registrations and connections fit the policy."""
+    """Makes registrations and connections comply with the policy."""
 
     _context: Context
     _leases: Leases
@@ -44,7 +50,7 @@ class PolicyEnforcer:
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def look(self) -> None:
-        """Enforce the policy if that has not been done since it changed."""
+        """Enforce the policy if the policy has changed since the last time."""
         policy = self._context.policy
         if policy.must_enforce or self._enforced_version != policy.rules.version:
             try:
@@ -53,9 +59,9 @@ class PolicyEnforcer:
                 log.debug("the proxy could not enforce the policy yet: %s", error)
 
     async def enforce(self) -> EnforcementCounts:
-        """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
+        """Hide, show and cut. Raises Unreachable, MasterError; cut connections stay cut."""
         async with self._lock:
-            # Before anything is awaited: what changes meanwhile is left for the next look.
+            # Before the first await: the next look handles changes that happen meanwhile.
             policy = self._context.policy
             version = policy.rules.version
             policy.must_enforce = False
@@ -75,9 +81,10 @@ class PolicyEnforcer:
         return enforced
 
     def _cut_relays(self) -> int:
-        """End the connections that outside, or a node inside, may not have; how many.
+        """End the connections that the policy denies to outside or to a node inside; their number.
 
-        The name of what is not registered is not known: a connection to it may be denied as well.
+        The name of an unregistered topic or service is unknown, so the policy may deny such a
+        connection as well.
         """
         policy = self._context.policy
         count = 0
@@ -96,10 +103,10 @@ class PolicyEnforcer:
         return policy.check_outside(relay.kind, relay.name, endpoint, relay.peer) is not None
 
     def _take_fast_ports(self) -> int:
-        """Take fast ports from nodes of which something may be denied; how many connections."""
+        """Take fast ports from nodes that the policy may deny in part; the cut connections."""
         policy = self._context.policy
         count = 0 if policy.inside_may_bypass() else self._stand_ins.close_fast_ports()
-        # These are connections of nodes inside, who may have to be told of their publishers again.
+        # Nodes inside have lost connections, and may need their publishers once more.
         if count:
             self._leases.watch(self._context.registry)
         for endpoint in self._context.registry:

@@ -1,14 +1,17 @@
-"""Looking after each node by its pulse: probe, unregister the dead, free the ports of the unused.
+"""Probe each node, unregister dead nodes, and free unused ports.
 
-Every few seconds a node that nobody called is asked for its pid: one that is well over a connection
-that is kept (`rosproxy.ros1.clients.kept_connections`), any other by a call; so is, at once, one
-that has ended that connection. Two failures in a row make its port refuse, so that a dead node
-looks dead; after the time of ``--cleanup-after`` it is unregistered at the master. A node that
-answers again is served again, and registered again if need be. Another pid than before means
-another process: what the former one left is taken back.
+At each ``--probe-interval`` the proxy asks a node for the pid, if no other call has reached the
+node meanwhile. The proxy asks a healthy node over a kept connection
+(`rosproxy.ros1.clients.kept_connections`), and all other nodes by a call. The proxy also calls at
+once if a node has ended the kept connection.
 
-What follows from a probe: `Health.note` says how the node is, `liveness` what is due, and the
-`Registrar` and the modules beside this one do it.
+After two failures in a row the port refuses connections, so that a dead node looks dead. After
+``--cleanup-after`` the proxy unregisters the node at the master. When the node answers again, the
+proxy serves the node again, and registers the node if necessary. A new pid means a new process: the
+proxy then takes back the registrations that the former process left.
+
+`Health.note` says how the node is after a probe, `liveness` what is due. The `Registrar` and the
+modules beside this module act.
 """
 
 import asyncio
@@ -31,16 +34,16 @@ from rosproxy.ros1.upkeep.resubscriber import Resubscriber
 log = logging.getLogger(__name__)
 
 PROBE_TICK = 0.25
-"""Seconds between looks at all endpoints."""
+"""Seconds between two looks at all endpoints."""
 PARALLEL_PROBES = 64
 OVERDUE = "no answer in time"
 SWEEP_INTERVAL = 5.0
-"""Seconds between looks for kept connections whose endpoint has gone."""
+"""Seconds between two searches for kept connections whose endpoint has gone."""
 
 
 @dataclass(slots=True, eq=False)
 class Prober:
-    """Looks after all endpoints."""
+    """Probes all endpoints, and acts on the results."""
 
     _context: Context
     _leases: Leases
@@ -53,13 +56,13 @@ class Prober:
     _limit: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(PARALLEL_PROBES))
 
     def __post_init__(self) -> None:
-        """Begin with no connection."""
+        """Create the set of kept connections."""
         self.kept_connections = KeptConnections(
             self._context.nodes, self._context.settings.probe_timeout
         )
 
     async def look(self) -> None:
-        """Look after all endpoints once."""
+        """Begin the probes that are due, and end unused leases."""
         context = self._context
         if context.retired:
             return
@@ -77,17 +80,17 @@ class Prober:
             self.kept_connections.keep(set(context.registry))
 
     def _ask(self, endpoint: Endpoint, now: float) -> None:
-        """Find out how a node is, in the cheapest way that there is."""
+        """Ask for the pid of a node over a kept connection if possible, otherwise by a call."""
         pid = endpoint.health.pid if liveness.may_be_kept(endpoint) else None
         if pid is None or not self.kept_connections.ask(endpoint, endpoint.slave, pid, now):
             self._begin_probe(endpoint)
 
     def _note_result(self, endpoint: Endpoint, result: ProbeResult | None, now: float) -> None:
-        """Note what a kept connection has shown; None: the node has ended it."""
+        """Record what a kept connection has shown; None: the node has ended the connection."""
         if result is None:
             endpoint.health.note_hung_up()
         elif endpoint in self._probing or not liveness.may_be_kept(endpoint):
-            return  # it is suspected meanwhile: it is asked by a call
+            return  # the node is suspected meanwhile: a call asks the node
         elif result is ProbeResult.ANSWERED:
             endpoint.health.note(result, now)
         else:
@@ -101,18 +104,18 @@ class Prober:
         try:
             async with self._limit:
                 await self._look_after(endpoint, answer)
-        except (Unreachable, MasterError) as error:  # the same is due at the next probe
+        except (Unreachable, MasterError) as error:  # the next probe finds the same due
             log.debug("%s: the proxy could not act on the probe yet: %s", endpoint.label, error)
         finally:
             self._probing.discard(endpoint)
 
     async def _look_after(self, endpoint: Endpoint, answer: ProbeAnswer | None) -> None:
-        """Act on how a node has answered, or answers when it is called."""
+        """Act on the answer of a node; without ``answer``, call the node first."""
         slave = endpoint.slave
         health = endpoint.health
         answer = answer or await self._context.nodes.probe(slave)
         if endpoint.slave != slave:
-            return  # it has moved meanwhile
+            return  # the node has moved meanwhile
         was_failing = health.failures > 0
         went_down = health.note(answer.probe, self._context.now())
         if answer.probe is ProbeResult.ANSWERED:
@@ -137,7 +140,7 @@ class Prober:
             await self._registrar.unregister_left_over(endpoint)
         elif due is AfterAnswer.RECONCILE:
             await self._registrar.reconcile(endpoint)
-        # Only now: had a call to the master failed, the next probe would find the same due.
+        # Last: if a call to the master has failed, the next probe finds the same due.
         endpoint.health.pid = pid
         if not self._leases.is_open(endpoint):
             log.info("%s answers again", endpoint.label, extra=endpoint.log_fields)
@@ -150,7 +153,7 @@ class Prober:
             self._context.problems.add(endpoint.label, f"does not answer: {reason}", endpoint.port)
 
     def _end_if_unused(self, endpoint: Endpoint) -> None:
-        """End the lease of an endpoint that nobody has needed for long enough."""
+        """End the lease of an endpoint that has been unused for long enough."""
         now = self._context.now()
         if not endpoint.unused:
             endpoint.idle_since = None

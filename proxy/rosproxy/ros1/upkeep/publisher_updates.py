@@ -1,11 +1,11 @@
-"""The master's part for what it does not know: which publishers subscribers inside hear of.
+"""Send subscribers inside the publishers of a topic, with publishers that the master does not know.
 
-A list of publishers for a node inside is what the master says, and the hidden publishers besides
-(`rosproxy.ros1.policy`). When those change, the subscribers inside are told.
-The ones that the master knows need the master's list for that: registering them again yields it,
-and tells nobody anything.
+The list for a node inside has the publishers of the master and the hidden publishers
+(`rosproxy.ros1.policy`). When hidden publishers change, the proxy tells the subscribers inside. For
+a subscriber that the master knows, the proxy needs the list of the master. To get the list, the
+proxy registers the subscriber again, which sends no node an update.
 
-Updates of one topic wait for each other, so that an older list never comes after a newer one.
+Updates of the same topic wait for each other, so that an older list never follows a newer list.
 """
 
 import asyncio
@@ -26,11 +26,11 @@ log = logging.getLogger(__name__)
 
 PARALLEL_CALLS = 32
 RETRY = 2.0
-"""Seconds after which a master that could not be reached is asked again."""
+"""Seconds after which the proxy tries again to reach the master."""
 
 
 class PublisherUpdates:
-    """Hands subscribers their publishers."""
+    """Sends ``publisherUpdate`` to subscribers."""
 
     def __init__(self, context: Context, stand_ins: StandInPorts) -> None:
         self._context = context
@@ -40,9 +40,9 @@ class PublisherUpdates:
         self._changed_topics: dict[str, bool] = {}
 
     async def update(self, subscriber: str, topic: str, publishers: Sequence[str]) -> bool:
-        """Hand the node at a slave URI the publishers of a topic; whether it has answered.
+        """Send the publishers of a topic to the node at a slave URI; whether the node has answered.
 
-        All URIs are given as the master holds them.
+        All URIs are in the form that the master has.
         """
         endpoint = self._context.addressing.endpoint_of(subscriber)
         if endpoint:
@@ -53,7 +53,11 @@ class PublisherUpdates:
     async def update_inside(
         self, endpoint: Endpoint, topic: str, publishers: Sequence[str]
     ) -> bool:
-        """The same for an endpoint's node: with the hidden publishers, by URIs that it can use."""
+        """Send the node of an endpoint the publishers of a topic; whether the node has answered.
+
+        ``publishers`` are URIs in the form that the master holds. The method adds the hidden
+        publishers, and imports all URIs.
+        """
         caller = self._context.caller_at(endpoint)
         addressing = self._context.addressing
         await self._stand_ins.listen_for(publishers, caller)
@@ -62,29 +66,29 @@ class PublisherUpdates:
         return await self._update(endpoint.slave, topic, [*imported])
 
     def note_registration(self, registration: Registration) -> None:
-        """Note that a registration was made or has ended: subscribers that need it are told."""
+        """Tell the affected subscribers inside that a registration was made or has ended."""
         if registration.kind is Kind.PUBLISHER:
             self.update_subscribers([registration.name], registration.hidden)
 
-    def update_subscribers(self, topics: Iterable[str], everybody: bool = True) -> None:
+    def update_subscribers(self, topics: Iterable[str], all_inside: bool = True) -> None:
         """Tell the subscribers inside that publishers of some topics have changed.
 
-        Not ``everybody``: only the hidden subscribers, since the master tells the others.
+        Without ``all_inside``, only the hidden subscribers: the master tells all other subscribers.
         """
         for topic in topics:
-            if everybody or self._context.policy.hides_subscribers(topic):
-                self._changed_topics[topic] = everybody or self._changed_topics.get(topic, False)
+            if all_inside or self._context.policy.hides_subscribers(topic):
+                self._changed_topics[topic] = all_inside or self._changed_topics.get(topic, False)
                 if topic not in self._topics_underway:
                     self._topics_underway.add(topic)
                     self._context.tasks.spawn(self._update_topic(topic), f"publishers of {topic}")
 
     async def _update_topic(self, topic: str) -> None:
-        """Tell a topic's subscribers inside, until nothing of it has changed meanwhile."""
+        """Tell the subscribers of a topic inside; again, if the topic changes meanwhile."""
         try:
             while topic in self._changed_topics:
-                everybody = self._changed_topics.pop(topic)
+                all_inside = self._changed_topics.pop(topic)
                 inside = self._context.registry.subscriptions(topic)
-                inside = [(e, r) for e, r in inside if e.answers and (everybody or r.hidden)]
+                inside = [(e, r) for e, r in inside if e.answers and (all_inside or r.hidden)]
                 try:
                     await self._hand_out(inside)
                 except Unreachable as error:
@@ -98,7 +102,7 @@ class PublisherUpdates:
             self._topics_underway.discard(topic)
 
     async def _hand_out(self, subscribers: Sequence[EndpointRegistration]) -> None:
-        """Hand subscribers of one topic their publishers. Raises Unreachable."""
+        """Send subscribers of one topic the publishers. Raises Unreachable."""
         addressing = self._context.addressing
         shown = [(e, r) for e, r in subscribers if not r.hidden]
         calls = [decisions.register_call(r, addressing.advertised_uri(e), "") for e, r in shown]
@@ -114,7 +118,7 @@ class PublisherUpdates:
         await self.update_inside(endpoint, topic, publishers)
 
     async def _update(self, slave: HostPort, topic: str, publishers: Sequence[str]) -> bool:
-        # In the name that rosmaster gives (master_api.py, publisher_update_task).
+        # "/master" is the caller_id of rosmaster (master_api.py, publisher_update_task).
         body = xmlrpc.dump_call("publisherUpdate", "/master", topic, list(publishers))
         async with self._limit:
             try:

@@ -1,24 +1,24 @@
-"""After a start: finding at the master which nodes are behind this proxy, and on which ports.
+"""After a start: find the nodes behind this proxy, and their ports, at the master.
 
-The proxy keeps nothing on disk; the master is the database. `Recovery.ensure` reads the master's
-graph once, and what the proxy has it remember (`LeaseMemory`), finds the URIs that this proxy
-advertised (`recovery_claims.find_claims`), and rebuilds the endpoints on the ports that they had.
-Calls that register wait for it: a node that registered before would get another port, and the
-master would shut it down for having moved. Before that an operator's policy is waited for
-(``--await-policy``), or what it denies would be registered for a moment.
+The proxy keeps nothing on disk; the master is the database. `Recovery.ensure` reads the graph of
+the master once, and the parameter of the proxy (`LeaseMemory`). It finds the URIs that this proxy
+advertised (`recovery_claims.find_claims`), and rebuilds the endpoints on their former ports. Calls
+that register wait for the recovery. Otherwise a node would get another port, and the master would
+shut the node down because of the changed URI. First the recovery waits for the policy of an
+operator (``--await-policy``). Without the policy, the proxy would register denied names for a
+moment.
 
-What the master says is only a claim, since anybody can write to it. Until the node itself has
-borne it out (`Verifier`), the endpoint's port is held but refuses. Then subscribers are made to
-connect again (`Resubscriber.announce`). A node that does not answer yet is verified when a probe
-finds it (`Prober`).
+Any program can write to the master, so its data are only claims. Until the node has confirmed the
+claim (`Verifier`), the proxy holds the port, and the port refuses connections. Afterwards
+subscribers connect again (`Resubscriber.announce`). If a node does not answer yet, the proxy
+verifies the node when a probe gets an answer (`Prober`).
 
-A claim keeps no port from a node that lives: where the range is used up, one that registers waits a
-moment for claims that are being verified, and gets the port of one whose node is dead
-(`wait_for_dead_claim`). What the master has for nodes that got no port again, although it carries
-this proxy's own address, is nobody's: a former proxy left it behind, and it is taken back
-(`_sweep`).
+A claim never keeps a port from a live node. If the range is used up, a new node waits a moment for
+pending verifications, and gets the port of a claim whose node is dead (`wait_for_dead_claim`). Some
+registrations at the master have the address of this proxy, but no node got their port again. A
+former proxy left these registrations, and the proxy takes them back (`_sweep`).
 
-If ports are others after a start, look here: the log names each claim that was refused, and why.
+If nodes have other ports after a start, the log names each refused claim and the reason.
 """
 
 import asyncio
@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 
 PARALLEL_INSPECTIONS = 64
 CLAIM_GRACE = 1.0
-"""Seconds that a claim gets to be borne out once a living node waits for its port."""
+"""Seconds that a node has to confirm its claim once a live node waits for the port."""
 DOUBT = (
     "answers, but the proxy can't tell whether this is the node that the master has at this port: "
     "the client library lacks getPublications or getSubscriptions, and the node has no topic or "
@@ -56,9 +56,9 @@ DOUBT = (
 
 
 class Recovery:
-    """Rebuilds the registry from what the master holds.
+    """Rebuilds the registry from the data at the master.
 
-    ``verifying`` are the endpoints that wait to be verified, and need not be probed meanwhile.
+    ``verifying`` has the endpoints that wait for verification; the prober leaves them out.
     """
 
     def __init__(
@@ -87,10 +87,10 @@ class Recovery:
         self._announcing = asyncio.Lock()
 
     async def ensure(self) -> None:
-        """Have the registry rebuilt from the master, once. Raises Unreachable.
+        """Rebuild the registry from the master, once. Raises Unreachable.
 
-        All who wait for the same attempt share its failure: a master that hangs would keep the
-        last of them waiting for as many attempts as there are callers.
+        All callers that wait for the same attempt share its failure. Otherwise, with a master that
+        hangs, the last caller would wait for as many attempts as there are callers.
         """
         if self._recovered.is_set():
             return
@@ -111,7 +111,7 @@ class Recovery:
             self._recovered.set()
 
     async def serve(self, endpoint: Endpoint) -> None:
-        """Serve a recovered endpoint if its node bears it out, and have subscribers connect again.
+        """Serve a recovered endpoint if its node confirms the claim, and reconnect subscribers.
 
         Raises Unreachable, MasterError.
         """
@@ -122,8 +122,8 @@ class Recovery:
             self.verifying.discard(endpoint)
         if not self._leases.is_open(endpoint):
             return
-        # Each announcement reads the whole graph: one per node would cost the square of the nodes.
-        # So nodes that came up during the announcement before are announced together.
+        # Each announcement reads the whole graph, so an announcement for each node would cost the
+        # square of the number of nodes. Nodes that came up during an announcement share the next.
         self._unannounced.append(endpoint)
         async with self._announcing:
             endpoints = self._unannounced
@@ -132,9 +132,9 @@ class Recovery:
                 await self._resubscriber.announce(endpoints)
 
     async def wait_for_dead_claim(self) -> None:
-        """Wait a moment for a node that is being verified to turn out dead.
+        """Wait up to `CLAIM_GRACE` until a node under verification turns out dead.
 
-        Those that were inspected all that time and are silent count as failing from then on.
+        Nodes that were silent during the whole wait count as failing afterwards.
         """
         end = self._context.now() + CLAIM_GRACE
         awaited = set(self.verifying)
@@ -158,7 +158,7 @@ class Recovery:
         endpoints = [endpoint for _, endpoint in restored if endpoint is not None]
         served_ids = {id(claim) for claim, endpoint in restored if endpoint is not None}
         unserved = [claim for claim in claims if id(claim) not in served_ids]
-        # Before calls that register go on: their nodes could get these fast ports as leases.
+        # Before calls that register go on: other nodes could get these fast ports as leases.
         self._plane.recovered([e for e in endpoints if self._context.policy.may_bypass(e)])
         if (unserved or forgotten) and self._context.settings.cleanup_after:
             sweep = self._sweep(unserved, forgotten)
@@ -169,7 +169,7 @@ class Recovery:
             self._context.tasks.spawn(self._resume(endpoints), "recovery")
 
     async def _settle(self, claims: Sequence[Claim]) -> list[Claim]:
-        """One claim per port: where several are made, the nodes themselves are asked first."""
+        """Choose one claim for each port. The nodes of contested claims are asked first."""
 
         async def ask(claim: Claim) -> None:
             log.warning(
@@ -177,7 +177,8 @@ class Recovery:
                 claim.port,
                 claim.uri,
             )
-            # Anybody can write to the master: nobody outside is called on its word.
+            # Any program can write to the master, so the proxy calls no address outside for a
+            # claim.
             if is_inside(claim.slave.host, self._context.addressing.networks):
                 claim.node_info = await self._context.nodes.inspect(claim.slave)
 
@@ -185,7 +186,7 @@ class Recovery:
         return recovery_claims.choose_claims(claims)
 
     def _restore(self, claim: Claim) -> Endpoint | None:
-        """The endpoint of a claim, not trusted yet; None if it is outside, or its port is taken."""
+        """The untrusted endpoint of a claim; None if the node is outside, or the port is taken."""
         address = claim.slave.host
         if self._context.client_kind(address) is ClientKind.OUTSIDE:
             text = "port %d: not recovered: the node's address %s is not in an inside network"
@@ -203,11 +204,11 @@ class Recovery:
         for port in claim.service_ports:
             endpoint.note_service_port(port)
         if claim.advertised != self._context.addressing.advertised_uri(endpoint):
-            endpoint.former_uris.add(claim.advertised)  # the URI of a former version
+            endpoint.former_uris.add(claim.advertised)  # a former version advertised this URI
         return endpoint
 
     async def _resume(self, endpoints: Sequence[Endpoint]) -> None:
-        """Serve recovered endpoints; none waits for another that does not answer."""
+        """Serve recovered endpoints, all at the same time: a silent node delays no other node."""
         try:
             await asyncio.gather(*map(self.serve, endpoints))
             log.info("recovered %d nodes", sum(e.trusted for e in endpoints))
@@ -217,16 +218,16 @@ class Recovery:
     async def _sweep(
         self, unserved: Sequence[Claim], forgotten: Mapping[str, Sequence[Registration]]
     ) -> None:
-        """Take back at the master what no endpoint stands for, after ``--cleanup-after``.
+        """After ``--cleanup-after``, take back registrations at the master that have no endpoint.
 
-        Not of a node that bears out what the master has of it: it gets its port, if that is free
-        by now and the node is inside, as an operator may have said meanwhile. One that does not
-        tell who it is is left alone.
+        If the node of a claim confirms its registrations, and is inside by now, the node gets the
+        port if this is free. An operator may have reported the node meanwhile. The proxy leaves a
+        node alone that answers, but neither confirms nor refutes the claim.
         """
         await asyncio.sleep(self._context.settings.cleanup_after)
         self._context.refresh_networks()
         for uri, registrations in forgotten.items():
-            with contextlib.suppress(Unreachable):  # the next start finds it again
+            with contextlib.suppress(Unreachable):  # the next start of the proxy finds them again
                 await self._registrar.take_back(uri, registrations)
         for claim in unserved:
             try:
@@ -240,9 +241,9 @@ class Recovery:
                 log.warning("%s stays registered at the master: %s", claim.advertised, error)
 
     async def _is_borne_out(self, claim: Claim) -> bool | None:
-        """Whether the node of a claim is inside and is the one that the master has.
+        """Whether the node of a claim is inside and confirms its registrations.
 
-        None if it lives and does not tell.
+        None if the node answers, but neither confirms nor refutes the claim.
         """
         if self._context.client_kind(claim.slave.host) is ClientKind.OUTSIDE:
             return False
@@ -260,7 +261,7 @@ class Recovery:
         finally:
             self._inspecting.discard(endpoint)
         if endpoint.trusted or self._context.registry.by_port.get(endpoint.port) is not endpoint:
-            return  # it has registered meanwhile, or was given up for a node that lives
+            return  # the node has registered meanwhile, or lost the port to a live node
         if info is None:
             if endpoint.health.answered_at is None:
                 endpoint.health.note(ProbeResult.SILENT, self._context.now())
@@ -281,12 +282,12 @@ class Recovery:
         address = endpoint.location.address
         host = self._context.upstream.reach(endpoint.node).host
         addresses = await resolve(host, address)
-        # Neighbours can use the host's name if it leads here.
+        # Neighbours can use the host name if the name resolves to this address.
         if endpoint.location.address == address:
             endpoint.location = replace(endpoint.location, named=address in addresses)
         refuted = await self._verifier.refuted(endpoint.slave, registrations, info, ports)
         await self._registrar.disown(endpoint, refuted)
-        # The master has it by a former version's URI: it is registered by that of this one.
+        # The master has the URI of a former version of the proxy: register the present URI.
         if len(self._context.addressing.uris_at_master(endpoint)) > 1:
             current = list(endpoint.registrations.values())
             await self._registrar.register([(endpoint, r) for r in current])
@@ -294,6 +295,6 @@ class Recovery:
         await self._registrar.register_missing(endpoint, info)
 
     def _note_doubt(self, endpoint: Endpoint) -> None:
-        """Note that the node that answers does not tell who it is: it stays registered."""
+        """Record that the node answers, but does not confirm its claim: it stays registered."""
         endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
         self._context.problems.add(endpoint.label, DOUBT, endpoint.port)

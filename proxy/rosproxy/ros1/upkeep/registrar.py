@@ -1,11 +1,17 @@
-"""Keeping the master right: registering nodes again, and unregistering those that are gone.
+"""Register nodes at the master again, and unregister nodes that are gone.
 
-Everything that the proxy itself registers or unregisters goes through the `Registrar`; the modules
-beside this one decide when. `Registrar.register` is the way for all of it: it asks the master who
-has each name now, leaves a name to any other node that has it, frees one that the master has by a
-former URI of the same node, makes the calls, and hands subscribers the publishers that the replies
-name, as the master does with ``publisherUpdate``. What the policy denies it hides instead, and
-takes back where the master has it (`_conceal`).
+All registrations that the proxy makes or takes back by itself pass the `Registrar`. The modules
+beside this module decide when. `Registrar.register` works in these steps:
+
+1. Ask the master for the present URI of each name. If another node has the name by now, do not
+   register the name. If the master has a former URI of the same node, take back the registrations
+   first.
+2. Make the calls.
+3. Send subscribers the publishers that the replies name. The master does the same with
+   ``publisherUpdate``.
+
+The `Registrar` hides what the policy denies, and takes back these registrations at the master
+(`_conceal`).
 """
 
 import asyncio
@@ -26,15 +32,15 @@ from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 log = logging.getLogger(__name__)
 
 FormerUris = Mapping[str, tuple[Endpoint, str]]
-"""Names with their endpoints, and the former URIs by which the master has them."""
+"""For each name its endpoint, and the former URI that the master has for the name."""
 CHECKED_AT_ONCE = 100
-"""Registrations that the proxy checks before other tasks have their turn: rules may be many."""
+"""Registrations that the proxy checks before other tasks run: a policy may have many rules."""
 SETTLE_TIME = 2.0
-"""Seconds in which the master's updates about a publisher that is registered anew come in."""
+"""Seconds within which the master's updates about a newly registered publisher arrive."""
 
 
 class Registrar:
-    """Calls to the master on behalf of inside nodes, and what follows from the replies."""
+    """Calls the master on behalf of nodes inside, and acts on the replies."""
 
     def __init__(
         self, context: Context, publisher_updates: PublisherUpdates, memory: LeaseMemory
@@ -43,14 +49,14 @@ class Registrar:
         self._publisher_updates = publisher_updates
         self._memory = memory
         self._complete_state: tuple[bytes, int, frozenset[int]] = b"", -1, frozenset()
-        """The master's state, our own and the ports of nodes that answered, when nothing of theirs
-        was missing."""
+        """The state when no registration was missing: digest of the master's state, number of
+        changes of the registry, and ports of the nodes that answered."""
 
     async def register(self, registrations: Sequence[EndpointRegistration]) -> None:
         """Register again what the master has lost. Raises Unreachable, MasterError.
 
-        A name that another node has by now is left to it; what the master has by a former URI of
-        the same node is taken back first.
+        If another node has a name by now, the name stays with this node. If the master has a former
+        URI of the same node, the proxy first takes back the registrations with this URI.
         """
         names = {r.caller_id for _, r in registrations}
         uris = await self._context.upstream.look_up("lookupNode", names)
@@ -74,15 +80,15 @@ class Registrar:
     async def reclaim(self, former: FormerUris) -> None:
         """Register nodes anew that the master has by former URIs. Raises Unreachable, MasterError.
 
-        Registrations of theirs that only the master has are added to the registry.
+        Adds to the registry what only the master has of these nodes.
         """
         await self._register(await self._free(former))
 
     async def resettle(self, endpoints: Sequence[Endpoint]) -> None:
         """Register nodes anew that have moved to another address. Raises Unreachable, MasterError.
 
-        Their own connections have lost their address: roscpp makes new ones if it is told that
-        the publishers have gone before it is told that they are there.
+        The nodes' own connections have lost their local address. roscpp makes new connections if it
+        first gets an empty list of publishers, and then the full list.
         """
         topics = [(e, topic) for e in endpoints for topic in e.names(Kind.SUBSCRIBER)]
         update = self._publisher_updates.update_inside
@@ -92,7 +98,7 @@ class Registrar:
             endpoint.unsettled = False
 
     async def register_missing(self, endpoint: Endpoint, info: NodeInfo) -> None:
-        """Register what a node has and the master does not know of. Raises Unreachable."""
+        """Register the topics that a node has and the master does not know. Raises Unreachable."""
         missing = decisions.unregistered_topics(endpoint, info)
         for registration in missing:
             self._context.registry.register(endpoint, registration)
@@ -103,7 +109,8 @@ class Registrar:
     async def register_lost(self) -> None:
         """Register what the master no longer has of live nodes. Raises Unreachable, MasterError.
 
-        While the master's state and ours are as they were when nothing was missing, nothing is.
+        The comparison is left out if master and registry are unchanged since no registration was
+        missing.
         """
         registry = self._context.registry
         started = self._context.now()
@@ -123,7 +130,7 @@ class Registrar:
                 "the master has lost %d registrations; the proxy makes them again", len(missing)
             )
             await self.register([(endpoints[r], r) for r in missing])
-        elif our_state[0] == registry.changes:  # nothing was registered while it was asked
+        elif our_state[0] == registry.changes:  # no node registered while the master was asked
             self._complete_state = digest, *our_state
 
     async def clean_up(self, endpoint: Endpoint) -> None:
@@ -136,14 +143,14 @@ class Registrar:
         _log(endpoint, "%s unregistered: %d registrations taken back", len(registrations))
 
     async def give_up(self, endpoint: Endpoint) -> None:
-        """Unregister a node that does not answer, whose port another needs. Raises Unreachable."""
+        """Unregister a silent node whose port another node needs. Raises Unreachable."""
         if not endpoint.health.cleaned:
             await self.clean_up(endpoint)
 
     async def take_back(self, uri: str, registrations: Sequence[Registration]) -> None:
-        """Unregister what the master has by an advertised URI of names that are at no endpoint.
+        """Unregister names that the master has at an advertised URI, but that have no endpoint.
 
-        Names that have another URI by now are left alone. Raises Unreachable.
+        The names that have another URI by now stay. Raises Unreachable.
         """
         addressing = self._context.addressing
         upstream = self._context.upstream
@@ -151,7 +158,7 @@ class Registrar:
         slave = parse_slave_uri(uri)
         if slave is None:
             return
-        endpoint = addressing.endpoint_of(uri)  # another node's, which has the port by now
+        endpoint = addressing.endpoint_of(uri)  # of another node, which has the port now
         names = endpoint.callers if endpoint else ()
         stale = [
             r for r in registrations if uris.get(r.caller_id) == uri and r.caller_id not in names
@@ -166,8 +173,8 @@ class Registrar:
     async def disown(self, endpoint: Endpoint, registrations: Sequence[Registration]) -> None:
         """Unregister names that another node had on this port before. Raises Unreachable.
 
-        They are no former names of the endpoint's node either: a ``shutdown`` by the master for
-        such a name is not meant for it (`Adopter.absorb_shutdown`).
+        The names are no longer former names of this endpoint. So if the master calls ``shutdown``
+        for such a name, the proxy does not pass the call on (`Adopter.absorb_shutdown`).
         """
         current = [r for r in registrations if endpoint.registrations.get(r.key) is r]
         await self._forget(endpoint, current)
@@ -175,7 +182,7 @@ class Registrar:
             endpoint.former_callers.pop(registration.caller_id, None)
 
     async def come_back(self, endpoint: Endpoint, pid: int | None) -> None:
-        """Register a node again that was cleaned up and answers after all, as process ``pid``.
+        """Register an unregistered node again that answers as process ``pid``.
 
         Raises Unreachable, MasterError.
         """
@@ -193,7 +200,7 @@ class Registrar:
         _log(endpoint, "%s is back: %d registrations made again", len(kept))
 
     async def unregister_left_over(self, endpoint: Endpoint) -> None:
-        """Take back what a former process left behind: topics that the node does not have.
+        """Take back registrations that a former process left, such as topics that the node lacks.
 
         Raises Unreachable.
         """
@@ -204,9 +211,10 @@ class Registrar:
             await self._forget(endpoint, decisions.left_over_registrations(endpoint, info, started))
 
     async def reconcile(self, endpoint: Endpoint) -> None:
-        """Make up for the calls that a node made around the proxy. Raises Unreachable, MasterError.
+        """Repair the effects of direct calls to the master. Raises Unreachable, MasterError.
 
-        A service that it unregistered stays until the node ends: no node can be asked for services.
+        A service that the node unregistered directly stays registered until the node ends, because
+        no node tells its services.
         """
         started = self._context.now()
         info = await self._context.nodes.inspect(endpoint.slave)
@@ -215,10 +223,10 @@ class Registrar:
             await self.register_missing(endpoint, info)
 
     async def apply_policy(self, has_changed: bool = False) -> tuple[int, int]:
-        """Hide what is denied now, show what no longer is; returns how many registrations of each.
+        """Hide what the policy denies now, and show what it allows again; the numbers of both.
 
-        After a change of the policy, also report what would be denied (audit). Raises Unreachable,
-        MasterError.
+        If the policy ``has_changed``, also report which registrations audit rules would deny.
+        Raises Unreachable, MasterError.
         """
         policy = self._context.policy
         to_hide = list[EndpointRegistration]()
@@ -239,8 +247,9 @@ class Registrar:
     async def _conceal(self, registrations: Sequence[EndpointRegistration]) -> None:
         """Hide registrations, and take back what the master has of them. Raises Unreachable.
 
-        They are hidden before the master is called: so the lists of publishers that it then sends
-        are completed on their way, and no node inside is cut off. Parameters can't be hidden.
+        The proxy hides the registrations before the call to the master. So the proxy adds hidden
+        publishers to the lists that the master then sends, and no node inside loses a connection.
+        Parameter subscriptions cannot be hidden; they end.
         """
         registry = self._context.registry
         registrations = [(e, r) for e, r in registrations if e.registrations.get(r.key) is r]
@@ -252,8 +261,8 @@ class Registrar:
         try:
             await self._take_back([*shown, *params])
         except Unreachable:
-            # The master may have them still. Shown again, they are hidden by the next try
-            # (`apply_policy`).
+            # The master may still have the registrations. Show them again, so that the next
+            # `apply_policy` hides them.
             for endpoint, registration in concealed:
                 if endpoint.registrations.get(registration.key) is registration:
                     registry.register(endpoint, replace(registration, hidden=False))
@@ -264,7 +273,7 @@ class Registrar:
             registry.unregister(registration.kind, registration.name, registration.caller_id)
         subscribers = [(e, r) for e, r in registrations if r.kind is Kind.SUBSCRIBER]
         update = self._publisher_updates.update_inside
-        # To the empty list the publishers inside are added (`Ros1Policy.publishers_for`).
+        # `Ros1Policy.publishers_for` adds the publishers inside to the empty list.
         await asyncio.gather(*(update(e, r.name, []) for e, r in subscribers))
         self._publisher_updates.update_subscribers(
             {r.name for _, r in registrations if r.kind is Kind.PUBLISHER}
@@ -272,7 +281,7 @@ class Registrar:
 
     async def _take_back(self, registrations: Iterable[EndpointRegistration]) -> None:
         addressing = self._context.addressing
-        # rosmaster passes over a URI that it does not have (registrations.py, unregister).
+        # rosmaster ignores a URI that it does not have (registrations.py, unregister).
         calls = [
             decisions.unregister_call(r, uri, addressing.advertised_service(e))
             for e, r in registrations
@@ -281,9 +290,9 @@ class Registrar:
         await self._context.upstream.multicall(calls)
 
     async def _register(self, registrations: Sequence[EndpointRegistration]) -> None:
-        """Register at the master; subscribers are handed the publishers that the replies name.
+        """Register at the master, and send subscribers the publishers that the replies name.
 
-        What the policy denies is hidden.
+        Hides what the policy denies.
         """
         if self._context.retired:
             return
@@ -310,7 +319,7 @@ class Registrar:
         )
         await asyncio.gather(*updates)
         topics = {r.name for _, r in permitted if r.kind is Kind.PUBLISHER}
-        self._publisher_updates.update_subscribers(topics, everybody=False)
+        self._publisher_updates.update_subscribers(topics, all_inside=False)
 
     async def _forget(self, endpoint: Endpoint, ended: Sequence[Registration]) -> None:
         await self._unregister(endpoint, ended)
@@ -321,17 +330,18 @@ class Registrar:
             )
 
     async def _unregister(self, endpoint: Endpoint, registrations: Iterable[Registration]) -> None:
-        """Take back at the master what an endpoint's node has registered by its advertised URI."""
+        """Take back registrations of an endpoint at the master, and tell subscribers inside."""
         ended = list(registrations)
         await self._take_back((endpoint, r) for r in ended if not r.hidden)
         for registration in ended:
             self._publisher_updates.note_registration(registration)
 
     async def _free(self, former: FormerUris) -> list[EndpointRegistration]:
-        """All registrations of some names, once they are taken back at the master.
+        """Take back all registrations of some names at the master, and return them.
 
-        The master has nodes that moved by former advertised URIs: the registry knows what is
-        theirs. Those that registered around the proxy it has by their own: it alone knows that.
+        If a node has moved, the master has a former advertised URI, and the registry knows the
+        registrations. If a node registered directly, the master has the node's own URI, and only
+        the master knows all registrations.
         """
         registry = self._context.registry
         addressing = self._context.addressing
@@ -356,12 +366,17 @@ class Registrar:
         return [(e, r) for name, e in names.items() for r in _registrations_of(e, name)]
 
     async def _free_direct(self, former: FormerUris) -> tuple[list[Registration], dict[str, str]]:
-        """Take back all registrations of names that the master has by their nodes' own URIs.
+        """Take back all registrations of names that the master has by the nodes' own URIs.
 
-        Returns those, and the names that the master still knows, with their URIs. Such a URI may
-        be another one by now. Otherwise the name has a parameter subscription, which the master
-        does not list, beside the one that every node has: it gets its registrations back. Raises
-        Unreachable, MasterError.
+        A name stays known for two reasons. The name may have another URI by now. Or the node has a
+        parameter subscription, which the master does not list, besides the usual subscription. Then
+        the node gets its registrations back.
+
+        Returns:
+            The registrations that were taken back, and the URIs of names that the master still
+            knows.
+
+        Raises Unreachable, MasterError.
         """
         if not former:
             return [], {}
@@ -397,5 +412,5 @@ def _registrations_of(endpoint: Endpoint, name: str) -> list[Registration]:
 
 
 def _log(endpoint: Endpoint, text: str, *values: object) -> None:
-    """Log something of an endpoint, whose label comes first."""
+    """Log a line with the label of an endpoint first."""
     log.info(text, endpoint.label, *values, extra=endpoint.log_fields)

@@ -1,18 +1,19 @@
-"""A subscriber that hears nothing though its publisher is there: having it connect again.
+"""Reconnect subscribers that receive nothing although their publisher is there.
 
-After the proxy was away, or a port has refused for a time, subscribers may have given up for good
-(see `decisions.resubscription`). There is one fix for roscpp and rospy: a ``publisherUpdate``
-without the publisher, then one with it. The proxy sends the first itself (`_withdraw`), and only
-to subscribers without a connection, since it costs the others theirs. For the second, one publisher
-of each topic is registered again, which makes the master tell all of the topic's subscribers.
+After an outage of the proxy or of a port, subscribers may have given up (see
+`decisions.resubscription`). The same fix works for roscpp and rospy: a ``publisherUpdate`` without
+the publisher, then one with the publisher. The proxy sends the first itself (`_withdraw`), only to
+subscribers without a connection, because the update ends existing connections. For the second, the
+proxy registers one publisher of each topic again. The master then tells all subscribers of the
+topic.
 
-Inside subscribers can have missed publishers outside in the same way. Registering a subscriber
-again yields its publishers, which it is then handed; with ``--direction both`` those that it has no
-relay to are withdrawn first, too.
+Subscribers inside can lose publishers outside in the same way. The proxy registers such a
+subscriber again, and sends it the publishers from the reply. With ``--direction both`` the proxy
+first withdraws the publishers to which the subscriber has no relay.
 
-`announce` does this for endpoints that a fresh proxy has found at the master, `remind` for a node
-that answers again. Both have the endpoints looked at again later (`look`): what a subscriber does
-in the meantime takes up to three minutes.
+`announce` does this for endpoints that a new process of the proxy has found at the master, `remind`
+for a node that answers again. Both schedule further looks (`look`), because subscribers act on
+their own for up to three minutes.
 """
 
 import asyncio
@@ -39,22 +40,22 @@ from rosproxy.ros1.upkeep.registrar import Registrar
 log = logging.getLogger(__name__)
 
 LOOK_DELAYS = (4.0, 10.0, 25.0, 75.0, 165.0)
-"""Seconds after which endpoints are looked after that were out of reach for a time.
+"""Seconds from an outage to each look at the affected endpoints.
 
-Before the first a proxy that is replaced by force has ended, and roscpp's first retries are over.
-Before the last two rospy gives up a connection whose other end has vanished without a word: its
-keep-alive probes begin after 60 seconds, and are answered by a reset, or for 90 more by nothing.
+Before the first look, a proxy that is replaced by force has ended, and roscpp's first retries are
+over. Before the last two looks, rospy gives up a connection whose other end has vanished: TCP
+keep-alive probes begin after 60 seconds. Then a reset answers, or no answer comes for 90 seconds.
 """
 RESUBSCRIBE_TICK = 1.0
-"""Seconds between checks whether it is time to look at any."""
+"""Seconds between two checks which looks are due."""
 MissedPublisher = tuple[str, str, str]
-"""A topic, a subscriber's name, and the URI at the master of a publisher that it does not hear."""
+"""A topic, a subscriber's name, and the master's URI of a publisher that is not connected."""
 OutsidePath = tuple[StandIn | None, str]
-"""The stand-in for a node outside (None: it has none), and the address of a node inside."""
+"""The stand-in for a node outside (None if there is none), and the address of a node inside."""
 
 
 class Resubscriber:
-    """Looks after the subscribers of publishers that were out of reach for a time."""
+    """Reconnects the subscribers of publishers that were out of reach for a time."""
 
     def __init__(
         self,
@@ -75,13 +76,13 @@ class Resubscriber:
         self._look_times: dict[Endpoint, list[float]] = {}
 
     def watch(self, endpoints: Iterable[Endpoint]) -> None:
-        """Have endpoints looked at some times from now on."""
+        """Schedule looks at endpoints, after each of `LOOK_DELAYS`."""
         now = self._context.now()
         for endpoint in endpoints:
             self._look_times[endpoint] = [now + delay for delay in LOOK_DELAYS]
 
     async def announce(self, endpoints: Sequence[Endpoint]) -> None:
-        """Make up for what was missed while the proxy was away. Raises Unreachable, MasterError."""
+        """Repair connections after an outage of the proxy. Raises Unreachable, MasterError."""
         self.watch(endpoints)
         await self._withdraw(endpoints, ask=False)
         await self._registrar.register(
@@ -89,10 +90,11 @@ class Resubscriber:
         )
 
     async def remind(self, endpoint: Endpoint) -> None:
-        """Make up for what was missed while a node's port refused. Raises Unreachable, MasterError.
+        """Repair connections after the port of a node refused. Raises Unreachable, MasterError.
 
-        A subscriber whose requestTopic was refused does not ask again by itself: it is told of
-        its publishers once more when one registers. Connections that have lasted stay.
+        A subscriber whose requestTopic was refused does not ask again by itself. When a publisher
+        registers, the master sends the subscriber its publishers once more. Existing connections
+        stay.
         """
         self.watch([endpoint])
         kinds = (Kind.PUBLISHER, Kind.SUBSCRIBER)
@@ -100,7 +102,7 @@ class Resubscriber:
         await self._registrar.register([(endpoint, r) for r in registrations])
 
     async def look(self) -> None:
-        """Have subscribers connect that have lost a publisher in spite of `announce`."""
+        """Reconnect subscribers that still lack a publisher after `announce`."""
         endpoints = [] if self._context.retired else self._due()
         try:
             topics = await self._withdraw(endpoints) if endpoints else set()
@@ -109,11 +111,11 @@ class Resubscriber:
                 log.info(text, len(topics))
                 pairs = [*one_publisher_per_topic(endpoints), *_subscribers(endpoints)]
                 await self._registrar.register([pair for pair in pairs if pair[1].name in topics])
-        except (Unreachable, MasterError) as error:  # there are further looks (LOOK_DELAYS)
+        except (Unreachable, MasterError) as error:  # later looks follow (LOOK_DELAYS)
             log.debug("the proxy could not look for subscribers without a connection: %s", error)
 
     def _due(self) -> list[Endpoint]:
-        """The endpoints that it is time to look at; each is named once per look."""
+        """The endpoints to look at now, each once."""
         now = self._context.now()
         by_port = self._context.registry.by_port
         current = {e: times for e, times in self._look_times.items() if by_port.get(e.port) is e}
@@ -123,10 +125,10 @@ class Resubscriber:
         return [e for e in due if e.answers and not e.health.cleaned]
 
     async def _withdraw(self, endpoints: Sequence[Endpoint], ask: bool = True) -> set[str]:
-        """Tell subscribers without connection that these publishers have gone; the topics.
+        """Tell subscribers without a connection that these publishers have gone; return the topics.
 
-        They make a new connection once they are told that the publishers are there again. Unless
-        the publishers are asked (``ask``), those served by UDPROS are told as well. Raises
+        The subscribers connect again when they hear that the publishers are back. With ``ask``, the
+        proxy asks the publishers for their connections, and spares subscribers with UDPROS. Raises
         Unreachable, MasterError.
         """
         state = await self._context.upstream.read_registrations()
@@ -140,13 +142,13 @@ class Resubscriber:
         outside_publishers = self._outside_publishers(graph, endpoints)
         for endpoint, _, uris in outside_publishers:
             await self._stand_ins.listen_for(uris, self._context.caller_at(endpoint))
-        # The kernel's connections are read every few seconds: those of now are wanted.
+        # The plane reads the connections of the kernel every few seconds. Read them now.
         if self._context.stand_ins.by_port or any(
             s.endpoint.fast_port or s.endpoint.fast_peers for s in unrelayed
         ):
             await self._plane.look()
         addresses = await self._resolve_hosts(graph, unrelayed)
-        # Once more: some have connected while others were asked.
+        # Once more: some subscribers have connected meanwhile.
         unrelayed = decisions.without_relay(unrelayed, self._tcpros.topic_connections())
         missed = [
             (s.topic, s.caller_id, self._context.addressing.advertised_uri(s.endpoint))
@@ -157,7 +159,7 @@ class Resubscriber:
     def _through_proxy(
         self, graph: Graph, unrelayed: Iterable[TopicSubscription]
     ) -> list[TopicSubscription]:
-        """The subscriptions whose nodes reach the publisher through the proxy."""
+        """The subscriptions of nodes that reach the publisher through the proxy."""
         addressing = self._context.addressing
 
         def is_relayed(sub: TopicSubscription) -> bool:
@@ -172,7 +174,7 @@ class Resubscriber:
         return [s for s in unrelayed if is_relayed(s)]
 
     async def _read_buses(self, subs: Iterable[TopicSubscription]) -> dict[Endpoint, list[BusRow]]:
-        """What the publishers themselves say of their connections."""
+        """What the publishers name as their connections."""
 
         async def read(endpoint: Endpoint) -> list[BusRow]:
             upstream = self._context.upstream
@@ -192,7 +194,7 @@ class Resubscriber:
     async def _resolve_hosts(
         self, graph: Graph, unrelayed: Iterable[TopicSubscription]
     ) -> dict[str, list[str]]:
-        """The addresses of the subscribers' hosts, where the kernel's connections are by host."""
+        """The hosts' addresses of subscribers whose publisher has connections in the kernel."""
 
         async def resolve_host(uri: str) -> list[str]:
             endpoint = self._context.addressing.endpoint_of(uri)
@@ -206,9 +208,9 @@ class Resubscriber:
     def _outside_publishers(
         self, graph: Graph, endpoints: Iterable[Endpoint]
     ) -> list[tuple[Endpoint, Registration, list[str]]]:
-        """What the nodes of some endpoints subscribe to, with the URIs of publishers outside.
+        """The subscriptions of some endpoints, with the URIs of publishers outside.
 
-        Nothing where these are reached without the proxy.
+        The list is empty if nodes inside reach outside without the proxy.
         """
         both = self._context.stand_ins.is_bidirectional
         publishers = graph.by_topic(Kind.PUBLISHER)
@@ -223,10 +225,10 @@ class Resubscriber:
     def _missed_outside(
         self, outside_publishers: Iterable[tuple[Endpoint, Registration, list[str]]]
     ) -> list[MissedPublisher]:
-        """The publishers outside that subscribers inside are not connected to, but ought to be.
+        """The publishers outside that subscribers inside lack a connection to.
 
-        What the kernel forwards is known by addresses alone: unless there are as many connections
-        as a node inside has subscriptions to one outside, all of these count.
+        The proxy knows connections in the kernel only by address. If a node inside has fewer such
+        connections to a node outside than subscriptions, all these subscriptions count as missing.
         """
         context = self._context
         relays = self._tcpros.topic_connections() | self._stand_ins.udpros.connections()
@@ -246,7 +248,7 @@ class Resubscriber:
         ]
 
     async def _send_without(self, graph: Graph, missed: Iterable[MissedPublisher]) -> set[str]:
-        """Send each subscriber its publishers without those that it misses; the topics."""
+        """Send subscribers their publishers without the missed publishers; return the topics."""
         missed_uris: dict[tuple[str, str], set[str]] = {}
         for topic, node, uri in missed:
             missed_uris.setdefault((topic, node), set()).add(uri)
@@ -268,6 +270,6 @@ class Resubscriber:
 
 
 def _subscribers(endpoints: Iterable[Endpoint]) -> list[EndpointRegistration]:
-    """All that the nodes of some endpoints subscribe to."""
+    """All subscriptions of the nodes of some endpoints."""
     registrations = [(e, r) for e in endpoints for r in e.registrations.values()]
     return [pair for pair in registrations if pair[1].kind is Kind.SUBSCRIBER]

@@ -1,14 +1,17 @@
-"""Is the node at an address the one that somebody says it is?
+"""Check whether the node at an address is the node that the master or an operator names.
 
-The master says so after a restart, an operator of a container that has moved or arrived. Anybody
-can write to the master, so it is only a claim, and the node itself has to bear it out. First by the
-topics that it names. A library that does not tell them (ROS makes none implement the whole slave
-API) is asked for one of the topics that are registered for it: where it names a TCPROS port for
-that, and is called there by a name that is registered, it is the one; so it is where it answers for
-a service under that name.
+The master names the node after a restart of the proxy, an operator when a container moves or
+arrives. Any program can write to the master, so both are only claims, and the node itself has to
+confirm the claim. The topics that the node names decide first.
 
-Several names at one address are left by several processes, as a rule. Every node has /rosout, so of
-names that have no other topic those count that it answers for by a service.
+Some client libraries do not tell their topics, because no library has to implement the whole slave
+API. The proxy asks such a node for a registered topic. If the node names a TCPROS port for the
+topic, and a program at this port answers by a registered name, the node confirms the claim. The
+same holds if a program answers for a registered service by such a name.
+
+If the master has several names at one address, several processes have usually left these names.
+Nearly every node has /rosout, which identifies no node. So a name without other topics has to be
+confirmed by a service.
 """
 
 from collections.abc import Collection, Iterable
@@ -25,7 +28,7 @@ from rosproxy.ros1.upkeep.decisions import recovery_claims
 
 @dataclass(frozen=True, slots=True)
 class Verifier:
-    """Asks nodes whether they are who they are said to be."""
+    """Asks nodes whether they have the registrations that the master has for them."""
 
     _nodes: NodeClient
 
@@ -35,10 +38,13 @@ class Verifier:
         registrations: Collection[Registration],
         service_ports: Iterable[int] = (),
     ) -> tuple[NodeInfo | None, bool | None]:
-        """What the node at an address says of itself, and whether it is the one that registered.
+        """Ask the node at an address about itself, and judge whether it made the registrations.
 
-        Both are None if nothing answers there; the second is, too, if it can't be told.
-        ``service_ports`` are TCPROS ports at which it may have services.
+        ``service_ports`` are TCPROS ports at which the node may have services.
+
+        Returns:
+            What the node says about itself, and the verdict of `judge`. Both are None if no node
+            answers.
         """
         info = await self._nodes.inspect(slave)
         if info is None:
@@ -52,7 +58,11 @@ class Verifier:
         info: NodeInfo,
         service_ports: Iterable[int] = (),
     ) -> bool | None:
-        """Whether the node that says this of itself is the one: one of the names is enough."""
+        """Whether a node made the registrations: a single confirmed name is enough.
+
+        ``info`` is what the node says about itself. None if the node confirms nothing, and names
+        are left that the proxy cannot check, or if there are no registrations.
+        """
         by_name = recovery_claims.by_name(registrations)
         verdicts = {name: recovery_claims.confirmed_by(by_name[name], info) for name in by_name}
         if True in verdicts.values():
@@ -70,7 +80,7 @@ class Verifier:
         info: NodeInfo,
         service_ports: Iterable[int] = (),
     ) -> list[Registration]:
-        """The registrations of names that are not the node's, which is one of several names."""
+        """The registrations of names that the master has here, but that belong to other nodes."""
         by_name = recovery_claims.by_name(registrations)
         refuted = recovery_claims.unconfirmed_registrations(registrations, info)
         borne_out = by_name.keys() - {r.caller_id for r in refuted}
@@ -79,7 +89,7 @@ class Verifier:
             ports = {*info.topic_ports.values(), *service_ports}
             groups = (by_name[name] for name in doubtful)
             proven = {r[0].caller_id for r in groups if await self._serves(slave, r, ports)}
-            # Where no name is better than the others, none is refuted.
+            # If no name has better evidence than the others, the verifier refutes none.
             if proven or borne_out > doubtful:
                 refuted += [r for name in doubtful - proven for r in by_name[name]]
         return refuted
@@ -87,7 +97,7 @@ class Verifier:
     async def _answers_for(
         self, slave: HostPort, undecided: Collection[Registration], info: NodeInfo, ports: set[int]
     ) -> bool:
-        """Whether it answers for a topic or service, by a name that has registered it."""
+        """Whether the node answers for a topic or service, by a name that registered this topic."""
         callers = {r.caller_id for r in undecided}
         topics, services = recovery_claims.topics_and_services_to_ask(undecided)
         for topic in topics:
@@ -96,8 +106,8 @@ class Verifier:
                 continue
             ports.add(port)
             name = await self._nodes.publisher(HostPort(slave.host, port), topic)
-            # Some libraries answer nobody who takes any type, and so give no name: that they have a
-            # port for the topic has to do. Of everybody's /rosout it shows nothing.
+            # Some libraries do not answer a caller that accepts any type, and so give no name. A
+            # port for the topic is enough then, but not for /rosout, which nearly every node has.
             if name in callers or (name is None and topic != ROSOUT):
                 return True
         return await self._serves(slave, services, ports)
@@ -105,7 +115,7 @@ class Verifier:
     async def _serves(
         self, slave: HostPort, registrations: Collection[Registration], ports: Collection[int]
     ) -> bool:
-        """Whether it answers for a service, by a name that has registered one."""
+        """Whether the node answers for a service, by a name that has registered a service."""
         callers = {r.caller_id for r in registrations}
         _, services = recovery_claims.topics_and_services_to_ask(registrations)
         for service in services:

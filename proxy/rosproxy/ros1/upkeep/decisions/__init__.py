@@ -1,1 +1,1 @@
-"""What follows from what the master, the nodes and an operator say: decisions without I/O."""
+"""Decisions from the data of the master, the nodes and an operator, without I/O."""

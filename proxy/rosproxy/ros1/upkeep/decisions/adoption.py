@@ -1,13 +1,14 @@
-"""Nodes that registered around the proxy: which they are, where, and which calls are due to it.
+"""Adoption of nodes that registered at the real master directly: which nodes, where, which calls.
 
-A container may start while its master's name still leads to the real master. Its nodes then
-register with their own URIs, which outside can't reach: they are *direct*. Such a node is adopted:
-everything that it holds is taken back and registered anew in the form that outside can use.
+A container may start while the name of its master still leads to the real master. Its nodes then
+register with their own URIs, which outside cannot reach. Such nodes are *direct*. To adopt a direct
+node, the proxy takes back all registrations of the node, and makes them again with URIs that
+outside can reach.
 
-Its connection to the real master stays open (both client libraries keep it), so that later calls
-of such a node may go around the proxy as well. Then the master drops what the name had before and
-calls ``shutdown`` at the node, through the proxy, as it does if another node has taken the name.
-`has_name_still` tells the two apart.
+Both client libraries keep the connection to the real master open. So later calls of such a node may
+bypass the proxy as well. The master then drops the registrations that the name had before, and
+calls ``shutdown`` at the node, through the proxy. The master does the same if another node has
+taken the name. `has_name_still` tells the two cases apart.
 """
 
 import re
@@ -24,14 +25,14 @@ from rosproxy.ros1.rewriting.addressing import Addressing
 from rosproxy.ros1.upkeep.decisions.registration import is_known_as
 
 Container = tuple[str, Collection[str]]
-"""A container on an inside network: its IP address there, and its host names in lower case."""
+"""The IP address of a container on an inside network, and its host names in lower case."""
 
 _NEW_URI = re.compile(r"\[(/[^\]\s]*)\] Reason: new node registered")
 """rosmaster/registrations.py, shutdown_node_task."""
 
 
 class DirectNode(msgspec.Struct, frozen=True):
-    """A node that is registered with its own URI, and the places where it may be."""
+    """A node that is registered with its own URI, and the slave addresses where it may be."""
 
     caller_id: str
     uri: str
@@ -40,7 +41,7 @@ class DirectNode(msgspec.Struct, frozen=True):
 
     @property
     def topics(self) -> set[str]:
-        """Its topics, without /rosout, which nearly every node has, if it has others."""
+        """The topics of the node, without /rosout if there are others."""
         names = {r.name for r in self.registrations if r.kind in TOPIC_KINDS}
         return names - {ROSOUT} or names
 
@@ -48,7 +49,7 @@ class DirectNode(msgspec.Struct, frozen=True):
 def find_direct(
     graph: Graph, arrived: Iterable[Container], addressing: Addressing
 ) -> list[DirectNode]:
-    """The nodes of a master whose URI may mean one of the containers that have arrived."""
+    """The nodes of a master whose URI may mean a container that has arrived."""
     direct_nodes = []
     containers = list(arrived)
     for name, uri in graph.uris.items():
@@ -70,10 +71,14 @@ def locate(
     infos: Mapping[HostPort, NodeInfo],
     verified: Collection[tuple[str, HostPort]] = (),
 ) -> tuple[dict[HostPort, list[DirectNode]], dict[str, str]]:
-    """Where each node is, and why some are left alone, by name.
+    """Decide which nodes are at which slave address.
 
-    ``infos`` is what the node at a slave address says of itself; addresses without a node are
-    missing. Nodes that are ``verified``, by name and address, bear out what is registered for them.
+    ``infos`` has what the node at each slave address says about itself; addresses without a node
+    are missing. ``verified`` has the name and address of each node that has confirmed its
+    registrations.
+
+    Returns:
+        The nodes at each address, and by name the reason why a node is not adopted.
     """
     located: dict[HostPort, list[DirectNode]] = {}
     doubts: dict[str, str] = {}
@@ -89,24 +94,25 @@ def locate(
 
 
 def renamed_node(caller_id: str, reason: str) -> str | None:
-    """The name whose URI has changed, if that is why ``shutdown`` is called."""
+    """The name whose URI has changed, if that is the reason of a ``shutdown`` call."""
     match = _NEW_URI.match(reason)
     return match[1] if match and caller_id == "/master" else None
 
 
 def has_name_still(endpoint: Endpoint, uri: str | None, advertised: str) -> bool:
-    """Whether no other node has taken a name of an endpoint, which the master has by a URI now.
+    """Whether a name of an endpoint still belongs to the endpoint's node.
 
-    The master calls ``shutdown`` at the URI that the name had before. The new URI may be a former
-    one of the same node, which registered around the proxy, or the advertised one again by now.
+    ``uri`` is the URI that the master has for the name now. The master calls ``shutdown`` at the
+    URI that the name had before. The new URI may be a former URI of the same node, which registered
+    at the real master directly, or the advertised URI again.
     """
-    if uri is None:  # between being taken back and registered anew, the master does not know it
+    if uri is None:  # the proxy is registering the node anew: the master has no URI meanwhile
         return endpoint.has_registered_directly
     return uri == advertised or is_known_as(endpoint, uri)
 
 
 def _score(node: DirectNode, info: NodeInfo) -> int:
-    """How well the topics of the node that answers at an address fit a direct node."""
+    """The direct node's topics that the answering node has, minus the topics that it lacks."""
     counts = Counter(info.has(topic) for topic in node.topics)
     return counts[True] - counts[False]
 

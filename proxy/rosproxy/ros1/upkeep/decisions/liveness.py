@@ -1,8 +1,8 @@
-"""When a node is probed, when it counts as gone or moved, and when its port is free again.
+"""When to probe a node, when it counts as gone or moved, and when its port is free again.
 
-An operator knows that a container is gone or has moved before any time-out can tell, but its
-events may be late, or about an address that another container has by now. So each is a hint, and
-the node itself is asked before anything is done.
+An operator knows before any time-out that a container is gone or has moved. But its report may be
+late, or concern an address that another container has by now. So the report is a hint, and the
+proxy asks the node before the proxy acts.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,15 +13,15 @@ from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.node_health import UNKNOWN_PID, ProbeResult
 
 DIRECT_INTERVAL = 2.0
-"""Seconds between probes, at most, of a node that registered around the proxy."""
+"""The longest time between probes, in seconds, of a node that registered directly."""
 FORGET_AFTER = 3600.0
-"""Seconds after which a node that was cleaned up while it was silent is forgotten."""
+"""Seconds after which the proxy forgets a node that was unregistered while silent."""
 NO_PATIENCE = 0.001
-"""Seconds: less than between any two probes. Zero would mean that nothing is ever cleaned up."""
+"""Seconds, less than between any two probes. Zero would mean that no node is unregistered."""
 
 
 class AfterAnswer(Enum):
-    """What is due first once a node has answered."""
+    """What the proxy has to do first after a node has answered."""
 
     VERIFY = "only the master has named the node: verify that this is the node"
     COME_BACK = "the node was unregistered meanwhile: register the node again"
@@ -31,7 +31,7 @@ class AfterAnswer(Enum):
 
 
 def after_answer(endpoint: Endpoint, pid: int | None) -> AfterAnswer:
-    """What is due for an endpoint whose node has answered with a pid."""
+    """What to do for an endpoint whose node has answered with a pid."""
     health = endpoint.health
     if not endpoint.trusted:
         return AfterAnswer.VERIFY
@@ -43,9 +43,10 @@ def after_answer(endpoint: Endpoint, pid: int | None) -> AfterAnswer:
 
 
 def to_look_at(endpoints: Iterable[Endpoint], now: float, interval: float) -> list[Endpoint]:
-    """Those that may be due, or whose lease may end.
+    """The endpoints that may be due for a probe, or whose lease may end.
 
-    All are gone through several times a second: so it is a single expression, of attributes alone.
+    The proxy goes through all endpoints several times a second. So the test is a single expression
+    of attributes, for speed.
     """
     return [
         e
@@ -61,7 +62,7 @@ def to_look_at(endpoints: Iterable[Endpoint], now: float, interval: float) -> li
 
 
 def may_be_kept(endpoint: Endpoint) -> bool:
-    """Whether a node may be asked over a connection that is kept: nothing follows if it answers."""
+    """Whether a kept connection may ask the node: an answer then has no consequences."""
     health = endpoint.health
     return (
         health.steady
@@ -71,17 +72,17 @@ def may_be_kept(endpoint: Endpoint) -> bool:
 
 
 def is_due(endpoint: Endpoint, now: float, interval: float) -> bool:
-    """Whether it is time to probe a node; ``interval`` is that of idle nodes in seconds."""
+    """Whether to probe a node now; ``interval`` is that of idle nodes in seconds."""
     return endpoint.health.due(
         now, min(interval, DIRECT_INTERVAL) if endpoint.has_registered_directly else interval
     )
 
 
 def is_to_be_unregistered(endpoint: Endpoint, now: float, after: float) -> bool:
-    """Whether a node has been down for long enough (``after`` seconds; 0: never).
+    """Whether a node has been down for long enough: ``after`` seconds, or never if that is 0.
 
-    One that registered around the proxy has unregistered there as well, to no effect; so it
-    keeps nothing once it has ended.
+    A node that registered at the real master directly may have unregistered there as well, without
+    effect. So the proxy unregisters such a node as soon as the node has ended.
     """
     if endpoint.has_registered_directly and endpoint.health.refused:
         after = min(after, NO_PATIENCE)
@@ -89,17 +90,17 @@ def is_to_be_unregistered(endpoint: Endpoint, now: float, after: float) -> bool:
 
 
 def lease_lasts(endpoint: Endpoint, linger: float) -> float:
-    """Seconds for which an unused lease lasts; a node that was just silent may come back."""
+    """Seconds for which an unused lease lasts; an hour for a silent node, which may come back."""
     health = endpoint.health
     return FORGET_AFTER if health.cleaned and not (health.refused or health.has_ended) else linger
 
 
 def dead_endpoints(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint]:
-    """Those of the endpoints at addresses that are gone whose node does not answer.
+    """The endpoints at addresses that are gone whose node does not answer.
 
-    Where one answers, the address is in use again, or the event was late. One that is silent but
-    has registered ``since`` then is spared: a container that is restarted has its address
-    again, and a node that is just starting may take its time.
+    If a node answers, the address is in use again, or the report was late. A silent node stays if
+    the node has registered at or after ``since``, or is registering. The reason: a restarted
+    container has its old address, and a node that is starting may need some time to answer.
     """
 
     def is_spared(endpoint: Endpoint) -> bool:
@@ -116,7 +117,7 @@ def dead_endpoints(answers: Mapping[Endpoint, ProbeResult], since: float) -> lis
 def movable(
     endpoints: Iterable[Endpoint], moved: Mapping[str, str], networks: Sequence[Network]
 ) -> dict[Endpoint, str]:
-    """The endpoints at addresses that have changed, with their new one, if that is inside."""
+    """The endpoints whose address has changed, with the new address if this is inside."""
     moves = {e: moved.get(e.location.address, "") for e in endpoints}
     return {
         e: new for e, new in moves.items() if new != e.location.address and is_inside(new, networks)
@@ -124,10 +125,10 @@ def movable(
 
 
 def moved_location(endpoint: Endpoint, address: str) -> NodeLocation:
-    """Where a node is that has moved to another address.
+    """The location of a node that has moved to another address.
 
-    Neighbours are sent through the proxy from now on, even if the node's host name leads there:
-    to a URI that they know already, rospy doesn't connect again.
+    From now on neighbours reach the node through the proxy, even if its host name leads to the new
+    address: rospy does not connect again to a URI that it knows.
     """
     host = endpoint.node.host
     previous = endpoint.location
@@ -136,10 +137,10 @@ def moved_location(endpoint: Endpoint, address: str) -> NodeLocation:
 
 
 def is_same_process(known_pid: int | None, pid: int | None, borne_out: bool | None) -> bool:
-    """Whether the node that answers elsewhere with a pid is one with a known pid.
+    """Whether the node that answers elsewhere with a pid is the node with a known pid.
 
-    In a container of its own every node has the same pid, so the node has to bear out as well what
-    it has registered; if that can't be told (None), the pid alone decides.
+    Each node that is alone in a container has the same pid. So the node also has to confirm its
+    registrations. ``borne_out`` says whether it does; if that is unknown (None), the pid decides.
     """
     if pid is not None and known_pid not in UNKNOWN_PID and known_pid != pid:
         return False

@@ -1,10 +1,11 @@
-"""Rebuilding the registry from what the master holds, after a start without memory.
+"""Rebuild the registry from the data at the master, after a start of the proxy.
 
-The advertised URIs at the master tell the ports, and what the proxy remembers where their nodes
-are; those of former versions carry that in their path. Anybody can write both to the master, so
-what is found there is only a claim. Where several claim one port, or one node, the one that its
-node bears out best is kept (`choose_claims`); the node of one that is kept is asked before it is
-served (`confirmed_by`).
+The advertised URIs at the master tell the ports. The parameter of the proxy
+(`rosproxy.ros1.registry.remembered_leases`) tells where the nodes of these ports are; URIs of
+former versions have the node in the path instead. Any program can write both to the master, so the
+data are only claims. If several claims name the same port or the same node, `choose_claims` keeps
+the claim that its node confirms best. Before the proxy serves a node, the node has to confirm its
+claim (`confirmed_by`).
 """
 
 from collections import Counter
@@ -20,18 +21,18 @@ from rosproxy.ros1.registry.remembered_leases import RememberedLease
 from rosproxy.ros1.rewriting.addressing import Addressing
 
 NO_MERIT = -(10**9)
-"""The merit of a node that has not answered: less than that of any that has."""
+"""The merit of a claim whose node has not answered: less than the merit of any other claim."""
 MOST_ASKED = 3
-"""How many topics, and services, a node is asked for at most."""
+"""The highest number of topics, and of services, that a node is asked for."""
 
 
 @dataclass(slots=True)
 class Claim:
-    """An endpoint that the master's data tell of: its port, its inside address, what it holds.
+    """A possible endpoint from the master's data: port, inside address and registrations.
 
-    ``node`` is the host and port that the node calls itself, ``path`` its URI's, ``slave`` where to
-    look for it, ``advertised`` the URI that the master has.
-    ``node_info`` is what it says of itself; None if it was not asked or gave no answer.
+    ``node`` is the host and port that the node gave, ``path`` the path of its URI, ``slave`` the
+    address at which to look for the node, and ``advertised`` the URI at the master. ``node_info``
+    is what the node says about itself; None if the proxy did not ask, or got no answer.
     """
 
     port: int
@@ -45,21 +46,24 @@ class Claim:
 
     @property
     def topics(self) -> set[str]:
-        """The topics that the master has for it."""
+        """The topics that the master has for the node."""
         return {r.name for r in self.registrations if r.kind in TOPIC_KINDS}
 
     @property
     def uri(self) -> str:
-        """The slave URI as the node must have given it."""
+        """The slave URI in the form that the node must have given."""
         return slave_uri(self.node, self.path)
 
 
 def find_claims(
     graph: Graph, addressing: Addressing, memory: Mapping[int, RememberedLease]
 ) -> tuple[list[Claim], dict[str, list[Registration]]]:
-    """The endpoints of this proxy among the nodes of a master, by what it remembers of each port.
+    """Find the endpoints of this proxy among the nodes of a master.
 
-    Second, by URI, what the master has by advertised URIs of which nothing is remembered.
+    ``memory`` has the remembered lease of each port.
+
+    Returns:
+        The claims, and the registrations by advertised URI for ports without a remembered lease.
     """
     claims_by_uri = dict[str, Claim]()
     forgotten = dict[str, list[Registration]]()
@@ -80,14 +84,14 @@ def find_claims(
 
 
 def contested_claims(candidates: Sequence[Claim]) -> list[Claim]:
-    """The claims that share their port or their inside address with another."""
+    """The claims that share their port or their inside address with another claim."""
     ports = Counter(c.port for c in candidates)
     slaves = Counter(c.slave for c in candidates)
     return [claim for claim in candidates if ports[claim.port] > 1 or slaves[claim.slave] > 1]
 
 
 def choose_claims(candidates: Sequence[Claim]) -> list[Claim]:
-    """One claim per port and inside address: the one that its node bears out best."""
+    """One claim for each port and inside address: the claim that its node confirms best."""
 
     def merit(claim: Claim) -> tuple[int, int]:
         count = len(claim.registrations)
@@ -106,10 +110,11 @@ def choose_claims(candidates: Sequence[Claim]) -> list[Claim]:
 
 
 def confirmed_by(registrations: Iterable[Registration], info: NodeInfo) -> bool | None:
-    """Whether what a node says of its topics bears out what is registered for it.
+    """Whether the topics that a node names confirm its registrations.
 
-    A forged URI that leads to something other than the node of that name finds no answer here,
-    or one of another node. None: it does not tell, or no topic is registered.
+    A forged URI may lead to a program that is not the node of that name. Then there is no answer
+    here, or the topics of another node. None: no topic is registered, or the node does not tell its
+    topics.
     """
     topics = {r.name for r in registrations if r.kind in TOPIC_KINDS}
     answers = [info.has(topic) for topic in (topics - {ROSOUT} or topics)]
@@ -119,15 +124,16 @@ def confirmed_by(registrations: Iterable[Registration], info: NodeInfo) -> bool 
 
 
 def has_own_topic(registrations: Iterable[Registration]) -> bool:
-    """Whether a topic is registered that not every node has."""
+    """Whether a topic other than /rosout is registered."""
     return any(r.kind in TOPIC_KINDS and r.name != ROSOUT for r in registrations)
 
 
 def by_name(registrations: Iterable[Registration]) -> dict[str, list[Registration]]:
-    """Registrations by the node names that have made them.
+    """Registrations by node name.
 
-    Several names at one slave URI are several processes, as a rule: a port is used again, and the
-    master keeps what the one before had until it is taken back.
+    Several names at one slave URI usually mean several processes, one after the other. A port is
+    used again, and the master keeps the registrations of the earlier process until a program takes
+    them back.
     """
     registrations_by_name: dict[str, list[Registration]] = {}
     for registration in registrations:
@@ -138,7 +144,7 @@ def by_name(registrations: Iterable[Registration]) -> dict[str, list[Registratio
 def unconfirmed_registrations(
     registrations: Iterable[Registration], info: NodeInfo
 ) -> list[Registration]:
-    """The registrations of names that a node does not bear out by what it says of itself."""
+    """The registrations of names that are refuted by what the node says about itself."""
     groups = by_name(registrations).values()
     return [r for group in groups if confirmed_by(group, info) is False for r in group]
 
@@ -146,9 +152,9 @@ def unconfirmed_registrations(
 def topics_and_services_to_ask(
     registrations: Iterable[Registration],
 ) -> tuple[list[str], list[Registration]]:
-    """The topics and services by which a node can show that it is the one that registered them.
+    """The topics and services by which a node can confirm its registrations.
 
-    It is asked for a few at most, everybody's /rosout last.
+    At most `MOST_ASKED` of each, with /rosout as the last topic.
     """
     candidates = list(registrations)
     topics = {r.name for r in candidates if r.kind is Kind.PUBLISHER}

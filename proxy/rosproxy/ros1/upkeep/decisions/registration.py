@@ -1,13 +1,13 @@
 """Which registrations the proxy makes and takes back at the master on behalf of nodes.
 
-The master takes a registration back only with exactly the strings that it was made with; anything
-else leaves a stale entry. And it calls ``shutdown`` at the former URI of a name whose URI changes
-(rosmaster/registrations.py, _register_node_api). So a name that the master has by a former URI of
-the same node is freed first, of everything that it holds, and then registered anew.
+The master takes a registration back only if the call has exactly the strings of the registration.
+With other strings, a stale entry stays. When the URI of a name changes, the master calls
+``shutdown`` at the former URI (rosmaster/registrations.py, _register_node_api). So if the master
+has a name by a former URI of the same node, the proxy first takes back all registrations of the
+name, and then makes them again.
 
-The rest compares three views of a node: what the registry has, what the master has, and what the
-node itself says (`NodeInfo`). A node can be asked for its topics, but not for services and
-parameters.
+The other functions compare three views of a node: the registry, the master, and what the node
+itself says (`NodeInfo`). A node tells its topics, but not its services and parameters.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,14 +23,14 @@ MethodCall = tuple[str, list[Any]]
 """A method and its parameters, the caller_id first."""
 
 COMMON_PARAMETER = "/rosout_disable_topics_generation"
-"""roscpp and rospy subscribe to it with their first log message; it need not exist."""
+"""roscpp and rospy subscribe to this parameter with their first log message, set or not."""
 
 _REGISTERING = {spec.registers: method for method, spec in MASTER_METHODS.items()}
 _UNREGISTERING = {spec.unregisters: method for method, spec in MASTER_METHODS.items()}
 
 
 def register_call(registration: Registration, uri: str, service: str) -> MethodCall:
-    """The call that makes a registration with a slave URI, and for a service with its URI."""
+    """The call that makes a registration with a slave URI and, for a service, a service URI."""
     return _call(_REGISTERING[registration.kind], registration, uri, service)
 
 
@@ -40,18 +40,19 @@ def unregister_call(registration: Registration, uri: str, service: str) -> Metho
 
 
 def to_register(registrations: Iterable[EndpointRegistration]) -> list[EndpointRegistration]:
-    """Those of some registrations that have not ended meanwhile, in the order to make them.
+    """The registrations that have not ended meanwhile, in the order in which to make them.
 
-    Subscribers come last, so that they are handed all publishers at once.
+    Subscribers come last, so that each subscriber gets all publishers at once.
     """
     current = [(e, r) for e, r in registrations if e.registrations.get(r.key) is r]
     return sorted(current, key=lambda pair: pair[1].kind is Kind.SUBSCRIBER)
 
 
 def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[EndpointRegistration]:
-    """One publisher of each topic that some endpoints' nodes publish.
+    """One publisher of each topic that the nodes of some endpoints publish.
 
-    Registering it makes the master tell all subscribers of the topic who its publishers are.
+    When the proxy registers this publisher, the master sends all subscribers of the topic the list
+    of publishers.
     """
     topics: dict[str, EndpointRegistration] = {}
     for endpoint in endpoints:
@@ -62,9 +63,9 @@ def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[EndpointRegis
 
 
 def is_known_as(endpoint: Endpoint, uri: str) -> bool:
-    """Whether a URI at the master is a former one of this endpoint, or its node's own.
+    """Whether a URI at the master is a former URI of this endpoint, or the node's own URI.
 
-    A loopback address does not count: it is every node's own.
+    A loopback address does not count, because every node may give one.
     """
     is_own = parse_slave_uri(uri) == endpoint.node and not is_loopback(endpoint.node.host)
     return is_own or uri in endpoint.former_uris
@@ -73,9 +74,10 @@ def is_known_as(endpoint: Endpoint, uri: str) -> bool:
 def free_calls(
     registrations: Iterable[Registration], uris: Mapping[str, str], services: Mapping[str, str]
 ) -> list[MethodCall]:
-    """The calls that end what names hold with their ``uris``; ``services`` are the services' URIs.
+    """The calls that end all registrations of some names.
 
-    Subscribers go first, so that they are not told that the publishers go.
+    ``uris`` has the slave URI of each name, ``services`` the URI of each service. Subscribers go
+    first, so that the master does not tell them that publishers have gone.
     """
     ordered = sorted(_usable(registrations, services), key=lambda r: r.kind is not Kind.SUBSCRIBER)
     return [unregister_call(r, uris[r.caller_id], services.get(r.name, "")) for r in ordered]
@@ -84,15 +86,15 @@ def free_calls(
 def restore_calls(
     registrations: Iterable[Registration], uris: Mapping[str, str], services: Mapping[str, str]
 ) -> list[MethodCall]:
-    """The calls that make again what `free_calls` ended."""
+    """The calls that make again the registrations that `free_calls` ended."""
     usable = _usable(registrations, services)
     return [register_call(r, uris[r.caller_id], services.get(r.name, "")) for r in usable]
 
 
 def release_calls(uris: Mapping[str, str], caller: str) -> list[MethodCall]:
-    """The calls that end the parameter subscription that every node has, and tell what is left.
+    """The calls that end the parameter subscription of every node, and ask which names are left.
 
-    The master shows nothing of such a subscription, apart from the name that stays known.
+    The master does not list such a subscription. But it keeps the name of the node as known.
     """
     ask: list[MethodCall] = [("lookupNode", [caller, name]) for name in uris]
     params = [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in uris]
@@ -102,8 +104,8 @@ def release_calls(uris: Mapping[str, str], caller: str) -> list[MethodCall]:
 def read_release(
     uris: Mapping[str, str], values: Sequence[Any]
 ) -> tuple[list[Registration], dict[str, str]]:
-    """The results of `release_calls`: subscriptions that ended; names known still, with URIs."""
-    # First where each name was, then whether its subscription has ended, then where it is now.
+    """Read the results of `release_calls`: ended subscriptions; URIs of names that are left."""
+    # The results: first where each name was, then the unsubscriptions, then where each name is.
     before = zip(uris, values, strict=False)
     after = zip(uris, values[2 * len(uris) :], strict=True)
     known_uris = {name: uri for name, uri in after if uri is not None}
@@ -114,11 +116,14 @@ def read_release(
 def left_over_registrations(
     endpoint: Endpoint, info: NodeInfo, before: float
 ) -> list[Registration]:
-    """Which of an endpoint's registrations a process that is gone has left behind.
+    """The registrations of an endpoint that an ended process has left behind.
 
-    A topic is left behind if the node says that it does not have it; all of a node name is, if
-    another name has registered since and none of its own topics, apart from the /rosout of nearly
-    every node, may hold. Registrations made after ``before`` are not.
+    - A topic is left over if the node says that it does not have the topic.
+    - All registrations of a node name are left over under two conditions. Another name has
+      registered since. And the node names no topic of the first name, apart from /rosout, which
+      nearly every node has.
+
+    Registrations made after ``before`` are never left over.
     """
     registrations = list(endpoint.registrations.values())
     newest = max(registrations, key=lambda r: r.since, default=None)
@@ -139,7 +144,8 @@ def left_over_registrations(
 def vanished_topics(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
     """The topics registered before a time that the node says it does not have.
 
-    A node that registers around the proxy unregisters there too, where its URI means nothing.
+    A node that registers at the real master directly also unregisters there. The master ignores
+    such a call, because the master has another URI for the node.
     """
     registrations = endpoint.registrations.values()
     return [r for r in registrations if info.holds(r) is False and r.since < before]
@@ -148,10 +154,10 @@ def vanished_topics(endpoint: Endpoint, info: NodeInfo, before: float) -> list[R
 def valid_registrations(
     endpoint: Endpoint, info: NodeInfo, same_process: bool
 ) -> list[Registration]:
-    """Which of an endpoint's registrations hold for a node that has come back.
+    """The registrations of an endpoint that hold for a node that has come back.
 
-    A topic does unless the node says that it does not have it; services and parameters, which it
-    can't be asked for, if it is the ``same_process`` and not all of its topics have gone.
+    A topic holds unless the node says that it does not have the topic. Services and parameters
+    cannot be asked for. They hold if the ``same_process`` answers, and has not lost all topics.
     """
     registrations = list(endpoint.registrations.values())
     topics = [r for r in registrations if r.kind in TOPIC_KINDS]
@@ -162,10 +168,10 @@ def valid_registrations(
 
 
 def unregistered_topics(endpoint: Endpoint, info: NodeInfo) -> list[Registration]:
-    """The topics that a node has, with their types, and the master does not know of.
+    """The topics that a node has and the master does not know, with their types.
 
-    rospy gives up a registration for which it found no master. Of a slave API that several
-    node names share nothing is listed.
+    rospy gives up a registration if it finds no master. If several node names share the slave API,
+    the list is empty.
     """
     names = endpoint.caller_ids
     if len(names) != 1:
@@ -181,10 +187,11 @@ def unregistered_topics(endpoint: Endpoint, info: NodeInfo) -> list[Registration
 def lost_registrations(
     ours: Sequence[Registration], state: Mapping[str, list[Registration]], before: float
 ) -> list[Registration]:
-    """Which of our registrations the master no longer has.
+    """The registrations of the registry (``ours``) that the master no longer has.
 
-    Those made after ``before``, the time at which the master was asked, don't count; nor do
-    parameter subscriptions, which the master's state leaves out, unless their node is unknown.
+    ``before`` is the time at which the master was asked: later registrations do not count. The
+    state of the master has no parameter subscriptions. These count as lost if the master has lost
+    the whole node.
     """
     ours = [r for r in ours if not r.hidden]
     keys = {r.key for of_node in state.values() for r in of_node}
@@ -197,7 +204,7 @@ def lost_registrations(
 def _usable(
     registrations: Iterable[Registration], services: Mapping[str, str]
 ) -> list[Registration]:
-    """Those of some registrations that are no services, or services with a known URI."""
+    """The registrations without the services whose URI is unknown."""
     return [r for r in registrations if r.kind is not Kind.SERVICE or r.name in services]
 
 
@@ -210,5 +217,5 @@ def _call(method: str, registration: Registration, uri: str, service: str) -> Me
         positions.service_api: service,
         positions.caller_api: uri,
     }
-    # What a method does not have is under None, which is left out.
+    # Parameters that the method does not have are under the key None, and left out.
     return method, [params[position] for position in range(4) if position in params]

@@ -1,13 +1,13 @@
-"""Which subscribers have no connection to a publisher behind the proxy, though they should.
+"""Find the subscribers that lack a connection to a publisher behind the proxy.
 
-roscpp never tries again after a connection that was refused at once
-(transport_publisher_link.cpp, onRetryTimer), nor after a requestTopic that got no answer
-(subscription.cpp, pendingConnectionDone); rospy does not try again at all. Such a subscriber hears
-nothing until its list of publishers changes.
+roscpp does not try again after a connection that was refused at once
+(transport_publisher_link.cpp, onRetryTimer), nor after a requestTopic without an answer
+(subscription.cpp, pendingConnectionDone). rospy does not try again at all. Such a subscriber
+receives nothing until its list of publishers changes.
 
-Nobody can be asked for the connections that are missing, so they are what is left of all
-subscriptions at the master, once those are taken off that are served: by a relay of the proxy, by
-UDPROS, by the kernel, or directly, without the proxy.
+No node tells which connections are missing. So the proxy begins with all subscriptions at the
+master, and removes the subscriptions that have a connection: a relay of the proxy, UDPROS, the
+kernel, or a direct connection without the proxy.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -23,9 +23,9 @@ from rosproxy.ros1.rewriting.addressing import Addressing
 TopicConnection = tuple[int, str, str]
 """A connection through the proxy: its port, the topic and the subscriber's name."""
 BusRow = tuple[str, str, str]
-"""One of a publisher's own connections: the topic, the subscriber's name and the transport."""
+"""A connection that a publisher names: the topic, the subscriber's name and the transport."""
 Addresses = Mapping[str, Collection[str]]
-"""Nodes' names with the addresses of their hosts."""
+"""The addresses of the hosts of nodes, by node name."""
 
 
 class TopicSubscription(msgspec.Struct, frozen=True):
@@ -41,10 +41,11 @@ def subscriptions(
     endpoints: Iterable[Endpoint],
     addressing: Addressing,
 ) -> list[TopicSubscription]:
-    """Subscriptions to what the nodes of some endpoints publish, but not those of neighbours.
+    """Subscriptions to topics of some endpoints, without the subscriptions of neighbours.
 
-    ``registrations_by_node`` is what the master has. A neighbour that reaches a publisher by its
-    own URI is left out early: a thousand nodes that all hear each other are a million pairs.
+    ``registrations_by_node`` has all registrations of the master. A neighbour reaches the publisher
+    by the publisher's own URI. The function leaves neighbours out early, for speed: a thousand
+    nodes that all subscribe to each other make a million pairs.
     """
     topics: dict[str, dict[frozenset[int], list[Endpoint]]] = {}
     for endpoint in endpoints:
@@ -74,14 +75,14 @@ def subscriptions(
 def without_relay(
     candidates: Iterable[TopicSubscription], relays: Collection[TopicConnection]
 ) -> list[TopicSubscription]:
-    """Those that no relay serves."""
+    """The subscriptions without a relay."""
     return [s for s in candidates if (s.endpoint.port, s.topic, s.caller_id) not in relays]
 
 
 def read_bus(rows: Any) -> list[BusRow]:
-    """The connections to subscribers in the value of a publisher's getBusInfo.
+    """The connections to subscribers, from the value of a publisher's getBusInfo.
 
-    Rows: ``[id, subscriber's name, "o", transport, topic, …]``; others are left out.
+    A row is ``[id, subscriber's name, "o", transport, topic, …]``. Other rows are left out.
     """
     connections: list[BusRow] = []
     for row in rows if isinstance(rows, list) else ():
@@ -96,10 +97,10 @@ def unconnected(
     bus_rows: Mapping[Endpoint, Sequence[BusRow]],
     addresses: Addresses,
 ) -> list[TopicSubscription]:
-    """Those of the subscriptions without relay that no other way serves either.
+    """The subscriptions without a relay that have no other connection either.
 
-    For UDPROS the publisher's rows count. For TCPROS they don't: it takes connections for open
-    whose other end has vanished. What the kernel forwards is known by hosts alone.
+    The publisher's rows count for UDPROS, but not for TCPROS: a publisher still lists connections
+    whose other end has vanished. The proxy knows connections in the kernel only by host.
     """
     remaining: dict[Endpoint, list[TopicSubscription]] = {}
     for sub in unrelayed:
@@ -113,7 +114,7 @@ def unconnected(
 
 
 def _networks_of(address: str, addressing: Addressing) -> frozenset[int]:
-    """Which of the inside networks an address is in."""
+    """The indices of the inside networks that contain an address."""
     ip = ip_address(address)
     return frozenset(i for i, network in enumerate(addressing.networks) if ip in network)
 
@@ -121,10 +122,10 @@ def _networks_of(address: str, addressing: Addressing) -> frozenset[int]:
 def _not_forwarded(
     endpoint: Endpoint, group: list[TopicSubscription], rows: Sequence[BusRow], addresses: Addresses
 ) -> list[TopicSubscription]:
-    """Those of an endpoint's subscriptions that its connections in the kernel don't account for.
+    """The subscriptions to an endpoint that its connections in the kernel do not explain.
 
-    Where none comes from a host of theirs, something on the way hides addresses (NAT, Docker's
-    own proxy): they are then counted together.
+    If no connection comes from the host of a subscriber, NAT or Docker's port proxy hides the
+    addresses. The function then counts all connections together.
     """
     if not endpoint.fast_peers:
         return group
@@ -143,10 +144,11 @@ def _not_forwarded(
 def _unserved(
     connections: int, group: list[TopicSubscription], rows: Sequence[BusRow]
 ) -> list[TopicSubscription]:
-    """The subscriptions that none of a number of connections serves.
+    """The subscriptions of a group that none of its ``connections`` serves.
 
-    The publisher's rows have all that are open. If they don't tell enough subscriptions apart, all
-    count: one that was told in vain has made a new connection, which counts for the others.
+    The publisher's rows contain all open connections. If the rows do not tell enough subscriptions
+    apart, the whole group counts as unserved. A subscriber that was told in vain makes a new
+    connection, and the next look counts this connection.
     """
     if connections >= len(group):
         return []

@@ -1,4 +1,4 @@
-"""How many messages and bytes topics have carried, from what nodes count of their connections."""
+"""How many messages and bytes topics have carried, by the counts of the nodes."""
 
 from collections.abc import Iterator, Mapping
 
@@ -7,26 +7,27 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint
 
 SIDES = {OUT: "published", IN: "received"}
-"""What a node does with a topic, by the direction of its connections."""
+"""What a node does with a topic, by the direction of the connection."""
 MOST_NAMES = 1000
-"""Topics with sums of their own; those of all others are one."""
+"""The highest number of topics with separate sums. All further topics share a sum."""
 OTHERS = "other"
 WRAP = 2**32
-"""What roscpp's numbers have lost where they go on below zero."""
+"""The difference after an overflow: roscpp's numbers are signed 32-bit integers."""
 
 
 def registered_stats(endpoint: Endpoint, stats: BusStats) -> BusStats:
-    """What a node counts of the topics that it has registered; it may answer with any name."""
+    """The counts of topics that the node has registered. A node may answer with any name."""
     kinds = {OUT: Kind.PUBLISHER, IN: Kind.SUBSCRIBER}
     registered = {(way, name) for way, kind in kinds.items() for name in endpoint.names(kind)}
     return {key: connections for key, connections in stats.items() if key in registered}
 
 
 def growth(former: BusStats, newest: BusStats) -> Mapping[tuple[str, str], Count]:
-    """Bytes and messages that have been added between two answers, by direction and topic.
+    """The bytes and messages added between two answers, by direction and topic.
 
-    A message of a publisher goes to each of its connections. It counts once: as many messages as
-    the connection got that got most. Bytes are those of all connections, as they use the network.
+    A publisher sends a message over each of its connections, but the message counts once. So the
+    messages of a publisher are those of the connection with the most. The bytes are the sum of all
+    connections, as on the network.
     """
     return {
         key: _sum_up(key[0], list(_grown(key[0], former.get(key, {}), connections)))
@@ -35,13 +36,13 @@ def growth(former: BusStats, newest: BusStats) -> Mapping[tuple[str, str], Count
 
 
 class TopicSums:
-    """The sums of all nodes by topic and side; they only grow."""
+    """The sums of all nodes by topic and side. Sums never shrink."""
 
     def __init__(self) -> None:
         self.by_topic: dict[tuple[str, str], Count] = {}
 
     def add(self, topic: str, side: str, count: Count) -> None:
-        """Add what a node has counted."""
+        """Add the counts of a node."""
         key = topic, side
         if key not in self.by_topic and len(self.by_topic) >= MOST_NAMES:
             key = OTHERS, side
@@ -52,11 +53,12 @@ class TopicSums:
 def _grown(
     direction: str, former: Mapping[int, Count], newest: Mapping[int, Count]
 ) -> Iterator[Count]:
-    """How far each connection has got.
+    """The bytes and messages that each connection has added.
 
-    A subscriber of roscpp that connects again goes on counting, under another number
-    (``PublisherLink::setHeader``): it is taken for the connection that is gone and had most of what
-    it has. One of a publisher is another subscriber's, and begins with nothing.
+    When a subscriber of roscpp connects again, its counts go on under another connection number
+    (``PublisherLink::setHeader``). So a new connection continues the ended connection with the
+    most bytes whose counts do not exceed the new counts. A new connection of a publisher belongs to
+    another subscriber, and starts at zero.
     """
     gone = [count for number, count in former.items() if number not in newest]
     gone = sorted(gone, reverse=True) if direction == IN else []
@@ -69,7 +71,7 @@ def _grown(
 
 
 def _difference(former: int, newest: int) -> int:
-    """How far a number has grown; a smaller one has begun anew, unless it goes on below zero."""
+    """The growth of a number. A smaller number started anew, or overflowed if negative."""
     if newest >= former:
         return newest - former
     return newest - former + WRAP if newest < 0 <= former else max(newest, 0)
