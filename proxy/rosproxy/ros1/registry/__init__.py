@@ -1,1 +1,1 @@
-"""Which nodes are behind the proxy, what each has registered, and the port that stands for it."""
+"""The nodes behind the proxy, the registrations of each node, and its port."""

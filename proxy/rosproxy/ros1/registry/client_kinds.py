@@ -1,10 +1,10 @@
-"""Who may use the proxy as its master: nodes inside, and of those the ones that were selected.
+"""Which nodes may use the proxy as their master: nodes inside, or the selected nodes.
 
-ROS 1 knows no identity but the address that a call comes from. Without an operator every address
-of the inside networks may; an operator names the addresses that it has selected (``POST
-/containers``), and then only these may, wherever they lie. Until it has named them for the first
-time after a start, the networks count: a proxy that is started again while its operator is away
-serves whomever it served.
+ROS 1 has no identity but the address from which a call comes. Without an operator, every address in
+the inside networks may use the proxy. An operator names the selected addresses (``POST
+/containers``). From then on only these addresses may use the proxy, in any network. Until the first
+such report after a start, the inside networks count. So a proxy that starts without its operator
+serves the same nodes as before.
 """
 
 from collections.abc import Collection, Sequence
@@ -15,7 +15,7 @@ from rosproxy.net.addresses import Network, is_inside
 
 
 class ClientKind(Enum):
-    """What an address is to the proxy; the value is the word for it in metrics."""
+    """How the proxy treats an address; the value is the word for this in metrics."""
 
     ADMITTED = "admitted"
     OUTSIDE = "outside"
@@ -25,7 +25,7 @@ class ClientKind(Enum):
 def client_kind(
     address: str, networks: Sequence[Network], selected: Collection[str] | None
 ) -> ClientKind:
-    """What an address is, given the inside networks and the selected addresses; None: not told."""
+    """The kind of an address; ``selected`` is None if no operator has named addresses yet."""
     if selected is not None and address in selected:
         return ClientKind.ADMITTED
     if not is_inside(address, networks):
@@ -34,7 +34,7 @@ def client_kind(
 
 
 def refusal(address: str, kind: ClientKind, networks: Sequence[Network]) -> str:
-    """What somebody is told, in one line, who may not use the proxy as its master."""
+    """Why an address may not use the proxy as its master, and what to do, in one line."""
     if kind is ClientKind.UNSELECTED:
         return (
             f"rosproxy: {address} is not selected to use this proxy as its master. "

@@ -1,4 +1,4 @@
-"""An endpoint: a node behind the proxy, where it is, what it registered, the port it holds."""
+"""An endpoint: a node behind the proxy, its location, its registrations, and its port."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -10,32 +10,33 @@ from rosproxy.ros1.registry.node_health import Health, ProbeResult
 from rosproxy.telemetry.text import listed
 
 MOST_REGISTRATIONS = 10_000
-"""Registrations of one endpoint. A node for each topic of a thousand nodes, as ``rosbag record
--a``, has some thousands; a usual one has ten."""
+"""The highest number of registrations of an endpoint. ``rosbag record -a`` on a system of a
+thousand nodes has a few thousand, most nodes have ten."""
 MOST_CHARACTERS = 2_000_000
-"""Characters of all names and types that are registered for one endpoint. Those of 10,000 topics of
-a large system are 1,000,000."""
+"""The highest number of characters of all registered names and types of an endpoint. 10,000 topics
+of a large system have 1,000,000."""
 LONGEST_REGISTRATION = 8192
-"""Characters of one registration: three names and a URI, the topic's name with its namespace."""
+"""Characters of a registration: three names and a URI; the topic name includes its namespace."""
 MOST_SERVICE_PORTS = 16
-"""TCPROS ports of services that are remembered for one endpoint. rospy and roscpp have one for all
-topics and services; of a node with more the rest is asked for nothing after a restart."""
+"""Remembered TCPROS ports of services for an endpoint. rospy and roscpp have a single port for all
+topics and services. After a restart the proxy does not try ports beyond this number."""
 MOST_FORMER_CALLERS = 64
-"""Names that were registered at an endpoint and are no longer."""
+"""Remembered names that are no longer registered at an endpoint."""
 MOST_NAMED = 3
-"""Node names of one endpoint that a message gives: one as a rule, several where a port was used
-again by another node."""
+"""Node names of an endpoint in a message. Most endpoints have one name, and several if another node
+has used the same port again."""
 STATES = ("ok", "new", "failing", "refused", "silent", "cleaned", "ended", "unverified")
 
 
 @dataclass(frozen=True, slots=True)
 class NodeLocation:
-    """Where a node's slave API really is.
+    """The location of a node's slave API.
 
-    ``address`` is the IP address the proxy connects to. ``named``: the host that the node gives
-    leads there, so that neighbours can use it. ``confirmed``: the address is the one that the
-    registration came from; if not, the node's TCPROS port is believed only from the node itself.
-    ``stale``: the host that the node gives is an address that it no longer has.
+    - ``address``: the IP address to which the proxy connects.
+    - ``named``: the host name that the node gives leads to this address, so neighbours can use it.
+    - ``confirmed``: the registration came from this address. If not, the proxy takes the TCPROS
+      port only from the node itself.
+    - ``stale``: the host that the node gives is an address that the node no longer has.
     """
 
     address: str
@@ -46,11 +47,11 @@ class NodeLocation:
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """One registration at the master, on behalf of an endpoint.
+    """A registration at the master, on behalf of an endpoint.
 
-    ``type`` is the topic's message type, ``service_api`` the service URI as the node gave it
-    (None after a recovery, when only the node knows it). ``hidden``: the policy denies it, so that
-    the master knows nothing of it; see `rosproxy.ros1.policy.hidden`.
+    ``type`` is the message type of the topic, ``service_api`` the service URI as the node gave it.
+    The URI is None after a recovery, because only the node knows the URI. ``hidden``: the policy
+    denies the registration, and the master does not have it; see `rosproxy.ros1.policy.hidden`.
     """
 
     kind: Kind
@@ -63,38 +64,39 @@ class Registration:
 
     @property
     def key(self) -> tuple[Kind, str, str]:
-        """What tells registrations apart at the master."""
+        """The values that identify a registration at the master."""
         return self.kind, self.name, self.caller_id
 
     @property
     def characters(self) -> int:
-        """How long its texts are together."""
+        """The number of characters of all texts of the registration."""
         texts = self.name, self.caller_id, self.type, self.service_api or ""
         return sum(map(len, texts))
 
 
 @dataclass(slots=True, eq=False)
 class Endpoint:
-    """An inside slave URI and the port that stands for it outside.
+    """An inside slave URI, and the port at which outside reaches it.
 
-    ``callers`` are the nodes' names with the number of their registrations, and ``characters`` is
-    how long these are together; `Registry` keeps both.
-    It is plain state, and `Registry` keeps the indexes by which it is found.
+    An endpoint is plain state. `Registry` keeps the indexes, ``callers`` (the number of
+    registrations by node name) and ``characters`` (the length of all registrations).
 
-    ``uri`` is what the node calls itself, ``node`` its host and port, ``port`` the one the proxy
-    listens on. ``topic_ports`` are the TCPROS ports that the node itself named, by topic: one for
-    all in rospy and roscpp, one for each in other client libraries.
-    ``trusted`` is False while only the master's data tell of the endpoint. ``source`` is the
-    address whose registration it was made for; after a recovery the node's own.
-
-    ``former_uris`` are those by which the master may have known it: the node's own, if it
-    registered around the proxy, and advertised ones of places where it was. ``unsettled``: what
-    the master has may still be registered with one of them. Until ``settles_at``, a time, a list
-    of publishers without this one is taken for one from before it was registered anew.
-
-    ``fast_port`` is a second port of the range, for topics alone, which the kernel forwards where
-    it may (None: it has none). ``fast_peers`` tells how many connections the kernel forwards now,
-    by the peer's address.
+    - ``uri``: the slave URI as the node gave it. ``node`` is its host and port.
+    - ``port``: the lease, where the proxy listens.
+    - ``topic_ports``: the TCPROS ports that the node itself named, by topic. rospy and roscpp have
+      a single port for all topics, other client libraries one for each.
+    - ``trusted``: False while only the data of the master mention the endpoint.
+    - ``source``: the address from which the first registration came. After a recovery, the address
+      of the node.
+    - ``former_uris``: other URIs by which the master may have the node. A node that registered at
+      the real master directly has its own URI there. A node that moved has former advertised URIs.
+    - ``unsettled``: the master may still have registrations with a former URI.
+    - ``settles_at``: until this time, the proxy takes a list of publishers without this node for a
+      list from before the new registration.
+    - ``fast_port``: a second port of the range for topics only, which the kernel forwards if
+      possible. None: no fast port.
+    - ``fast_peers``: the number of connections that the kernel forwards now, by address of the
+      peer.
     """
 
     uri: str
@@ -106,20 +108,20 @@ class Endpoint:
     characters: int = 0
     topic_ports: dict[str, int] = field(default_factory=dict)
     service_ports: dict[int, None] = field(default_factory=dict)
-    """TCPROS ports at which it has registered services, oldest first."""
+    """TCPROS ports at which the node has registered services, oldest first."""
     former_callers: dict[str, None] = field(default_factory=dict)
-    """Names that were registered here and are no longer, oldest first; `Registry` keeps them."""
+    """Names that are no longer registered at this endpoint, oldest first; `Registry` fills it."""
     connections: int = 0
     """Open connections from outside that the proxy relays."""
     pending: int = 0
-    """Calls on their way that register something here: the lease does not end meanwhile."""
+    """Calls under way that register something here. The lease does not end meanwhile."""
     idle_since: float | None = None
-    """When the lease was last found unused; None if it is in use, as far as is known."""
+    """When the lease was last found unused; None if the lease is in use, as far as known."""
     trusted: bool = True
     source: str = ""
     health: Health = field(default_factory=Health)
     admissions: dict[tuple[HostPort, str], None] = field(default_factory=dict)
-    """Hosts and ports that mean it, each with its source, oldest first; `Registry` keeps them."""
+    """Hosts and ports that mean this endpoint, with their sources, oldest first; by `Registry`."""
     former_uris: set[str] = field(default_factory=set)
     unsettled: bool = False
     settles_at: float = 0.0
@@ -127,10 +129,10 @@ class Endpoint:
     fast_peers: Mapping[str, int] = field(default_factory=dict)
     inside: bool = True
     restored: bool = False
-    """Whether a former process of the proxy knew it, which may have known more of it."""
+    """Whether a former process of the proxy had the endpoint, and perhaps further data."""
 
     def mark_alive(self, pid: int | None, topic_ports: Mapping[str, int], now: float) -> None:
-        """Take in what its node has said of itself: it is served, and what it registered holds."""
+        """Record what the node has said about itself: it is served, and its registrations hold."""
         self.trusted = True
         self.topic_ports = dict(topic_ports)
         self.health.note(ProbeResult.ANSWERED, now)
@@ -138,42 +140,42 @@ class Endpoint:
         self.health.cleaned = False
 
     def note_unused(self, now: float) -> float:
-        """Note that nobody needs the lease now; for how many seconds that has been so."""
+        """Record that the lease is unused now; return for how many seconds it has been unused."""
         if self.idle_since is None:
             self.idle_since = now
         return now - self.idle_since
 
     def note_verified(self, pid: int | None, topic_ports: Mapping[str, int]) -> None:
-        """Note that the node itself has borne out what the master says of it."""
+        """Record that the node itself has confirmed the registrations at the master."""
         self.topic_ports = dict(topic_ports)
         self.trusted = True
-        # A known one stays: by it the prober finds out that this is another process.
+        # A known pid stays, so that the prober notices another process.
         if self.health.pid is None:
             self.health.pid = pid
 
     def note_former_caller(self, caller_id: str) -> None:
-        """Note that a name is no longer registered here."""
+        """Record that a name is no longer registered here."""
         self.former_callers.pop(caller_id, None)
         self.former_callers[caller_id] = None
         while len(self.former_callers) > MOST_FORMER_CALLERS:
             del self.former_callers[next(iter(self.former_callers))]
 
     def note_moved(self, former_uri: str, uri: str) -> None:
-        """Note that the advertised URI has changed; the master still has the former one."""
+        """Record that the advertised URI has changed. The master still has the former URI."""
         self.former_uris.add(former_uri)
         self.former_uris.discard(uri)
         self.unsettled = True
 
     def confirm(self) -> None:
-        """Note that the node registered from its own address: what it says is believed."""
+        """Record that the node registered from its own address: the proxy trusts what it says."""
         self.location = replace(self.location, confirmed=True)
         self.trusted = True
 
     def note_topic_port(self, topic: str, port: int | None) -> None:
-        """Note the TCPROS port that the node names for a topic now, if it does.
+        """Record the TCPROS port that the node names for a topic; None removes the topic.
 
-        Only for those that it has registered: roscpp names its port for any topic, so anybody could
-        have names remembered without end.
+        Only registered topics are recorded. roscpp names its port for any topic, so a caller could
+        make the proxy record names without end.
         """
         if port is not None and self.publishes(topic):
             self.topic_ports[topic] = port
@@ -181,7 +183,7 @@ class Endpoint:
             self.topic_ports.pop(topic, None)
 
     def note_service_port(self, port: int) -> bool:
-        """Note a TCPROS port at which the node has a service; return whether it was unknown."""
+        """Record a TCPROS port at which the node has a service; return whether it was unknown."""
         if port in self.service_ports:
             return False
         self.service_ports[port] = None
@@ -196,36 +198,36 @@ class Endpoint:
 
     @property
     def state(self) -> str:
-        """One word for its state: one of STATES."""
+        """The state of the node in one word: one of STATES."""
         return self.health.state if self.trusted else "unverified"
 
     @property
     def is_down(self) -> bool:
-        """Whether the node is known not to answer, so that its port refuses."""
+        """Whether the node counts as dead, so that its port refuses connections."""
         return self.health.down
 
     @property
     def answers(self) -> bool:
-        """Whether the node is known to be there, as far as the proxy can tell."""
+        """Whether the node counts as alive."""
         return self.trusted and not self.health.down
 
     @property
     def proven(self) -> bool:
-        """Whether its node has ever answered here, as itself."""
+        """Whether the node itself has ever answered at this address."""
         return self.trusted and self.health.answered_at is not None
 
     @property
     def never_found(self) -> bool:
-        """Whether its node registered and has never answered here: it may be elsewhere."""
+        """Whether the node has registered, but has never answered here: it may be elsewhere."""
         health = self.health
         return self.trusted and health.answered_at is None and health.failures > 0
 
     @property
     def expendable(self) -> bool:
-        """Whether its port may go to a node that lives: its own does not answer.
+        """Whether the port may go to a live node, because this endpoint's node does not answer.
 
-        One that never answered has one chance; what the master alone tells of must be borne out
-        when it is asked for the first time.
+        A node that has never answered gets a single probe. A node that only the master mentions has
+        to confirm its registrations with its first answer.
         """
         if self.pending or self.connected:
             return False
@@ -240,33 +242,33 @@ class Endpoint:
 
     @property
     def has_registered_directly(self) -> bool:
-        """Whether the node registered around the proxy, so that it may do so again."""
+        """Whether the node registered at the real master directly, and so may do that again."""
         return any(parse_slave_uri(uri) == self.node for uri in self.former_uris)
 
     @property
     def inside_path(self) -> InsidePath:
-        """What is remembered of where it is."""
+        """What the proxy remembers about the location of the node."""
         address = None if self.node.host == self.address else self.address
         return InsidePath(self.node, address, path_of(self.uri))
 
     @property
     def slave(self) -> HostPort:
-        """Where the proxy reaches the slave API: what an endpoint is known by."""
+        """The address and port of the slave API; they identify the endpoint."""
         return HostPort(self.location.address, self.node.port)
 
     @property
     def caller_ids(self) -> list[str]:
-        """The names of the nodes registered here; one, as a rule."""
+        """The names of the nodes registered here, usually one."""
         return sorted(self.callers)
 
     @property
     def label(self) -> str:
-        """How messages name this endpoint: node name and own URI."""
+        """The endpoint in messages: node names and own URI."""
         return f"{listed(self.caller_ids, MOST_NAMED) or 'unnamed node'} ({self.uri})"
 
     @property
     def log_fields(self) -> dict[str, str | int]:
-        """What a log entry about it has as fields, to be given as ``extra``."""
+        """The fields of a log entry about the endpoint, for ``extra``."""
         return {"node": listed(self.caller_ids, MOST_NAMED), "port": self.port}
 
     def names(self, kind: Kind) -> list[str]:
@@ -274,12 +276,12 @@ class Endpoint:
         return sorted(r.name for r in self.registrations.values() if r.kind is kind)
 
     def names_at_master(self, kind: Kind) -> list[str]:
-        """The topics, services or parameters of a ``kind`` that the master knows of."""
+        """The topics, services or parameters of a ``kind`` that the master knows."""
         registrations = self.registrations.values()
         return sorted(r.name for r in registrations if r.kind is kind and not r.hidden)
 
     def callers_of(self, kind: Kind, name: str) -> list[str]:
-        """The nodes here that have registered something; all that are here if none has."""
+        """The nodes here that have made a registration; all nodes here if there is none."""
         callers = [caller for caller in self.callers if (kind, name, caller) in self.registrations]
         return callers or self.caller_ids
 
@@ -288,9 +290,9 @@ class Endpoint:
         return any((Kind.PUBLISHER, topic, name) in self.registrations for name in self.callers)
 
     def may_hear_of(self, parameter: str) -> bool:
-        """Whether the node may have subscribed to a parameter, or to a namespace that it is in.
+        """Whether the node may be subscribed to a parameter or to a namespace around it.
 
-        After a recovery that can't be told: the master lists no parameter subscriptions.
+        After a recovery the answer is yes, because the master lists no parameter subscriptions.
         """
         changed = prefix(parameter)
         return self.restored or any(
@@ -306,17 +308,17 @@ class Endpoint:
 
     @property
     def connected(self) -> bool:
-        """Whether somebody outside is connected, through the proxy or through the kernel."""
+        """Whether a program outside is connected, through the proxy or through the kernel."""
         return bool(self.connections or self.fast_peers)
 
     @property
     def fast_connections(self) -> int:
-        """How many connections the kernel forwards now."""
+        """The number of connections that the kernel forwards now."""
         return sum(self.fast_peers.values())
 
     @property
     def reason_full(self) -> str | None:
-        """Why nothing more is registered here; None if something may be."""
+        """Why the endpoint accepts no more registrations; None if it does."""
         for count, most, label in (
             (len(self.registrations), MOST_REGISTRATIONS, "registrations"),
             (self.characters, MOST_CHARACTERS, "characters of registered names"),
@@ -327,10 +329,10 @@ class Endpoint:
 
     @property
     def unused(self) -> bool:
-        """Whether nobody needs the lease: no registration stands, nobody is connected or calls."""
+        """Whether the lease has no registration, no connection and no call under way."""
         is_registered = self.registrations and not self.health.cleaned
         return not (is_registered or self.connected or self.pending)
 
 
 EndpointRegistration = tuple[Endpoint, Registration]
-"""A registration and the endpoint that has it."""
+"""An endpoint, and one of its registrations."""

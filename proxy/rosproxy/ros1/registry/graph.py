@@ -1,7 +1,8 @@
-"""The ROS graph: who publishes, subscribes and serves what, and where.
+"""The ROS graph: which node publishes, subscribes to and serves what, and where.
 
-The master tells it of all nodes (`Graph`), a node through its slave API of itself (`NodeInfo`).
-The two may differ: anybody can write to the master, and it keeps what a dead node had.
+The master tells the graph of all nodes (`Graph`). A node tells its own part through its slave API
+(`NodeInfo`). The two may differ: any program can write to the master, and the master keeps the
+registrations of dead nodes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,20 +15,20 @@ from rosproxy.ros1.registry.endpoint import Registration
 
 _Table = list[tuple[str, list[str]]]
 ROSOUT = "/rosout"
-"""The topic that nearly every node publishes, so that it tells nothing of who a node is."""
+"""The topic that nearly every node publishes, so that it identifies no node."""
 TOPIC_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER)
-"""What a node can be asked for (getPublications, getSubscriptions)."""
+"""The registrations that a node itself tells (getPublications, getSubscriptions)."""
 _STATE_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 
 
 class Graph(msgspec.Struct, frozen=True):
-    """What each node has registered, and each node's slave URI as far as known."""
+    """The registrations of each node by name, and the known slave URIs of nodes by name."""
 
     registrations: Mapping[str, Sequence[Registration]]
     uris: Mapping[str, str]
 
     def by_topic(self, kind: Kind) -> dict[str, list[str]]:
-        """The slave URIs of each topic's publishers or subscribers."""
+        """The slave URIs of the publishers or subscribers, by topic."""
         topics: dict[str, list[str]] = {}
         for node, registrations in self.registrations.items():
             for registration in registrations:
@@ -37,10 +38,10 @@ class Graph(msgspec.Struct, frozen=True):
 
 
 class NodeInfo(msgspec.Struct, frozen=True):
-    """What a node says of itself: its pid, its topics with their types, the TCPROS ports of some.
+    """What a node says about itself: pid, topics with types, and TCPROS ports of some topics.
 
-    None is what it does not tell. That means nothing: no client library has to implement all of
-    the slave API, and several don't.
+    None means that the node does not tell the value. This is no fault: no client library has to
+    implement the whole slave API, and several implement only a part.
     """
 
     pid: int | None
@@ -50,28 +51,29 @@ class NodeInfo(msgspec.Struct, frozen=True):
 
     @property
     def by_kind(self) -> dict[Kind, Mapping[str, str]]:
-        """Its topics by the kind of registration that they need, as far as it tells them."""
+        """The known topics of the node, by kind of registration."""
         topics_by_kind = {Kind.PUBLISHER: self.published, Kind.SUBSCRIBER: self.subscribed}
         return {kind: topics for kind, topics in topics_by_kind.items() if topics is not None}
 
     def has(self, topic: str) -> bool | None:
-        """Whether it publishes a topic or subscribes to it; None if it does not tell."""
+        """Whether the node publishes or subscribes to a topic; None if the node does not tell."""
         tables = self.by_kind.values()
         if any(topic in topics for topics in tables):
             return True
         return False if len(tables) == len(TOPIC_KINDS) else None
 
     def holds(self, registration: Registration) -> bool | None:
-        """Whether it has what is registered; None if it does not tell, as of services."""
+        """Whether the node has what is registered; None if it does not tell, as of services."""
         topics = self.by_kind.get(registration.kind)
         return None if topics is None else registration.name in topics
 
 
 def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:
-    """What each node has registered, from the values of getSystemState and getTopicTypes.
+    """Read the registrations of each node from the values of getSystemState and getTopicTypes.
 
     ``state`` is ``[publishers, subscribers, services]``, each ``[[name, [node, …]], …]``, and
-    ``types`` is ``[[topic, type], …]``. Raises msgspec.ValidationError if ``state`` is not.
+    ``types`` is ``[[topic, type], …]``. Raises msgspec.ValidationError if ``state`` has another
+    form.
     """
     tables = msgspec.convert(state, tuple[_Table, _Table, _Table])
     type_by_topic = read_types(types)
@@ -85,7 +87,7 @@ def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:
 
 
 def read_types(rows: Any) -> dict[str, str]:
-    """Topics with their types, from ``[[topic, type], …]``; other rows are left out."""
+    """Read topics with their types from ``[[topic, type], …]``; other rows are left out."""
     types: dict[str, str] = {}
     for row in rows if isinstance(rows, list) else ():
         match row:

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from enum import Enum
 
 UNKNOWN_PID = (None, -1)
-"""What stands for a pid that is not known, or not relied on."""
+"""Values for a pid that is unknown or not trusted."""
 
 FAILURES_TO_CLOSE = 2
-"""Failed probes in a row after which a node's port refuses."""
+"""Failed probes in a row after which the port of a node refuses connections."""
 
 
 RETRY = 1.0
@@ -15,7 +15,7 @@ RETRY = 1.0
 
 
 class ProbeResult(Enum):
-    """How a call to a node's slave API ended."""
+    """How a call to the slave API of a node ended."""
 
     ANSWERED = "answered"
     REFUSED = "refused"
@@ -24,13 +24,14 @@ class ProbeResult(Enum):
 
 @dataclass(slots=True)
 class Health:
-    """What is known of a node's health; times are seconds of a monotonic clock.
+    """The health of a node; times are seconds of a monotonic clock.
 
-    ``refused`` tells whether the last failure was a refused connection, which only a node that
-    has ended gives; one that hangs or is cut off is silent. ``cleaned``: its registrations were
-    taken back at the master, at ``cleaned_at``, and are kept only for the case that it answers
-    again. ``has_ended``: it is known to have ended for good, even if its address is just silent.
-    ``hung_up_pid`` is the process that ended the last connection that was to be kept.
+    - ``refused``: the last failure was a refused connection, so the node has ended. A node that
+      hangs or is cut off is silent instead.
+    - ``cleaned``: the registrations were taken back at the master, at ``cleaned_at``. The registry
+      keeps them for the case that the node answers again.
+    - ``has_ended``: the node has ended for good, even if its address is only silent.
+    - ``hung_up_pid``: the process that ended the last kept connection.
     """
 
     answered_at: float | None = None
@@ -46,7 +47,7 @@ class Health:
 
     @property
     def down(self) -> bool:
-        """Whether the node is known not to answer, so that its port refuses."""
+        """Whether the node counts as dead, so that its port refuses connections."""
         return self.failures >= FAILURES_TO_CLOSE
 
     @property
@@ -63,17 +64,17 @@ class Health:
         return "new" if self.answered_at is None else "ok"
 
     def probe_soon(self) -> None:
-        """Have the node probed at once."""
+        """Make the next look probe the node."""
         self.checked_at = None
 
     def note_hung_up(self) -> None:
-        """Have the node probed at once: it has ended a connection that was to be kept."""
+        """Make the next look probe the node, which has ended a kept connection."""
         self.checked_at = None
         self.hung_up_pid = self.pid
 
     @property
     def steady(self) -> bool:
-        """Whether it has answered whenever it was asked of late, always as the same process."""
+        """Whether the latest calls were all answered, by the same process."""
         is_well = self.answered_at is not None and not (
             self.failures or self.cleaned or self.has_ended
         )
@@ -81,26 +82,26 @@ class Health:
 
     @property
     def hangs_up(self) -> bool:
-        """Whether the process that answers has ended a connection that was to be kept."""
+        """Whether the process that answers now has ended a kept connection."""
         return self.hung_up_pid is not None and self.hung_up_pid == self.pid
 
     def note_cleaned(self, at: float) -> None:
-        """Note that its registrations were taken back at the master, as they were at a time."""
+        """Record that the registrations of a time were taken back at the master."""
         self.cleaned = True
         self.cleaned_at = at
 
     def note_back(self, pid: int | None) -> None:
-        """Note that it answers after all, as process ``pid``, and that it is registered again."""
+        """Record that the node answers again as process ``pid``, and is registered again."""
         self.pid = pid
         self.cleaned = False
 
     def suspect(self) -> None:
-        """Have the node probed at once, as if another process could be there by now."""
+        """Make the next look probe the node, as if another process had taken its address."""
         self.checked_at = None
         self.pid = -1
 
     def note(self, probe: ProbeResult, now: float) -> bool:
-        """Take in a probe result; whether the node went down by it."""
+        """Record a probe result; return whether the node went down with this result."""
         was_down = self.down
         self.checked_at = now
         if probe is ProbeResult.ANSWERED:
@@ -115,9 +116,9 @@ class Health:
         return self.down and not was_down
 
     def end(self, now: float) -> None:
-        """Note that the node has ended, whatever it is that its address answers."""
+        """Record that the node has ended, regardless of answers at its address."""
         self.failures = max(self.failures, FAILURES_TO_CLOSE)
-        # Failing since ever, so that `clean_up` waits for nothing.
+        # An infinitely old failure: `clean_up` then does not wait.
         self.checked_at = now
         self.failing_since = float("-inf")
         self.has_ended = True

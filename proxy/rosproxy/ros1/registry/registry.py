@@ -1,7 +1,7 @@
-"""What the proxy knows: endpoints, the ports they hold, and what is registered for them.
+"""The state of the proxy: endpoints, the ports of the endpoints, and their registrations.
 
-Plain state without I/O. It is changed in place rather than copied: with a thousand nodes of ten
-topics each a copy per call would make registration quadratic.
+Plain state without I/O. Methods change the state in place. With a thousand nodes of ten topics
+each, a copy for each call would make the cost of registrations quadratic.
 """
 
 from collections import Counter
@@ -22,25 +22,25 @@ from rosproxy.ros1.registry.endpoint import (
 )
 
 MOST_ADMISSIONS = 16
-"""Hosts with ports, and sources, remembered for one endpoint. A node gives one, from one address
-or, on a machine that is in several networks, from a few."""
+"""Remembered pairs of host:port and source for an endpoint. A node gives one host, from a single
+address, or from a few on a machine with several networks."""
 UNPROVEN_SHARE = 4
-"""One part in so many of the range is for nodes of one source that have never answered. A node
-that is well answers within milliseconds of its first registration."""
+"""Nodes of one source that have never answered may hold the range divided by this number. A healthy
+node answers within milliseconds after its first registration."""
 
 _NO_HOLDERS: Mapping[str, Endpoint] = {}
 
 
 class RangeExhausted(Exception):
-    """No port of the range is left for another node; the message is meant for the node's user."""
+    """No port of the range is left for another node. The message is for the user of the node."""
 
 
 class Registry:
-    """All endpoints, found by port, by address, by URI, by service and by node name.
+    """All endpoints, by port, address, URI, service and node name.
 
-    ``by_port``, ``by_slave``, ``by_caller`` and ``services`` are for others to read only.
-    ``changes`` grows with each registration that comes or goes, ``lease_changes`` with whatever is
-    to be remembered of leases.
+    ``by_port``, ``by_slave``, ``by_caller`` and ``services`` are read-only for other modules.
+    ``changes`` grows with each registration that begins or ends, ``lease_changes`` with each change
+    of the remembered leases.
     """
 
     def __init__(self, ports: PortRange) -> None:
@@ -57,29 +57,30 @@ class Registry:
         self._last_port: dict[HostPort, int] = {}
         self._former: dict[int, Endpoint] = {}
         self._unproven: dict[str, dict[Endpoint, None]] = {}
-        """The endpoints of each source that had not answered when that was last asked."""
+        """The endpoints of each source that had not answered at the last check."""
 
     def __iter__(self) -> Iterator[Endpoint]:
-        """All endpoints; safe against changes while iterating."""
+        """All endpoints; safe against changes during the iteration."""
         return iter(list(self.by_port.values()))
 
     def __len__(self) -> int:
-        """How many ports are held."""
+        """The number of held ports."""
         return len(self.by_port)
 
     def admitted(self, node: HostPort | None, source: str) -> Endpoint | None:
-        """The endpoint that a URI was found to mean when ``source`` registered it before.
+        """The endpoint for which ``source`` registered the same host and port before.
 
-        URIs are told apart by host and port: some client libraries end them with a slash, some
-        don't, and what the master had of them is known without.
+        Host and port identify a URI: some client libraries end a URI with a slash, and some do not.
+        What the master had before a recovery has no path either.
         """
         return self._admitted.get((node, source)) if node else None
 
     def admit(self, uri: str, node: HostPort, location: NodeLocation, source: str) -> Endpoint:
         """The endpoint of a slave URI that ``source`` registers; made if there is none.
 
-        One that is there already takes on what came from the node's own address: nobody can rename
-        somebody else's. Raises RangeExhausted if it needs a port and none can be had.
+        A registration from the node's own address may change the URI of an existing endpoint. Other
+        registrations may do so only until then, so that no other node renames the endpoint. Raises
+        RangeExhausted if no port is left.
         """
         slave = HostPort(location.address, node.port)
         endpoint = self.by_slave.get(slave)
@@ -105,7 +106,7 @@ class Registry:
     def restore(
         self, uri: str, node: HostPort, location: NodeLocation, port: int
     ) -> Endpoint | None:
-        """Rebuild an endpoint on the port that it had; None if either is taken."""
+        """Rebuild an endpoint on its former port; None if the port or the address is taken."""
         if HostPort(location.address, node.port) in self.by_slave or not self.pool.claim(port):
             return None
         endpoint = self._add(uri, node, location, port, location.address)
@@ -115,7 +116,7 @@ class Registry:
         return endpoint
 
     def remove(self, endpoint: Endpoint) -> None:
-        """Forget an endpoint with all its registrations and give its port back."""
+        """Remove an endpoint with all its registrations, and give its port back."""
         for key in list(endpoint.registrations):
             self._drop(endpoint, key)
         self.lease_changes += 1
@@ -130,15 +131,15 @@ class Registry:
             self._unproven.pop(endpoint.source, None)
 
     def move(self, locations: Mapping[Endpoint, NodeLocation]) -> list[Endpoint]:
-        """Note that nodes are at other addresses now; ports and registrations stay.
+        """Record that nodes have moved to other addresses; ports and registrations stay.
 
-        What came from the old address means the node at the new one from now on, and what it
-        calls itself too. Those whose new address and port another endpoint holds are left where
-        they are; the others are returned.
+        From now on the URIs that came from the old address mean the same endpoint when they come
+        from the new address. An endpoint does not move if another endpoint has the new address and
+        port. Returns the endpoints that have moved.
         """
         moved = self._movable(locations)
         self.lease_changes += 1
-        # All leave before the first one arrives: two containers may have swapped their addresses.
+        # All leave before the first arrives, because two containers may have swapped addresses.
         for endpoint in moved:
             del self.by_slave[endpoint.slave], self._last_port[endpoint.slave]
         admissions = [(e, a) for e in moved for a in self._take_admissions(e)]
@@ -151,18 +152,19 @@ class Registry:
         return moved
 
     def longest_idle(self) -> Endpoint | None:
-        """The endpoint to give up first when the range is short: idle for the longest time.
+        """The endpoint that has been unused for the longest time; None if all are in use.
 
-        One that has just been admitted is not idle: the master's reply is still on its way.
+        An endpoint that was just admitted counts as used, because the reply of the master is still
+        under way.
         """
         idle = [e for e in self if e.unused and e.idle_since is not None]
         return min(idle, key=lambda e: e.idle_since or 0.0, default=None)
 
     def dead_endpoint(self) -> Endpoint | None:
-        """The endpoint to give up first for a node that lives; None if no node is dead.
+        """The endpoint whose port a live node gets first; None if no node is dead.
 
-        Those that never answered go first, of the source that has most of them; then those that
-        refuse, which have ended; then those that are silent, for the longest time.
+        First come endpoints that have never answered, from the source with the most such endpoints.
+        Then come endpoints that refuse connections, then silent endpoints, longest first.
         """
         expendable = [e for e in self if e.expendable]
         crowds = Counter(e.source for e in expendable if not e.proven)
@@ -176,7 +178,7 @@ class Registry:
         return min(expendable, key=order, default=None)
 
     def unproven(self, source: str) -> list[Endpoint]:
-        """The endpoints that a source has registered whose nodes have never answered."""
+        """The endpoints that a source has registered and whose nodes have never answered."""
         unproven = self._unproven.get(source, {})
         for endpoint in list(unproven):
             if endpoint.proven or self.by_port.get(endpoint.port) is not endpoint:
@@ -185,16 +187,16 @@ class Registry:
 
     @property
     def most_unproven(self) -> int:
-        """How many such endpoints one source may have."""
+        """The highest number of endpoints of one source that have never answered."""
         return max(1, len(self.pool.range) // UNPROVEN_SHARE)
 
     def register(self, endpoint: Endpoint, registration: Registration) -> None:
-        """Note what the master has accepted.
+        """Record what the master has accepted.
 
-        As the master does, a service has one provider, and a name that registers from another
-        URI loses all that it had at the old one (rosmaster/registrations.py). What is over a bound
-        is left out: a node that registers it is refused before; what is read from the master or
-        from a node may be anything.
+        As at the master, a service has a single provider, and a name that registers with another
+        URI loses all its former registrations (rosmaster/registrations.py). A registration beyond a
+        bound is left out. The proxy refuses such a registration from a node earlier, so this
+        concerns data from the master or from a node's own lists.
         """
         self.changes += 1
         former = endpoint.registrations.get(registration.key)
@@ -224,27 +226,27 @@ class Registry:
         endpoint.idle_since = None
 
     def unregister(self, kind: Kind, name: str, caller_id: str) -> None:
-        """Note that a registration has ended, whoever ended it."""
+        """Record that a registration has ended, by any cause."""
         endpoint = self.by_caller.get(caller_id)
         if endpoint:
             self._drop(endpoint, (kind, name, caller_id))
 
     def drop_caller(self, endpoint: Endpoint, caller_id: str) -> None:
-        """Note that a node is no longer registered at an endpoint at all."""
+        """Record that a node has no registration at an endpoint any more."""
         for key in [key for key in endpoint.registrations if key[2] == caller_id]:
             self._drop(endpoint, key)
 
     def by_node(self, node: HostPort) -> list[Endpoint]:
-        """The endpoints that call themselves so; several only for host names reused.
+        """The endpoints whose URI has this host and port; several if host names are used again.
 
-        Those removed come last, until somebody else has their port: a node that was handed their
-        URI may still send it back.
+        Removed endpoints come last, until another endpoint gets the port, because a node may still
+        send back their URI.
         """
         endpoints = self._by_node.get(node, {}).values()
         return sorted(endpoints, key=lambda endpoint: endpoint.port in self._former)
 
     def service_port(self, endpoint: Endpoint, name: str) -> int | None:
-        """The TCPROS port that an endpoint's node gave for a service; None if it is not known."""
+        """The TCPROS port that the node gave for a service; None if it is unknown."""
         provider = self.services.get(name)
         if provider is None or provider[0] is not endpoint:
             return None
@@ -252,14 +254,14 @@ class Registry:
         return service.port if service else None
 
     def note_service_port(self, endpoint: Endpoint, name: str, port: int) -> None:
-        """Note the TCPROS port at which an endpoint's node has answered for a service."""
+        """Record the TCPROS port at which the node has answered for a service."""
         provider = self.services.get(name)
         if provider is not None and provider[0] is endpoint:
             uri = service_uri(HostPort(endpoint.node.host, port))
             self.register(endpoint, replace(provider[1], service_api=uri))
 
     def registrations(self) -> list[EndpointRegistration]:
-        """Everything that is registered, with its endpoint."""
+        """All registrations, each with its endpoint."""
         return [(e, r) for e in self for r in e.registrations.values()]
 
     def subscriptions(self, topic: str) -> list[EndpointRegistration]:
@@ -270,7 +272,7 @@ class Registry:
 
     @property
     def hides(self) -> bool:
-        """Whether there is a hidden registration, of which the master knows nothing."""
+        """Whether there is a hidden registration, which the master does not have."""
         return bool(self._hidden)
 
     def hidden_holders(self, kind: Kind, name: str) -> Mapping[str, Endpoint]:
@@ -286,7 +288,7 @@ class Registry:
         ]
 
     def _movable(self, locations: Mapping[Endpoint, NodeLocation]) -> list[Endpoint]:
-        """Those whose new addresses are free, or will be; of two for the same one the first."""
+        """The endpoints whose new address is free, or will be; the first if two have the same."""
         moved = list(locations)
         while True:
             taken = {slave for slave, e in self.by_slave.items() if e not in moved}
@@ -301,7 +303,7 @@ class Registry:
             moved = kept
 
     def _take_admissions(self, endpoint: Endpoint) -> list[HostPort]:
-        """End the admissions of an endpoint's own address; their hosts and ports, and its own."""
+        """End the admissions from an endpoint's own address; return their hosts and ports."""
         address = endpoint.location.address
         nodes = [node for node, source in endpoint.admissions if source == address]
         for node in nodes:
@@ -321,7 +323,7 @@ class Registry:
         return endpoint
 
     def _admit(self, endpoint: Endpoint, node: HostPort, source: str) -> None:
-        # It may have been another endpoint's before, and counts as this one's newest from now on.
+        # Another endpoint may have had the admission, which is the newest of this endpoint now.
         previous = self._admitted.get((node, source), endpoint)
         previous.admissions.pop((node, source), None)
         self._admitted[node, source] = endpoint
@@ -331,7 +333,7 @@ class Registry:
             del endpoint.admissions[oldest], self._admitted[oldest]
 
     def _remember(self, endpoint: Endpoint) -> None:
-        """Note who has a port now, in place of who had it last."""
+        """Record the present holder of a port in place of the last holder."""
         former = self._former.pop(endpoint.port, None)
         if former is not None:
             self._forget_node(former)
@@ -349,7 +351,7 @@ class Registry:
             del self._by_node[endpoint.node]
 
     def _index_hidden(self, endpoint: Endpoint, registration: Registration) -> None:
-        """Note by kind and name that a registration is hidden, or no longer."""
+        """Update the index of hidden registrations for a registration."""
         endpoints = self._hidden.setdefault((registration.kind, registration.name), {})
         if registration.hidden:
             endpoints[registration.caller_id] = endpoint
@@ -369,7 +371,7 @@ class Registry:
         if kind is Kind.SERVICE:
             self.services.pop(name, None)
         elif kind is Kind.PUBLISHER:
-            endpoint.topic_ports.pop(name, None)  # it may have another one if it is back
+            endpoint.topic_ports.pop(name, None)  # a node that is back may have another port
         endpoint.callers[caller_id] -= 1
         if not endpoint.callers[caller_id]:
             del endpoint.callers[caller_id], self.by_caller[caller_id]

@@ -1,18 +1,18 @@
-"""What outlasts the proxy: where the node of each lease is, as one parameter at the master.
+"""The parameter at the master that outlasts the proxy: where the node of each lease is.
 
-A slave URI at the master tells no more than the lease (``http://HOST:PORT/``): a path is too much
-for some client libraries, which call such a URI malformed (roslisp) or take all that follows the
-colon for the port (ROS.NET). So the rest is kept where roslaunch keeps what outlasts it, at the
-parameter server: a text with a line for each lease, its advertised port, the node's own address in
-the form of `rosproxy.ros1.protocol.uris.inside_path`, and the TCPROS ports of its services, which
-no node can be asked for:
+A slave URI at the master only tells the port of the lease (``http://HOST:PORT/``). Some client
+libraries cannot read a URI with a path: roslisp calls such a URI malformed, and ROS.NET takes all
+that follows the colon for the port. So the proxy keeps the rest at the parameter server, as
+roslaunch does with data that outlast roslaunch. The value is a text with a line for each lease: the
+advertised port, the node's own address in the form of `rosproxy.ros1.protocol.uris.inside_path`,
+and the TCPROS ports of services, which nodes do not tell:
 
     50000 /172.30.0.11:38191/ 41234
     50001 /c2:40001/172.30.0.12/
 
-It is named by the advertised host and the first port of the range, so that each proxy has one.
-Anybody can write to it. So it is a claim, as is all that the master says, and the nodes are asked
-(`rosproxy.ros1.upkeep.verifier`).
+The name of the parameter has the advertised host and the first port of the range, so each proxy has
+its own parameter. Any program can write to the parameter. So the content is a claim, like all data
+from the master, and the nodes have to confirm it (`rosproxy.ros1.upkeep.verifier`).
 """
 
 import re
@@ -30,14 +30,14 @@ _LINE = re.compile(r"(\d{1,5}) (/\S{1,4096}/)((?: \d{1,5})*)")
 
 
 class RememberedLease(msgspec.Struct, frozen=True):
-    """Where the node of a lease was, and on which TCPROS ports it had services."""
+    """The location of the node of a lease, and the TCPROS ports of its services."""
 
     node: InsidePath
     service_ports: tuple[int, ...] = ()
 
 
 NAMESPACE = "/rosproxy"
-"""Where the parameters of all proxies are."""
+"""The namespace of the parameters of all proxies."""
 
 
 def parameter_of(host: str, ports: PortMap) -> str:
@@ -46,18 +46,18 @@ def parameter_of(host: str, ports: PortMap) -> str:
 
 
 def leases_text(endpoints: Iterable[Endpoint], ports: PortMap) -> str:
-    """The parameter's value; empty if there is nothing to remember."""
+    """The value of the parameter; empty if there is nothing to remember."""
     return "".join(f"{_line(endpoint, ports)}\n" for endpoint in endpoints)
 
 
 def read_leases(value: object, ports: PortMap) -> Mapping[int, RememberedLease]:
-    """What a value tells of the ports of the range, by the port that listens; never an error."""
+    """Read the leases of the range from a value, by listening port; bad lines are left out."""
     leases = {ports.listening(port): lease for port, lease in _read(value)}
     return {port: lease for port, lease in leases.items() if port is not None}
 
 
 def lease_at(parameters: object, advertised: HostPort) -> RememberedLease | None:
-    """What any proxy has at an advertised host and port, given the parameters in NAMESPACE."""
+    """The lease at an advertised host and port, of any proxy, from the parameters in NAMESPACE."""
     name = _name_of(advertised.host)
     items = parameters.items() if isinstance(parameters, dict) else ()
     values = [v for key, v in items if str(key).startswith(name)]
@@ -69,10 +69,10 @@ def _name_of(host: str) -> str:
 
 
 def _read(value: object) -> Iterator[tuple[int, RememberedLease]]:
-    """The advertised ports in a value, with what it tells of each."""
+    """The advertised ports in a value, each with its lease."""
     for line in value.splitlines() if isinstance(value, str) else ():
         match = _LINE.fullmatch(line)
-        # Only the path counts; any host and port make a URI of it.
+        # Only the path counts. Host and port of the URI may be any.
         node = parse_inside_path(f"http://h:1{match[2]}") if match else None
         if match and node:
             services = [int(text) for text in match[3].split()][:MOST_SERVICE_PORTS]

@@ -1,22 +1,23 @@
-"""Which ports of the proxy stand in for nodes outside, and what inside nodes are told of them.
+"""Which ports of the proxy stand in for nodes outside, and which URIs nodes inside get.
 
-A *stand-in* is a port on one of the proxy's inside addresses. What arrives there is passed on to
-one node outside, or to the server of one service. There are two cases of it:
+A *stand-in* is a port on an inside address of the proxy. The proxy passes what arrives there on to
+a node outside, or to the server of a service outside. There are two cases:
 
-  * ``--direction both``: inside has no way outwards but the proxy. Every URI of outside gets a
-    stand-in, at a port of the proxy's choice, and inside is told that port instead,
-    ``http://PROXY:PORT/``: what comes back from inside is turned back by it.
-  * The master's host name leads to the proxy (a network alias of Docker, so that ``ROS_MASTER_URI``
-    need not change). The nodes on the master's host give that very name in their URIs, which lead
-    to the proxy, too. So the same port numbers stand in for theirs, and the URIs stay as they are.
+  * ``--direction both``: inside reaches outside only through the proxy. Every URI of outside gets a
+    stand-in, at a port that the proxy chooses. Nodes inside get ``http://PROXY:PORT/`` instead of
+    the URI. When a node inside sends this URI back, the proxy restores the original URI.
+  * The host name of the master leads to the proxy (a network alias of Docker, so that
+    ``ROS_MASTER_URI`` stays unchanged). Nodes on the master's host give the same name in their
+    URIs, and these URIs lead to the proxy, too. So the proxy opens stand-ins at the same port
+    numbers, and the URIs stay as they are.
 
-The port of a URI follows from its text, so that a proxy which has lost all memory gives it the same
-one again: subscribers come back to the port that they were connected to, by themselves. Only where
-two texts meet at one port does the order count; then the master's list, which subscribers get after
-a restart, leads them on.
+The port of a URI follows from the text of the URI. So after a restart the proxy gives the URI the
+same port again, and subscribers connect to this port again by themselves. The order counts only if
+two texts lead to the same port. Then subscribers find the new port in the list of publishers, which
+the proxy sends after a restart.
 
-A slave URI gets a second port with the first, the *fast port*: topics are had there where the
-kernel forwards (`rosproxy.forwarding.kernel`).
+A slave URI also gets a second port, the *fast port*, for topics that the kernel forwards
+(`rosproxy.forwarding.kernel`).
 """
 
 from collections.abc import Iterator, Mapping
@@ -34,30 +35,31 @@ from rosproxy.ros1.protocol.uris import (
 from rosproxy.settings import Settings
 
 MOST_STAND_INS = 1024
-"""How many ports stand in for nodes at most."""
+"""The highest number of stand-ins."""
 PORTS = range(20_000, 32_768)
-"""Where they are chosen from: below those that Linux gives to outgoing connections. The first half
-is for the ports themselves, the second for their fast ports."""
+"""The ports of stand-ins, below the ports that Linux gives to outgoing connections. The first half
+is for the stand-ins, the second for their fast ports."""
 _HALF = len(PORTS) // 2
 TRIES = 16
-"""How many ports are tried for a URI."""
+"""The highest number of ports that the proxy tries for a URI."""
 MOST_TOPICS = 512
-"""How many topics of a node are remembered with their port."""
+"""The highest number of remembered topics with their ports, for a node."""
 MOST_FORMER = 2048
-"""How many ports that stand in no more are remembered with what they stood for."""
+"""The highest number of remembered former stand-ins."""
 
 
 @dataclass(slots=True, eq=False)
 class StandIn:
-    """A port that stands in for a node outside, or for a service there.
+    """A port that stands in for a node or a service outside.
 
-    ``local`` is where it listens, ``uri`` what the master has. ``is_uri_kept``: inside is told the
-    URI as it is, which leads to ``local``. ``topic_ports`` are the TCPROS ports by topic that the
-    node has named. ``address`` is where the node was reached, empty before.
-
-    ``fast_port`` is a second port, for topics alone, which the kernel forwards where it may (None:
-    it has none). ``fast_peers`` tells how many connections it forwards now, by the inside address.
-    ``fast_attempts`` counts the candidates for it that other stand-ins had.
+    - ``local``: where the stand-in listens. ``uri``: the URI at the master.
+    - ``is_uri_kept``: nodes inside get the URI unchanged, and this URI leads to ``local``.
+    - ``topic_ports``: the TCPROS ports that the node has named, by topic.
+    - ``address``: where the proxy has reached the node; empty before.
+    - ``fast_port``: a second port for topics only, which the kernel forwards if possible. None: no
+      fast port.
+    - ``fast_peers``: the number of connections that the kernel forwards now, by inside address.
+    - ``fast_attempts``: the number of candidates for the fast port that other stand-ins had.
     """
 
     local: HostPort
@@ -75,17 +77,17 @@ class StandIn:
 
     @property
     def port(self) -> int:
-        """What the kernel plane knows it by: the port that may be its fast port; 0 if none may."""
+        """The key in the kernel plane: the number of the possible fast port; 0 if there is none."""
         return self.fast_candidate.port if self.fast_candidate else 0
 
     @property
     def fast_connections(self) -> int:
-        """How many connections the kernel forwards now."""
+        """The number of connections that the kernel forwards now."""
         return sum(self.fast_peers.values())
 
     @property
     def label(self) -> str:
-        """How messages name the node."""
+        """The node in messages."""
         return self.uri
 
     @property
@@ -95,15 +97,15 @@ class StandIn:
 
     @property
     def caller_ids(self) -> list[str]:
-        """What metrics call the node: by its host, since its URI is another at each start."""
+        """The node in metrics: by host, because the URI changes with each start of the node."""
         return [self.target.host]
 
     @property
     def fast_candidate(self) -> HostPort | None:
-        """Where its fast port is to listen; None for a service, and where URIs are kept.
+        """The possible fast port; None for a service, and if the URI is kept.
 
-        The kernel's rules tell ports apart, but not the proxy's addresses: so a URI has another one
-        at each of them.
+        The rules of the kernel distinguish ports, but not addresses of the proxy. So a URI has a
+        different fast port at each address.
         """
         if self.is_uri_kept or parse_service_uri(self.uri):
             return None
@@ -111,9 +113,10 @@ class StandIn:
         return HostPort(self.local.host, PORTS[_HALF + number % _HALF])
 
     def note_topic_port(self, topic: str, port: int) -> None:
-        """Note the TCPROS port that the node has named for a topic, and the latest such alone.
+        """Record the TCPROS port that the node has named for a topic. Only the latest topics stay.
 
-        roscpp names its port for any topic: whoever asks could have names remembered without end.
+        roscpp names its port for any topic, so a caller could make the proxy record names without
+        end.
         """
         self.topic_ports.pop(topic, None)
         self.topic_ports[topic] = port
@@ -122,7 +125,7 @@ class StandIn:
 
     @property
     def inside_uri(self) -> str:
-        """What inside is told instead of the URI."""
+        """The URI that nodes inside get."""
         if self.is_uri_kept:
             return self.uri
         if parse_service_uri(self.uri):
@@ -131,9 +134,9 @@ class StandIn:
 
 
 class StandIns:
-    """The stand-ins by where they listen and by what they stand for.
+    """The stand-ins by local address and by URI.
 
-    ``aliased`` is the master's host name in lower case, if it may lead to the proxy.
+    ``aliased`` is the master's host name in lower case, if this name may lead to the proxy.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -141,17 +144,17 @@ class StandIns:
         self.is_bidirectional = settings.direction == "both"
         self.aliased = aliased_host(settings.master_uri) or ""
         self.by_local: dict[HostPort, StandIn] = {}
-        """By where they listen, the one that was unused for longest first."""
+        """By listening address and port; the stand-in that has been unused longest is the first."""
         self._by_uri: dict[tuple[str, str], StandIn] = {}
         self._former: dict[HostPort, str] = {}
-        """URIs by where something stood in for them, longest ago first."""
+        """The URIs of former stand-ins, by listening address and port, oldest first."""
         self.by_port: dict[int, StandIn] = {}
         """The stand-ins with a fast port, by that port."""
 
     def target(self, uri: str) -> HostPort | None:
-        """What a stand-in for a URI of the master's has to lead to; None if it needs none.
+        """The host and port of a URI from the master that needs a stand-in; None if none is needed.
 
-        The caller makes sure that it is no URI of this proxy's own, and none of inside.
+        The caller makes sure that the URI is neither of this proxy nor of inside.
         """
         host_port = parse_slave_uri(uri) or parse_service_uri(uri)
         if host_port is None or self.is_bidirectional:
@@ -159,7 +162,7 @@ class StandIns:
         return host_port if self.aliased and host_port.host.lower() == self.aliased else None
 
     def candidates(self, uri: str, target: HostPort, address: str) -> Iterator[StandIn]:
-        """The stand-ins to try for a URI at an address, one after the other; always the same."""
+        """The stand-ins to try for a URI at an address, always in the same order."""
         if not self.is_bidirectional:
             yield StandIn(HostPort(address, target.port), uri, target, is_uri_kept=True)
             return
@@ -169,10 +172,10 @@ class StandIns:
             yield StandIn(HostPort(address, port), uri, target, is_uri_kept=False)
 
     def address(self, proxy: str) -> str:
-        """Where stand-ins listen for a node inside that sees the proxy at an address.
+        """The address where stand-ins listen for a node inside that sees the proxy at ``proxy``.
 
-        At that address alone. Where the URIs are kept, at all addresses (``--bind``): the name in
-        them may lead to any.
+        This is ``proxy`` alone. If URIs are kept, it is ``--bind``, because the host name in a URI
+        may lead to any address of the proxy.
         """
         return proxy if self.is_bidirectional else self._settings.bind
 
@@ -185,31 +188,32 @@ class StandIns:
         return self._by_uri.get((address, uri))
 
     def choose_fast_candidate(self, stand_in: StandIn) -> HostPort | None:
-        """Go on to the first of its candidates that no other stand-in has; None if all are taken.
+        """Choose the first candidate that no other stand-in has, as the fast port to open.
 
-        None as well if it needs none, since it has a fast port or may have none.
+        None if all candidates are taken. None as well if the stand-in has a fast port or may not
+        have one.
         """
         if stand_in.fast_port is not None or stand_in.fast_candidate is None:
             return None
-        # `port` and `fast_candidate` follow from the attribute that is counted up here.
+        # `port` and `fast_candidate` follow from `fast_attempts`, the loop variable.
         for stand_in.fast_attempts in range(TRIES):
             if stand_in.port not in self.by_port:
                 return stand_in.fast_candidate
         return None
 
     def is_own_port(self, port: int) -> bool:
-        """Whether the proxy itself listens at a port, or may."""
+        """Whether the proxy itself listens at a port, or may listen there."""
         stands_in = port in self.by_port or any(port == local.port for local in self.by_local)
         return stands_in or obstacle(port, self._settings) is not None
 
     def add(self, stand_in: StandIn) -> None:
-        """Take in a stand-in that listens now."""
+        """Add a stand-in that listens now."""
         self.by_local[stand_in.local] = stand_in
         self._by_uri[stand_in.local.host, stand_in.uri] = stand_in
         self._former.pop(stand_in.local, None)
 
     def remove(self, stand_in: StandIn) -> None:
-        """Forget a stand-in that listens no more."""
+        """Remove a stand-in that no longer listens."""
         del self.by_local[stand_in.local]
         del self._by_uri[stand_in.local.host, stand_in.uri]
         self._former[stand_in.local] = stand_in.uri
@@ -218,22 +222,22 @@ class StandIns:
         self.note_fast_port(stand_in, None)
 
     def note_fast_port(self, stand_in: StandIn, port: int | None) -> None:
-        """Note that a stand-in has a fast port, or none any more."""
+        """Record the fast port of a stand-in; None: the stand-in no longer has one."""
         stand_in.fast_port = port
         if port is not None:
             self.by_port[stand_in.port] = stand_in
             return
-        stand_in.fast_peers = {}  # nobody counts them any more
+        stand_in.fast_peers = {}  # without a fast port, the plane counts no connections
         if self.by_port.get(stand_in.port) is stand_in:
             del self.by_port[stand_in.port]
 
     def note_used(self, stand_in: StandIn) -> None:
-        """Note that a stand-in is used."""
+        """Record that a stand-in is used."""
         if self.by_local.get(stand_in.local) is stand_in:
             self.by_local[stand_in.local] = self.by_local.pop(stand_in.local)
 
     def advice(self, target: HostPort, reason: str, address: str) -> str:
-        """What is wrong where no port can stand in, and the fix; ``address`` is the master's."""
+        """Why no port can stand in for a node, and the fix; ``address`` is the master's."""
         if self.is_bidirectional:
             return (
                 f"inside nodes can't reach {target}: the proxy found no stand-in port; the last "
@@ -245,12 +249,12 @@ class StandIns:
         )
 
     def import_uri(self, uri: str, address: str) -> str:
-        """What inside nodes are told instead of a URI of outside, given the proxy's address."""
+        """The URI that nodes inside get for a URI of outside, given the address of the proxy."""
         stand_in = self.find(self.address(address), uri)
         return stand_in.inside_uri if stand_in else uri
 
     def export_uri(self, uri: str) -> str | None:
-        """The URI of outside that inside nodes were once told this one for; None if it is none."""
+        """The URI of outside for which nodes inside once got this URI; None if there is none."""
         if not self.is_bidirectional or len(uri) > LONGEST_URI:
             return None
         service = parse_service_uri(uri)
@@ -273,7 +277,7 @@ def aliased_host(master_uri: str) -> str | None:
 
 
 def obstacle(port: int, settings: Settings) -> str | None:
-    """What the proxy itself needs a port for, so that it can't stand in; None if nothing."""
+    """The use of a port by the proxy itself, which excludes a stand-in; None if there is none."""
     if port in settings.ports.listen:
         return f"lies in the range {settings.ports.listen} of the proxy"
     use_by_port = {
@@ -285,5 +289,5 @@ def obstacle(port: int, settings: Settings) -> str | None:
 
 
 def _number(text: str) -> int:
-    """A number that follows from a text, and looks like any other."""
+    """A number that depends on a text alone, spread evenly."""
     return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "big")
