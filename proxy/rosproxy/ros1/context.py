@@ -1,6 +1,6 @@
-"""What the parts of a running proxy share: its state, and the tools to act on it.
+"""What the parts of a running proxy share: the state, and the tools to act on the state.
 
-Made once, before the parts; none of them keeps a copy of what is in it.
+The proxy makes the context once, before the parts. No part keeps a copy of anything in the context.
 """
 
 import asyncio
@@ -26,25 +26,27 @@ from rosproxy.runtime import Runtime
 from rosproxy.settings import MEBIBYTE
 
 REGISTRATION_GRACE = 0.5
-"""Seconds that a publisherUpdate waits at most for a registration of the same node."""
+"""The longest time in seconds that a publisherUpdate waits for a registration of the node."""
 MANY_VALUES = 100
-"""Values from which on a document is large; registrations have six."""
+"""A document with more values is large. Registrations have six."""
 MOST_PASSING = 256
-"""Calls and replies that pass unread at once; each takes a thread of the master's."""
+"""Calls and replies that pass unread at the same time. Each takes a thread of the master."""
 MOST_CLIENTS = 4096
-"""Addresses whose `ClientKind` is remembered."""
+"""The highest number of addresses whose `ClientKind` is remembered."""
 PASSING_SHARE = 64
-"""How many of them may come from one source."""
+"""The share of `MOST_PASSING` for one source."""
 
 
 class Context:
     """The state and the tools of ROS 1 in a proxy that is about to start.
 
-    ``retired``: nothing is registered any more, neither for nodes nor by the proxy itself.
-    ``lease_call`` and ``master_call`` bound what is read of a call from outside and from inside.
-    ``gate`` counts connections, ``buffered`` the bytes of requests and replies in memory,
-    ``unread_calls`` the calls that pass unread; ``refusals`` tells what is over these and other
-    bounds. ``policy``: what outside may see and do, and what inside may take from outside.
+    - ``retired``: the proxy makes no more registrations, for nodes or by itself.
+    - ``lease_call``, ``master_call``: bounds of a call from outside and from inside.
+    - ``gate`` counts connections.
+    - ``buffered`` counts the bytes of requests and replies in memory.
+    - ``unread_calls`` counts the calls that pass unread.
+    - ``refusals`` reports what exceeds these and other bounds.
+    - ``policy``: what outside may see and do, and what inside may take from outside.
     """
 
     def __init__(self, runtime: Runtime) -> None:
@@ -88,18 +90,18 @@ class Context:
         self._selected: frozenset[str] | None = None
         self._proxy_addresses: dict[str, str] = {}
         self._client_kinds: dict[str, ClientKind] = {}
-        """By address; emptied when the networks or the selection are read again."""
+        """By address; cleared when the networks or the selection change."""
         self._client_networks: list[Network] | None = None
         self._network_changes = NetworkChanges()
         self.read_networks()
 
     async def close(self) -> None:
-        """Close what is open towards the master, the nodes and the kernel."""
+        """Close the connections to the master and the nodes, and the socket to the kernel."""
         self._network_changes.close()
         await self.upstream.close()
 
     def now(self) -> float:
-        """Seconds of the event loop's clock, which never goes back."""
+        """Seconds of the event loop's clock, which is monotonic."""
         return self._runtime.now()
 
     def uptime(self) -> float:
@@ -107,17 +109,17 @@ class Context:
         return self._runtime.uptime()
 
     async def yield_to_others(self) -> None:
-        """Wait for one's turn to read or rewrite a document of more than MANY_VALUES.
+        """Wait for a turn to read or rewrite a document of more than MANY_VALUES.
 
-        All connections are served in between. Otherwise many large documents that come together
-        would hold up everybody else.
+        The proxy serves all connections between two turns. Otherwise many large documents at the
+        same time would hold up all other calls.
         """
         async with self._turn:
             await asyncio.sleep(0)
 
     @property
     def selected(self) -> frozenset[str] | None:
-        """The addresses that may use the proxy as their master; None: no operator has said."""
+        """The addresses that may use the proxy as their master; None: no operator has named any."""
         return self._selected
 
     @selected.setter
@@ -127,7 +129,7 @@ class Context:
         self._client_networks = None
 
     def client_kind(self, address: str) -> ClientKind:
-        """Whether an address may use the proxy as its master, as far as is known now."""
+        """Whether an address may use the proxy as its master, as far as known now."""
         kind = self._client_kinds.get(address)
         if kind is None:
             if len(self._client_kinds) >= MOST_CLIENTS:
@@ -137,34 +139,34 @@ class Context:
         return kind
 
     def client_networks(self) -> Sequence[Network]:
-        """The networks that may use the proxy as their master; none overlaps another."""
+        """The networks that may use the proxy as their master, without overlaps."""
         if self._client_networks is None:
             networks = self.addressing.networks
             if self.selected is not None:
                 networks = [ip_network(address) for address in self.selected]
-            # nft takes no intervals that overlap in one set (`near4` of the kernel's table).
+            # nft accepts no overlapping intervals in a set (`near4` of the kernel's table).
             ipv4 = collapse_addresses(n for n in networks if isinstance(n, IPv4Network))
             ipv6 = collapse_addresses(n for n in networks if isinstance(n, IPv6Network))
             self._client_networks = [*ipv4, *ipv6]
         return self._client_networks
 
     async def wait_for_registration(self, endpoint: Endpoint) -> None:
-        """Let the reply to a registration that is under way reach a node first.
+        """Let the reply to a pending registration reach a node before an update.
 
-        A node that applies an older list of publishers after a newer one loses a publisher; the
-        way through the proxy must not make that race of ROS more likely.
+        A node that applies an older list of publishers after a newer list loses a publisher. The
+        way through the proxy must not make this race of ROS more likely.
         """
         deadline = self.now() + REGISTRATION_GRACE
         while endpoint.pending and self.now() < deadline:  # noqa: ASYNC110 - rare, short
             await asyncio.sleep(0.002)
 
     def refresh_networks(self) -> None:
-        """Take in the networks of the proxy's interfaces, if these have changed."""
+        """Read the networks of the proxy's interfaces again, if they have changed."""
         if self._network_changes.noticed(self.now()):
             self.read_networks()
 
     def read_networks(self) -> None:
-        """Take in at once the networks that the proxy's interfaces are in."""
+        """Read the networks of the proxy's interfaces now."""
         self._proxy_addresses.clear()
         self._client_kinds.clear()
         self._client_networks = None
@@ -174,9 +176,10 @@ class Context:
         self.addressing.networks = configured or interface_networks(without_uplink=both)
 
     def caller_at(self, endpoint: Endpoint) -> Caller:
-        """The node of an endpoint as a caller that is handed addresses.
+        """The node of an endpoint as a caller that gets addresses.
 
-        The proxy's address as the node sees it is looked up as often as the networks are.
+        The proxy looks up its own address, as the node sees it, again whenever it reads the
+        networks.
         """
         address = endpoint.location.address
         name = min(endpoint.callers, default="")

@@ -1,10 +1,11 @@
-"""Leases: the ports of the range, reserved from the start and listening only while leased.
+"""Leases: the ports of the range, which are reserved from the start and listen only while leased.
 
-Each endpoint holds a *lease*, one port of the range, and maybe a *fast port* for its topics, which
-the kernel forwards where possible (`rosproxy.leases.fast_ports`). Both listen and are served alike.
-The proxy reserves all ports at the start (`rosproxy.net.sockets.reserve`). So the kernel gives none
-of them to an outgoing connection, no other program binds them, and the proxy learns which ports are
-taken. A reserved port refuses.
+Each endpoint holds a *lease*, which is a port of the range. An endpoint may also have a *fast port*
+for its topics, which the kernel forwards where possible (`rosproxy.leases.fast_ports`). Both ports
+listen, and the proxy serves both in the same way. The proxy reserves all ports at the start
+(`rosproxy.net.sockets.reserve`). So the kernel gives no port of the range to an outgoing
+connection, no other program binds one, and the proxy learns which ports are taken. A reserved port
+refuses connections.
 """
 
 import logging
@@ -24,21 +25,21 @@ log = logging.getLogger(__name__)
 
 
 class LeaseServer(Protocol):
-    """Answers connections to an endpoint's ports."""
+    """Answers connections to the ports of an endpoint."""
 
     async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str, /) -> None:
-        """Serve a connection; ``peer`` is the address it comes from."""
+        """Serve a connection from the address ``peer``."""
 
     def end_calls(self, port: int, /) -> None:
-        """Let what is kept open through a port end: it refuses from now on."""
+        """End the kept connections of a port, which refuses connections from now on."""
 
 
 class Leases:
     """Opens, closes and lends the ports of the range.
 
-    ``server`` answers what comes in. The server needs the leases itself, to close the port of a
-    dead node, so it is set once both exist, before the first port opens. ``watch`` looks after
-    subscribers of endpoints, whose connections may be lost.
+    ``server`` answers connections. The server itself needs the leases, to close the port of a dead
+    node. So ``server`` is set when both exist, before the first port opens. ``watch`` makes the
+    resubscriber look at endpoints whose subscribers may have lost connections.
     """
 
     server: LeaseServer
@@ -58,14 +59,14 @@ class Leases:
         self._closed = False
 
     def reserve_range(self) -> list[int]:
-        """Bind all ports of the range; returns those that other programs hold."""
+        """Bind all ports of the range; return the ports that other programs hold."""
         taken = [port for port in self._pool.range.ports() if not self._reserve(port)]
         for port in taken:
             self._pool.block(port)
         return taken
 
     async def retry_blocked(self) -> None:
-        """Take in ports of the range that other programs have let go."""
+        """Reserve the ports of the range that other programs have released."""
         blocked = sorted(self._pool.blocked)
         for port in filter(self._reserve, blocked):
             self._pool.unblock(port)
@@ -74,11 +75,11 @@ class Leases:
             self._problems.solved(PORTS)
 
     def is_open(self, endpoint: Endpoint) -> bool:
-        """Whether an endpoint's port listens."""
+        """Whether the port of an endpoint listens."""
         return endpoint.port in self._acceptors
 
     def open(self, endpoint: Endpoint) -> OSError | None:
-        """Let an endpoint's ports listen, if it still holds the lease; the error if it fails."""
+        """Make the ports of an endpoint listen, if it holds the lease; the error if that fails."""
         if self._closed or self._registry.by_port.get(endpoint.port) is not endpoint:
             return None
         self._kernel.note_change(endpoint)
@@ -91,9 +92,10 @@ class Leases:
         return error
 
     def close(self, endpoint: Endpoint) -> None:
-        """Let an endpoint's ports refuse, if it still holds the lease; open connections stay.
+        """Make the ports of an endpoint refuse connections; open connections stay.
 
-        The port may be another node's by now: callers may have waited for something meanwhile.
+        If the endpoint no longer holds the lease, nothing happens: another node may have the port,
+        because callers may have waited meanwhile.
         """
         if self._registry.by_port.get(endpoint.port) is not endpoint:
             return
@@ -102,7 +104,7 @@ class Leases:
             self._refuse(port)
 
     def end(self, endpoint: Endpoint) -> None:
-        """End a lease: close its port and forget its endpoint."""
+        """End a lease: close the port and forget the endpoint."""
         if self._registry.by_port.get(endpoint.port) is endpoint:
             self.close(endpoint)
             self._problems.solved_at(endpoint.port)
@@ -110,7 +112,7 @@ class Leases:
             self._registry.remove(endpoint)
 
     def close_all(self) -> None:
-        """Close all ports and give the range back, for good; endpoints and registrations stay."""
+        """Close all ports and release the range for good; endpoints and registrations stay."""
         self._closed = True
         for endpoint in self._registry:
             self.close(endpoint)
@@ -119,14 +121,14 @@ class Leases:
         self._reserved.clear()
 
     def give_up_spare(self) -> bool:
-        """Take a port back that no node needs, if there is one: a lent one, or a fast port."""
+        """Take back a port that no node needs (lent or fast); whether there was one."""
         if self._lent:
             self._take_back(next(iter(self._lent)))
             return True
         return self._give_fast_port_back() is not None
 
     def withdraw_fast_port(self, endpoint: Endpoint) -> None:
-        """Take the fast port of an endpoint back: its topics have to go through the lease."""
+        """Take back the fast port of an endpoint, so that its topics use the lease."""
         port = endpoint.fast_port
         self._refuse(port)
         fast_ports.give_back(self._pool, endpoint)
@@ -134,20 +136,20 @@ class Leases:
         self.watch([endpoint])
 
     def end_idle(self) -> bool:
-        """End the lease that is needed least, if it is unused."""
+        """End the lease that has been unused for longest; whether there was one."""
         oldest = self._registry.longest_idle()
         if oldest is not None:
             self.end(oldest)
         return oldest is not None
 
     async def cleared(self, endpoint: Endpoint) -> None:
-        """Wait a moment until the kernel no longer forwards a new lease, which was a fast port."""
+        """Wait a moment until the kernel no longer forwards a new lease that was a fast port."""
         await self._kernel.cleared(endpoint.port)
 
     async def fast_port(self, endpoint: Endpoint, node_port: int) -> int | None:
-        """The port that the kernel forwards to a TCPROS port of an endpoint's node; None if none.
+        """The port that the kernel forwards to a TCPROS port of the endpoint's node; None if none.
 
-        It is handed out when a subscriber first asks for a topic, while the range has ports left.
+        The endpoint gets the fast port when a subscriber first asks for a topic, if a port is left.
         """
         if self._kernel.may_forward(endpoint):
             if endpoint.fast_port is None and fast_ports.claim(self._pool, endpoint):
@@ -161,11 +163,12 @@ class Leases:
     async def lent(
         self, order: Iterable[int], handler: Handler, or_fast: bool
     ) -> AsyncIterator[int | None]:
-        """A port that no node needs meanwhile, on which a handler serves; None if there is none.
+        """Lend a port that no node needs, and serve it by a handler; None if none is free.
 
-        It is the first in an order that is free, with ``or_fast`` else a fast port, whose holder
-        gets it again when a subscriber next asks. It is taken back where a node needs it
-        (`is_lent`). Raises OSError if another program took it meanwhile.
+        The port is the first free port in ``order``. If there is none, ``or_fast`` allows a fast
+        port; its holder gets a fast port again when a subscriber next asks. If a node needs the
+        port, the proxy takes the port back (`is_lent`). Raises OSError if another program has taken
+        the port.
         """
         port = next(filter(self._pool.claim, order), None)
         if port is None and or_fast:
@@ -177,14 +180,14 @@ class Leases:
         self._lent.add(port)
         try:
             await self._kernel.cleared(port)
-            if port in self._lent:  # a node may have needed it meanwhile
+            if port in self._lent:  # otherwise a node has needed the port meanwhile
                 self._accept(port, handler)
             yield port
         finally:
             self._take_back(port)
 
     def is_lent(self, port: int) -> bool:
-        """Whether a port that was lent still is."""
+        """Whether a port is still lent."""
         return port in self._lent
 
     def _take_back(self, port: int) -> None:
@@ -194,7 +197,7 @@ class Leases:
             self._pool.give_back(port)
 
     def _reserve(self, port: int) -> bool:
-        """Bind a port, which then refuses; False if another program holds it, or all is over."""
+        """Bind a port, which then refuses; False if another program holds it, or after the end."""
         if self._closed:
             return False
         try:
@@ -205,7 +208,7 @@ class Leases:
         return True
 
     def _accept(self, port: int, handler: Handler) -> None:
-        """Let a port listen. Raises OSError if another program took it meanwhile."""
+        """Make a port listen. Raises OSError if another program has taken the port."""
         sock = self._reserved.pop(port, None) or reserve(self._context.settings.bind, port)
         try:
             listen_on(sock)
@@ -215,7 +218,7 @@ class Leases:
         self._acceptors[port] = Acceptor(self._context.tasks, sock, handler, self._context.gate)
 
     def _listen(self, endpoint: Endpoint, port: int) -> OSError | None:
-        """Let a port listen for an endpoint; the error if that fails."""
+        """Make a port listen for an endpoint; the error if that fails."""
         if port not in self._acceptors:
             try:
                 self._accept(port, lambda conn, peer: self.server.serve(endpoint, conn, peer))
@@ -224,16 +227,16 @@ class Leases:
         return None
 
     def _refuse(self, port: int | None) -> None:
-        """Stop listening and keep the port reserved."""
+        """Stop listening, and keep the port reserved."""
         acceptor = self._acceptors.pop(port, None) if port is not None else None
         if acceptor is not None and port is not None:
             acceptor.close()
             self.server.end_calls(port)
-            # If another program is quicker, `_accept` tries again when the port is next needed.
+            # If another program is faster, `_accept` tries again when a node next needs the port.
             self._reserve(port)
 
     def _give_fast_port_back(self) -> int | None:
-        """Give back the fast port that is needed least, and tell which it was; None: none left."""
+        """Give back the least used fast port, and return it; None if there is none."""
         holder = fast_ports.least_used_holder(self._registry)
         if holder is None:
             return None

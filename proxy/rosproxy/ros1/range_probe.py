@@ -1,9 +1,9 @@
-"""Can the advertised ports be reached? Tried over free ports of the range, from two places.
+"""Try whether outside reaches the advertised ports, over free ports of the range, from two places.
 
-The proxy dials its own advertised address; where NAT has no way back for that (no hairpin), it
-fails although outside gets through. So the master is made to try as well: it calls paramUpdate at
-a subscriber of a parameter, which here is the port under test. That leaves no trace in the graph
-and none among the parameters.
+The proxy connects to its own advertised address. If NAT does not lead such a connection back (no
+hairpin), the attempt fails although outside reaches the port. So the master tries as well. It calls
+paramUpdate at a subscriber of a parameter, and the proxy subscribes the port under test. The probe
+leaves no trace in the graph or among the parameters.
 """
 
 import asyncio
@@ -27,20 +27,20 @@ log = logging.getLogger(__name__)
 
 TIMEOUT = 3.0
 MASTER_WAIT = 4.0
-"""Seconds that the master gets to call back; rosmaster does so from three threads."""
+"""Seconds within which the master must call back. rosmaster calls back from three threads."""
 MAX_REQUEST = 65536
 
 
 @dataclass(slots=True, eq=False)
 class _PortTrial:
-    """A port under test: the secrets by which its two callers are told from strangers."""
+    """A port under test, and the secrets by which its two callers identify themselves."""
 
     proxy_secret: str = field(default_factory=lambda: secrets.token_hex(16))
     master_secret: str = field(default_factory=lambda: secrets.token_hex(16))
     reached: asyncio.Event = field(default_factory=asyncio.Event)
 
     async def greet(self, conn: socket.socket, peer: str) -> None:
-        """Answer a caller, in the way of a node, if it knows one of the secrets."""
+        """Answer a caller that knows one of the secrets, in the way of a node."""
         loop = asyncio.get_running_loop()
         request = b""
         async with asyncio.timeout(TIMEOUT):
@@ -50,8 +50,8 @@ class _PortTrial:
                     break
                 request += chunk
             if self._recognize(request):
-                # A triple, which rosmaster takes apart (master_api.py, param_update_task), with the
-                # secret by which the proxy knows itself.
+                # rosmaster unpacks a triple (master_api.py, param_update_task). The triple has the
+                # secret by which the proxy recognizes its own answer.
                 body = xmlrpc.dump_reply([1, self.proxy_secret, 0])
                 head = "HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\nContent-Length:"
                 await loop.sock_sendall(conn, f"{head} {len(body)}\r\n\r\n".encode() + body)
@@ -66,13 +66,14 @@ class _PortTrial:
 async def probe_range(
     context: Context, leases: Leases, or_fast: bool = True
 ) -> tuple[PortProbe, ...]:
-    """Try the lowest and the highest free port of the range; where none is free, one fast port.
+    """Try the lowest and the highest free port of the range; without a free port, one fast port.
 
-    After that the proxy forwards the topics of the fast port's node for a while, so it is optional:
-    without ``or_fast`` nothing is tried where no port is free.
+    After the probe, the proxy relays the topics of the fast port's node for a while. So without
+    ``or_fast`` nothing is tried if no port is free.
 
-    The second port is left out where the master misses the first: rosmaster calls back from three
-    threads, and each call into a void holds one for as long as TCP tries, two minutes.
+    If the master misses the first port, the probe leaves out the second. The reason: rosmaster
+    calls back from three threads, and a call without an answer holds a thread as long as TCP tries,
+    two minutes.
     """
     pool = context.registry.pool
     ports = context.settings.ports.listen.ports()
@@ -87,7 +88,7 @@ async def probe_range(
                 _dial(context, trial, target), _ask_master(context, trial, target)
             )
             if not leases.is_lent(port):
-                break  # a node has got it meanwhile, so nothing is known
+                break  # a node has got the port meanwhile, so the result is unknown
         probes.append(PortProbe(port, str(target), from_proxy, from_master))
         if probes[0].from_master == "missed" or pool.free == 1:
             break
@@ -95,7 +96,7 @@ async def probe_range(
 
 
 async def _dial(context: Context, trial: _PortTrial, target: HostPort) -> str:
-    """Connect through the advertised address and see who answers."""
+    """Connect to the advertised address, and check the answer."""
     addresses = await resolve(context.upstream.reach(target).host)
     if not addresses:
         return "unresolvable"
@@ -132,7 +133,7 @@ async def _await_greeting(
 
 
 async def _ask_master(context: Context, trial: _PortTrial, target: HostPort) -> str:
-    """Have the master call the port, as it calls a node whose parameter has changed."""
+    """Make the master call the port, as if the port were a node with a changed parameter."""
     try:
         async with _subscribed(context, trial, target), asyncio.timeout(MASTER_WAIT):
             await trial.reached.wait()
@@ -146,9 +147,9 @@ async def _ask_master(context: Context, trial: _PortTrial, target: HostPort) -> 
 
 @asynccontextmanager
 async def _subscribed(context: Context, trial: _PortTrial, target: HostPort) -> AsyncIterator[None]:
-    """A parameter with the port under test as its subscriber, for as long as it takes."""
-    # A subscriber's name that nobody else has: rosmaster calls shutdown at the former URI of a name
-    # that registers with another (registrations.py, _register_node_api).
+    """Subscribe the port under test to a parameter while the block runs."""
+    # No other node has this subscriber name: rosmaster calls shutdown at the former URI of a name
+    # that registers with another URI (registrations.py, _register_node_api).
     name = f"{CALLER_ID}_probe_{trial.master_secret}"
     uri = slave_uri(target)
     multicall = context.upstream.multicall

@@ -1,16 +1,16 @@
-"""Connections to nodes that are kept, to ask over and over whether the node still answers.
+"""Kept connections to nodes, by which the proxy asks again and again whether a node answers.
 
-A call with a connection of its own takes the proxy half a millisecond: a thousand nodes, each asked
-every five seconds, would take a tenth of a processor. Over a connection that is kept a question is
-one ``send`` and its answer one ``recv``. Nobody is woken by an answer: the next look collects what
-has come (`KeptConnections.collect`). An answer that has the body of the one before tells the same
-pid, and is not read.
+A call with a new connection takes the proxy half a millisecond. With a thousand nodes and a call
+every five seconds, this is a tenth of a processor. Over a kept connection, a question is one
+``send`` and an answer one ``recv``. An answer wakes no task: the next look collects the answers
+(`KeptConnections.collect`). An answer with the same body as the last answer has the same pid, and
+the proxy does not parse it.
 
-The kernel tells which connections have been ended by their node (EPOLLRDHUP), as it does for a
-process that ends in any way. So its end is known at the next look.
+The kernel tells which connections the nodes have ended (EPOLLRDHUP), also after a crash of the
+process. So the next look knows the end of a node.
 
-All of this is for nodes that are well. At anything but the answer that is expected the connection
-is closed, and `NodeClient.probe` has to tell how the node is.
+Kept connections are for healthy nodes. After any unexpected answer the proxy closes the connection,
+and `NodeClient.probe` finds out how the node is.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.registry.node_health import ProbeResult
 
 LONGEST_ANSWER = 4096
-"""Bytes of an answer with its header: rospy's have 400."""
+"""Bytes of an answer with its header. Answers of rospy have 400 bytes."""
 
 _OK = b"HTTP/1.1 200 "
 _LENGTH = re.compile(rb"\r\nContent-Length:\s*(\d{1,4})\s*(?:\r\n|\Z)", re.IGNORECASE)
@@ -37,10 +37,10 @@ _K = TypeVar("_K")
 
 @dataclass(slots=True, eq=False)
 class _Connection:
-    """A connection to a node; ``body`` is that of its latest answer.
+    """A connection to a node; ``body`` is the body of the latest answer.
 
-    ``question`` is what has not been sent yet of the last request, which was made at ``asked_at``,
-    and ``received`` what has come of its answer.
+    ``question`` is the unsent rest of the last request, from the time ``asked_at``. ``received`` is
+    the part of the answer that has arrived.
     """
 
     sock: socket.socket
@@ -52,31 +52,31 @@ class _Connection:
     received: bytes = b""
 
     def send(self) -> None:
-        """Send what the kernel takes. Raises OSError, BlockingIOError while it is connecting."""
+        """Send what the kernel takes. Raises OSError, BlockingIOError during the connect."""
         while self.question:
             self.question = self.question[self.sock.send(self.question) :]
 
 
 class KeptConnections(Generic[_K]):
-    """At most one connection for each node to be asked, ``most`` in all, by keys of the caller's.
+    """At most one connection for each key of the caller, and ``most`` connections in all.
 
-    An answer has to come ``within`` so many seconds. Times are seconds of a monotonic clock.
+    An answer has to arrive ``within`` so many seconds. Times are seconds of a monotonic clock.
     """
 
     def __init__(self, nodes: NodeClient, within: float) -> None:
         self._nodes = nodes
         self._within = within
-        self.most = 0  # until it is known how many files may be open (`Ros1.reserve_range`)
+        self.most = 0  # until the limit of open files is known (`Ros1.reserve_range`)
         self._connections: dict[_K, _Connection] = {}
         self._waiting: dict[_K, _Connection] = {}
         self._key_by_fd: dict[int, _K] = {}
         self._epoll = select.epoll()
 
     def ask(self, key: _K, slave: HostPort, pid: int, now: float) -> bool:
-        """Ask a node for its pid, unless an answer is waited for; False if there is no way to.
+        """Ask a node for its pid, unless an answer is still due; False without a connection.
 
-        The connection is made with the first question, and given up if the node is to be another
-        process, or elsewhere.
+        The first question opens the connection. If the pid or address has changed, a new connection
+        replaces the old one.
         """
         conn = self._connections.get(key)
         if conn is not None and (conn.slave, conn.pid) != (slave, pid):
@@ -94,18 +94,18 @@ class KeptConnections(Generic[_K]):
         conn.question = self._nodes.pid_question(slave)
         conn.received = b""
         self._waiting[key] = conn
-        with contextlib.suppress(OSError):  # `collect` finds out
+        with contextlib.suppress(OSError):  # `collect` notices the error
             conn.send()
         return True
 
     def collect(self, now: float) -> dict[_K, ProbeResult | None]:
-        """What has become of the connections since the last time, by their keys.
+        """The results since the last call, by key.
 
-        Their nodes have answered, have been SILENT for too long, or (None) refused or ended the
-        connection, or sent something else.
+        ANSWERED; SILENT after ``within`` seconds; None if the node has refused or ended the
+        connection, or has sent anything else.
         """
         results = dict(self._answers(now))
-        # In this order: an end counts even if the node has answered before it.
+        # In this order: an end counts even if the node has answered before the end.
         results.update({self._key_by_fd[fd]: None for fd, _ in self._epoll.poll(0)})
         for key, result in results.items():
             if result is ProbeResult.ANSWERED:
@@ -122,7 +122,7 @@ class KeptConnections(Generic[_K]):
             self.close(key)
 
     def close(self, key: _K) -> None:
-        """Close the connection of a node that is not to be asked any more."""
+        """Close the connection of a node, if there is one."""
         conn = self._connections.pop(key, None)
         self._waiting.pop(key, None)
         if conn is not None:
@@ -130,26 +130,26 @@ class KeptConnections(Generic[_K]):
             conn.sock.close()
 
     def _leave(self, key: _K) -> None:
-        """Give up a connection on which an answer is due."""
+        """Give up a connection with an answer still due."""
         conn = self._connections.pop(key)
         del self._waiting[key], self._key_by_fd[conn.sock.fileno()]
-        # The socket stays open until its answer has come, so it does not leave epoll by itself, as
-        # those do that are closed (epoll(7)).
+        # The socket stays open until the answer arrives. Closed sockets leave epoll by themselves
+        # (epoll(7)), but this socket does not.
         self._epoll.unregister(conn.sock)
         self._nodes.close_after_answer(conn.sock)
 
     def close_all(self) -> None:
-        """Close all connections, for good."""
+        """Close all connections for good."""
         self.most = 0
         self.keep(set())
         self._epoll.close()
 
     def _connect(self, key: _K, slave: HostPort, pid: int) -> _Connection | None:
-        """Begin to connect; None if there are as many as there may be. Raises OSError."""
+        """Begin to connect; None if the maximum is reached. Raises OSError."""
         if len(self._connections) >= self.most:
             return None
         sock = self._nodes.connect(slave)
-        # A refused connection is told as well: EPOLLHUP and EPOLLERR always are (epoll_ctl(2)).
+        # epoll always reports EPOLLHUP and EPOLLERR, so also a refused connection (epoll_ctl(2)).
         self._epoll.register(sock, select.EPOLLRDHUP)
         self._key_by_fd[sock.fileno()] = key
         self._connections[key] = conn = _Connection(sock, slave, pid)
@@ -167,9 +167,9 @@ class KeptConnections(Generic[_K]):
                 yield key, None
 
     def _read(self, conn: _Connection) -> ProbeResult | None:
-        """ANSWERED by the answer that is expected, None by anything else.
+        """Read the answer: ANSWERED if it is the expected answer, otherwise None.
 
-        Raises BlockingIOError while it has not come, or not all of it, and OSError.
+        Raises BlockingIOError until the whole answer has arrived, and OSError.
         """
         chunk = conn.sock.recv(LONGEST_ANSWER)
         conn.received += chunk
@@ -195,6 +195,6 @@ class KeptConnections(Generic[_K]):
 
 
 def _length(head: bytes) -> int:
-    """How long a body is, by its header; -1 if that does not tell."""
+    """The length of the body from the header; -1 if there is none or it is too long."""
     match = _LENGTH.search(head)
     return int(match[1]) if match and int(match[1]) <= LONGEST_ANSWER else -1

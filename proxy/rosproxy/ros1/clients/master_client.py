@@ -1,10 +1,12 @@
 """XML-RPC calls to the master and to nodes.
 
-``post_to_…`` sends a document as it is and gives the reply's bytes: that is how calls of nodes are
-forwarded. ``pass_to_…`` does the same for what nobody here reads: a long reply comes piece by
-piece, and a document may go so. ``call_…`` makes a call of the proxy's own and gives the value of
-the ROS triple ``[1, message, value]`` in the reply; ``multicall`` makes many to the master at once.
-``read_graph`` and ``look_up`` ask it for the ROS graph.
+- ``post_to_…`` sends a document unchanged, and returns the bytes of the reply. The proxy forwards
+  calls of nodes in this way.
+- ``pass_to_…`` does the same for documents that the proxy does not read. A long reply arrives piece
+  by piece, and the document may be sent piece by piece.
+- ``call_…`` makes a call of the proxy itself, and returns the value of the ROS triple ``[1,
+  message, value]`` in the reply. ``multicall`` makes many calls to the master at once.
+- ``read_graph`` and ``look_up`` ask the master for the ROS graph.
 """
 
 import asyncio
@@ -39,26 +41,26 @@ from rosproxy.telemetry.problems import LONGEST_TEXT
 from rosproxy.telemetry.text import brief
 
 CALLER_ID = "/rosproxy"
-"""The node name under which the proxy itself calls."""
+"""The node name of the proxy in its own calls."""
 LOOP_HEADER = "X-Rosproxy"
-"""Carries the proxy's own id, so that it notices when a call of its own comes back to it."""
+"""Has the id of the proxy, so that the proxy notices when its own call comes back."""
 MULTICALL_SIZE = 100
 MASTER_CONNECTIONS = 64
 NODE_CONNECTIONS = 10_000
 MASTER_TIMEOUT = 30.0
 MASTER_KEEPALIVE = 8.0
-"""Seconds that an unused connection to the master is kept; rosmaster spends a thread on each."""
+"""Seconds to keep an unused connection to the master; rosmaster spends a thread on each."""
 NODE_KEEPALIVE = 2.0
-"""The same for a node; rospy spends a thread on each."""
+"""Seconds to keep an unused connection to a node; rospy spends a thread on each."""
 NODE_TIMEOUT = 15.0
 
 
 class Unreachable(CallFailed):
-    """A call that got no XML-RPC reply.
+    """A call without an XML-RPC reply.
 
-    ``probe`` is what that means for the health of whoever was called: the connection was refused,
-    nothing came, or (ANSWERED) something in HTTP that is no reply, as libraries answer what they
-    don't implement.
+    ``probe`` is the meaning for the health of the called node: the connection was refused, no
+    answer came, or (ANSWERED) an HTTP answer came that is no reply. Libraries answer so to methods
+    that they do not implement.
     """
 
     def __init__(self, message: str, probe: ProbeResult = ProbeResult.SILENT) -> None:
@@ -76,15 +78,15 @@ class MasterError(CallFailed):
 
 
 class MasterClient:
-    """HTTP sessions towards the master and the nodes.
+    """HTTP sessions to the master and to the nodes.
 
-    Connections are kept alive: the master's between any two calls, a node's for the calls that
-    follow each other closely, as when a machine subscribes to several of its topics.
+    The client keeps connections alive: to the master between any two calls, to a node between calls
+    in quick succession, for example when a machine subscribes to several of its topics.
 
-    ``master_address``, which may be changed at any time, is the IP address at which the host of
-    ``master_uri`` is reached; None: where its name leads. In a container network that name may
-    lead to the proxy itself. It holds for the nodes that run on the master's host as well.
-    ``longest`` is the most bytes of what passes unread.
+    ``master_address`` is the IP address at which the proxy reaches the host of ``master_uri``; it
+    may change at any time. None: the address follows from the host name. In a container network
+    this name may lead to the proxy itself. The address also holds for nodes on the master's host.
+    ``longest`` is the highest number of bytes of a document that passes unread.
     """
 
     def __init__(
@@ -102,8 +104,8 @@ class MasterClient:
         self._master_path = uri.path or "/"
         self._netloc = uri.netloc
         self._master_host_port = HostPort(uri.hostname or "", uri.port or 80)
-        # By these two a call that comes back to the proxy tells which address has led it here:
-        # --master-uri, or that of a node (`MasterApi`).
+        # If a call comes back to the proxy, the header tells which address has led it here:
+        # --master-uri, or the address of a node (`MasterApi`).
         master_headers = {LOOP_HEADER: instance}
         node_headers = {LOOP_HEADER: f"{instance} node"}
         self._master = HttpClient(master_headers, MASTER_KEEPALIVE, MASTER_CONNECTIONS, longest)
@@ -115,29 +117,29 @@ class MasterClient:
 
     @property
     def reached_at(self) -> str | None:
-        """The address at which the master is looked for; None before its name was resolved."""
+        """The address where the proxy looks for the master; None before its name was resolved."""
         host = self._master_host_port.host
         return self.master_address or (host if is_address(host) else self._master.last_address)
 
     async def master_addresses(self) -> list[str]:
-        """The addresses of the master's host; empty if its name can't be resolved."""
+        """The addresses of the master's host; empty if the name cannot be resolved."""
         if self.master_address:
             return [self.master_address]
         return await resolve(self._master_host_port.host)
 
     def reach(self, host_port: HostPort) -> HostPort:
-        """Where to connect to for a host and port that a URI from outside names.
+        """The address to connect to for a host and port in a URI from outside.
 
-        That differs only for the master's host while its address is given.
+        Only the host of the master has a different address, and only if ``master_address`` is set.
         """
         if self.master_address and host_port.host.lower() == self._master_host_port.host:
             return HostPort(self.master_address, host_port.port)
         return host_port
 
     async def post_to_master(self, body: bytes, limits: Limits = REPLY) -> bytes:
-        """The master's reply to a call, within such limits. Raises Unreachable.
+        """The master's reply to a call, within ``limits``. Raises Unreachable.
 
-        Kept connections are told apart by address, so a new address means new connections.
+        Kept connections belong to an address, so a new address means new connections.
         """
         target = self.reach(self._master_host_port)
         path = self._master_path
@@ -146,9 +148,9 @@ class MasterClient:
             return await self._master.post(target, path, name, body, MASTER_TIMEOUT, limits.size)
 
     async def pass_to_master(self, body: bytes | LongBody) -> bytes | LongReply:
-        """The master's reply to a call, neither of which is read here.
+        """The master's reply to a call; the proxy reads neither the call nor the reply.
 
-        Raises Unreachable, and XmlRpcError as a long body does.
+        Raises Unreachable. Raises XmlRpcError if a long body does.
         """
         target = self.reach(self._master_host_port)
         path = self._master_path
@@ -157,7 +159,7 @@ class MasterClient:
             return await self._master.pass_on(target, path, name, body, MASTER_TIMEOUT)
 
     async def call_master(self, method: str, *params: Any) -> Any:
-        """The value of the proxy's own call to the master. Raises Unreachable, MasterError."""
+        """Call the master and return the value. Raises Unreachable, MasterError."""
         started = time.monotonic()
         call = xmlrpc.dump_call(method, CALLER_ID, *params)
         reply = await self.post_to_master(call, OWN_REPLY)
@@ -165,9 +167,9 @@ class MasterClient:
         return read_value(method, reply, OWN_REPLY)
 
     async def multicall(self, calls: Sequence[tuple[str, list[Any]]]) -> list[Any]:
-        """The values of many calls ``(method, params)``, as ``system.multicall``.
+        """Make many calls ``(method, params)`` by ``system.multicall``; return the values.
 
-        ``params`` include the caller_id. A call that failed gives None. Raises Unreachable.
+        ``params`` include the caller_id. The value of a failed call is None. Raises Unreachable.
         """
         values: list[Any] = []
         for start in range(0, len(calls), MULTICALL_SIZE):
@@ -181,10 +183,11 @@ class MasterClient:
         return values
 
     async def read_changes(self, last: bytes) -> tuple[bytes, dict[str, list[Registration]] | None]:
-        """What each node has registered, without types, and what to give as ``last`` next time.
+        """The registrations of each node, without types, and the digest for ``last`` next time.
 
-        None if nothing has changed since then: to read the names of ten thousand topics takes half
-        a second, to see that they are the same a hundredth. Raises Unreachable, MasterError.
+        The registrations are None if nothing has changed since ``last``. To parse the names of ten
+        thousand topics takes half a second, to compare the digest a hundredth. Raises Unreachable,
+        MasterError.
         """
         reply = await self.post_to_master(xmlrpc.dump_call("getSystemState", CALLER_ID), OWN_REPLY)
         digest = blake2b(reply).digest()
@@ -193,19 +196,19 @@ class MasterClient:
         return digest, _read_state(read_value("getSystemState", reply, OWN_REPLY), [])
 
     async def read_registrations(self) -> dict[str, list[Registration]]:
-        """What each node has registered. Raises Unreachable, MasterError."""
+        """The registrations of each node. Raises Unreachable, MasterError."""
         state, types = await asyncio.gather(
             self.call_master("getSystemState"), self.call_master("getTopicTypes")
         )
         return _read_state(state, types)
 
     async def read_graph(self) -> Graph:
-        """What each node has registered, and where it is. Raises Unreachable, MasterError."""
+        """The registrations and URI of each node. Raises Unreachable, MasterError."""
         registrations = await self.read_registrations()
         return Graph(registrations, await self.look_up("lookupNode", registrations))
 
     async def look_up(self, method: str, names: Iterable[str]) -> dict[str, str]:
-        """The URIs of those nodes (``lookupNode``) or services (``lookupService``) that it knows.
+        """The URIs of the known nodes (``lookupNode``) or services (``lookupService``), by name.
 
         Raises Unreachable.
         """
@@ -222,9 +225,10 @@ class MasterClient:
         path: str = "/",
         name: str = "",
     ) -> bytes:
-        """A node's reply to a call, which calls it by ``name`` if that is not where it is.
+        """A node's reply to a call. Raises Unreachable.
 
-        ``within`` is in seconds. Raises Unreachable.
+        ``within`` is in seconds. ``name`` is the host and port for the HTTP header and for errors,
+        if they differ from the address.
         """
         called = name or str(slave)
         with _FailuresOf(f"node at {called}"):
@@ -232,9 +236,9 @@ class MasterClient:
             return await self._nodes.post(target, path, called, body, within, REPLY.size)
 
     async def pass_to_node(self, slave: HostPort, body: bytes | LongBody) -> bytes | LongReply:
-        """A node's reply to a call, neither of which is read here.
+        """A node's reply to a call; the proxy reads neither the call nor the reply.
 
-        Raises Unreachable, and XmlRpcError as a long body does.
+        Raises Unreachable. Raises XmlRpcError if a long body does.
         """
         with _FailuresOf(f"node at {slave}"):
             target = self.reach(slave)
@@ -244,16 +248,16 @@ class MasterClient:
     async def call_node(
         self, slave: HostPort, within: float, method: str, *params: Any, limits: Limits = REPLY
     ) -> Any:
-        """The value of the proxy's own call to a node. Raises Unreachable, MasterError."""
+        """Call a node and return the value. Raises Unreachable, MasterError."""
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
         return read_value(method, await self.post_to_node(slave, body, within), limits)
 
     def close_after_answer(self, sock: socket.socket) -> None:
-        """Close a connection to a node on which an answer is due, once that has come."""
+        """Close a connection to a node once the answer that is due has arrived."""
         self._nodes.leave(sock)
 
     def node_request(self, slave: HostPort, body: bytes) -> bytes:
-        """A call to a node as HTTP, for whoever has a connection of his own."""
+        """A call to a node as an HTTP request, for callers with a connection of their own."""
         return self._nodes.request("/", str(slave), body)
 
 
@@ -299,7 +303,7 @@ def _unreachable(peer: str, error: BaseException) -> Unreachable:
 
 
 def parse_value(reply: bytes, limits: Limits = OWN_REPLY) -> Any:
-    """A reply's value, a fault's too. Raises Unreachable."""
+    """The value of a reply, or of a fault. Raises Unreachable."""
     try:
         return xmlrpc.read_response(reply, limits)
     except xmlrpc.XmlRpcError as error:
@@ -307,7 +311,7 @@ def parse_value(reply: bytes, limits: Limits = OWN_REPLY) -> Any:
 
 
 def read_value(method: str, reply: bytes, limits: Limits = REPLY) -> Any:
-    """The value in a reply of the master's or a node's. Raises Unreachable, MasterError."""
+    """The value in a reply of the master or a node. Raises Unreachable, MasterError."""
     match parse_value(reply, limits):
         case [list(), list()] as value if method == "getBusStats":
             return value  # roscpp gives the value alone (TopicManager::getBusStatsCallback)

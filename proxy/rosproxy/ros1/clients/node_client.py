@@ -1,12 +1,14 @@
-"""Asking a node who it is: does it answer, as which process, with which topics, on which port?
+"""Questions to a node: does it answer, as which process, with which name, topics and ports?
 
-There are four questions. `NodeClient.probe` is the cheap one (``getPid``), asked over and over; of
-nodes that are well by `rosproxy.ros1.clients.kept_connections`.
-`NodeClient.inspect` has the node describe itself; whoever is about to believe what somebody else
-said of a node (the master after a restart, an operator, the node's former process) inspects it
-first. `NodeClient.name` asks what it is called, before it is registered for somebody who calls from
-another address, and `NodeClient.provider` whether it has a service. All only ask: what follows for
-the endpoint is decided in `upkeep`.
+- `NodeClient.probe` is the cheap question (``getPid``), which the proxy asks again and again.
+  `rosproxy.ros1.clients.kept_connections` asks healthy nodes the same.
+- `NodeClient.inspect` makes the node describe itself. The proxy inspects a node before the proxy
+  trusts a claim about the node: from the master after a restart, from an operator, or from the
+  former process of the node.
+- `NodeClient.name` asks for the name, before a node is registered by a caller at another address.
+- `NodeClient.provider` asks whether the node has a service.
+
+The client only asks. The modules in `upkeep` decide what follows for the endpoint.
 """
 
 import asyncio
@@ -36,15 +38,15 @@ log = logging.getLogger(__name__)
 
 GET_PID = "getPid"
 TOPICS_ASKED = 3
-"""How many of its topics a node is asked for at most until it has answered for enough."""
+"""The highest number of topics for which the proxy asks a node, until it has enough ports."""
 ENOUGH_PORTS = 2
-"""How many of their TCPROS ports are asked for: a node has one for all topics, or one for each."""
+"""TCPROS ports that are enough: a node has one port for all topics, or one for each topic."""
 
 _PID_CALL = xmlrpc.dump_call(GET_PID, CALLER_ID)
 
 
 class ProbeAnswer(msgspec.Struct, frozen=True):
-    """How a probe ended; ``pid`` if the node answered, ``reason`` if it didn't."""
+    """The result of a probe; ``pid`` if the node answered, ``reason`` if not."""
 
     probe: ProbeResult
     pid: int | None = None
@@ -52,14 +54,14 @@ class ProbeAnswer(msgspec.Struct, frozen=True):
 
 
 class NodeClient:
-    """Questions to nodes; ``within`` is the time-out of each in seconds."""
+    """Asks nodes; ``within`` is the time-out of each question in seconds."""
 
     def __init__(self, upstream: MasterClient, within: float) -> None:
         self._upstream = upstream
         self._within = within
 
     async def probe(self, slave: HostPort, within: float | None = None) -> ProbeAnswer:
-        """Call ``getPid``. Whatever answers in HTTP lives, even if it does not know that call."""
+        """Call ``getPid``. Any HTTP answer shows that the node lives, even an unknown method."""
         try:
             body = await self._upstream.post_to_node(slave, _PID_CALL, within or self._within)
             return ProbeAnswer(ProbeResult.ANSWERED, self.read_pid(body))
@@ -67,21 +69,21 @@ class NodeClient:
             return ProbeAnswer(error.probe, reason=str(error))
 
     def connect(self, slave: HostPort) -> socket.socket:
-        """A connection to the slave API at an address that is about to be made. Raises OSError."""
+        """Begin a connection to the slave API at an address. Raises OSError."""
         return sockets.begin_to_dial(self._upstream.reach(slave))
 
     def close_after_answer(self, sock: socket.socket) -> None:
-        """Close such a connection once the answer that is due on it has come."""
+        """Close a connection from `connect` once the answer that is due has arrived."""
         self._upstream.close_after_answer(sock)
 
     def pid_question(self, slave: HostPort) -> bytes:
-        """The HTTP request by which the node at an address is asked for its pid."""
+        """The HTTP request that asks the node at an address for its pid."""
         return self._upstream.node_request(slave, _PID_CALL)
 
     def read_pid(self, body: bytes) -> int | None:
-        """The pid that a reply's body gives, whatever its status; None if it gives none.
+        """The pid in the body of a reply, with any status; None if there is none.
 
-        Raises Unreachable if it is no XML-RPC.
+        Raises Unreachable if the body is not XML-RPC.
         """
         match parse_value(body, PID_REPLY):
             case [_, _, int(pid)]:
@@ -89,7 +91,7 @@ class NodeClient:
         return None
 
     async def inspect(self, slave: HostPort) -> NodeInfo | None:
-        """What the node at an address says of itself; None if nothing answers there."""
+        """What the node at an address says about itself; None if no node answers there."""
         answer, published, subscribed = await asyncio.gather(
             self.probe(slave),
             self._topics(slave, "getPublications"),
@@ -102,15 +104,17 @@ class NodeClient:
         return NodeInfo(answer.pid, published, subscribed, ports)
 
     async def name(self, slave: HostPort, service: tuple[str, int] | None = None) -> str | None:
-        """What the node at an address is called, as it says itself; None if it doesn't.
+        """The name that the node at an address gives; None if it gives none.
 
-        rospy has ``getName`` for that. roscpp has nothing like it in its slave API, but gives its
-        name in the header with which it answers a TCPROS connection (roscpp's
-        transport_subscriber_link.cpp and service_client_link.cpp, handleHeader): for a topic that
-        it publishes, or for a ``service``, given with its port. It has one of them when it
-        registers for the first time: it notes a publisher (/rosout is the first of all) and a
-        service before it registers them. Its subscriptions are not asked for: it keeps them locked
-        while it registers one (topic_manager.cpp, subscribe).
+        rospy has ``getName`` for this. roscpp has no such method in its slave API. But roscpp gives
+        its name in the header with which it answers a TCPROS connection for a topic or a service
+        (transport_subscriber_link.cpp and service_client_link.cpp, handleHeader). roscpp has a
+        topic or a service when it registers for the first time, because it records a publisher or
+        service before it registers. /rosout is the first publisher of all. ``service`` is the
+        service of the registration, with its port.
+
+        The proxy does not ask for subscriptions, because roscpp keeps them locked during a
+        registration (topic_manager.cpp, subscribe).
         """
         try:
             name = await self._upstream.call_node(slave, self._within, "getName")
@@ -124,13 +128,13 @@ class NodeClient:
         return await self._name_by_tcpros(slave, service)
 
     async def provider(self, server: HostPort, service: str) -> str | None:
-        """The name of the node with a TCPROS server, if it has a service; None if it has not."""
+        """The name of the node with a TCPROS server, if the node has a service; None if not."""
         return await self._server_name(server, {"service": service})
 
     async def publisher(self, server: HostPort, topic: str) -> str | None:
-        """The name of the node with a TCPROS server, if it publishes a topic; None if it doesn't.
+        """The name of the node with a TCPROS server, if the node publishes a topic; None if not.
 
-        None, too, of a library that does not answer somebody who takes any type.
+        None as well if the library does not answer a subscriber that accepts any type.
         """
         return await self._server_name(server, {"topic": topic, "type": "*"})
 
@@ -147,7 +151,7 @@ class NodeClient:
         return await self._server_name(HostPort(slave.host, service[1]), {"service": service[0]})
 
     async def _server_name(self, server: HostPort, fields: dict[str, str]) -> str | None:
-        """The name in the header with which a TCPROS server answers; None if it gives none."""
+        """The name in the header with which a TCPROS server answers; None if there is none."""
         try:
             async with asyncio.timeout(self._within):
                 with await sockets.dial(server) as conn:
@@ -157,12 +161,13 @@ class NodeClient:
             return None
 
     async def take_leave(self, conn: socket.socket, topic: str) -> None:
-        """Close a connection to a publisher that has got no header yet, after one of the proxy's.
+        """Close a connection to a publisher that has not had a header, after a header of the proxy.
 
-        rospy's one thread that accepts connections warns of each that ends before its header. Where
-        that is its first warning, it asks its master for a parameter, over a connection that it
-        keeps; if the network to there has just gone, nobody else is accepted for a quarter of an
-        hour (rospy: tcpros_base.py, _tcp_server_callback; rosout.py, _rosout).
+        rospy accepts connections in a single thread, which logs a warning for each connection that
+        ends before its header. With its first warning, the thread asks the master for a parameter,
+        over a kept connection. If the network to the master has just failed, the thread accepts no
+        connection for a quarter of an hour (rospy: tcpros_base.py, _tcp_server_callback; rosout.py,
+        _rosout).
         """
         with conn, contextlib.suppress(OSError, EOFError, HeaderError):
             async with asyncio.timeout(self._within):
@@ -186,7 +191,7 @@ class NodeClient:
         return None
 
     async def _topic_ports(self, slave: HostPort, topics: list[str]) -> dict[str, int]:
-        """The TCPROS ports of two topics, which show whether all of the node's are the same."""
+        """The TCPROS ports of two topics, which show whether all topics have the same port."""
         ports: dict[str, int] = {}
         for topic in topics[:TOPICS_ASKED]:
             port = await self._topic_port_or_none(slave, topic)
@@ -206,8 +211,8 @@ class NodeClient:
 
 async def _greet(conn: socket.socket, fields: Mapping[str, str]) -> dict[str, str]:
     """Exchange TCPROS headers with a node. Raises OSError, EOFError, HeaderError."""
-    # "*" is the md5sum of any type. A service of rospy that is probed closes the connection after
-    # its header, and waits for no request (tcpros_service.py, handle).
+    # "*" is the md5sum of any type. After the header of a probe, a service of rospy closes the
+    # connection, and waits for no request (tcpros_service.py, handle).
     header = encode_header({"callerid": CALLER_ID, "md5sum": "*", "probe": "1", **fields})
     await asyncio.get_running_loop().sock_sendall(conn, header)
     size = header_length(await sockets.read_exactly(conn, 4))

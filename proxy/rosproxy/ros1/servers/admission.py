@@ -1,20 +1,20 @@
 """Admission: a node that registers through the proxy gets an endpoint and a port.
 
-A node says where it is by its slave URI, and that may name a host which only its own container
-knows. So the address that the registration came from counts where it must: see `NodeAdmission`'s
-``_locate``. Another address than that one is taken only if the node there says itself that it has
-the name that is being registered: else anybody could have any node published.
+A slave URI may name a host that only the node's own container can resolve. So the source address of
+the registration counts in many cases: see `NodeAdmission`'s ``_locate``. The proxy takes another
+address only if the node there confirms the registered name. Otherwise any node could make the proxy
+publish any other node.
 
-Ports are for nodes that live. Those that have never answered get a part of the range, by the
-address that registers them; and where the range is used up, a node that answers gets the port of
-one that doesn't, whose registrations are taken back (`_make_room`). So neither dead URIs nor stale
-claims of former proxies keep a port from it.
+Ports are for live nodes. Nodes that have never answered get a part of the range, by source. If the
+range is used up, a node that answers gets the port of a node that does not answer, and the proxy
+takes back the registrations of the latter (`_make_room`). So neither dead URIs nor stale claims of
+former proxies keep a port from a live node.
 
-Log messages begin with the address that registers, so that whoever makes up names is one subject,
-for which the log has a bound (`rosproxy.telemetry.logs`).
+Log messages begin with the source address. So a source that makes up names is a single subject, and
+the log bounds the lines of a subject (`rosproxy.telemetry.logs`).
 
-A new node is probed at once, so that one which can't be reached is reported at once; a node that
-registers again is taken for alive, whatever was believed of it.
+The proxy probes a new node at once, to report at once if the node is unreachable. A node that
+registers again counts as alive, whatever the state of its endpoint.
 """
 
 import asyncio
@@ -46,26 +46,26 @@ from rosproxy.ros1.rewriting.master_calls import (
 log = logging.getLogger(__name__)
 
 PATIENCE = 15.0
-"""Seconds that a node has to answer for the first time where many of its source have not: all nodes
-of a machine that has just started may be slow at once."""
+"""Seconds for a first answer if many nodes of the source have not answered yet: all nodes of a
+machine that has just started may be slow."""
 PATIENCE_STEP = 0.2
 MOST_ADDRESSES = 4
-"""How many addresses of a host name are tried."""
+"""The highest number of addresses that the proxy tries for a host name."""
 RETIRED = "rosproxy: this proxy is retired and accepts no registrations"
 
 
 class Cleanup(Protocol):
-    """Takes back at the master what a node has that does not answer."""
+    """Takes back the registrations of a node that does not answer."""
 
     async def give_up(self, endpoint: Endpoint, /) -> None:
-        """Unregister it. Raises Unreachable."""
+        """Unregister the node. Raises Unreachable."""
 
 
 class Verification(Protocol):
-    """Asks nodes that only the master tells of; see `rosproxy.ros1.upkeep.recovery`."""
+    """Verifies nodes that only the master mentions; see `rosproxy.ros1.upkeep.recovery`."""
 
     async def wait_for_dead_claim(self) -> None:
-        """Wait a moment until one of them turns out dead."""
+        """Wait a moment until such a node turns out dead."""
 
 
 class NodeAdmission:
@@ -85,9 +85,9 @@ class NodeAdmission:
         self._making_room = asyncio.Lock()
 
     async def admit(self, call: Call, caller: Caller) -> CallOutcome:
-        """The endpoint of a call that registers, or why there is none.
+        """The endpoint of a call that registers, or the reason why there is none.
 
-        Raises Unreachable if the master is needed and away.
+        Raises Unreachable if the master is needed and does not answer.
         """
         uri = registering_uri(call)
         if uri is None:
@@ -97,7 +97,7 @@ class NodeAdmission:
         uri = with_caller_address(uri, caller.address)
         node = parse_slave_uri(uri)
         endpoint = self._context.registry.admitted(node, caller.address)
-        # One that has never answered where it was believed to be is located anew.
+        # A node that has never answered at its location is located anew.
         if endpoint is not None and not endpoint.never_found:
             return await self._admit_again(endpoint, uri, call, caller)
         if node is None:
@@ -111,9 +111,9 @@ class NodeAdmission:
     async def _admit_again(
         self, endpoint: Endpoint, uri: str, call: Call, caller: Caller
     ) -> Endpoint | LocalAnswer:
-        """The endpoint that a URI has meant before, for a node that is there.
+        """The endpoint that a URI has meant before, for a node that registers again.
 
-        Somebody else at a source that hides several has to bear out its name as well.
+        If another node behind the same source registers, that node has to confirm its name as well.
         """
         caller_id = call.string(0) or ""
         location = endpoint.location
@@ -126,12 +126,12 @@ class NodeAdmission:
                     f"{caller_id[:200]} runs"
                 )
         if location.address == caller.address:
-            endpoint.uri = uri  # a recovery knows no more of it than the host and port
+            endpoint.uri = uri  # after a recovery the endpoint has only host and port
         self._welcome_back(endpoint, caller)
         return endpoint
 
     async def _admit_new(self, uri: str, node: HostPort, call: Call, caller: Caller) -> CallOutcome:
-        """The endpoint of a node that has not registered from there before; see `admit`."""
+        """The endpoint of a node that is new at this URI; see `admit`."""
         location = await self._locate(node, call, caller)
         if location is None:
             return Passing.FOREIGN_URI
@@ -150,10 +150,10 @@ class NodeAdmission:
         caller: Caller,
         answers: bool = False,
     ) -> Endpoint | LocalAnswer:
-        """The endpoint of a node found at a place, its port open; a refusal if none is left.
+        """The endpoint of a node at a location, with an open port; a refusal if no port is left.
 
-        Ports that turn out to be taken are passed over. ``answers``: the node has just done so.
-        Raises Unreachable.
+        The method skips ports that other programs have taken. ``answers``: the node has just
+        answered. Raises Unreachable.
         """
         registry = self._context.registry
         problems = self._context.problems
@@ -168,20 +168,20 @@ class NodeAdmission:
                 endpoint = registry.admit(uri, node, location, source)
             except RangeExhausted as error:
                 answers = answers or await self._answers(slave)
-                # One after the other: whoever has waited may find a port that was freed meanwhile,
-                # and then displaces nobody.
+                # One after the other: a waiting node may find a port that was freed meanwhile, and
+                # then displaces no other node.
                 async with self._making_room:
                     room = registry.pool.free or await self._make_room(answers)
                 if room:
                     continue
                 return self._refuse(uri, caller, str(error))
             failure = self._open(endpoint, answers)
-            # What the master has of a node leads to this port: such a node keeps it even if another
-            # program has taken it.
+            # The master has this port for a registered node. So such a node keeps the port even if
+            # another program has taken the port.
             if self._leases.is_open(endpoint) or endpoint.registrations:
                 return endpoint
             registry.remove(endpoint)
-            problems.solved_at(endpoint.port)  # `open` has reported it as this node's
+            problems.solved_at(endpoint.port)  # `open` has reported it for this node
             if text := _fault_of_all_ports(endpoint.port, failure):
                 return self._refuse(uri, caller, text)
             registry.pool.block(endpoint.port)
@@ -194,12 +194,12 @@ class NodeAdmission:
         return self._leases.open(endpoint)
 
     async def _make_room(self, answers: bool) -> bool:
-        """Free a port for a new node, if one can be had.
+        """Free a port for a new node, if possible.
 
-        Only one that ``answers`` displaces others. Raises Unreachable.
+        Only a node that ``answers`` displaces other nodes. Raises Unreachable.
         """
-        # What is missed least goes first: a fast port, without which topics only take the lease; a
-        # dead node's port; a lease that nobody uses, which its node would get again.
+        # The least useful port goes first: a fast port, whose topics then take the lease; a dead
+        # node's port; an unused lease, which its node would get again.
         if self._leases.give_up_spare():
             return True
         if answers and await self._give_up_dead():
@@ -212,9 +212,9 @@ class NodeAdmission:
         return self._context.registry.pool.free > 0 or await self._give_up_dead()
 
     async def _give_up_dead(self) -> bool:
-        """Unregister a node that is dead and end its lease; whether there was one.
+        """Unregister a dead node and end its lease; whether there was one.
 
-        It may have come back while the master was told: then it keeps its port.
+        If the node comes back during the call to the master, it keeps its port.
         """
         registry = self._context.registry
         endpoint = registry.dead_endpoint()
@@ -231,9 +231,9 @@ class NodeAdmission:
         return True
 
     def _is_crowded(self, source: str) -> bool:
-        """Whether a source has all the nodes that it may have which have never answered.
+        """Whether a source has the highest number of nodes that have never answered.
 
-        Those that have no registration left are given up for new ones.
+        Such nodes without a registration give their ports to new nodes.
         """
         registry = self._context.registry
         while len(unproven := registry.unproven(source)) >= registry.most_unproven:
@@ -244,9 +244,9 @@ class NodeAdmission:
         return False
 
     async def _comes_to_answer(self, slave: HostPort, source: str) -> bool:
-        """Whether a node answers, in the time that it may take on a machine that just starts.
+        """Whether a node answers within the time that a starting machine may need.
 
-        Nobody waits for it once it is known not to be there, or not needed to be.
+        The wait ends as soon as the node refuses connections, or the source is no longer crowded.
         """
         end = self._context.now() + PATIENCE
         while True:
@@ -268,23 +268,24 @@ class NodeAdmission:
         return refusal(text)
 
     def _welcome_back(self, endpoint: Endpoint, caller: Caller) -> None:
-        """A node that registers is alive, whatever was believed of it."""
+        """Record that a node that registers is alive, whatever the state of its endpoint."""
         if not endpoint.location.confirmed and endpoint.location.address == caller.address:
             endpoint.confirm()
             self._context.problems.solved_at(endpoint.port)
-        if endpoint.trusted:  # if not, its node has yet to bear out what the master has of it
+        if endpoint.trusted:  # otherwise the node still has to confirm its registrations
             self._leases.open(endpoint)
         names = endpoint.caller_ids
         if endpoint.health.down or (names and caller.caller_id not in names):
             endpoint.health.suspect()
 
     async def _locate(self, node: HostPort, call: Call, caller: Caller) -> NodeLocation | None:
-        """Where a node is that gives ``node`` as its address; None if that is outside.
+        """The location of a node that gives ``node`` as its address; None if this is outside.
 
-        If the address leads elsewhere than to the source of the call, and no node answers at the
-        source (the way to the proxy hides it), the node there must bear out that it has the name
-        that the call registers. Outside it need only be there: a gateway registers nodes of another
-        machine under names of its own, and no port is opened for that.
+        The address may lead elsewhere than to the source of the call, while no node answers at the
+        source, because the way to the proxy hides the source. Then the node at the address has to
+        confirm the name that the call registers. A node outside only has to answer: a gateway
+        registers nodes of another machine under different names, and the proxy opens no port for
+        such a node.
         """
         source = caller.address
         caller_id = call.string(0) or ""
@@ -299,7 +300,7 @@ class NodeAdmission:
             slave = HostPort(address, node.port)
             client_kind = self._context.client_kind(address)
             if client_kind is ClientKind.OUTSIDE:
-                bears_out = await self._answers(slave)  # a gateway gives it another name
+                bears_out = await self._answers(slave)  # a gateway gives the node another name
             else:
                 bears_out = await self._context.nodes.name(slave, service) == caller_id
             if bears_out and client_kind is ClientKind.ADMITTED:
@@ -319,7 +320,7 @@ class NodeAdmission:
         return NodeLocation(source, named=False)
 
     async def _probe_first(self, endpoint: Endpoint, caller_id: str) -> None:
-        """Look at once whether a new node can be reached, and say so if not."""
+        """Probe a new node at once, and report if it is unreachable."""
         answer = await self._context.nodes.probe(endpoint.slave)
         endpoint.health.note(answer.probe, self._context.now())
         endpoint.health.pid = answer.pid
@@ -333,7 +334,7 @@ class NodeAdmission:
 
 
 def _service(call: Call, caller: Caller) -> tuple[str, int] | None:
-    """The service that a call registers, and its port; None if it registers another thing."""
+    """The service that a call registers, and its port; None if the call registers no service."""
     spec = method_spec(call.method)
     service = parse_service_uri(
         with_caller_address(call.string(spec.service_api) or "", caller.address)
@@ -352,7 +353,7 @@ def _crowd_text(source: str, slave: HostPort, most: int) -> str:
 def _on_loopback(endpoint: Endpoint) -> bool:
     """Whether a node of another machine gives a loopback address.
 
-    Then roscpp, too, accepts TCPROS connections on loopback only, though its slave API answers
+    roscpp then accepts TCPROS connections on loopback only, although its slave API answers
     (transport_tcp.cpp, isOnlyLocalhostAllowed).
     """
     return is_loopback(endpoint.node.host) and not is_loopback(endpoint.location.address)
@@ -372,7 +373,7 @@ def _unreachable_text(endpoint: Endpoint, reason: str) -> str:
 
 
 def _fault_of_all_ports(port: int, failure: OSError | None) -> str:
-    """Why no port can be opened, if that is so; empty if another program has this port alone."""
+    """Why no port can be opened; empty if another program has taken only this port."""
     if failure is None or failure.errno == errno.EADDRINUSE:
         return ""
     return f"rosproxy: port {port} can't be opened: {failure.strerror}"

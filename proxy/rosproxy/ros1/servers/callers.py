@@ -1,18 +1,19 @@
-"""Who is let in at the master port, which is for inside nodes alone.
+"""Which callers may use the master port, which is for nodes inside alone.
 
-`rosproxy.ros1.registry.client_kinds` decides by the address that a connection comes from, before
-anything that it sends is read. Programs on the proxy's own machine are always let in.
+`rosproxy.ros1.registry.client_kinds` decides by the source address of a connection, before the
+proxy reads any byte. Programs on the proxy's own machine may always use the port.
 
-An operator tells of a container some tenths of a second after its start, and the container's first
-call may be faster. So a call from an address that is not selected waits for an update, up to
-UPDATE_TIMEOUT. Right after a start nobody is known to be selected yet: where an operator runs, all
-calls wait for its first word, up to UPDATE_TIMEOUT, and are let in if none comes, so that an
-operator that is away stops nobody (`Callers.await_operator`).
+An operator reports a container some tenths of a second after the start of the container, and the
+first call of the container may come earlier. So a call from an address that is not selected waits
+for an update, up to UPDATE_TIMEOUT. Right after a start of the proxy, no address is selected yet.
+If an operator manages the proxy, all calls wait for the first update, up to UPDATE_TIMEOUT. If no
+update comes, the proxy lets these calls in, so that nodes work without the operator
+(`Callers.await_operator`).
 
-What is refused gets HTTP 403 with the reason, not an XML-RPC fault: roscpp takes a fault for the
-master's last word and never asks again (master.cpp, execute), but goes on trying after anything
-that is no XML-RPC reply, as rospy does. So a node whose container is selected later still comes to
-register.
+A refused call gets HTTP 403 with the reason, not an XML-RPC fault. roscpp takes a fault for the
+master's final answer and never asks again (master.cpp, execute). After an answer that is no XML-RPC
+reply, roscpp tries again, and so does rospy. So a node whose container is selected later still
+registers.
 """
 
 import asyncio
@@ -29,44 +30,44 @@ from rosproxy.ros1.registry.client_kinds import ClientKind
 log = logging.getLogger(__name__)
 
 UPDATE_TIMEOUT = 3.0
-"""Seconds that a call waits at most for an update that selects its source."""
+"""The longest time in seconds that a call waits for an update that selects its source."""
 MOST_WAITING = 512
-"""Calls that wait for an update at once; beyond that they are refused without. A node makes one
-call at a time, so that these are as many nodes that start in the same seconds."""
+"""The highest number of waiting calls. The proxy refuses further calls at once. A node makes one
+call at a time, so this is the number of nodes that may start within the same seconds."""
 MOST_WAITING_EACH = 64
-"""The same for one source: nobody takes all places."""
+"""The highest number of waiting calls of one source, so that no source takes all places."""
 LOG_INTERVAL = 10.0
 """Seconds between two log lines about refused callers."""
 SUBJECT = "master port"
 
 
 class Callers:
-    """Lets callers in, or says why not."""
+    """Decides which callers may use the master port."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
         self._update = asyncio.Event()
         self._begun = asyncio.Event()
-        """Set once callers are judged; until then they wait."""
+        """Set once the proxy judges callers. Until then callers wait."""
         if not context.settings.admin_token_hash:
             self._begun.set()
         self._waiting = Counter[str]()
         self._logged: float | None = None
 
     def select(self, addresses: Iterable[str]) -> None:
-        """Take in which addresses an operator has selected, instead of those before."""
+        """Replace the addresses that an operator has selected."""
         self._context.selected = frozenset(addresses)
         self._begun.set()
         self._context.problems.solved(SUBJECT)
-        # Calls that wait now are woken; later calls wait for the next update.
+        # Wake the calls that wait now. Later calls wait for the next update.
         update = self._update
         self._update = asyncio.Event()
         update.set()
 
     async def await_operator(self) -> None:
-        """Have callers wait for an operator's first word, for UPDATE_TIMEOUT at most from now on.
+        """Make callers wait for the first update of an operator, up to UPDATE_TIMEOUT from now on.
 
-        None is waited for without the hash of a token, by which operators start their proxies.
+        Operators start proxies with the hash of a token. Without this hash, callers do not wait.
         """
         try:
             async with asyncio.timeout(UPDATE_TIMEOUT):
@@ -76,11 +77,11 @@ class Callers:
             self._begun.set()
 
     async def wait_until_begun(self) -> None:
-        """Wait as long as callers are to wait after a start; see `await_operator`."""
+        """Wait as long as callers have to wait after a start; see `await_operator`."""
         await self._begun.wait()
 
     async def refusal(self, source: str) -> str | None:
-        """Why a caller is refused, in one line; None if it is let in."""
+        """Why a caller is refused, in one line; None if the caller may use the port."""
         if not self._begun.is_set() and not is_own(source):
             await self.wait_until_begun()
         if self._client_kind(source) is ClientKind.ADMITTED:
@@ -103,7 +104,7 @@ class Callers:
     async def _wait_for_update(self, source: str) -> None:
         """Wait until an operator has selected a source, up to UPDATE_TIMEOUT.
 
-        No operator is heard where the admin endpoint is on loopback, if none was heard so far.
+        If the admin endpoint is on loopback and no update has come yet, there is no operator.
         """
         no_update = self._context.selected is None and is_loopback(
             self._context.settings.admin.host
@@ -127,7 +128,7 @@ class Callers:
         context = self._context
         now = self._context.now()
         context.metrics.strangers.labels(kind.value).inc()
-        context.problems.solved(SUBJECT)  # the last one is enough: there may be any number
+        context.problems.solved(SUBJECT)  # only the last refusal stays: there may be any number
         context.problems.add(SUBJECT, text)
         if self._logged is None or now - self._logged >= LOG_INTERVAL:
             self._logged = now

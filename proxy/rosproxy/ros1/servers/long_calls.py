@@ -1,4 +1,4 @@
-"""Calls that are too long to be read whole, or have too many elements, and need not be read."""
+"""Calls with too many bytes or elements to read, which the proxy need not read."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 class LongCall:
-    """A call whose method is known and whose body of ``size`` bytes may still be coming.
+    """A call with a known method, whose body of ``size`` bytes may still be arriving.
 
-    ``head`` is what of it has come, ``rest`` brings the rest.
+    ``head`` is the part of the body that has arrived, ``rest`` the stream with the rest.
     """
 
     def __init__(
@@ -31,24 +31,25 @@ class LongCall:
         self._watch = watch
 
     async def pieces(self) -> AsyncIterator[bytes]:
-        """The body, watched; its last piece comes once all of it was.
+        """The pieces of the body. The last piece comes after the whole body has been watched.
 
-        Raises XmlRpcError if it must not pass, Unreachable if the caller does not send it.
+        Raises XmlRpcError if the call must not pass, Unreachable if the caller does not send the
+        body.
         """
         if len(self._head) == self.size and self._watch.passes(self._head):
             yield self._head
             return
-        for piece in cut(self._head):  # others are served between two pieces
+        for piece in cut(self._head):  # other tasks run between two pieces
             self._watch.see(piece)
             await asyncio.sleep(0)
-        # Always one piece behind: rosmaster and nodes read a body to its end before they look into
-        # it, so without the last piece none of them acts on a call that is refused.
+        # Always one piece behind. rosmaster and nodes read a body to the end before they parse
+        # the body, so without the last piece they do not act on a refused call.
         previous = self._head
         while not self._rest.at_eof():
             try:
                 async with asyncio.timeout(PIECE_TIMEOUT):
                     piece = await self._rest.readany()
-            except (OSError, BadBody) as error:  # a time-out is one of the former
+            except (OSError, BadBody) as error:  # a TimeoutError is an OSError
                 raise Unreachable(f"the caller did not send the whole body: {error}") from error
             self._watch.see(piece)
             yield previous
@@ -61,7 +62,7 @@ class LongCalls(Protocol):
     """What a service does with long calls that it need not read."""
 
     def watch(self, method: str, size: int) -> CallWatch | None:
-        """How to watch a call of a method while it passes; None if it has to be read."""
+        """The watch for a call of a method while it passes; None if the call has to be read."""
 
     async def pass_on(self, call: "IncomingCall", long_call: LongCall) -> bytes | LongReply:
-        """The reply to a call; ``call`` says who makes it. Raises XmlRpcError, Unreachable."""
+        """The reply to a call; ``call`` names the caller. Raises XmlRpcError, Unreachable."""

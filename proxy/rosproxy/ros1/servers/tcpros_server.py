@@ -1,8 +1,9 @@
 """TCPROS through a lease: read the connection header, find the node's port, relay.
 
 A client sends a connection header that names a topic or a service. The node behind the lease has a
-TCPROS port of its own, which it has named itself (in a reply to ``requestTopic``, in a service URI)
-or is asked for now. The header is sent on to that port, and the bytes are relayed from then on.
+separate TCPROS port. The node has named this port in a reply to ``requestTopic`` or in a service
+URI, or the proxy asks for the port now. The proxy sends the header to this port, and then relays
+the bytes.
 """
 
 import asyncio
@@ -32,42 +33,42 @@ log = logging.getLogger(__name__)
 
 RATE_INTERVAL = 2.0
 UNREGISTERED = "unregistered"
-"""What a relay's topic or service is called that its node has not registered."""
+"""The name of a relay whose topic or service is not registered."""
 NO_PORT = 0
 """In place of a TCPROS port: the node says that it does not have the topic or service."""
 
 
 class NotOffered(Exception):
-    """A node says that it does not have the topic or service that somebody connects for."""
+    """A node says that it does not have the topic or service that a client asks for."""
 
 
 class TcprosTarget(Protocol):
-    """The node that a connection to one of the proxy's ports leads to."""
+    """The node that a connection to a port of the proxy leads to."""
 
     inside: bool
-    """Whether it is inside; who connects is then outside, and the other way round."""
+    """Whether the node is inside. Clients are on the other side."""
 
     @property
     def port(self) -> int:
-        """The proxy's port."""
+        """The port of the proxy."""
 
     def check(self, kind: str, name: str, peer: str, caller_id: str) -> Denial | None:
         """Check whether a client may have a topic or service."""
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
-        """A connection to the node's TCPROS server; None if there is none. Raises NotOffered."""
+        """Connect to the node's TCPROS server; None if there is none. Raises NotOffered."""
 
     def label(self, kind: str, name: str) -> str:
-        """What a topic or service is called in status and metrics: whoever connects names it."""
+        """The name of a topic or service in status and metrics. Clients may send any name."""
 
     def note_connection(self) -> None:
-        """Note that a connection is relayed."""
+        """Record that a relay for the node has started."""
 
     def note_disconnection(self) -> None:
-        """Note that one is relayed no more."""
+        """Record that a relay for the node has ended."""
 
     def note_failure(self, name: str) -> None:
-        """Note that there was no connection for a topic or service."""
+        """Record that there was no connection for a topic or service."""
 
 
 class TcprosServer:
@@ -93,13 +94,13 @@ class TcprosServer:
         return total
 
     async def sample_rates(self) -> None:
-        """Compute the rates of all connections since the last time."""
+        """Compute the rates of all connections since the last call."""
         now = self._context.now()
         for relay in self.relays:
             relay.sample(now)
 
     async def serve(self, target: TcprosTarget, peer: str, conn: socket.socket) -> None:
-        """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
+        """Relay a connection whose first bytes are a TCPROS header. Close it on failure."""
         try:
             header = await read_header(self._context, peer, conn)
             kind, name, caller_id = _requested(decode_header(header[4:]))
@@ -116,8 +117,8 @@ class TcprosServer:
         if not await hand_on(header, node):
             self._fail(target, conn, name)
             return
-        # While the node was asked and connected to, the policy may have changed. After a reset the
-        # client comes again, and is then told why it is refused.
+        # The policy may have changed during the calls to the node. After a reset the client
+        # connects again, and then gets the reason.
         changed = self._context.policy.rules.version != version
         if changed and target.check(kind, name, peer, caller_id):
             node.close()
@@ -129,21 +130,22 @@ class TcprosServer:
             splice=self._may_splice, inside_asks=not target.inside, client_listens=kind == "topic",
         )  # fmt: skip
         target.note_connection()
-        self._context.gate.enter(peer, target.port)  # the acceptor counts it until `serve` ends
+        self._context.gate.enter(peer, target.port)  # the acceptor counts until `serve` ends
         self.relays.start(relay, lambda ended: self._finished(target, ended))
 
     async def _connect(
         self, target: TcprosTarget, kind: str, name: str, conn: socket.socket
     ) -> socket.socket | None:
-        """A connection to the target; None if the client gets none, which it has been shown."""
-        # A subscriber that is told of a publisher twice keeps the later connection, and rospy's
-        # publishers the one whose header comes last: were the former one handed on, none was left.
+        """Connect to the target; None after the client was refused, reset or gone."""
+        # A subscriber that hears of a publisher twice keeps the later connection. A publisher of
+        # rospy keeps the connection with the later header. So a header on an ended connection
+        # would leave no connection at all.
         if kind == "topic" and sockets.has_ended(conn):
             conn.close()
             return None
         try:
             node = await target.connect(kind, name)
-        except NotOffered as error:  # roscpp tries for ever after a reset, and gives up after this
+        except NotOffered as error:  # roscpp gives up; after a reset it would not
             await self._refuse(conn, str(error), "not offered")
             return None
         if node is None:
@@ -161,7 +163,7 @@ class TcprosServer:
                 relay.end()
 
     async def _refuse(self, conn: socket.socket, text: str, reason: str) -> None:
-        """Say why in a header, as ROS's servers do, and close."""
+        """Send the reason in a header, as the servers of ROS do, and close."""
         reply = encode_header({"error": f"rosproxy: {text}"})
         await asyncio.get_running_loop().sock_sendall(conn, reply)
         conn.close()
@@ -173,7 +175,7 @@ class TcprosServer:
         self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
 
     def _fail(self, target: TcprosTarget, conn: socket.socket, name: str) -> None:
-        """Reset, as a node that is gone would: roscpp and rospy try again."""
+        """Reset the connection, like a node that is gone: roscpp and rospy then try again."""
         self._context.metrics.relay_errors.labels("node unreachable").inc()
         sockets.reset_on_close(conn)
         conn.close()
@@ -181,10 +183,10 @@ class TcprosServer:
 
 
 class InsideNodes:
-    """The nodes inside as targets.
+    """Makes targets of the nodes inside.
 
-    A connection leads to a port on the endpoint's own address, as that node itself named it; the
-    host in a reply or registration is never used, so none can lead to another inside host.
+    A connection leads to a port on the endpoint's own address, which the node itself has named. The
+    proxy never uses the host in a reply or registration. So no reply leads to another host inside.
     """
 
     def __init__(self, context: Context) -> None:
@@ -192,11 +194,11 @@ class InsideNodes:
         self._port_tasks: dict[tuple[Endpoint, str, str], asyncio.Task[int | None]] = {}
 
     def target(self, endpoint: Endpoint) -> "InsideNode":
-        """What connections to an endpoint's ports lead to."""
+        """The target of connections to an endpoint's ports."""
         return InsideNode(self._context, endpoint, self._learn_port)
 
     async def _learn_port(self, endpoint: Endpoint, kind: str, name: str) -> int | None:
-        """The TCPROS port of a topic or service now; the node is asked once for all who wait."""
+        """Ask the node for the TCPROS port of a topic or service, once for all waiting callers."""
         key = endpoint, kind, name
         task = self._port_tasks.get(key)
         if task is None:
@@ -204,10 +206,10 @@ class InsideNodes:
             task = self._context.tasks.spawn(ask(endpoint, name), f"TCPROS port of {name}")
             self._port_tasks[key] = task
             task.add_done_callback(lambda _: self._port_tasks.pop(key))
-        return await asyncio.shield(task)  # the others wait on if one of the callers goes away
+        return await asyncio.shield(task)  # other callers go on waiting if one is cancelled
 
     async def _ask_topic_port(self, endpoint: Endpoint, topic: str) -> int | None:
-        """The port that the node names for a topic, or NO_PORT; None if it can't be asked."""
+        """The port that the node names for a topic, or NO_PORT; None without an answer."""
         port: int | None = None
         try:
             port = await self._context.nodes.topic_port(endpoint.slave, topic) or NO_PORT
@@ -220,9 +222,10 @@ class InsideNodes:
         return port
 
     async def _ask_service_port(self, endpoint: Endpoint, service: str) -> int | None:
-        """The port at which the node answers for a service, or NO_PORT; None if none answers.
+        """The port where the node answers for a service, or NO_PORT; None if no port answers.
 
-        No node can be asked where its services are. In rospy and roscpp it is where its topics are.
+        Nodes do not tell the ports of services. In rospy and roscpp topics and services share a
+        port.
         """
         ports = [*endpoint.node_ports, *endpoint.service_ports]
         if not ports:
@@ -234,13 +237,13 @@ class InsideNodes:
             if await self._context.nodes.provider(server, service) in endpoint.callers:
                 self._context.registry.note_service_port(endpoint, service, port)
                 return port
-        # A registered service may answer next time: its client is reset, and comes again.
+        # A registered service may answer next time. The client is reset, and connects again.
         return None if service in endpoint.names(Kind.SERVICE) else NO_PORT
 
 
 @dataclass(slots=True)
 class InsideNode:
-    """A node inside as a target, for those who connect from outside."""
+    """A node inside as the target of clients outside."""
 
     _context: Context
     _endpoint: Endpoint
@@ -254,14 +257,15 @@ class InsideNode:
 
     def check(self, kind: str, name: str, peer: str, caller_id: str) -> Denial | None:
         """Check whether outside may have a topic or service."""
-        # Without the caller_id: publishers take the topic of a header as it stands (rospy's
+        # Without the caller_id: publishers use the topic of a header unchanged (rospy's
         # tcpros_pubsub.py, topic_connection_handler; roscpp's transport_subscriber_link.cpp).
         return self._context.policy.check_outside(kind, name, self._endpoint, peer)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
-        """A connection to the node; a port that is not known or refuses is asked for.
+        """Connect to the node; ask the node for an unknown port, or if the known port refuses.
 
-        A port of another topic or service is never tried: nodes may have one for each.
+        The method never tries a port of another topic or service: a node may have one port for
+        each.
         """
         endpoint = self._endpoint
         if kind == "topic":
@@ -269,7 +273,7 @@ class InsideNode:
         elif endpoint.location.confirmed:
             port = self._context.registry.service_port(endpoint, name)
         else:
-            port = None  # it came from an address that hides several: the node has to answer for it
+            port = None  # the source hides several nodes: the node itself has to name the port
         node = await _dial(endpoint.address, port)
         if node is not None:
             return node
@@ -284,16 +288,16 @@ class InsideNode:
         return name if name in self._endpoint.names(wanted_kind) else UNREGISTERED
 
     def note_connection(self) -> None:
-        """Note that a connection is relayed."""
+        """Record that a relay for the node has started."""
         self._endpoint.connections += 1
         self._endpoint.idle_since = None
 
     def note_disconnection(self) -> None:
-        """Note that one is relayed no more."""
+        """Record that a relay for the node has ended."""
         self._endpoint.connections -= 1
 
     def note_failure(self, name: str) -> None:
-        """Tell of a node that is registered, and whose TCPROS server can't be reached."""
+        """Report a registered node whose TCPROS server is unreachable."""
         endpoint = self._endpoint
         if not endpoint.registrations or endpoint.health.has_ended:
             return
@@ -308,11 +312,11 @@ class InsideNode:
 
 
 def _requested(fields: Mapping[str, str]) -> tuple[str, str, str]:
-    """Kind and name of what a header asks for, and who asks. Raises HeaderError."""
+    """The kind and name that a header asks for, and the caller_id. Raises HeaderError."""
     if too_long := too_long_to_connect(fields):
         raise HeaderError(too_long)
     # rospy and roscpp would serve the topic (tcpros_base.py, _tcp_server_callback;
-    # connection_manager.cpp, onConnectionHeaderReceived), and the policy be asked for the service.
+    # connection_manager.cpp, onConnectionHeaderReceived), but the policy would check the service.
     if "service" in fields and "topic" in fields:
         raise HeaderError("the connection header names both a topic and a service")
     kind = "service" if "service" in fields else "topic"
@@ -320,9 +324,9 @@ def _requested(fields: Mapping[str, str]) -> tuple[str, str, str]:
 
 
 async def read_header(context: Context, peer: str, conn: socket.socket) -> bytes:
-    """Take a connection header off the socket: its four bytes of length and its body.
+    """Read a connection header from a socket: four bytes of length, and the body.
 
-    Raises HeaderError if it is too long, EOFError, TimeoutError, OSError.
+    Raises HeaderError if the header is too long, EOFError, TimeoutError, OSError.
     """
     charge = Charge(context.buffered, peer)
     with context.gate.waiting(peer, partial(sockets.hang_up, conn)), charge:
@@ -346,13 +350,13 @@ async def _dial(address: str, port: int | None) -> socket.socket | None:
 
 
 async def hand_on(header: bytes, inside: socket.socket) -> bool:
-    """Send a node the header that was read; closes the connection to it if that fails."""
+    """Send a node the header of a client; close the connection to the node if that fails."""
     try:
         async with asyncio.timeout(sockets.CONNECT_TIMEOUT):
             await asyncio.get_running_loop().sock_sendall(inside, header)
     except BaseException as error:
         inside.close()
-        if not isinstance(error, OSError):  # a time-out is one, too
+        if not isinstance(error, OSError):  # a TimeoutError is an OSError
             raise
         log.debug("the TCPROS header could not be sent to the node: %s", error)
         return False

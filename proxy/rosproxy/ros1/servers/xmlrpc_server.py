@@ -1,12 +1,13 @@
 """The server of XML-RPC: `rosproxy.net.http_server` reads requests, a service makes the replies.
 
-What peers expect (ros_comm/utilities/xmlrpcpp, Python's xmlrpc.client): a Content-Length always,
-no chunks, no compression, any path. Errors are XML-RPC faults with HTTP status 200.
+Peers (ros_comm/utilities/xmlrpcpp, Python's xmlrpc.client) expect a Content-Length in every reply,
+no chunks and no compression, and may call any path. Errors are XML-RPC faults with HTTP status 200.
 
-What a service reads is bounded (`limits`), and what all servers hold together (`Context.buffered`);
-over it a request is answered with HTTP 413 or 503. A long call that a service need not read passes
-piece by piece (`long_calls`), as do long replies. Compressed requests are refused: ROS sends none.
-A client that takes nothing of its reply is cut by the kernel (`sockets.end_if_stalled`).
+Each document that a service reads is bounded (`limits`), and so is the sum of all documents in
+memory (`Context.buffered`). Beyond a bound the server answers with HTTP 413 or 503. A long call
+that a service need not read passes piece by piece (`long_calls`), and so do long replies. The
+server refuses compressed requests, because ROS sends none. If a client reads nothing of its reply,
+the kernel cuts the connection (`sockets.end_if_stalled`).
 """
 
 import asyncio
@@ -45,22 +46,22 @@ from rosproxy.telemetry.metrics import Metrics
 log = logging.getLogger(__name__)
 
 BODY_TIMEOUT = 60.0
-"""Seconds in which a request's body must arrive."""
+"""Seconds within which the body of a request must arrive."""
 HEADER_TIMEOUT = 30.0
-"""Seconds in which the header of a connection's first request must arrive."""
+"""Seconds within which the header of the first request of a connection must arrive."""
 STOP_TIMEOUT = 0.5
-"""Seconds that calls under way get to end when the server stops."""
+"""Seconds that calls under way have to end when the server stops."""
 VALUE = 400
-"""Bytes of memory that a value of a document takes while its call is answered."""
+"""Bytes of memory for each value of a document while the call is being answered."""
 
 _Answer = TypeVar("_Answer")
 
 
 class IncomingCall:
-    """One XML-RPC request: its body, who sent it and where it arrived.
+    """An XML-RPC request: the body, the source, and the address where it arrived.
 
-    ``charge`` is told how many bytes more the call takes in memory until it is answered; it raises
-    OverBudget.
+    ``charge`` takes the number of further bytes that the call needs in memory until the answer.
+    Raises OverBudget.
     """
 
     def __init__(self, request: HttpRequest, hold: Callable[[int], None]) -> None:
@@ -74,11 +75,11 @@ class IncomingCall:
 
     @property
     def path(self) -> str:
-        """The path that is called, with what follows a question mark."""
+        """The path of the request, with the query."""
         return self._request.path
 
     def comes_from(self, instance: str) -> bool:
-        """Whether a proxy itself made this call."""
+        """Whether the proxy ``instance`` itself made this call."""
         return self.loop_id.partition(" ")[0] == instance
 
     @property
@@ -88,10 +89,10 @@ class IncomingCall:
 
     @property
     def reached_locally(self) -> bool:
-        """Whether the caller named the very address and port of this machine that it reached.
+        """Whether the Host header names the local address and port of the connection.
 
-        So does a neighbour that was given the proxy's inside address; whoever comes through a
-        published port names the host instead.
+        A neighbour that has the inside address of the proxy names this address. A caller that comes
+        through a published port names the host instead.
         """
         return parse_host_port(self.host_header) == self.local
 
@@ -101,13 +102,13 @@ XmlRpcService = Callable[[IncomingCall], Awaitable[bytes | LongReply]]
 
 
 Guard = Callable[[str], Awaitable[str | None]]
-"""Why a source's calls are refused, in one line, before they are read; None if they are not."""
+"""Why the server refuses calls from a source, in one line, before a read; None to accept."""
 
 
 async def count_reply(
     metrics: Metrics, api: str, method: str, reply: Awaitable[_Answer]
 ) -> _Answer:
-    """A forwarded call's reply, once it is counted whether there was one. Raises Unreachable."""
+    """Wait for the reply to a forwarded call, and count the result. Raises Unreachable."""
     try:
         answer = await reply
     except Unreachable:
@@ -127,10 +128,10 @@ class HttpRefusal(Exception):
 
 
 class XmlRpcServer(HttpServer):
-    """Turns accepted sockets into XML-RPC calls to a service, for those whom the guard lets in.
+    """Turns accepted sockets into XML-RPC calls to a service, if the guard accepts the source.
 
-    ``limits`` are those of calls that the service reads; ``long_calls`` take those that it need not
-    read; without, all are read.
+    ``limits`` apply to calls that the service reads. ``long_calls`` takes the calls that the
+    service need not read. Without ``long_calls``, the service reads all calls.
     """
 
     def __init__(
@@ -159,11 +160,11 @@ class XmlRpcServer(HttpServer):
         peer: str,
         relay: Callable[[socket.socket], Awaitable[None]] | None = None,
     ) -> None:
-        """Take a connection over, or hand it to ``relay`` if it is TCPROS; without, all is HTTP.
+        """Serve a connection as HTTP, or give it to ``relay`` if it is TCPROS. No ``relay``: HTTP.
 
-        In both protocols the client speaks first, and four bytes tell them apart: letters are an
-        HTTP method, anything else the length of a connection header. They are only peeked at. One
-        that ends before it has said anything is closed. Raises TimeoutError, OSError.
+        In both protocols the client sends first, and the first four bytes decide: letters are an
+        HTTP method, other bytes the length of a connection header. The server only peeks at these
+        bytes. A connection that ends before any byte is closed. Raises TimeoutError, OSError.
         """
         with self._context.gate.waiting(peer, partial(hang_up, conn)):
             first = await peek(conn, 4)
@@ -176,11 +177,11 @@ class XmlRpcServer(HttpServer):
             await relay(conn)
 
     def count(self, port: int) -> int:
-        """How many connections are open that came in on a port."""
+        """The number of open connections that arrived at a port."""
         return len(self._by_port[port])
 
     def close_port(self, port: int) -> None:
-        """Let the connections that came in on a port end with the calls that they carry now."""
+        """End the connections that arrived at a port, busy connections after the current call."""
         for connection in list(self._by_port[port]):
             if connection.busy:
                 connection.close()
@@ -192,7 +193,7 @@ class XmlRpcServer(HttpServer):
         await self.shutdown(STOP_TIMEOUT)
 
     def connection_made(self, connection: HttpConnection) -> None:
-        """Know a connection by the port that it came in on, and wait for its first request."""
+        """Record a connection by the port where it arrived, and wait for the first request."""
         super().connection_made(connection)
         port = connection.local.port
         source = connection.source.host
@@ -230,7 +231,7 @@ class XmlRpcServer(HttpServer):
             return text_reply("XML-RPC uses POST\n", 405, lines="Allow: POST\r\n")
         source = request.connection.source.host
         denial = await self._guard(source) if self._guard else None
-        if denial:  # rospy shows the reason phrase, people the text
+        if denial:  # rospy shows the reason phrase, other tools show the text
             return text_reply(f"{denial}\n", 403, denial, lasts=False)
         try:
             with Charge(self._context.buffered, source) as charge:
@@ -271,13 +272,16 @@ class XmlRpcServer(HttpServer):
             return None
         if len(reply) > passing.SHORT:
             call.charge(len(reply))
-        await request.send(HttpReply(reply))  # here, since the charge ends with this method
+        await request.send(HttpReply(reply))  # here, because the charge ends with this method
         return None
 
     async def _read(
         self, request: HttpRequest, call: IncomingCall
     ) -> Awaitable[bytes | LongReply] | None:
-        """Read a call's body; the answer to one that passes, of which only the head is read.
+        """Read the body of a call. If the call passes unread, read only the head.
+
+        Returns:
+            The answer to a call that passes unread; None if the service has to read the call.
 
         Raises HttpRefusal, OverBudget.
         """
@@ -286,7 +290,7 @@ class XmlRpcServer(HttpServer):
             raise HttpRefusal(415, "compressed", text)
         try:
             size = request.content_length or 0
-            if size <= passing.SHORT and request.content.is_eof():  # it came with the header
+            if size <= passing.SHORT and request.content.is_eof():  # arrived with the header
                 await self._take_in(call, request.content.read_nowait())
                 return self._pass_unread(request, call)
             with TimeLimit(self._time_limits, BODY_TIMEOUT):
@@ -308,13 +312,13 @@ class XmlRpcServer(HttpServer):
     def _pass_unread(
         self, request: HttpRequest, call: IncomingCall
     ) -> Awaitable[bytes | LongReply] | None:
-        """The answer to a whole call with more elements than are read, if it need not be read."""
+        """The answer to a call with too many elements to read, if the service need not read it."""
         service = self._long_calls
         limits = self._limits
         if service is None or not xmlrpc.exceeds_elements(call.body, limits):
             return None
         method = passing.method_of(call.body)
-        watch = service.watch(method, limits.size + 1) if method else None  # as one too long
+        watch = service.watch(method, limits.size + 1) if method else None  # like a long body
         if method is None or watch is None:
             return None
         long_call = LongCall(method, len(call.body), call.body, request.content, watch)
@@ -323,7 +327,7 @@ class XmlRpcServer(HttpServer):
     async def _read_head(
         self, request: HttpRequest, call: IncomingCall, size: int, service: LongCalls
     ) -> LongCall | None:
-        """Read so much of a long body that its method is known; the call if it passes.
+        """Read the head of a long body, up to the method; the call if it passes, otherwise None.
 
         Raises TooLong, OverBudget.
         """
@@ -345,7 +349,7 @@ class XmlRpcServer(HttpServer):
         await self._take_in(call, call.body + rest, len(call.body) + len(rest))
 
     async def _take_in(self, call: IncomingCall, body: bytes, charged: int = 0) -> None:
-        """Take in a whole body, of which ``charged`` bytes are held already. Raises TooLong."""
+        """Store a whole body, of which ``charged`` bytes are charged already. Raises TooLong."""
         if len(body) > self._limits.size:
             raise TooLong(self._limits.size)
         call.body = body
@@ -362,14 +366,14 @@ class XmlRpcServer(HttpServer):
             return await service.pass_on(call, long_call)
 
     async def _send_long(self, request: HttpRequest, call: IncomingCall, reply: LongReply) -> None:
-        """Send a reply on, piece by piece. Raises OverBudget."""
+        """Forward a reply piece by piece. Raises OverBudget."""
         try:
             with Charge(self._context.unread_calls, call.source) as charge:
                 charge.add(1)
                 await request.begin(reply.size)
                 async for piece in reply.pieces():
                     await request.write(piece)
-        except (OSError, ClientError) as error:  # a time-out is one of the former
+        except (OSError, ClientError) as error:  # a TimeoutError is an OSError
             log.debug("a long reply for %s was cut: %s", call.source, error)
             request.reset()
         finally:
