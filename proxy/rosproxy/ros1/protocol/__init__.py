@@ -1,1 +1,1 @@
-"""What ROS 1 speaks: XML-RPC documents, TCPROS headers, URIs, the master's methods. Pure."""
+"""The protocols of ROS 1: XML-RPC documents, TCPROS headers, URIs, the master's methods. Pure."""

@@ -1,12 +1,12 @@
-"""What a node counts of its topic connections: the reply to ``getBusStats``.
+"""The counts of a node for its topic connections: the reply to ``getBusStats``.
 
-It has a list of publications and one of subscriptions, each with rows of a topic and its
-connections. A subscription's connection is ``[id, bytes, messages, drops, ...]``. A publication's
-is ``[id, bytes, messages, connected]`` in rospy, and in roscpp ``[id, bytes, bytes of messages,
-messages, connected]`` (``Publication::getStats``).
+The reply has a list of publications and a list of subscriptions. Each list has rows of a topic and
+its connections. A connection of a subscription is ``[id, bytes, messages, drops, ...]``. A
+connection of a publication is ``[id, bytes, messages, connected]`` in rospy, and in roscpp ``[id,
+bytes, bytes of messages, messages, connected]`` (``Publication::getStats``).
 
-The numbers have 32 bits, with a sign. roscpp counts with 64 and cuts them off, so that beyond 2 GiB
-they go on below zero; rospy, which has to tell a greater one, answers with an error.
+The numbers are signed and have 32 bits. roscpp counts with 64 bits and drops the upper 32, so
+numbers beyond 2 GiB continue below zero. rospy answers with an error if a number is too large.
 """
 
 from collections.abc import Mapping
@@ -17,21 +17,21 @@ OUT = "o"
 IN = "i"
 """Directions, as in ``getBusInfo``: of a publisher's connections, and of a subscriber's."""
 MOST_CONNECTIONS = 256
-"""Connections of a topic that are read; `/rosout` of a large system has 200."""
+"""The highest number of connections to read for a topic; `/rosout` of a large system has 200."""
 LEAST = -(2**31)
 GREATEST = 2**31 - 1
-"""Bounds of a number of XML-RPC."""
+"""The bounds of an integer of XML-RPC."""
 Count = tuple[int, int]
 """Bytes and messages."""
 BusStats = Mapping[tuple[str, str], Mapping[int, Count]]
-"""What is counted, by direction and topic, then by the number of the connection."""
+"""The counts, by direction and topic, then by the number of the connection."""
 
 
 def read_bus_stats(stats: Any) -> BusStats:
-    """The counts in a reply's value; rows that can't be read are left out.
+    """Read the counts from the value of a reply; rows of another form are left out.
 
-    roscpp's first connection has the number 0, and so has each that is being made: the counts of
-    one number are added up.
+    roscpp gives the number 0 to its first connection, and to each connection that is not
+    established yet. So the counts of connections with the same number are added up.
     """
     by_topic: dict[tuple[str, str], dict[int, Count]] = {}
     for direction, rows in zip((OUT, IN), _items(stats)[:2], strict=False):

@@ -1,8 +1,8 @@
-"""The rows of the master API that name addresses: which parameter, which part of the reply.
+"""The methods of the master API with addresses: in which parameters, and where in the reply.
 
 Sources: http://wiki.ros.org/ROS/Master_API, http://wiki.ros.org/ROS/Parameter%20Server%20API and
-ros_comm/tools/rosmaster/src/rosmaster/master_api.py. A method without an entry is forwarded as it
-is.
+ros_comm/tools/rosmaster/src/rosmaster/master_api.py. The proxy forwards a method without an entry
+unchanged.
 """
 
 from enum import Enum
@@ -11,7 +11,7 @@ import msgspec
 
 
 class Kind(Enum):
-    """What a node can be registered as."""
+    """The kinds of a registration."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"
@@ -20,7 +20,7 @@ class Kind(Enum):
 
 
 class Reply(Enum):
-    """What the third element of a reply holds."""
+    """The content of the third element of a reply."""
 
     OTHER = 0
     SLAVE_URI = 1
@@ -30,7 +30,7 @@ class Reply(Enum):
 
 
 class MethodSpec(msgspec.Struct, frozen=True):
-    """One method: positions of the parameters that matter, what it registers and returns."""
+    """A method: positions of parameters, the kind that it (un)registers, and its reply."""
 
     name: int | None = None
     type: int | None = None
@@ -62,33 +62,33 @@ MASTER_METHODS: dict[str, MethodSpec] = {
 NO_SPEC = MethodSpec()
 
 GRAPH_METHODS = frozenset({"getPublishedTopics", "getSystemState", "getTopicTypes"})
-"""The calls whose replies tell the graph: the names of topics, services and nodes."""
+"""The calls whose replies contain the graph: the names of topics, services and nodes."""
 _PARAMETERS = {"deleteParam", "getParam", "getParamNames", "hasParam", "searchParam", "setParam"}
 _NODES = {"getBusInfo", "getBusStats", "getMasterUri", "getName", "getPid", "shutdown"}
 _TOPICS = {"getPublications", "getSubscriptions", "publisherUpdate", "requestTopic", "paramUpdate"}
 KNOWN_METHODS = GRAPH_METHODS.union(
     MASTER_METHODS, _PARAMETERS, _NODES, _TOPICS, {"system.multicall"}
 )
-"""The methods of both APIs; metrics count calls of any other name together."""
+"""The methods of both APIs. Metrics count all other names together."""
 
 
 def method_spec(method: str) -> MethodSpec:
-    """What is rewritten of a method; an empty spec if nothing in it is rewritten."""
+    """What to rewrite for a method; an empty spec if there is nothing to rewrite."""
     return MASTER_METHODS.get(method, NO_SPEC)
 
 
 def resolve_name(name: str, caller_id: str) -> str:
-    """The global name that the master takes a name for (http://wiki.ros.org/Names)."""
+    """The global name that the master resolves a name to (http://wiki.ros.org/Names)."""
     if name.startswith("/"):
         resolved = name
     elif name.startswith("~"):
         resolved = f"{caller_id}/{name[1:]}"
     else:
         resolved = f"{caller_id.rpartition('/')[0]}/{name}"
-    # As rosgraph does it (rosgraph/names.py, canonicalize_name).
+    # As in rosgraph (rosgraph/names.py, canonicalize_name).
     return "/" + "/".join(segment for segment in resolved.split("/") if segment)
 
 
 def prefix(name: str) -> str:
-    """What all names below a parameter's begin with."""
+    """The beginning of all names below a parameter."""
     return name if name.endswith("/") else f"{name}/"

@@ -1,9 +1,9 @@
-"""How long the names and URIs are that the proxy keeps, at most.
+"""Bounds for the length of names and URIs that the proxy stores.
 
-ROS 1 bounds neither (http://wiki.ros.org/Names), and rosmaster keeps whatever comes. The proxy
-keeps them as well, sends them on and shows them in its log, its metrics and ``/status``; so what
-is longer than any system's is refused where it would be kept: in registrations, in calls to a node
-that name a topic, and in TCPROS headers. Whatever else is that long passes as it is.
+ROS 1 has no such bounds (http://wiki.ros.org/Names), and rosmaster stores names of any length. The
+proxy stores names as well, sends them on, and shows them in its log, its metrics and ``/status``.
+So the proxy refuses names that are longer than in any real system: in registrations, in calls of
+the slave API, and in TCPROS headers. All other long texts pass unchanged.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,12 +13,12 @@ from rosproxy.ros1.protocol.uris import LONGEST_URI
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 
 LONGEST_NAME = 1024
-"""Characters of a node's, topic's, service's, parameter's or type's name. Those of large systems,
-nested in many namespaces, have a hundred; ROS 2 allows 255."""
+"""Characters of the name of a node, topic, service, parameter or type. Names of large systems with
+many nested namespaces have a hundred; ROS 2 allows 255."""
 
 
 def too_long_to_register(call: Call) -> str | None:
-    """What in a call that registers is too long; None if nothing is, and for any other call."""
+    """What is too long in a call that registers; None if nothing is, and for any other call."""
     spec = method_spec(call.method)
     if spec.registers is None:
         return None
@@ -30,7 +30,7 @@ def too_long_to_register(call: Call) -> str | None:
 
 
 def too_long_to_ask(call: Call) -> str | None:
-    """What in a call of the slave API is too long; None if nothing is."""
+    """What is too long in a call of the slave API; None if nothing is."""
     names = {"caller_id": 0}
     if call.method in ("requestTopic", "publisherUpdate"):
         names["topic"] = 1
@@ -38,13 +38,13 @@ def too_long_to_ask(call: Call) -> str | None:
 
 
 def too_long_to_connect(fields: Mapping[str, str]) -> str | None:
-    """Which name in the fields of a TCPROS header is too long; None if none is."""
+    """Which name is too long in the fields of a TCPROS header; None if none is."""
     names = ("callerid", "topic", "service")
     return _too_long((name, fields.get(name, ""), LONGEST_NAME) for name in names)
 
 
 def _too_long(texts: Iterable[tuple[str, str, int]]) -> str | None:
-    """The first of some texts, each with its label and bound, that is too long."""
+    """The first text that is longer than its bound, from (label, text, bound); None if none is."""
     for label, text, most in texts:
         if len(text) > most:
             return f"{label} has {len(text)} characters, at most {most} are accepted"

@@ -8,10 +8,10 @@ import struct
 from collections.abc import Mapping
 
 MAX_HEADER = 1_000_000
-"""Longest header in bytes that is read. A header holds a message definition at most; roscpp's own
-bound is 10^9 (connection.cpp), rospy has none."""
+"""The highest length of a header in bytes. The longest field is a message definition. roscpp's own
+bound is 10^9 (connection.cpp), rospy has no bound."""
 MAX_FIELDS = 64
-"""Most fields of a header that are read; roscpp and rospy send nine at most."""
+"""The highest number of fields in a header. roscpp and rospy send nine at most."""
 
 _LENGTH = struct.Struct("<I")
 
@@ -28,11 +28,12 @@ def encode_header(fields: Mapping[str, str]) -> bytes:
 
 
 def decode_header(body: bytes) -> dict[str, str]:
-    """The fields of a header, given without its leading total length.
+    """The fields of a header; ``body`` is the header without its leading total length.
 
-    Names come without blanks around them, as rospy reads them (rosgraph/network.py); roscpp keeps
-    the blanks. So that all see the same, none may be there twice. Raises HeaderError if one is, if
-    a field's length leads outside the body, a field has no ``=`` or there are more than MAX_FIELDS.
+    Names lose the blanks around them, as in rospy (rosgraph/network.py). roscpp keeps the blanks. A
+    repeated name is refused, so that all readers find the same fields. Raises HeaderError for a
+    repeated name, a length that leads outside the body, a field without ``=``, or more than
+    MAX_FIELDS fields.
     """
     fields = dict[str, str]()
     position = 0
@@ -58,8 +59,8 @@ def decode_header(body: bytes) -> dict[str, str]:
 def header_length(first: bytes) -> int:
     """The length in bytes that the first four bytes of a connection announce.
 
-    Raises HeaderError if it is more than MAX_HEADER. Four ASCII letters, as at the start of an
-    HTTP request, always are: that is how the two protocols share one port.
+    Raises HeaderError for more than MAX_HEADER. Four ASCII letters, as at the start of an HTTP
+    request, always mean more. So the two protocols can share a port.
     """
     length: int = _LENGTH.unpack(first)[0]
     if length > MAX_HEADER:
@@ -70,5 +71,5 @@ def header_length(first: bytes) -> int:
 
 def speaks_http(first: bytes) -> bool:
     """Whether a connection's first four bytes are the start of an HTTP request."""
-    # A method of three letters has a blank behind it ("GET ").
+    # A method of three letters has a blank as the fourth byte ("GET ").
     return len(first) == 4 and first.isascii() and first.replace(b" ", b"A").isalpha()

@@ -1,10 +1,10 @@
 """The addresses in ROS URIs: slave URIs (``http://host:port/``) and service URIs (``rosrpc://``).
 
-An *advertised* URI is ``http://HOST:PORT/`` with a port of the range, which says all that others
-need. Where the node is is remembered elsewhere (`rosproxy.ros1.registry.remembered_leases`), in the
-form of a path, in which former versions advertised it: ``/10.0.0.5:40001/``. Where the node calls
-itself by a name, a second segment holds the address that it was found at: ``/c1:40001/10.0.0.5/``.
-Where its own URI has a path, a third one holds that.
+An *advertised* URI is ``http://HOST:PORT/`` with a port of the range. Other nodes need no more. The
+proxy stores the location of the node elsewhere (`rosproxy.ros1.registry.remembered_leases`), in the
+form of a path: ``/10.0.0.5:40001/``. Former versions advertised URIs with this path. If the node
+gives a host name, a second segment has the address of the node: ``/c1:40001/10.0.0.5/``. If the
+node's own URI has a path, a third segment has this path.
 """
 
 import re
@@ -15,18 +15,18 @@ import msgspec
 from rosproxy.net.addresses import HostPort, cached, is_address, parse_authority, parse_host_port
 
 LONGEST_URI = 2048
-"""Characters of a URI at most. A host's name has 253 at most, and stands twice in a URI that a
-former version advertised. What is longer is no URI to the proxy: it is neither rewritten nor
-remembered."""
+"""The highest number of characters of a URI. A host name has 253 at most, and stands twice in a URI
+that a former version advertised. The proxy treats a longer text as no URI, and neither rewrites nor
+remembers it."""
 
 LONGEST_PATH = 512
-"""Characters of a node's own path at most that is remembered with its lease."""
+"""The highest number of characters of a node's own path that the proxy remembers."""
 _NO_HOST = re.compile(r"((?:http|rosrpc)://):(\d{1,5})(/?)")
 _UNQUOTED = re.compile(r"[A-Za-z0-9_.:\[\]-]*")
 
 
 class InsidePath(msgspec.Struct, frozen=True):
-    """Where a node is: its own host, port and path, and its address if that is another."""
+    """The location of a node: its own host, port and path, and its address if that differs."""
 
     node: HostPort
     address: str | None = None
@@ -34,24 +34,24 @@ class InsidePath(msgspec.Struct, frozen=True):
 
     @property
     def slave(self) -> HostPort:
-        """Where the slave API is reached."""
+        """The address and port of the slave API."""
         return HostPort(self.address or self.node.host, self.node.port)
 
 
 def parse_slave_uri(uri: str) -> HostPort | None:
-    """Host and port of an ``http://host:port/…`` URI, or None if it is no such URI."""
+    """Host and port of an ``http://host:port/…`` URI; None if it is no such URI."""
     return parse_authority(uri) if uri.startswith("http://") and _fits(uri) else None
 
 
 def parse_service_uri(uri: str) -> HostPort | None:
-    """Host and port of a ``rosrpc://host:port`` URI, or None if it is no such URI."""
+    """Host and port of a ``rosrpc://host:port`` URI; None if it is no such URI."""
     return parse_authority(uri) if uri.startswith("rosrpc://") and _fits(uri) else None
 
 
 def with_caller_address(uri: str, address: str) -> str:
-    """A URI with the address that it came from where it names no host, as ``http://:41063``.
+    """A URI, with ``address`` as the host if the URI has none, as ``http://:41063``.
 
-    roslisp says so where ROS_HOSTNAME is set to nothing, and rosmaster takes it.
+    roslisp sends such a URI if ROS_HOSTNAME is set to nothing, and rosmaster accepts it.
     """
     match = _NO_HOST.fullmatch(uri)
     return f"{match[1]}{HostPort(address, int(match[2]))}{match[3]}" if match else uri
@@ -63,12 +63,12 @@ def slave_uri(host_port: HostPort, path: str = "/") -> str:
 
 
 def service_uri(host_port: HostPort) -> str:
-    """The service URI of a host and port; it has no path (rospy's parser takes none)."""
+    """The service URI of a host and port, without a path, which rospy's parser refuses."""
     return f"rosrpc://{host_port}"
 
 
 def path_of(uri: str) -> str:
-    """The path of a slave URI, as a request has it."""
+    """The path of a slave URI, as in a request."""
     try:
         return urlsplit(uri).path or "/"
     except ValueError:
@@ -76,7 +76,7 @@ def path_of(uri: str) -> str:
 
 
 def inside_path(inside: InsidePath) -> str:
-    """What is remembered of where a node is, in the form of a path; see the module's text."""
+    """The location of a node in the form of a path; see the text of the module."""
     own_path = inside.path if len(inside.path) <= LONGEST_PATH else "/"
     segments = [_quoted(str(inside.node))]
     if inside.address is not None or own_path != "/":
@@ -88,7 +88,7 @@ def inside_path(inside: InsidePath) -> str:
 
 @cached
 def parse_inside_path(uri: str) -> InsidePath | None:
-    """Where the node of an advertised URI with a path is; None if the path does not tell.
+    """The location of the node of an advertised URI with a path; None if the path has none.
 
     An address segment must be an IP address; a name there is refused.
     """

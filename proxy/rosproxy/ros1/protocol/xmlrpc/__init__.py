@@ -1,1 +1,1 @@
-"""XML-RPC as ROS uses it, edited in place: every byte that need not change stays."""
+"""XML-RPC as ROS uses it, edited in place: the proxy changes only the necessary bytes."""

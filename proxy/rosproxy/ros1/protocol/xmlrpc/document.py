@@ -1,9 +1,9 @@
-"""XML-RPC documents, parsed for rewriting in place.
+"""XML-RPC documents, parsed for edits in place.
 
-A parsed document keeps the byte offsets of every value, so that a rewrite replaces the text of
-single strings and leaves every other byte as the sender wrote it. Decoding and encoding again
-would change types: roscpp sends untyped strings and ``<i4>``, Python sends ``<string>`` and
-``<int>``, and XML-RPC has types (base64, dateTime) that a round trip through Python changes.
+A parsed document keeps the byte offsets of every value. So an edit replaces the text of single
+strings and leaves every other byte unchanged. Decoding and encoding would change types: roscpp
+sends untyped strings and ``<i4>``, Python sends ``<string>`` and ``<int>``. XML-RPC also has types
+(base64, dateTime) that change on the way through Python.
 
 Specification: http://xmlrpc.com/spec.md.
 """
@@ -26,28 +26,28 @@ PARSE_ERROR = -32700
 INVALID_REQUEST = -32600
 """Fault code: well-formed XML that is not an XML-RPC call."""
 INVALID_PARAMS = -32602
-"""Fault code: a method's parameters do not fit."""
+"""Fault code: the parameters do not fit the method."""
 SYSTEM_ERROR = -32400
-"""Fault code: the proxy itself could not do its part."""
+"""Fault code: an error in the proxy itself."""
 
 LONGEST_TAG = 4096
-"""Bytes of a tag. Those of ROS have no attributes, and 20 bytes at most."""
-# The value of an attribute may hold ``>``, and never ``<``. The quantifiers are possessive: a plain
-# one keeps a state of 100 bytes for each byte of a long tag.
+"""The highest number of bytes of a tag. Tags of ROS have no attributes, and 20 bytes at most."""
+# The value of an attribute may contain ``>``, but never ``<``. The quantifiers are possessive: a
+# plain quantifier keeps a state of 100 bytes for each byte of a long tag.
 _TAG = re.compile(rb"<(?:[^<>\"']++|\"[^<\"]*+\"|'[^<']*+')*+>")
 _LONG_TAG = re.compile(rb"(?=<[^!?][^<]{%d})%b" % (LONGEST_TAG - 1, _TAG.pattern))
-"""A tag, with what follows it up to the next one, that is longer than a tag may be."""
+"""A tag with the text up to the next tag, longer than LONGEST_TAG together."""
 _ENCODINGS = frozenset({"utf-8", "us-ascii", "ascii", "iso-8859-1"})
 _MEANING = frozenset(
     {"methodName", "params", "fault", "value", "string", "array", "struct", "member", "name"}
 )
-"""Elements that Python's Unmarshaller takes for themselves with any prefix, as ``<x:value>``."""
+"""Elements that Python's Unmarshaller recognizes with any prefix, as ``<x:value>``."""
 
 
 class XmlRpcError(ValueError):
-    """A document that is refused.
+    """A document that the proxy refuses.
 
-    ``code`` is the XML-RPC fault code to answer with; the message says what is wrong.
+    ``code`` is the XML-RPC fault code of the answer; the message says what is wrong.
     """
 
     def __init__(self, code: int, message: str) -> None:
@@ -62,21 +62,21 @@ class Call(msgspec.Struct, frozen=True):
     params: list[Value]
 
     def string_value(self, index: int | None) -> Value | None:
-        """Parameter ``index`` if it is there and a string, else None."""
+        """Parameter ``index`` if it exists and is a string, else None."""
         if index is None or index >= len(self.params):
             return None
         return self.params[index] if self.params[index].kind == "string" else None
 
     def string(self, index: int | None) -> str | None:
-        """The text of parameter ``index`` if it is there and a string, else None."""
+        """The text of parameter ``index`` if it exists and is a string, else None."""
         value = self.string_value(index)
         return value.text if value else None
 
 
 def apply(body: bytes, edits: Iterable[Edit]) -> bytes:
-    """The document with the edits done; they must not overlap. The order given does not matter.
+    """Apply edits to a document, in any order. Edits must not overlap.
 
-    Several insertions at one place keep the order in which they are given.
+    Several insertions at the same place keep their order.
     """
     pieces = []
     position = 0
@@ -89,9 +89,9 @@ def apply(body: bytes, edits: Iterable[Edit]) -> bytes:
 def parse_call(body: bytes, limits: Limits = OWN_REPLY) -> Call:
     """Parse a ``methodCall``.
 
-    Raises XmlRpcError if the document is malformed, holds a DTD or entities, is too large or deep
-    or is not a method call. Of what looks like several method names XmlRpc++ takes the first, even
-    in a comment, and Python the last element: such a document is refused.
+    Raises XmlRpcError if the document is malformed, contains a DTD or entities, is too large or
+    deep, or is not a method call. With several method names, XmlRpc++ takes the first, even in a
+    comment, and Python takes the last element. So such a document is refused as well.
     """
     plain = fast.call(body, limits)
     if plain is not None:
@@ -115,7 +115,7 @@ def parse_reply(body: bytes, limits: Limits = REPLY) -> Value | None:
 
 
 def parse_response(body: bytes, limits: Limits = OWN_REPLY) -> tuple[Value, bool]:
-    """Parse a ``methodResponse``: its value, and whether that is a fault.
+    """Parse a ``methodResponse``: its value, and whether the value is a fault.
 
     Raises XmlRpcError as ``parse_reply`` does.
     """
@@ -129,23 +129,23 @@ def parse_response(body: bytes, limits: Limits = OWN_REPLY) -> tuple[Value, bool
 
 
 def read_response(body: bytes, limits: Limits = OWN_REPLY) -> Any:
-    """What a reply of the master's or a node's holds, a fault's value too. Raises XmlRpcError."""
+    """The value of a reply from the master or a node, or of a fault. Raises XmlRpcError."""
     plain = fast.lists(body, limits)
     return python_value(parse_response(body, limits)[0]) if plain is None else plain
 
 
 def dump_call(method: str, *params: Any) -> bytes:
-    """A ``methodCall`` of the proxy's own."""
+    """A ``methodCall`` of the proxy itself."""
     return dumps(params, method).encode()
 
 
 def dump_reply(value: Any) -> bytes:
-    """A ``methodResponse`` of the proxy's own."""
+    """A ``methodResponse`` of the proxy itself."""
     return dumps((value,), methodresponse=True).encode()
 
 
 def dump_fault(code: int, message: str) -> bytes:
-    """A fault response of the proxy's own."""
+    """A fault response of the proxy itself."""
     return dumps(Fault(code, message), methodresponse=True).encode()
 
 
@@ -156,9 +156,9 @@ def dump_value(value: Any) -> bytes:
 
 
 def python_value(value: Value) -> Any:
-    """A value as Python sees it, for lists of strings and numbers such as ROS status triples.
+    """Convert a value to Python, for lists of strings and numbers such as ROS status triples.
 
-    Kinds other than string, int, array and struct come back as their text.
+    Kinds other than string, int, array and struct become their text.
     """
     if value.kind == "array":
         return [python_value(item) for item in value.items]
@@ -168,7 +168,7 @@ def python_value(value: Value) -> Any:
 
 
 def exceeds_elements(body: bytes, limits: Limits) -> bool:
-    """Whether a document has more elements than may be read."""
+    """Whether a document has too many elements to read."""
     shortest = len("<a/>")
     if len(body) <= shortest * limits.elements:
         return False
@@ -180,7 +180,7 @@ def _has_long_tag(body: bytes) -> bool:
 
 
 class _Parser:
-    """One pass of expat over a document, collecting values and their byte offsets."""
+    """A pass of expat over a document that collects values with byte offsets."""
 
     def __init__(self, body: bytes, limits: Limits) -> None:
         self.body = body
@@ -196,14 +196,14 @@ class _Parser:
         self._inner = 0
         if len(body) > limits.size:
             raise XmlRpcError(PARSE_ERROR, f"the document is longer than {limits.size} bytes")
-        if exceeds_elements(body, limits):  # before any takes memory
+        if exceeds_elements(body, limits):  # before any element takes memory
             text = f"the document has more than {limits.elements} elements"
             raise XmlRpcError(PARSE_ERROR, text)
-        # expat has all attributes of a tag in memory, each in some 200 bytes, when it tells of it.
+        # When expat reports a tag, all its attributes are in memory, each in some 200 bytes.
         if _has_long_tag(body):
             text = f"the document has a tag of more than {LONGEST_TAG} bytes"
             raise XmlRpcError(PARSE_ERROR, text)
-        # expat finds UTF-16 out by itself; here tags and texts are looked for as ASCII.
+        # expat recognizes UTF-16 by itself, but this module looks for tags and texts in ASCII.
         if b"\0" in body:
             raise XmlRpcError(PARSE_ERROR, "the document has NUL bytes; use UTF-8")
         self._expat = parser = expat.ParserCreate()
@@ -242,10 +242,10 @@ class _Parser:
         elif name == "fault":
             self.fault = True
         elif self._path[-2:-1] == ["value"]:
-            self._open[-1].kind = "other"  # an extension type, as ``ex:nil``, which passes as it is
+            self._open[-1].kind = "other"  # an extension type, such as ``ex:nil``: passes unchanged
 
     def _check(self, name: str) -> None:
-        """Refuse an element that begins, if it is one too many or could be read in two ways."""
+        """Refuse an element that exceeds a limit or that readers could understand in two ways."""
         if len(self._path) > self._limits.depth:
             text = f"the document is nested deeper than {self._limits.depth} elements"
             raise XmlRpcError(PARSE_ERROR, text)
@@ -287,7 +287,7 @@ class _Parser:
         index = self._expat.CurrentByteIndex
         if value.inner[1] < 0:
             value.inner = (value.inner[0], max(value.inner[0], index))
-        # At the end of ``<value/>`` expat is behind it already, at the start of the next tag.
+        # At the end of ``<value/>`` expat is already at the start of the next tag.
         if self.body[value.outer[1] - 2 : value.outer[1]] != b"/>":
             value.outer = (value.outer[0], self._tag_end())
         if value.kind == "struct" and len(value.members) != len(value.items):
@@ -295,7 +295,7 @@ class _Parser:
         (self._open[-1].items if self._open else self.values).append(value)
 
     def _text(self) -> str:
-        """What the name element that ends here holds."""
+        """The text of the name element that ends here."""
         raw = self.body[self._inner : max(self._inner, self._expat.CurrentByteIndex)]
         return text_of(raw, self._encoding)
 

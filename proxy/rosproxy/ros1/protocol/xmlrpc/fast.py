@@ -1,9 +1,9 @@
-"""XML-RPC documents in the plain form that ROS's clients write, read by regular expressions.
+"""XML-RPC documents in the plain form of ROS's clients, read by regular expressions.
 
-Such a document holds nothing but printable ASCII, tags without attributes, and no entity,
-comment, CDATA or self-closing tag. So a tag ends at the next ``>`` and text at the next ``<``, and
-no two readers differ in what it says. Any other document is left to expat, which takes four times
-as long and decides what is an error.
+A plain document has only printable ASCII and tags without attributes, but no entities, comments,
+CDATA or self-closing tags. So a tag ends at the next ``>``, a text at the next ``<``, and all
+readers find the same content. expat reads all other documents, four times as slowly, and decides
+what is an error.
 """
 
 import re
@@ -48,7 +48,7 @@ _MULTICALL = re.compile(
     + _CALL_END.pattern
 )
 _INNER_METHOD = re.compile(rb"<name>methodName</name>\s*<value>\s*(?:<string>)?([\w./]+)")
-# The last group is empty, so that there is always a match: `finditer` would skip what is no token.
+# The last group is empty, so that there is always a match: `finditer` would skip other text.
 _TOKEN = re.compile(
     rb"""\s*(?:
     (<value>)(?:
@@ -82,10 +82,10 @@ _STRING, _INTEGER, _LIST, _LIST_END = range(1, 5)
 _FIRST_PARAM = re.compile(rb"\s*<param>")
 _LAST_PARAM = re.compile(rb"\s*</param>" + _RESPONSE_END.pattern)
 _AROUND = "methodResponse", "params", "param", "value", "string"
-"""The elements around a text that is in no list; each list adds three."""
+"""The elements around a text outside of lists. Each list adds three."""
 _VALUE, _TYPE, _TYPED, _TEXT, _ARRAY, _STRUCT = range(1, 7)
 _ARRAY_END, _NAME, _MEMBER_END, _STRUCT_END, _PARAM, _PARAM_END, _NONE = range(7, 14)
-"""The groups of a token; the last one of a match tells what it is."""
+"""The groups of a token. The last group of a match tells the kind of the token."""
 _END_OF_VALUE = len(b"</value>")
 _KINDS = {name.encode(): kind for name, kind in KINDS.items()}
 
@@ -93,11 +93,11 @@ _Tokens = Iterator[re.Match[bytes]]
 
 
 class _NotPlain(Exception):
-    """A document that is not of the plain form."""
+    """A document that does not have the plain form."""
 
 
 def call(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, list[Value]] | None:
-    """The method and parameters of a ``methodCall``, None if it is not of the plain form."""
+    """The method and parameters of a ``methodCall``; None if it does not have the plain form."""
     head = _CALL.match(body)
     if head is None or not _is_plain(body, limits):
         return None
@@ -122,7 +122,7 @@ def methods_of_multicall(body: bytes) -> set[str] | None:
 
 
 def response(body: bytes, limits: Limits = OWN_REPLY) -> Value | None:
-    """The value of a ``methodResponse``, None if it is a fault or not of the plain form."""
+    """The value of a ``methodResponse``; None for a fault or without the plain form."""
     head = _RESPONSE.match(body)
     if head is None or not _is_plain(body, limits):
         return None
@@ -131,14 +131,14 @@ def response(body: bytes, limits: Limits = OWN_REPLY) -> Value | None:
 
 
 def lists(body: bytes, limits: Limits = OWN_REPLY) -> list[Any] | None:
-    """What a ``methodResponse`` holds if that is a list of strings, numbers and lists, else None.
+    """The value of a ``methodResponse`` with only strings, numbers and lists; otherwise None.
 
-    Such are the master's own replies, of which those that name all topics are long. It takes a
-    fifth of the time of `response`, which also tells where each value is.
+    The master sends such replies, and replies with all topics are long. The function takes a fifth
+    of the time of `response`, which also finds the position of each value.
     """
     head = _RESPONSE.match(body)
     param = _FIRST_PARAM.match(body, head.end()) if head else None
-    # A parser has to turn "\r" into "\n" (XML 1.0, 2.11); here texts are taken as they are.
+    # A parser has to turn "\r" into "\n" (XML 1.0, 2.11). This function copies texts unchanged.
     if param is None or b"\r" in body or not _is_plain(body, limits):
         return None
     top = list[Any]()
@@ -148,8 +148,8 @@ def lists(body: bytes, limits: Limits = OWN_REPLY) -> list[Any] | None:
 
 
 def _read_lists(body: bytes, start: int, top: list[Any], depth: int) -> int | None:
-    """Read one value into ``top``, with at most ``depth`` lists in each other; where it ends."""
-    # `scanner` is not documented: a match of its has to begin where the one before has ended.
+    """Read a value into ``top``, with at most ``depth`` nested lists; return where it ends."""
+    # `scanner` is not documented. Each match has to begin where the last match has ended.
     stack = [top]
     match = _LIST_TOKEN.scanner(body, start).match  # type: ignore[attr-defined]
     while (token := match()) and len(stack) <= depth:
@@ -172,8 +172,8 @@ def _is_plain(body: bytes, limits: Limits) -> bool:
     return (
         len(body) <= limits.size
         and not body.translate(None, _PLAIN)
-        and b"]]>" not in body  # no text may hold it (XML 1.0, 2.4)
-        and body.count(b"</") <= limits.elements  # each is closed by a tag of its own
+        and b"]]>" not in body  # forbidden in texts (XML 1.0, 2.4)
+        and body.count(b"</") <= limits.elements  # each element has a closing tag
     )
 
 
@@ -204,7 +204,7 @@ def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> 
         return Value(body, "utf-8", kind, (start, token.end()), token.span(_TYPED), [], [])
     if group == _TEXT and depth:
         return Value(body, "utf-8", "string", (start, token.end()), token.span(_TEXT), [], [])
-    if depth < 4:  # an item would be too deep; expat tells whether there is one
+    if depth < 4:  # an item would be too deep; expat finds out whether there is an item
         raise _NotPlain
     items = list[Value]()
     members = list[str]()
@@ -221,7 +221,7 @@ def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> 
 
 
 def _array(body: bytes, tokens: _Tokens, depth: int, items: list[Value]) -> int:
-    """Read items up to the end of their array; where that is."""
+    """Read items up to the end of the array; return its position."""
     for token in tokens:
         if token.lastindex == _ARRAY_END:
             return token.end()
@@ -232,7 +232,7 @@ def _array(body: bytes, tokens: _Tokens, depth: int, items: list[Value]) -> int:
 def _struct(
     body: bytes, tokens: _Tokens, depth: int, items: list[Value], members: list[str]
 ) -> int:
-    """Read members up to the end of their struct; where that is."""
+    """Read members up to the end of the struct; return its position."""
     for token in tokens:
         if token.lastindex == _STRUCT_END:
             return token.end()

@@ -1,16 +1,16 @@
-"""How large a document may be, by who sends it.
+"""How large a document may be, by its sender.
 
-A document is read as a whole, by the one thread that serves everybody, and each value that is
-found takes some 400 bytes until the call is answered. So the bounds hold the time and the memory
-that one document can take. What has no addresses in it is not read at all and has no bound here
-(`passing`). How far real systems stay below: docs/reference/limits.md.
+A single thread serves all connections, and reads each document as a whole. Each value takes some
+400 bytes until the call is answered. So the bounds limit the time and the memory for a document.
+The proxy does not read long documents without addresses, and these limits do not apply to them
+(`passing`). How far real systems stay below the limits: docs/reference/limits.md.
 """
 
 import msgspec
 
 
 class Limits(msgspec.Struct, frozen=True):
-    """The most bytes and elements of a document, and how deep they may be nested."""
+    """The highest number of bytes, elements and nested levels of a document."""
 
     size: int
     elements: int
@@ -18,25 +18,25 @@ class Limits(msgspec.Struct, frozen=True):
 
 
 def lease_call(mebibytes: int) -> Limits:
-    """Of a call from outside to a node.
+    """The limits of a call from outside to a node.
 
-    The largest real one, publisherUpdate, has two elements and some 60 bytes for each publisher of
+    The largest real call, publisherUpdate, has two elements and some 60 bytes for each publisher of
     a topic.
     """
     return Limits(mebibytes * 1024 * 1024, mebibytes * 10_000)
 
 
 def master_call(mebibytes: int) -> Limits:
-    """Of a call of a node inside to the master. Registrations have twenty elements."""
+    """The limits of a call from inside to the master. Registrations have twenty elements."""
     return Limits(mebibytes * 1024 * 1024, mebibytes * 5_000)
 
 
 REPLY = Limits(4 * 1024 * 1024, 20_000)
-"""A reply in which addresses are replaced: the publishers of a topic, a node's connections."""
+"""A reply with addresses to replace: the publishers of a topic, the connections of a node."""
 BUS_STATS = Limits(4 * 1024 * 1024, 10_000)
-"""What a node has counted: twelve elements for each topic with two connections."""
+"""The counts of a node: twelve elements for each topic with two connections."""
 PID_REPLY = Limits(4 * 1024 * 1024, 100)
-"""A node's pid, which it is asked for over and over, or its refusal: five elements."""
+"""The pid of a node, for which the proxy asks again and again, or a refusal: five elements."""
 OWN_REPLY = Limits(64 * 1024 * 1024, 500_000)
-"""The master's reply to a call of the proxy's own: the graph of all nodes, of ten elements for each
-topic and as many for each service."""
+"""The master's reply to a call of the proxy itself: the graph of all nodes, with ten elements for
+each topic and for each service."""

@@ -20,9 +20,9 @@ from rosproxy.ros1.protocol.xmlrpc.values import Edit
 
 MULTICALL = "system.multicall"
 MOST_CALLS = 1000
-"""Calls that one multicall may have. They are admitted, or put to a node, one after the other. Only
-roslaunch and the proxy itself (a hundred at once) make such calls; roslaunch's set parameters and
-are counted from 64 KiB on no more (`passing`)."""
+"""The highest number of calls in a multicall. The proxy admits these calls, or sends them to a
+node, one after the other. Only roslaunch and the proxy itself (a hundred at once) send multicalls.
+The multicalls of roslaunch set parameters; from 64 KiB on they pass without a count (`passing`)."""
 
 
 def inner_items(call: Call) -> list[Value]:
@@ -35,8 +35,8 @@ def inner_items(call: Call) -> list[Value]:
 def inner_calls(call: Call) -> list[Call | None]:
     """The calls of a multicall, in order; None for an element that is no call.
 
-    Raises XmlRpcError if there are too many, or if one of them is a multicall again: rosmaster
-    would carry it out, and XmlRpc++ does so without end.
+    Raises XmlRpcError for too many calls, and for a multicall inside the multicall. rosmaster would
+    execute the inner multicall, and XmlRpc++ would recurse without end.
     """
     items = inner_items(call)
     if len(items) > MOST_CALLS:
@@ -48,23 +48,23 @@ def inner_calls(call: Call) -> list[Call | None]:
 
 
 def single_call(call: Call) -> bytes:
-    """One call of a multicall as a document of its own, its parameters as they were sent."""
+    """A call of a multicall as a separate document, with the parameters as sent."""
     params = b"".join(b"<param>%b</param>" % value.raw for value in call.params)
     head = b"<methodName>%b</methodName>" % escape(call.method).encode()
     return b"<?xml version='1.0'?><methodCall>%b<params>%b</params></methodCall>" % (head, params)
 
 
 def result_value(reply: bytes) -> bytes:
-    """The reply to a single call as a result among others.
+    """The reply to a single call, as a result of a multicall.
 
-    Raises XmlRpcError if it is no XML-RPC response.
+    Raises XmlRpcError if the reply is no XML-RPC response.
     """
     value, fault = parse_response(reply, REPLY)
     return value.raw if fault else _array([value.raw])
 
 
 def fault_value(code: int, message: str) -> bytes:
-    """A fault of the proxy's own as a result among others."""
+    """A fault of the proxy itself, as a result of a multicall."""
     return dump_value({"faultCode": code, "faultString": message})
 
 
@@ -77,7 +77,7 @@ def results_reply(results: Iterable[bytes]) -> bytes:
 def insert_items(array: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edit]:
     """Edits that insert raw values into an array of at least one item.
 
-    Each insert is (index in the finished array, value); indices rise.
+    Each insert is (index in the finished array, value), with rising indices.
     """
     edits = []
     items = array.items
@@ -89,7 +89,7 @@ def insert_items(array: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edi
 
 
 def _inner_call(item: Value) -> Call | None:
-    if len(set(item.members)) < len(item.members):  # Python takes the last of a name
+    if len(set(item.members)) < len(item.members):  # Python takes the last member of a name
         raise XmlRpcError(INVALID_PARAMS, f"a call in {MULTICALL} has a member twice")
     method = item.member("methodName")
     params = item.member("params")

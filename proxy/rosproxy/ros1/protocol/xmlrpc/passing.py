@@ -1,15 +1,17 @@
-"""Calls that pass unread, because they are large and hold no address: parameters, above all.
+"""Calls that pass unread, because they are long and have no addresses, such as parameters.
 
-The method is read from the head of the document, in the form that ROS's clients write; a document
-with another head is read whole, within the bounds of `limits`. The rest is only watched while it
-passes: the master, or a node, must not see another method than was judged. Whoever takes the pieces
-further holds the last one back until all were watched, so that nobody acts on a refused document:
-rosmaster and nodes read a body to its end before they look into it.
+The proxy reads the method from the head of the document, in the form of ROS's clients. The proxy
+reads a document with another head as a whole, within `limits`. While the rest of the document
+passes, the proxy only watches for a second method name. The master or a node must not find a method
+that the proxy has not judged. The proxy holds the last piece back until the whole document has been
+watched. So no program acts on a refused document, because rosmaster and nodes read a body to the
+end before they parse it.
 
-A ``system.multicall``, by which roslaunch sets parameters, is taken apart by expat, piece by piece:
-it passes if each of its calls does. Its grammar is held to the letter, as Python's Unmarshaller
-(xmlrpc/client.py), which keeps a stack and knows no grammar, could see another one. A regular
-expression has seen the usual document in a twentieth of that time (`fast.methods_of_multicall`).
+roslaunch sets parameters by ``system.multicall``. expat parses such a call piece by piece, and the
+call passes if each inner call may pass. The document has to follow the grammar strictly. Python's
+Unmarshaller (xmlrpc/client.py) has a stack and no grammar, so it could find another method in a
+document with another structure. A regular expression accepts the usual document in a twentieth of
+the time (`fast.methods_of_multicall`).
 """
 
 import re
@@ -26,17 +28,17 @@ from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.protocol.xmlrpc.values import text_of
 
 SHORT = 64 * 1024
-"""Bytes up to which a document is read whole, whatever it is: that takes some milliseconds."""
+"""Bytes up to which the proxy reads any document as a whole, in some milliseconds."""
 HEAD = 4096
-"""Bytes of a document in which its method is looked for."""
+"""The bytes of a document in which the proxy looks for the method."""
 DEPTH = 64
-"""Elements of a multicall inside of each other, as `Limits` has it for what is read."""
+"""The highest number of nested elements in a multicall, as in `Limits`."""
 LONGEST_MARKUP = 64 * 1024
-"""Bytes of a tag, comment or processing instruction of a multicall. expat keeps one until it is
-whole. Before version 2.6 expat reads it again from its start with each piece that comes."""
+"""Bytes of a tag, comment or processing instruction in a multicall. expat buffers such markup until
+it is complete. Before version 2.6, expat starts again at the beginning with each new piece."""
 LONGEST_NAMES = 4096
-"""Characters of the names of all elements and attributes of a multicall, each counted once. The
-parser keeps them until the end of the document. XML-RPC has 20 names."""
+"""Characters of all names of elements and attributes in a multicall, each name counted once. The
+parser keeps the names until the end of the document. XML-RPC has 20 names."""
 
 _HEAD = re.compile(
     rb"""(?:<\?xml\s+version=(?:'1\.0'|"1\.0")
@@ -51,22 +53,22 @@ _STATUS = re.compile(
     re.VERBOSE,
 )
 _PARAMS_BEGIN = re.compile(rb"\s*<params>\s*")
-# Without markup, references and bytes beyond ASCII a text is the same in each encoding of _HEAD and
-# to every parser.
+# Without markup, references and bytes beyond ASCII, a text is the same in each encoding of _HEAD
+# and for every parser.
 _STRING_PARAM = re.compile(
     rb"\s*<param>\s*<value>(?:\s*<string>([^<&\x80-\xff]*)</string>\s*|([^<&\x80-\xff]*))"
     rb"</value>\s*</param>\s*"
 )
-# With a prefix, too: Python's Unmarshaller drops it (xmlrpc/client.py, end). NUL bytes are those of
-# UTF-16, which expat recognizes by itself, and in which a search for bytes finds no name.
+# A prefix counts, too: Python's Unmarshaller drops prefixes (xmlrpc/client.py, end). NUL bytes mean
+# UTF-16, which expat recognizes by itself. A search for bytes finds no name in UTF-16.
 _FORBIDDEN = re.compile(rb"[<:]methodName[\s/>]|<!DOCTYPE|<!ENTITY|\0")
 _HINTS = (b"methodName", b"<!DOCTYPE", b"<!ENTITY", b"\0")
-"""One of them is in all that is forbidden; to look for them first takes a hundredth of the time."""
+"""Each forbidden text has one of these. A search for these first takes a hundredth of the time."""
 _NESTING = re.compile(rb"<(/?)(?:array|struct)>")
 _LONGEST = len(b"<methodName>")
-"""Bytes of the longest thing that is looked for."""
+"""Bytes of the longest text in the search."""
 NESTED = 20
-"""Arrays and structs inside of each other: XmlRpc++ takes a piece of its stack for each."""
+"""The highest number of nested arrays and structs. XmlRpc++ uses its stack for each."""
 
 _LEVELS = (
     {"methodCall"},
@@ -75,7 +77,7 @@ _LEVELS = (
     {"name", "value"},
     {"string", "array"},
 )
-"""The elements of a multicall, from the root down to what a call's members hold."""
+"""The elements of a multicall, from the root down to the content of a call's members."""
 _VALUE_DEPTH = 7
 """The depth of a value that holds a call."""
 _CALL_DEPTH = 8
@@ -85,21 +87,21 @@ _MEMBER_DEPTH = 9
 _FIELD_DEPTH = 10
 """The depth of a member's name and value."""
 _CONTENT_DEPTH = 11
-"""The depth of what a member's value holds."""
+"""The depth of the content of a member's value."""
 _METHOD = ["name:methodName", "value"]
 _PARAMS = ["name:params", "value", "array"]
 
 
 def method_of(head: bytes) -> str | None:
-    """The method of a call whose document begins so; None if that can't be told from its head."""
+    """The method of a call, from the head of its document; None if the head does not tell it."""
     match = _HEAD.match(head, 0, HEAD)
     return match[2].decode() if match else None
 
 
 def first_strings(head: bytes, count: int) -> list[str | None]:
-    """The first ``count`` parameters of a call whose document begins so, if they are strings.
+    """The first ``count`` parameters of a call, from the head of its document.
 
-    None stands for the first one that can't be told for sure, and for all that follow.
+    From the first parameter on that is no plain string, or not in the head, all elements are None.
     """
     match = _HEAD.match(head, 0, HEAD)
     position = match.end() if match else 0
@@ -116,20 +118,20 @@ def first_strings(head: bytes, count: int) -> list[str | None]:
 
 
 def status_of(head: bytes) -> int | None:
-    """The ROS status of a reply that begins so; None if that can't be told from its head."""
+    """The ROS status of a reply, from its head; None if the head does not tell it."""
     match = _STATUS.match(head, 0, HEAD)
     return int(match[2]) if match else None
 
 
 class CallWatch:
-    """Watches a document that passes, from its head on."""
+    """Watches a passing document, from its head on."""
 
     def __init__(self) -> None:
         self._tail: bytes | None = None
         self._nested = 0
 
     def see(self, piece: bytes) -> None:
-        """Look at the next piece; the first one holds the method. Raises XmlRpcError."""
+        """Watch the next piece; the first piece has the method. Raises XmlRpcError."""
         if self._tail is None:
             head = _HEAD.match(piece)
             piece = piece[head.end() :] if head else piece
@@ -139,20 +141,20 @@ class CallWatch:
             token = match[0].decode("latin-1").strip("\0<:/> \t\r\n") or "a NUL byte"
             raise XmlRpcError(INVALID_REQUEST, f"{token} is not allowed inside a long call")
         for tag in _NESTING.finditer(text):
-            if tag.end() <= len(self._tail or b""):  # seen with the piece before
+            if tag.end() <= len(self._tail or b""):  # seen with the last piece
                 continue
-            # Tags count wherever they stand, also in a comment or CDATA. Those that close nothing
-            # must not make room for more.
+            # Tags count everywhere, also in a comment or CDATA. A closing tag without an opening
+            # tag must not make room for further levels.
             self._nested = max(self._nested - 1, 0) if tag[1] else self._nested + 1
             if self._nested > NESTED:
                 raise XmlRpcError(
                     PARSE_ERROR, f"arrays and structs are nested deeper than {NESTED} levels"
                 )
-        # What is looked for may begin here and end in the next piece.
+        # A forbidden text may begin here and end in the next piece.
         self._tail = text[1 - _LONGEST :]
 
     def end(self) -> None:
-        """All of it was seen. Raises XmlRpcError if it should not have ended."""
+        """End the watch after the last piece. Raises XmlRpcError if the document is incomplete."""
 
     def passes(self, _body: bytes) -> bool:
         """Whether a whole document passes at a glance; it is watched otherwise."""
@@ -160,7 +162,7 @@ class CallWatch:
 
 
 class MulticallWatch(CallWatch):
-    """Watches a multicall that passes; ``may_pass`` says whether calls of a method pass unread."""
+    """Watches a passing multicall; ``may_pass`` says whether calls of a method pass unread."""
 
     def __init__(self, may_pass: Callable[[str], bool]) -> None:
         super().__init__()
@@ -178,12 +180,12 @@ class MulticallWatch(CallWatch):
         parser.EndElementHandler = self._end
 
     def see(self, piece: bytes) -> None:
-        """Look at the next piece; the first one holds the method. Raises XmlRpcError."""
+        """Watch the next piece; the first piece has the method. Raises XmlRpcError."""
         super().see(piece)
         self._parse(piece)
 
     def end(self) -> None:
-        """All of it was seen. Raises XmlRpcError if it should not have ended."""
+        """End the watch after the last piece. Raises XmlRpcError if the document is incomplete."""
         self._parse(b"", last=True)
 
     def passes(self, body: bytes) -> bool:
@@ -225,7 +227,7 @@ class MulticallWatch(CallWatch):
         elif self._depth >= _FIELD_DEPTH:
             self._elements.append(name)
             self._text = ""
-            # An array holds the parameters, which may be long: no text of theirs is collected.
+            # An array has the parameters, which may be long, so their text is not collected.
             self._parser.CharacterDataHandler = None if name == "array" else self._add_text
 
     def _note_names(self, names: Iterable[str]) -> None:
@@ -275,5 +277,5 @@ class MulticallWatch(CallWatch):
 
 
 def cut(body: bytes) -> Iterator[bytes]:
-    """A body in pieces that are each watched in some milliseconds."""
+    """A body in pieces; to watch a piece takes some milliseconds."""
     return (body[start : start + SHORT] for start in range(0, len(body), SHORT))

@@ -1,7 +1,6 @@
 """The values of XML-RPC documents, as `rosproxy.ros1.protocol.xmlrpc.document` finds them.
 
-A value tells the edits that change it, so that a document is entered twice: to be read, and to have
-all edits done.
+The methods of a value return edits of the document, and `document.apply` makes all edits at once.
 """
 
 from dataclasses import dataclass, field
@@ -19,9 +18,9 @@ KINDS: dict[str, Kind] = {
     **dict.fromkeys(("int", "i4", "i8"), "int"),
     **dict.fromkeys(("boolean", "double", "dateTime.iso8601", "base64", "nil"), "other"),
 }
-"""The elements that a value holds (http://xmlrpc.com/spec.md, and nil, which it lacks)."""
+"""The elements inside a value (http://xmlrpc.com/spec.md, and nil, which is an extension)."""
 SCALARS = KINDS.keys() - {"array", "struct"}
-"""Those of them that hold text."""
+"""The elements that hold text."""
 
 
 class Edit(msgspec.Struct, frozen=True):
@@ -34,11 +33,11 @@ class Edit(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class Value:
-    """One ``<value>``: its kind, its place in the document and what it holds.
+    """A ``<value>``: its kind, its place in the document, and its content.
 
     ``outer`` spans the whole element, ``inner`` the text of a scalar; both are byte offsets.
     ``members`` are the names of a struct's members, in the order of ``items``. ``encoding`` is the
-    document's.
+    encoding of the document.
     """
 
     body: bytes = field(repr=False)
@@ -60,7 +59,7 @@ class Value:
 
     @property
     def raw(self) -> bytes:
-        """The whole element as it was sent, in UTF-8."""
+        """The whole element as sent, in UTF-8."""
         return self.body[slice(*self.outer)].decode(self.encoding).encode()
 
     def string(self) -> str | None:
@@ -81,29 +80,29 @@ class Value:
         return self.items[self.members.index(name)] if name in self.members else None
 
     def with_text(self, text: str) -> Edit:
-        """The edit that gives a scalar another text and leaves its type as it is.
+        """The edit that changes the text of a scalar and keeps its type.
 
-        It changes no byte if the scalar has that text already, however that is written.
+        If the scalar has this text already, in any notation, the edit changes no byte.
         """
         start, end = self.inner
         if text == self.text:
             return Edit(start, start, b"")
         raw = escape(text).encode(self.encoding, "xmlcharrefreplace")
-        if self.body[start - 2 : start] == b"/>":  # <value/> or <string/>: no inside to write to
+        if self.body[start - 2 : start] == b"/>":  # <value/> and <string/> have no inside
             return self.replaced_by(b"<value>" + raw + b"</value>")
         return Edit(start, end, raw)
 
     def replaced_by(self, raw: bytes) -> Edit:
-        """The edit that puts another value, as it is written, in its place."""
+        """The edit that replaces the value by another raw value."""
         return Edit(*self.outer, raw)
 
     def removed(self) -> Edit:
-        """The edit that takes it out of its array."""
+        """The edit that removes the value from its array."""
         return self.replaced_by(b"")
 
 
 def text_of(raw: bytes, encoding: str) -> str:
-    """What a piece of a document reads, with entities, CDATA and line ends resolved."""
+    """The text of a part of a document, with entities, CDATA and line ends resolved."""
     if b"&" not in raw and b"<" not in raw:
         text = raw.decode(encoding, "replace")
         return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
