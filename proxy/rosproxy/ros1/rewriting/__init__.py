@@ -1,1 +1,1 @@
-"""Addresses of one side made into the other's, in calls and replies. Pure."""
+"""Rewrites addresses of one side for the other side, in calls and replies. Pure."""

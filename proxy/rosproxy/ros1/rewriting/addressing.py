@@ -1,7 +1,7 @@
 """Export (inside to outside) and import (outside to inside) of URIs.
 
-The two are inverses for every URI that the proxy ever handed out: a tool inside may send any of
-them back, as ``rosnode cleanup`` does when it unregisters somebody else's node.
+Export and import are inverses for every URI that the proxy has ever given out. A tool inside may
+send back any such URI: ``rosnode cleanup`` does this when it unregisters a node of another process.
 """
 
 from collections.abc import Sequence
@@ -25,11 +25,11 @@ from rosproxy.ros1.registry.stand_ins import StandIns
 
 
 class Caller(msgspec.Struct, frozen=True):
-    """Who is going to use an address.
+    """The node that is going to use an address.
 
-    ``address`` is the caller's own IP address, ``proxy`` the proxy's address that it can reach,
-    ``caller_id`` its node name and ``endpoint`` its endpoint, each as far as known. ``master`` is
-    how it calls its master: ``host:port``.
+    ``address`` is the caller's own IP address, ``proxy`` the proxy's address that the caller
+    reaches, ``caller_id`` the node name and ``endpoint`` the endpoint of the caller, each as far as
+    known. ``master`` is the address by which the caller calls its master: ``host:port``.
     """
 
     address: str
@@ -41,9 +41,9 @@ class Caller(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class Addressing:
-    """The rules that turn one side's addresses into the other's.
+    """The rules that export and import addresses.
 
-    ``networks`` are those inside which nodes reach each other without the proxy.
+    Nodes within one of ``networks`` reach each other without the proxy.
     """
 
     registry: Registry
@@ -54,13 +54,14 @@ class Addressing:
     _advertised: dict[int, str] = field(default_factory=dict)
 
     def outside(self, port: int) -> HostPort:
-        """What outside sees of a port that the proxy listens on."""
+        """The host and port at which outside reaches a listening port of the proxy."""
         return HostPort(self.host, self.ports.advertised(port))
 
     def advertised_uri(self, endpoint: Endpoint) -> str:
-        """The slave URI that stands for an endpoint at the master and outside.
+        """The slave URI that the master and outside have for an endpoint.
 
-        It has no path: some client libraries take that for a malformed URI, or for a port.
+        The URI has no path: some client libraries call a URI with a path malformed, or take the
+        path for a part of the port.
         """
         uri = self._advertised.get(endpoint.port)
         if uri is None:
@@ -68,12 +69,12 @@ class Addressing:
         return uri
 
     def uris_at_master(self, endpoint: Endpoint) -> list[str]:
-        """The slave URIs by which the master may have an endpoint: a former version's, too."""
+        """The slave URIs that the master may have for an endpoint, also of a former version."""
         former = [uri for uri in endpoint.former_uris if self.lease_of(uri) == endpoint.port]
         return list(dict.fromkeys([self.advertised_uri(endpoint), *former]))
 
     def advertised_service(self, endpoint: Endpoint) -> str:
-        """The service URI that stands for an endpoint's services outside."""
+        """The service URI that outside has for the services of an endpoint."""
         return service_uri(self.outside(endpoint.port))
 
     def export_slave(self, uri: str, caller: Caller) -> str:
@@ -120,21 +121,21 @@ class Addressing:
         return service_uri(HostPort(caller.proxy, endpoint.port))
 
     def stand_in_target(self, uri: str) -> HostPort | None:
-        """Where a stand-in for a URI at the master is to lead; None if it needs no stand-in."""
+        """The host and port for a stand-in for a URI at the master; None if none is needed."""
         target = self.stand_ins.target(uri)
         if target is None or self.advertises(target) or is_inside(target.host, self.networks):
             return None
         return target
 
     def is_own_uri(self, uri: str, caller: Caller) -> bool:
-        """Whether a slave URI is one of this proxy's own, in the inside or the outside form."""
+        """Whether a slave URI is a URI of this proxy, in the inside or the outside form."""
         slave = parse_slave_uri(uri)
         if slave is None:
             return False
         return self._is_relayed(slave, caller) or self.endpoint_of(uri) is not None
 
     def advertises(self, host_port: HostPort) -> bool:
-        """Whether outside finds one of this proxy's own ports at a host and port."""
+        """Whether outside reaches a port of this proxy at a host and port."""
         return self._listening(host_port) is not None
 
     def lease_of(self, uri: str) -> int | None:
@@ -145,14 +146,14 @@ class Addressing:
         return self.stand_ins.import_uri(uri, caller.proxy) if self.stand_in_target(uri) else uri
 
     def _import(self, endpoint: Endpoint, caller: Caller) -> str:
-        # Several nodes may call themselves the same: sent back, the URI has to mean this one.
+        # Several nodes may give the same URI. When the URI comes back, it has to mean this node.
         if self._is_direct(endpoint, caller) and self._meant_by(endpoint.node, caller) is endpoint:
             return endpoint.uri
         return slave_uri(HostPort(caller.proxy, endpoint.port))
 
     def _is_direct(self, endpoint: Endpoint, caller: Caller) -> bool:
-        # Its own URI as it gave it: roscpp compares the text, so as not to connect to itself
-        # (subscription.cpp, pubUpdate).
+        # A node gets its own URI unchanged: roscpp compares the text, so that the node does not
+        # connect to itself (subscription.cpp, pubUpdate).
         if endpoint is caller.endpoint:
             return True
         if caller.address == endpoint.location.address:
@@ -161,10 +162,10 @@ class Addressing:
         return endpoint.location.named and is_inside(endpoint.location.address, shared)
 
     def endpoint_of(self, uri: str) -> Endpoint | None:
-        """The endpoint that an advertised slave URI stands for.
+        """The endpoint of an advertised slave URI; None if there is none.
 
-        Those of former versions carry the inside address in their path: another one means another
-        node, which had the port before.
+        A URI of a former version has the inside address in its path. If this address differs from
+        the endpoint's, the URI means a node that had the port before.
         """
         endpoint = self._endpoint_at(parse_slave_uri(uri))
         inside = parse_inside_path(uri)
@@ -185,7 +186,7 @@ class Addressing:
         return host_port.host == caller.proxy and host_port.port in self.ports.listen
 
     def _meant_by(self, node: HostPort, caller: Caller) -> Endpoint | None:
-        """Whom a caller means by a host and port; several nodes may call themselves the same."""
+        """The endpoint that a caller means by a host and port: several nodes may give the same."""
         admitted = self.registry.admitted(node, caller.address)
 
         def distance(endpoint: Endpoint) -> tuple[bool, bool, bool]:
@@ -195,6 +196,6 @@ class Addressing:
         return min(self.registry.by_node(node), key=distance, default=None)
 
     def _own_service_uri(self, endpoint: Endpoint, service: str) -> str | None:
-        """A service's URI as its provider gave it; None if that is not known (after a recovery)."""
+        """The URI of a service as its node gave it; None if unknown (after a recovery)."""
         provider = self.registry.services.get(service)
         return provider[1].service_api if provider and provider[0] is endpoint else None

@@ -1,9 +1,13 @@
-"""The master API as inside nodes call it: calls rewritten on the way out, replies on the way in.
+"""The master API for nodes inside: export URIs in calls, import URIs in replies.
 
-A request goes one way through four steps, each of which makes a new value of the one before and
-changes nothing: `master_calls.read_request`, `export_request` (once it is known what becomes of
-each call), `master_calls.read_reply`, which tells what the registry has to learn, and
-`import_reply`. Rows and traps: http://wiki.ros.org/ROS/Master_API and
+A request passes four steps. Each step makes a new value and changes no earlier value.
+
+1. `master_calls.read_request` parses the request.
+2. `export_request` exports the URIs, when the outcome of each call is known.
+3. `master_calls.read_reply` parses the reply, and says what the registry has to record.
+4. `import_reply` imports the URIs.
+
+Methods and pitfalls: http://wiki.ros.org/ROS/Master_API and
 ros_comm/tools/rosmaster/src/rosmaster/master_api.py.
 """
 
@@ -34,15 +38,15 @@ from rosproxy.ros1.rewriting.master_calls import (
 from rosproxy.ros1.rewriting.slave_api import replace_value
 
 ResultFilter = Callable[[CallResult, Caller], Sequence[Edit]]
-"""The edits of a result in which a caller may not read all, or is to read more; else none."""
+"""The edits of a result that hide or add parts for a caller; empty if there are none."""
 
 
 def export_request(
     request: Request, outcomes: Sequence[CallOutcome], addressing: Addressing
 ) -> ExportedRequest:
-    """The request for the master: URIs exported, calls that the proxy answers left out.
+    """The request for the master, with exported URIs, without calls that the proxy answers.
 
-    ``outcomes`` has one for each call.
+    ``outcomes`` has an element for each call.
     """
     edits: list[Edit] = []
     for call, outcome in zip(request.calls, outcomes, strict=True):
@@ -56,7 +60,7 @@ def export_request(
 
 
 def import_reply(reply: MasterReply, addressing: Addressing, filter_result: ResultFilter) -> bytes:
-    """The reply for the inside node: filtered, URIs imported, the proxy's own replies put in."""
+    """The reply for the node inside: filtered, with imported URIs and the proxy's own answers."""
     edits: list[Edit] = []
     request = reply.exported.request
     for result in reply.results:
@@ -73,9 +77,9 @@ def import_reply(reply: MasterReply, addressing: Addressing, filter_result: Resu
 
 
 def rename_master(request: Request, reply: bytes, master: str) -> bytes:
-    """A reply with the master's own URI, where getUri asked for it, as ``master`` is reached.
+    """A reply with ``http://MASTER/`` in place of the master's own URI in results of getUri.
 
-    Nothing else in it is changed. Raises XmlRpcError.
+    The rest of the reply stays the same. Raises XmlRpcError.
     """
     if not any(call and call.method == "getUri" for call in request.calls):
         return reply
@@ -94,7 +98,7 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
 def unregistering_endpoint(
     call: Call, caller: Caller, addressing: Addressing
 ) -> Endpoint | Passing:
-    """The endpoint of the registration that a call ends, if it gives that endpoint's URI."""
+    """The endpoint of the registration that a call ends, if the call has the endpoint's URI."""
     spec = method_spec(call.method)
     endpoint = addressing.registry.by_caller.get(caller_id_of(call))
     if endpoint is None:

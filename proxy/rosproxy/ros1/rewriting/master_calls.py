@@ -1,8 +1,9 @@
-"""A request to the master and its reply, read: which calls they hold and what follows from them.
+"""Read a request to the master and the reply: which calls they contain, and what follows.
 
-A request is one call or a ``system.multicall`` of several; each follows its own row of
-``rosproxy.ros1.protocol.master_methods``. What a call registers, which URIs a reply holds and what
-the registry has to learn of both is told here; `rosproxy.ros1.rewriting.master_api` rewrites them.
+A request is a single call, or a ``system.multicall`` of several calls. Each call follows its row in
+``rosproxy.ros1.protocol.master_methods``. This module says what a call registers, which URIs a
+reply contains, and what the registry has to record. `rosproxy.ros1.rewriting.master_api` rewrites
+the URIs.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,9 +31,10 @@ from rosproxy.ros1.rewriting.slave_api import ros_triple
 
 
 class LocalAnswer(msgspec.Struct, frozen=True):
-    """The answer to a call that the master does not get; ``change`` follows from the call.
+    """The proxy's own answer to a call that does not reach the master.
 
-    ``value`` is the third element of the triple, whose status is ``code``.
+    ``value`` is the third element of the triple, ``code`` its status. ``change`` is what the
+    registry has to record.
     """
 
     code: int
@@ -46,7 +48,7 @@ class LocalAnswer(msgspec.Struct, frozen=True):
 
 
 class Passing(Enum):
-    """Why a call goes to the master without an endpoint; its URIs are exported all the same."""
+    """Why a call passes to the master without an endpoint. Its URIs are exported nevertheless."""
 
     NO_REGISTRATION = "the call neither registers nor unregisters"
     FOREIGN_URI = "the URI is not that of the caller's own endpoint: a node outside, or another"
@@ -59,15 +61,15 @@ def refusal(reason: str) -> LocalAnswer:
 
 _URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
 CallOutcome = Endpoint | LocalAnswer | Passing
-"""What becomes of a call: the endpoint that it registers or unregisters, the proxy's own answer, or
-the reason why the call passes to the master without either."""
+"""The outcome of a call: the endpoint that the call registers or unregisters, the proxy's own
+answer, or the reason why the call passes without an endpoint."""
 
 
 class Request(msgspec.Struct, frozen=True):
-    """A request of an inside node, read: one call, or the calls of a ``system.multicall``.
+    """A parsed request of a node inside: a single call, or the calls of a ``system.multicall``.
 
-    ``calls`` holds None for an element of a multicall that is no call; ``items`` are those
-    elements as they were sent.
+    ``calls`` has None for an element of a multicall that is no call. ``items`` are the elements of
+    a multicall as sent.
     """
 
     body: bytes
@@ -78,38 +80,38 @@ class Request(msgspec.Struct, frozen=True):
 
     @property
     def method(self) -> str:
-        """The outer method's name."""
+        """The name of the outer method."""
         if self.multicall:
             return MULTICALL
         return self.calls[0].method if self.calls and self.calls[0] else ""
 
     @property
     def tells_graph(self) -> bool:
-        """Whether the reply tells of the graph of all nodes."""
+        """Whether the reply has the graph of all nodes."""
         return any(call and call.method in GRAPH_METHODS for call in self.calls)
 
     @property
     def reply_limits(self) -> Limits:
-        """How large the reply may be."""
+        """The limits of the reply."""
         return OWN_REPLY if self.tells_graph or self.reply_passes else REPLY
 
     @property
     def reply_passes(self) -> bool:
-        """Whether nothing in the reply is rewritten."""
+        """Whether the proxy changes nothing in the reply."""
         if self.multicall or self.tells_graph or self.method == "getParamNames":
             return False
         return method_spec(self.method).reply is Reply.OTHER
 
     @property
     def plain(self) -> bool:
-        """Whether request and reply pass untouched."""
+        """Whether request and reply pass unchanged."""
         return all(call is None or method_spec(call.method) == NO_SPEC for call in self.calls)
 
 
 class ExportedRequest(msgspec.Struct, frozen=True):
-    """A request made ready for the master, and what became of each of its calls.
+    """A request for the master, and the outcome of each call.
 
-    ``body`` is what the master gets; None if it gets nothing, since the proxy answers all calls.
+    ``body`` is the document for the master; None if the proxy answers all calls itself.
     """
 
     request: Request
@@ -117,20 +119,20 @@ class ExportedRequest(msgspec.Struct, frozen=True):
     body: bytes | None
 
     def local_reply(self) -> bytes:
-        """The whole reply to a request of which the master gets nothing."""
+        """The whole reply to a request that the proxy answers itself."""
         triples = [o.triple() for o in self.outcomes if isinstance(o, LocalAnswer)]
         return xmlrpc.dump_reply([[t] for t in triples] if self.request.multicall else triples[0])
 
     def registry_changes(self) -> "list[RegistryChange]":
-        """What the registry has to learn from the calls that the proxy answers."""
+        """What the registry has to record for the calls that the proxy answers."""
         local = (o for o in self.outcomes if isinstance(o, LocalAnswer))
         return [o.change for o in local if o.change]
 
 
 class CallResult(msgspec.Struct, frozen=True):
-    """A call that the master has answered: its ROS status and value, and the endpoint it registers.
+    """The result of a call to the master: ROS status, value, and the registered endpoint.
 
-    ``triple`` is None where the reply holds nothing that is rewritten, and was not read.
+    ``triple`` is None if the reply has nothing to rewrite, and was not parsed.
     """
 
     call: Call
@@ -145,14 +147,14 @@ class CallResult(msgspec.Struct, frozen=True):
 
     @property
     def value(self) -> Value | None:
-        """The third element of the triple, if it was read."""
+        """The third element of the triple, if the reply was parsed."""
         return self.triple.items[2] if self.triple else None
 
 
 class RegistryChange(msgspec.Struct, frozen=True):
     """A fact from an accepted call, for the registry.
 
-    ``endpoint`` is where the registration was made, None if it has ended.
+    ``endpoint`` is the endpoint of a new registration; None if the registration has ended.
     """
 
     registration: Registration
@@ -160,9 +162,9 @@ class RegistryChange(msgspec.Struct, frozen=True):
 
 
 class MasterReply(msgspec.Struct, frozen=True):
-    """The master's reply, matched with its request.
+    """The reply of the master, matched with its request.
 
-    ``results`` leaves out faults and malformed triples.
+    ``results`` has no faults and no malformed triples.
     """
 
     exported: ExportedRequest
@@ -171,10 +173,10 @@ class MasterReply(msgspec.Struct, frozen=True):
     results: tuple[CallResult, ...]
 
     def registry_changes(self, now: float) -> list[RegistryChange]:
-        """What the registry has to learn from the calls that the master accepted.
+        """What the registry has to record for the calls that the master has accepted.
 
-        The master also accepts what changes nothing: a node that makes room for another of its
-        name unregisters with its own URI, and the other's registrations stay.
+        The master also accepts a call without effect. When a second node has taken a name, the
+        first node unregisters with its own URI, and the registrations of the second node stay.
         """
         changes = []
         for result in self.results:
@@ -185,7 +187,7 @@ class MasterReply(msgspec.Struct, frozen=True):
         return changes
 
     def uris(self) -> Iterator[str]:
-        """The URIs that it hands to an inside node, as the master holds them."""
+        """The URIs in the reply for a node inside, in the form that the master has."""
         for result in self.results:
             value = result.value
             if value and result.accepted and method_spec(result.call.method).reply in _URIS:
@@ -194,7 +196,7 @@ class MasterReply(msgspec.Struct, frozen=True):
 
 
 def read_request(body: bytes, caller: Caller, limits: Limits = OWN_REPLY) -> Request:
-    """Parse a request within limits. Raises XmlRpcError if it is none, or is beyond them."""
+    """Parse a request within limits. Raises XmlRpcError if it is malformed or too large."""
     call = xmlrpc.parse_call(body, limits)
     if call.method != MULTICALL:
         return Request(body, (call,), False, replace(caller, caller_id=caller_id_of(call)))
@@ -204,10 +206,10 @@ def read_request(body: bytes, caller: Caller, limits: Limits = OWN_REPLY) -> Req
 
 
 def read_reply(exported: ExportedRequest, reply: bytes) -> MasterReply:
-    """Match a reply with its request. Raises XmlRpcError if it is no XML-RPC response.
+    """Match a reply with its request. Raises XmlRpcError if the reply is no XML-RPC response.
 
-    Of one that holds no address only the status is read: the value of a parameter that a node
-    subscribes to may be anything.
+    If the reply has no addresses, the function only reads the status: the value of a subscribed
+    parameter may be anything.
     """
     if exported.request.reply_passes and (status := passing.status_of(reply)) is not None:
         call = exported.request.calls[0]
@@ -220,14 +222,14 @@ def read_reply(exported: ExportedRequest, reply: bytes) -> MasterReply:
 
 
 def registering_uri(call: Call | None) -> str | None:
-    """The slave URI that a call registers, if it is a complete registration."""
+    """The slave URI in a call that registers; None for any other call, or without a URI."""
     if call is None or method_spec(call.method).registers is None:
         return None
     return call.string(method_spec(call.method).caller_api)
 
 
 def registration_of(call: Call, now: float, source: str) -> Registration | None:
-    """What a call from an address registers or unregisters; None for any other call."""
+    """The registration that a call from an address makes or ends; None for any other call."""
     spec = method_spec(call.method)
     caller_id = caller_id_of(call)
     kind = spec.registers or spec.unregisters
@@ -243,12 +245,12 @@ def registration_of(call: Call, now: float, source: str) -> Registration | None:
 
 
 def second_parameter_name(call: Call) -> str:
-    """The topic, service or node that a call's second parameter names."""
+    """The topic, service or node in the second parameter of a call."""
     return resolve_name(call.string(1) or "", caller_id_of(call))
 
 
 def caller_id_of(call: Call) -> str:
-    """The name of the node that makes a call; "" if it gives none."""
+    """The name of the node that makes a call; "" if the call has none."""
     return call.string(0) or ""
 
 
@@ -259,7 +261,7 @@ def _results(exported: ExportedRequest, value: Value) -> Iterator[CallResult]:
         triples = [item.items[0] if item.items else None for item in value.items]
     pairs = zip(exported.request.calls, exported.outcomes, strict=True)
     sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, LocalAnswer)]
-    # A reply may hold fewer results than there were calls; what has none is passed on as it is.
+    # A reply may have fewer results than calls. A call without a result is left out.
     for (call, outcome), triple in zip(sent, triples, strict=False):
         if call and triple and ros_triple(triple):
             yield CallResult(call, triple.items[0].integer(), triple, _endpoint_of(outcome))

@@ -1,10 +1,10 @@
-"""The slave API: what is rewritten in a call that passes the proxy, and in its reply.
+"""The slave API: what the proxy rewrites in a call that passes, and in the reply.
 
-It is the same both ways. What an address becomes on its way is told by a `CallView`: `from_outside`
-where outside or the master calls a node inside, `from_inside` where a node inside calls one
-outside.
+The functions are the same for both directions. A `CallView` says how addresses change:
+`from_outside` if outside or the master calls a node inside, `from_inside` if a node inside calls a
+node outside.
 
-Rows: http://wiki.ros.org/ROS/Slave_API; the replies' shapes: ros_comm's
+Methods: http://wiki.ros.org/ROS/Slave_API. Forms of the replies: ros_comm's
 clients/rospy/src/rospy/impl/masterslave.py and clients/roscpp/src/libros/topic_manager.cpp.
 """
 
@@ -23,17 +23,18 @@ from rosproxy.ros1.protocol.xmlrpc.values import Edit, Value
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 
 MASTER_ONLY = frozenset({"shutdown", "publisherUpdate", "paramUpdate"})
-"""What the master calls at nodes; a policy can refuse it from anybody else."""
+"""The calls of the master to nodes. A policy may refuse these calls from all other callers."""
 
 _URI_REPLIES = frozenset({"getUri", "getMasterUri"})
 _REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
 
 
 class CallView(msgspec.Struct, frozen=True):
-    """How the two ends of a call see the nodes that they name.
+    """How both ends of a call see the nodes that the call names.
 
-    ``rewrite_in_call`` makes of a slave URI in the call what the node sees, ``rewrite_in_reply`` of
-    one in the reply what the caller sees; ``master_uri`` is the caller's URI for the master.
+    ``rewrite_in_call`` turns a slave URI in the call into the URI for the node,
+    ``rewrite_in_reply`` a URI in the reply into the URI for the caller. ``master_uri`` is the
+    caller's URI for the master.
     """
 
     rewrite_in_call: Callable[[str], str]
@@ -42,50 +43,50 @@ class CallView(msgspec.Struct, frozen=True):
 
 
 def from_outside(node: Caller, master_uri: str, addressing: Addressing) -> CallView:
-    """The view of a call from outside at a node inside."""
+    """The view of a call from outside to a node inside."""
     imported = partial(addressing.import_slave, caller=node)
     return CallView(imported, partial(addressing.export_slave, caller=node), master_uri)
 
 
 def from_inside(caller: Caller, master_uri: str, addressing: Addressing) -> CallView:
-    """The view of a call from a node inside at one outside."""
+    """The view of a call from a node inside to a node outside."""
     exported = partial(addressing.export_slave, caller=caller)
     return CallView(exported, partial(addressing.import_slave, caller=caller), master_uri)
 
 
 def is_rewritten(method: str) -> bool:
-    """Whether anything in a call or its reply is rewritten."""
+    """Whether the proxy rewrites a call or its reply."""
     return method in _REWRITTEN
 
 
 def passes_unread(method: str) -> bool:
-    """Whether a call passes unread: it holds no address, and nothing in it is looked at.
+    """Whether a call may pass unread, because it has no address and needs no check.
 
-    A multicall is taken apart, and a ``shutdown`` may be kept from the node.
+    The proxy takes a multicall apart, and may keep a ``shutdown`` from the node.
     """
     return not (is_rewritten(method) or method in ("shutdown", MULTICALL))
 
 
 def rewrite_call(body: bytes, call: Call, view: CallView) -> bytes:
-    """The call for the node: the publishers of a ``publisherUpdate`` as it sees them.
+    """The call for the node, with the publishers of a ``publisherUpdate`` rewritten.
 
-    Their order is kept; a publisher that is named twice is left out the second time.
+    The order stays the same. A repeated publisher is left out.
     """
     edits = []
     listed = set()
     for item in _publishers(call):
         uri = view.rewrite_in_call(item.text)
-        # roscpp would connect twice to one that is listed twice (subscription.cpp, pubUpdate).
+        # roscpp would connect twice to a repeated publisher (subscription.cpp, pubUpdate).
         edits.append(item.removed() if uri in listed else item.with_text(uri))
         listed.add(uri)
     return xmlrpc.apply(body, edits)
 
 
 def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -> bytes:
-    """The reply for the caller: addresses as it sees them.
+    """The reply for the caller, with addresses that the caller can use.
 
-    ``reached`` is the address and port at which it is to find the node's topics, and the address
-    from which it gets datagrams.
+    ``reached`` is the address and port at which the caller finds the node's topics, and the address
+    from which the caller gets datagrams.
     """
     triple = ros_triple(xmlrpc.parse_reply(reply))
     if triple is None:
@@ -94,7 +95,7 @@ def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -
     if call.method == "requestTopic" and _is_tcpros(triple):
         edits = send_to(triple, reached)
     elif call.method == "requestTopic" and _is_udpros(triple):
-        # Datagrams come from there, by a relay or by NAT; some libraries drop any other's.
+        # A relay or NAT sends the datagrams from there; some libraries drop all other datagrams.
         edits = [triple.items[2].items[1].with_text(reached.host)]
     elif call.method == "getBusInfo":
         edits = [peer.with_text(view.rewrite_in_reply(peer.text)) for peer in _peers(triple)]
@@ -104,9 +105,9 @@ def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -
 
 
 def with_address_in_reply(call: Call, reply: bytes, host: str, address: str) -> bytes:
-    """A node's reply with an address in place of a host's name where a topic is to be had.
+    """A node's reply, with ``address`` in place of the host name ``host`` for a topic.
 
-    So topics flow without the proxy. Everything else stays as it is. Raises XmlRpcError.
+    So topics flow without the proxy. The rest of the reply stays the same. Raises XmlRpcError.
     """
     triple = ros_triple(xmlrpc.parse_reply(reply)) if call.method == "requestTopic" else None
     server = tcpros_address(triple) if triple else None
@@ -116,9 +117,9 @@ def with_address_in_reply(call: Call, reply: bytes, host: str, address: str) -> 
 
 
 def with_address(body: bytes, call: Call, host: str, address: str) -> bytes:
-    """A ``requestTopic`` from outside, with the address where it names a host for UDPROS.
+    """A ``requestTopic`` from outside, with ``address`` in place of the host name in UDPROS offers.
 
-    A subscriber tells there where it wants its datagrams; no port could stand in for that.
+    The subscriber receives datagrams at this host. No stand-in is possible for such an address.
     """
     if call.method != "requestTopic" or len(call.params) < 3:
         return body
@@ -130,7 +131,7 @@ def with_address(body: bytes, call: Call, host: str, address: str) -> bytes:
 
 
 def named_publishers(call: Call, reply: bytes) -> dict[str, list[str]]:
-    """The slave URIs of other nodes in a reply, by the topic that they are said to publish."""
+    """The slave URIs of publishers in a reply to ``getBusInfo``, by topic."""
     triple = ros_triple(xmlrpc.parse_reply(reply)) if call.method == "getBusInfo" else None
     publishers: dict[str, list[str]] = {}
     for row in triple.items[2].items if triple else ():
@@ -141,14 +142,14 @@ def named_publishers(call: Call, reply: bytes) -> dict[str, list[str]]:
 
 
 def announced_publishers(call: Call) -> list[str]:
-    """The publishers that a ``publisherUpdate`` names; nothing for other calls."""
+    """The publishers in a ``publisherUpdate``; empty for other calls."""
     return [item.text for item in _publishers(call)]
 
 
 def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
     """Whether a ``publisherUpdate`` lacks a publisher that is being registered anew.
 
-    A newer one follows; a subscriber inside need not drop its connection in between.
+    A newer update follows, so a subscriber inside need not drop its connection meanwhile.
     """
     topic = call.string(1) or ""
     listed = set(announced_publishers(call))
@@ -161,7 +162,7 @@ def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
 
 
 def topic_port(call: Call, reply: bytes) -> int | None:
-    """The port that a reply to ``requestTopic`` names for a topic, if it is one for TCPROS."""
+    """The TCPROS port in a reply to ``requestTopic``; None if there is none."""
     triple = ros_triple(xmlrpc.parse_reply(reply))
     server = tcpros_address(triple) if triple else None
     return server.port if server and call.string(1) else None
@@ -173,7 +174,7 @@ def ros_triple(value: Value | None) -> Value | None:
 
 
 def tcpros_address(triple: Value) -> HostPort | None:
-    """Where a reply to ``requestTopic`` sends the subscriber, if that is for TCPROS."""
+    """The TCPROS address in a reply to ``requestTopic``; None if there is none."""
     if not _is_tcpros(triple):
         return None
     _, host, port = triple.items[2].items
@@ -182,7 +183,7 @@ def tcpros_address(triple: Value) -> HostPort | None:
 
 
 def send_to(triple: Value, target: HostPort) -> list[Edit]:
-    """Edits by which a reply to ``requestTopic`` sends the subscriber elsewhere."""
+    """Edits that change the address in a reply to ``requestTopic`` to ``target``."""
     _, host, port = triple.items[2].items
     edits = [host.with_text(target.host), port.with_text(str(target.port))]
     # rospy's message is "ready on HOST:PORT" (tcpros_pubsub.py, init_publisher).
@@ -190,14 +191,14 @@ def send_to(triple: Value, target: HostPort) -> list[Edit]:
 
 
 def replace_value(triple: Value, text: str) -> list[Edit]:
-    """Edits by which a reply gives another text, also where its status message quotes it."""
-    # As in rosmaster's lookupService (master_api.py) and rospy's getMasterUri (masterslave.py).
+    """Edits that replace the value of a reply, also inside the status message."""
+    # rosmaster's lookupService (master_api.py) and rospy's getMasterUri (masterslave.py) quote it.
     value = triple.items[2]
     return [value.with_text(text), *_in_message(triple, value.text, text)]
 
 
 def _in_message(triple: Value, before: str, after: str) -> list[Edit]:
-    """The edit of a status message that quotes a text; none if it does not."""
+    """The edit of a status message that quotes a text; empty if the message does not."""
     text = triple.items[1].string() or ""
     return [triple.items[1].with_text(text.replace(before, after))] if before in text else []
 
@@ -219,7 +220,7 @@ def _is_udpros(triple: Value) -> bool:
 
 
 def _peers(triple: Value) -> list[Value]:
-    """The nodes that the rows of ``getBusInfo`` name by their slave URIs."""
+    """The nodes in the rows of ``getBusInfo`` that have a slave URI."""
     named = [row.items[1] for row in triple.items[2].items if len(row.items) > 1]
     return [peer for peer in named if parse_slave_uri(peer.string() or "")]
 

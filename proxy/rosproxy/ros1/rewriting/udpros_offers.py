@@ -1,4 +1,4 @@
-"""The offers of UDPROS in a ``requestTopic``: read, led elsewhere, or taken out.
+"""The offers of UDPROS in a ``requestTopic``: read, redirect, or remove offers.
 
 An offer is ``["UDPROS", header, host, port, datagram size]`` with a connection header in base64
 (``Subscription::negotiateConnection`` in clients/roscpp/src/libros/subscription.cpp).
@@ -18,9 +18,9 @@ PROTOCOL = "UDPROS"
 
 
 class UdprosOffer(msgspec.Struct, frozen=True):
-    """Where a subscriber wants its datagrams, and the topic that its connection header names.
+    """Where a subscriber wants to receive datagrams, and the topic in the connection header.
 
-    ``topic`` is empty and ``receiver`` None if that can't be read.
+    ``topic`` is empty without a readable header, ``receiver`` None without a valid address.
     """
 
     value: Value
@@ -40,7 +40,7 @@ def read_offers(call: Call) -> list[UdprosOffer]:
 
 
 def redirect_offer(offer: UdprosOffer, target: HostPort | None) -> list[Edit]:
-    """The edits by which an offer leads elsewhere; None takes it out of the call."""
+    """The edits that redirect an offer to ``target``; None removes the offer from the call."""
     if target is None or offer.receiver is None:
         return [offer.value.removed()]
     _, _, host, port, *_ = offer.value.items
