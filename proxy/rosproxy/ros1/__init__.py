@@ -1,1 +1,1 @@
-"""ROS 1: its master API, slave API and TCPROS, rewritten and relayed."""
+"""ROS 1: rewrites the master API and the slave API, and relays TCPROS."""

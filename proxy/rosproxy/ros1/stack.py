@@ -1,8 +1,8 @@
-"""ROS 1 in a running proxy: its parts put together, started and stopped.
+"""ROS 1 in a running proxy: makes, connects, starts and stops the parts.
 
-Each part is given those that it needs, as they are or as a `Protocol`. They are made from the
-bottom up. One thing goes the other way: a leased port hands its connections to the servers, which
-in turn may close the port (``leases.server``).
+Each part gets the parts that it needs, directly or as a `Protocol`, so the stack makes the parts
+from the bottom up. There is one exception: a lease gives its connections to the servers, and the
+servers may close the lease (``leases.server``).
 """
 
 import asyncio
@@ -61,15 +61,15 @@ log = logging.getLogger(__name__)
 SPARE_FILES = 64
 """Open files that the proxy needs besides its ports and connections."""
 RETRY_BLOCKED = 30.0
-"""Seconds between looks whether ports that other programs held have become free."""
+"""Seconds between two attempts to reserve ports that other programs held."""
 
 
 class Ros1:
-    """The part for ROS 1. `start` it in a running event loop, `stop` it in the same."""
+    """The part for ROS 1. `start` and `stop` it in the same running event loop."""
 
     def __init__(self, runtime: Runtime) -> None:
         self.settings = settings = runtime.settings
-        # Callers may make up methods without end; those of other names share one label.
+        # Callers may invent method names without end, so all unknown names share one label.
         runtime.metrics.known_methods = KNOWN_METHODS
         self.context = context = Context(runtime)
         self.tcpros = TcprosServer(context)
@@ -133,11 +133,11 @@ class Ros1:
         )
 
     async def start(self) -> None:
-        """Bind all ports and begin. Raises SettingError if a port is taken."""
+        """Bind all ports and begin. Raises SettingError if a necessary port is taken."""
         settings = self.settings
         context = self.context
         self.reserve_range()
-        # Before any port listens, as the kernel has to see connections from their beginning.
+        # Before any port listens: the kernel has to see connections from their beginning.
         await self.plane.start()
         master = self._make_master_api()
         context.tasks.spawn(self._callers.await_operator(), "waiting for an operator")
@@ -161,7 +161,7 @@ class Ros1:
 
     @property
     def actions(self) -> Mapping[str, Action]:
-        """What posts at the admin endpoint do, by their paths."""
+        """The actions of posts to the admin endpoint, by path."""
         return {
             "/containers": self._handle_update,
             "/master-address": self._set_master_address,
@@ -170,7 +170,7 @@ class Ros1:
 
     @property
     def greeting(self) -> str:
-        """How nodes use it, for the log."""
+        """How nodes use the proxy, for the log."""
         settings = self.settings
         return (
             f"nodes use http://<this host>:{settings.master_port} as ROS_MASTER_URI; master "
@@ -179,14 +179,14 @@ class Ros1:
         )
 
     async def stop(self) -> None:
-        """End everything; registrations stay at the master, for the next start to find."""
+        """Stop all parts. Registrations stay at the master for the next start."""
         for acceptor in self._acceptors:
             acceptor.close()
         self.leases.close_all()
         self.stand_ins.close()
         await self.context.tasks.cancel()
         self.prober.kept_connections.close_all()
-        # After the tasks, one of which would put the kernel's table right again.
+        # After the tasks: a task would repair the kernel's table.
         await self.plane.stop()
         servers = (server.close() for server in self._servers)
         await asyncio.gather(self.tcpros.relays.stop(), *servers)
@@ -194,19 +194,19 @@ class Ros1:
 
     @property
     def retired(self) -> bool:
-        """Whether all its nodes were unregistered, for good."""
+        """Whether all nodes were unregistered for good."""
         return self.context.retired
 
     async def settle(self) -> None:
-        """Wait until the master has answered: `probe` has it call the ports under test."""
+        """Wait until the master has answered: `probe` makes it call the ports under test."""
         await self.master_monitor.answered.wait()
 
     async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
-        """How some ports of the range are reached from outside."""
+        """Try whether outside reaches some ports of the range."""
         return await probe_range(self.context, self.leases, or_fast)
 
     async def try_ports(self) -> tuple[PortProbe, ...]:
-        """Instead of a start: take the range, have it tried, and let go. Raises SettingError."""
+        """Without a start: reserve the range, try it, and release it. Raises SettingError."""
         try:
             self.reserve_range()
             return await self.probe(or_fast=True)
@@ -215,15 +215,15 @@ class Ros1:
             await self.context.close()
 
     async def apply_policy(self) -> EnforcementCounts:
-        """Make everything fit the policy. Raises Unreachable, MasterError."""
+        """Enforce the policy now. Raises Unreachable, MasterError."""
         return await self._enforcer.enforce()
 
     def add_to(self, status: ProxyStatus) -> ProxyStatus:
-        """The status of the proxy, with what there is to tell of ROS 1."""
+        """The status of the proxy, with the part for ROS 1."""
         return self._state.add_to(status)
 
     def unready(self) -> str | None:
-        """Why nodes can't use it now; None if they can."""
+        """Why nodes cannot use the proxy now; None if they can."""
         if self.retired:
             return "the proxy is retired and accepts no registrations"
         if self.master_monitor.up:
@@ -234,9 +234,9 @@ class Ros1:
         )
 
     async def _handle_update(self, body: Any) -> dict[str, Any]:
-        """``POST /containers``: how many nodes were unregistered, moved and adopted.
+        """``POST /containers``: return how many nodes were unregistered, moved and adopted.
 
-        The selected addresses apply at once: nodes wait for that, and it needs no master.
+        The selected addresses apply at once: nodes wait for the selection, which needs no master.
         """
         update = read_body(body, ContainerUpdate)
         if update.selected is not None:
@@ -247,14 +247,14 @@ class Ros1:
         return {**await self._containers.handle(update.gone, update.moved, arrived)}
 
     async def _retire(self, body: Any) -> dict[str, Any]:
-        """``POST /retire``: how many nodes were unregistered."""
+        """``POST /retire``: return how many nodes were unregistered."""
         read_body(body, EmptyBody)
         count = await self._containers.retire()
         await self._memory.write()
         return {"unregistered": count}
 
     async def _set_master_address(self, body: Any) -> dict[str, Any]:
-        """``POST /master-address``: where the master is looked for from now on."""
+        """``POST /master-address``: set the address where the proxy looks for the master."""
         address = read_body(body, MasterAddress).address
         upstream = self.context.upstream
         if address != upstream.master_address:
@@ -267,14 +267,17 @@ class Ros1:
         return {"address": address}
 
     def reserve_range(self) -> None:
-        """Keep the range's ports from others. Raises SettingError if none can be had."""
+        """Reserve the ports of the range.
+
+        Raises SettingError if no port is free, or if the process may open too few files.
+        """
         ports = self.settings.ports.listen
         files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         if files != resource.RLIM_INFINITY and files < len(ports) + SPARE_FILES:
             needed = len(ports) + SPARE_FILES
             text = f"{ports} needs {needed} open files, and this process may have {files}"
             raise SettingError(RANGE_OPTION, f"{text}. Raise the limit (ulimit -Hn)")
-        # Half of what is left may go to kept connections, one for each node; clients get the rest.
+        # Kept connections, one for each node, get half of the rest at most; clients get all else.
         spare = max(files, 0) - len(ports) - SPARE_FILES
         self.prober.kept_connections.most = max(0, min(len(ports), spare // 2))
         self.context.gate.bound(spare - self.prober.kept_connections.most)

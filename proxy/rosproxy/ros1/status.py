@@ -144,7 +144,7 @@ class Ros1State(Collector):
             labels=["node", "direction"],
         )
         for labels, size in self._plane.traffic.totals():
-            forwarded.add_metric(labels[1:], size)  # the first one is "node" for all
+            forwarded.add_metric(labels[1:], size)  # the first label is always "node"
         return relayed, forwarded
 
     def _counted_by_nodes(self) -> Iterable[Metric]:
@@ -207,7 +207,7 @@ class Ros1State(Collector):
         )
 
     def _hidden(self) -> tuple[list[document.HiddenStatus], int]:
-        """What the policy keeps from the master, and how much of that is left out."""
+        """The registrations that the policy hides, and how many of them the list leaves out."""
         policy = self._context.policy
         hidden = policy.hidden_registrations()
         rows = [

@@ -1,1 +1,1 @@
-"""Ports of the proxy, on its inside addresses, that stand in for nodes outside."""
+"""Stand-ins: ports on inside addresses of the proxy that lead to nodes outside."""

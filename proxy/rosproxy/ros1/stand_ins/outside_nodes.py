@@ -1,8 +1,9 @@
 """How nodes inside reach nodes outside through a stand-in: by slave API calls and by TCPROS.
 
-No connection leads to the proxy itself or to inside: whoever writes to the master names the
-addresses. Nodes of outside may run beside the proxy, though: at an address of its own machine only
-the proxy's own ports are refused. Loopback always is: whoever gave it meant another machine.
+No connection may lead to the proxy itself or to inside, because any program can write addresses to
+the master. Nodes of outside may run on the proxy's own machine. So at an address of this machine
+only the proxy's own ports are refused. Loopback is always refused, because the node that gave a
+loopback address meant another machine.
 """
 
 import logging
@@ -25,20 +26,21 @@ log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT = 2.0
 LOOK_TIMEOUT = 1.0
-"""Seconds at most for which a node inside waits while one that refused before is tried again."""
+"""Seconds that a node inside waits at most while the proxy tries a node that has refused."""
 
 
 class Outside:
-    """Reaches nodes outside. ``note_refused`` gets the stand-in of one that refuses: it ended."""
+    """Reaches nodes outside. ``note_refused`` gets the stand-in of a node that has ended."""
 
     def __init__(self, context: Context, note_refused: Callable[[StandIn], None]) -> None:
         self._context = context
         self._note_refused = note_refused
 
     async def refuses(self, uri: str, target: HostPort) -> bool:
-        """Whether a node outside, or a service there, refuses connections.
+        """Whether a node or a service outside refuses connections.
 
-        A node gets a real call: roslisp ends if a connection to it says nothing.
+        The proxy makes a real call to a node, because roslisp ends after a connection without a
+        call.
         """
         try:
             reached = await self.reach(target)
@@ -53,10 +55,10 @@ class Outside:
         return False
 
     async def ask(self, stand_in: StandIn, body: bytes, path: str) -> bytes:
-        """Forward a slave API call to a node outside; its answer. Raises Unreachable."""
+        """Forward a slave API call to a node outside; return its answer. Raises Unreachable."""
         path = path if stand_in.is_uri_kept else path_of(stand_in.uri)
         try:
-            # To the address that was looked at: a name server may answer otherwise the next time.
+            # The checked address: a name server may give another address next time.
             reached = await self.reach(stand_in.target)
             name = str(stand_in.target)  # for the Host field
             return await self._context.upstream.post_to_node(reached, body, path=path, name=name)
@@ -70,7 +72,7 @@ class Outside:
             raise
 
     async def ask_topic_port(self, stand_in: StandIn, topic: str) -> int | None:
-        """The TCPROS port that a node outside names for a topic; None if it names none."""
+        """The TCPROS port that a node outside names for a topic; None if the node names none."""
         try:
             slave = await self.reach(stand_in.target)
             port = await self._context.nodes.topic_port(slave, topic)
@@ -82,25 +84,25 @@ class Outside:
         return port
 
     async def connect(self, stand_in: StandIn, port: int | None) -> socket.socket | None:
-        """A connection to a TCPROS port of a node outside; None if there is none."""
+        """Connect to a TCPROS port of a node outside; None if that fails."""
         if port is None:
             return None
         target = HostPort(stand_in.target.host, port)
         try:
             return await self._dial(target, CONNECT_TIMEOUT)
-        except OSError as error:  # a time-out is one, too
+        except OSError as error:  # a TimeoutError is an OSError
             log.debug("%s: %s", target, error)
-            # Only at the port of its URI: a node that has closed a TCPROS port may live on.
+            # Only the port of the URI counts: a node that has closed a TCPROS port may live.
             if isinstance(error, ConnectionRefusedError) and target == stand_in.target:
                 self._note_refused(stand_in)
             return None
 
     async def _dial(self, target: HostPort, within: float) -> socket.socket:
-        """Connect to a port outside; refused where that leads back or inside. Raises OSError."""
+        """Connect to a port outside; refuse targets inside or of the proxy. Raises OSError."""
         return await sockets.dial(await self.reach(target), within)
 
     async def reach(self, target: HostPort) -> HostPort:
-        """The address and port of a host outside. Raises OSError: refused if it is not outside."""
+        """The address and port of a host outside. Raises OSError, also for a host inside."""
         mapped = self._context.upstream.reach(target)
         resolved = await resolve(mapped.host, NODES)
         if not resolved:
@@ -111,7 +113,7 @@ class Outside:
         return HostPort(outside[0], target.port)
 
     def _leads_back(self, target: HostPort) -> bool:
-        """Whether an address and port are inside, or the proxy's own."""
+        """Whether an address and port are inside, on loopback, or the proxy's own."""
         stand_ins = self._context.stand_ins
         address = target.host
         inside = stand_ins.is_bidirectional and is_inside(
@@ -133,7 +135,7 @@ class OutsideNode:
 
     @property
     def port(self) -> int:
-        """The port that stands in for it."""
+        """The port of the stand-in."""
         return self._stand_in.local.port
 
     def check(self, kind: str, name: str, peer: str, caller_id: str) -> Denial | None:
@@ -141,7 +143,7 @@ class OutsideNode:
         return self._context.policy.check_inside(kind, name, peer, caller_id)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
-        """A connection to the node, which is asked for its port again if the known one refuses."""
+        """Connect to the node; ask for its port again if the known port refuses."""
         outside = self._outside
         stand_in = self._stand_in
         is_service = parse_service_uri(stand_in.uri) is not None
@@ -153,15 +155,15 @@ class OutsideNode:
         return node or await outside.connect(stand_in, await outside.ask_topic_port(stand_in, name))
 
     def label(self, kind: str, name: str) -> str:
-        """The topic if the node has named a port for it; for anything else its URI."""
+        """The topic if the node has named a port for it, otherwise the URI."""
         return name if name in self._stand_in.topic_ports else self._stand_in.uri
 
     def note_connection(self) -> None:
-        """Nothing to note: whether a stand-in is in use is counted by its relays."""
+        """Record nothing: the relays of a stand-in tell whether it is in use."""
 
     def note_disconnection(self) -> None:
-        """Note that the stand-in was in use until now."""
+        """Record that the stand-in was in use until now."""
         self._context.stand_ins.note_used(self._stand_in)
 
     def note_failure(self, name: str) -> None:
-        """Nothing to note: that a node outside is gone is for the master to say."""
+        """Record nothing: the master decides whether a node outside is gone."""

@@ -1,16 +1,18 @@
-"""Listens on the ports that stand in for nodes outside, and passes on what arrives there.
+"""Listens on the ports of stand-ins, and passes on what arrives there.
 
-A port is opened right before an inside node is given a URI that needs it (`listen_for`), and closed
-when the node behind it refuses, since a dead node must look dead. Only URIs that the master names
-open one: they come with its replies, or it is asked (`listen_for_announced`).
+The proxy opens a port right before a node inside gets a URI that needs this port (`listen_for`).
+The proxy closes the port when the node behind it refuses connections, since a dead node must look
+dead. Only URIs from the master open a port. These URIs come with a reply of the master, or the
+proxy asks the master (`listen_for_announced`).
 
-Slave API calls are forwarded to the node, TCPROS connections relayed. Where the URIs are kept
-because the master's name leads here (`registry.stand_ins`), topics flow without the proxy: the
-node's reply to ``requestTopic`` leads to its address. Nothing is relayed that does not begin with a
-TCPROS header.
+The proxy forwards slave API calls to the node, and relays TCPROS connections. If URIs are kept
+because the master's name leads to the proxy (`registry.stand_ins`), topics flow without the proxy:
+the reply to ``requestTopic`` has the address of the node. The proxy relays only connections that
+begin with a TCPROS header.
 
-A slave URI's stand-in has a fast port as well, if the kernel forwards and no rule of the policy
-could be passed by there. It listens for as long, and what the kernel does not forward is relayed.
+The stand-in of a slave URI also has a fast port, if the kernel forwards and no rule of the policy
+could be bypassed by the fast port. The fast port listens as long as the stand-in. The proxy relays
+connections that the kernel does not forward.
 """
 
 import asyncio
@@ -46,18 +48,18 @@ from rosproxy.ros1.stand_ins.udpros_relays import UdprosRelays
 log = logging.getLogger(__name__)
 
 MOST_RETRIES = 32
-"""Nodes that refused before and are tried again at the same time."""
+"""Nodes that have refused and that the proxy tries again at the same time."""
 PORTS_PER_TURN = 50
-"""Ports that are opened before the event loop does other work."""
+"""Ports that the proxy opens before the event loop does other work."""
 TIDY_INTERVAL = 30.0
 SERVICE_PROBLEM = 600.0
-"""Seconds for which a problem with a service is kept: it is looked up anew for each call."""
+"""Seconds to keep a problem with a service: each call of a client looks the service up anew."""
 LONGEST_SHOWN_URI = 200
 """Characters of a URI in the status."""
 
 
 class StandInPorts:
-    """Opens and closes the ports that stand in for nodes outside, and serves them."""
+    """Opens, closes and serves the ports of stand-ins."""
 
     def __init__(
         self,
@@ -73,7 +75,7 @@ class StandInPorts:
         self._plane = plane
         self._acceptors: dict[HostPort, Acceptor] = {}
         self._refused: dict[str, None] = {}
-        """URIs of nodes that refused when they were last tried, the oldest first; not too many."""
+        """URIs of nodes that refused at the last attempt, oldest first; the number is bounded."""
         self._retry_slots = asyncio.Semaphore(MOST_RETRIES)
         greeting = "rosproxy: a ROS node outside\n"
         self.server = XmlRpcServer(context, self._forward, greeting, context.master_call)
@@ -82,14 +84,14 @@ class StandInPorts:
         self._closed = False
         self._query_lock = asyncio.Lock()
         self._pending_topics: set[str] = set()
-        """Topics whose publishers the master is to be asked for next: somebody waits for them."""
+        """Topics of the next question to the master: callers wait for their publishers."""
         self._publishers: dict[str, set[str]] = {}
         """The publishers in the master's last answer: slave URIs by topic."""
 
     async def listen_for(self, uris: Iterable[str], caller: Caller) -> None:
-        """Have a port listen for each of these URIs that needs one, before inside is told of them.
+        """Open a port for each URI that needs one, before inside gets the URI.
 
-        The URIs must be known to be the master's own.
+        The URIs must come from the master.
         """
         targets = self._targets(uris)
         if not targets:
@@ -106,12 +108,12 @@ class StandInPorts:
                 self._listen(uri, target, self._stand_ins.address(caller.proxy))
 
     async def listen_for_announced(self, topic: str, uris: Sequence[str], caller: Caller) -> None:
-        """The same for those URIs that are publishers at the master, where another names them.
+        """Open ports for the URIs that are publishers at the master, if another program names them.
 
-        Anybody may call ``publisherUpdate`` at a lease, and name any port. Its source proves
-        nothing: every program on the master's host has that address, and NAT gives it to others.
-        And a node outside says in its bus info what it likes. So where a port would have to be
-        opened the master is asked whether it has that publisher.
+        Any program may call ``publisherUpdate`` at a lease, and name any port. The source of the
+        call proves nothing: every program on the master's host has that address, and NAT gives the
+        address to other hosts. A node outside may put any URI into its bus info. So before the
+        proxy opens a port, it asks the master whether the URI is a publisher of the topic.
         """
         targets = self._targets(uris)
         address = self._stand_ins.address(caller.proxy)
@@ -121,16 +123,17 @@ class StandInPorts:
         await self.listen_for((uri for uri in targets if uri in known_uris), caller)
 
     def with_address(self, body: bytes, call: xmlrpc.Call) -> bytes:
-        """A call from outside, parsed as ``call``, in a form that an inside node can use."""
+        """A call from outside, parsed as ``call``, in a form for nodes inside."""
         address = self._context.upstream.master_address
         if not address or not self._stand_ins.aliased:
             return body
         return slave_api.with_address(body, call, self._stand_ins.aliased, address)
 
     async def tidy(self) -> None:
-        """Forget the problems of nodes that have ended, and of services not looked up any more.
+        """Remove problems of nodes that have ended, and of services that have not failed lately.
 
-        A service's port is not tried: rospy complains of a connection that says nothing.
+        The proxy does not try the port of a service: rospy logs a warning for a connection without
+        a header.
         """
         self.udpros.sweep()
         for problem in self._context.problems.all():
@@ -170,7 +173,7 @@ class StandInPorts:
         return ports
 
     def close_fast_ports(self) -> int:
-        """Close all fast ports, as no header is read there; how many connections that has cut."""
+        """Close all fast ports, where no header is checked; the number of cut connections."""
         count = 0
         for stand_in in self._stand_ins.by_local.values():
             if stand_in.fast_port is not None:
@@ -180,7 +183,7 @@ class StandInPorts:
         return count
 
     def close(self) -> None:
-        """Stop listening, for good."""
+        """Stop listening for good."""
         self._closed = True
         self.udpros.close()
         for stand_in in list(self._stand_ins.by_local.values()):
@@ -192,20 +195,21 @@ class StandInPorts:
         return self._stand_ins.is_bidirectional or self._context.upstream.master_address is not None
 
     def _targets(self, uris: Iterable[str]) -> dict[str, HostPort]:
-        """The URIs that need a stand-in, each with the host and port that it has to lead to."""
+        """The URIs that need a stand-in, each with the host and port of the target."""
         if not self._active or self._closed:
             return {}
         pairs = ((uri, self._context.addressing.stand_in_target(uri)) for uri in uris)
         return {uri: target for uri, target in pairs if target}
 
     async def _publishers_of(self, topic: str) -> set[str]:
-        """The slave URIs of a topic's publishers as the master has them now; none if it is away.
+        """The slave URIs of a topic's publishers at the master; empty without an answer.
 
-        The master gets one query at a time, for all topics that have come up meanwhile.
+        The master gets one question at a time, for all topics that callers have asked for
+        meanwhile.
         """
         self._pending_topics.add(topic)
         async with self._query_lock:
-            if topic in self._pending_topics:  # nobody has asked since
+            if topic in self._pending_topics:  # no other caller has asked meanwhile
                 topics = self._pending_topics
                 self._pending_topics = set()
                 self._publishers = await self._ask_publishers(topics)
@@ -228,7 +232,7 @@ class StandInPorts:
         return {topic: set(publishers.get(topic, ())) for topic in topics}
 
     def _listen(self, uri: str, target: HostPort, address: str) -> None:
-        """Let a port listen that a URI needs, or report why none can."""
+        """Open the port for a URI, or report why that fails."""
         problems = self._context.problems
         if stand_in := self._stand_ins.find(address, uri):
             self._stand_ins.note_used(stand_in)
@@ -249,11 +253,11 @@ class StandInPorts:
         problems.add(uri, text)
 
     def _make_room(self) -> str | None:
-        """Close the port unused for longest if there are too many; why not if all are in use."""
+        """Close the port unused for longest if there are too many; the reason if all are in use."""
         if len(self._stand_ins.by_local) < stand_ins.MOST_STAND_INS:
             return None
         counts = self._connections()
-        # `by_local` begins with the one that was unused for longest.
+        # `by_local` begins with the stand-in that has been unused longest.
         unused = (s for s in self._stand_ins.by_local.values() if not counts[s.local.port])
         stand_in = next(unused, None)
         if stand_in is None:
@@ -262,7 +266,7 @@ class StandInPorts:
         return None
 
     def _open(self, stand_in: StandIn) -> str | None:
-        """Open a port; the reason if that can't be done."""
+        """Open a port; return the reason if that fails."""
         local = stand_in.local
         if why := stand_ins.obstacle(local.port, self._context.settings):
             return why
@@ -281,7 +285,7 @@ class StandInPorts:
         return None
 
     def _open_fast_port(self, stand_in: StandIn) -> None:
-        """Open a stand-in's second port where that can be of use, and can be had."""
+        """Open the fast port of a stand-in if it is useful and possible."""
         usable = self._plane.syncer.usable
         candidate = self._stand_ins.choose_fast_candidate(stand_in) if usable else None
         if candidate is None:
@@ -307,7 +311,7 @@ class StandInPorts:
             self._plane.syncer.note_change(stand_in)
 
     async def _topic_listener(self, stand_in: StandIn, tcpros_port: int) -> HostPort:
-        """The proxy's port for a node's topics: the fast port if the kernel forwards that to it."""
+        """The proxy's port for a node's topics: the fast port if the kernel forwards it."""
         syncer = self._plane.syncer
         fast_port = stand_in.fast_port
         if fast_port is None:
@@ -323,7 +327,7 @@ class StandInPorts:
         return stand_in.local
 
     def _close(self, stand_in: StandIn) -> None:
-        """Let a port refuse; relays that are open stay."""
+        """Make a port refuse connections; open relays stay."""
         acceptor = self._acceptors.pop(stand_in.local, None)
         if acceptor is not None:
             acceptor.close()
@@ -332,7 +336,7 @@ class StandInPorts:
             self.server.close_port(stand_in.local.port)
 
     def _note_refused(self, stand_in: StandIn) -> None:
-        """Close the port of a node that refuses, since it has ended, until it is found again."""
+        """Close the port of a node that refuses, which has ended, until the node is found again."""
         log.debug(
             "%s refuses connections: the proxy closes the stand-in %s", stand_in.uri, stand_in.local
         )
@@ -366,7 +370,7 @@ class StandInPorts:
         await self.server.dispatch(conn, peer, partial(self._tcpros.serve, target, peer))
 
     async def _forward(self, call: IncomingCall) -> bytes:
-        """A node's reply to a call. Raises XmlRpcError, Unreachable."""
+        """The node's reply to a call. Raises XmlRpcError, Unreachable."""
         if call.comes_from(self._context.instance):
             raise Unreachable("the address of a node outside leads back to the proxy itself")
         stand_in = self._stand_ins.at(call.local)

@@ -1,22 +1,26 @@
-"""UDPROS: the offers of subscribers lead to ports of the proxy, which pass the datagrams on.
+"""UDPROS: redirect the offers of subscribers to ports of the proxy, which relay the datagrams.
 
-A subscriber offers in ``requestTopic`` where it wants its datagrams
-(clients/roscpp/src/libros/subscription.cpp); the publisher sends them there from a port that nobody
-is told (transport_udp.cpp). So the offer is all that has to be rewritten. rospy has no UDPROS.
+A subscriber offers in ``requestTopic`` an address for datagrams
+(clients/roscpp/src/libros/subscription.cpp). The publisher sends the datagrams there from a port
+that it does not announce (transport_udp.cpp). So the proxy only has to rewrite the offer. rospy has
+no UDPROS.
 
 With ``--direction both`` neither side can send to the other:
 
-  * an offer to a node inside, from outside or from another inside network, leads to a UDP port of
-    the stand-ins on the proxy's inside address, and from there to the subscriber (`lead_outwards`);
-  * an inside subscriber's offer to a node outside leads to a UDP port of the range as outside sees
-    it, if the range is published for UDP (``--udp``), and from there inside (`lead_inwards`).
+  * The offer to a node inside, from outside or from another inside network, gets a UDP port of the
+    stand-ins on the proxy's inside address. The proxy relays from there to the subscriber
+    (`lead_outwards`).
+  * The offer of a subscriber inside to a node outside gets a UDP port of the range, in the form for
+    outside, if the range is published for UDP (``--udp``). The proxy relays from there to inside
+    (`lead_inwards`).
 
-An offer for which there is no relay is taken out of the call: the publisher then chooses TCPROS if
-that was offered, too. So is one whose connection header names another topic than the call: roscpp
-serves the topic of the header (topic_manager.cpp), and the policy was asked about the call's.
+If there is no relay for an offer, the proxy removes the offer from the call. The publisher then
+chooses TCPROS if that was offered, too. The proxy also removes an offer whose connection header
+names another topic than the call. The reason: roscpp serves the topic of the header
+(topic_manager.cpp), but the policy has checked the topic of the call.
 
-A relay lasts as long as both ends of it: until the subscriber refuses, or one of them is not
-registered any more (`sweep`), or the subscriber may not have the topic any more (`cut_denied`).
+A relay lasts until the subscriber refuses datagrams, until one end is no longer registered
+(`sweep`), or until the policy denies the topic (`cut_denied`).
 """
 
 import logging
@@ -45,17 +49,17 @@ log = logging.getLogger(__name__)
 
 MOST_RELAYS = 256
 MOST_RELAYS_EACH = 64
-"""Relays of one proxy, and of subscribers at one address. For one more the oldest relay of the
-address that has most is ended: who asks for many takes none from others."""
+"""Relays of the proxy, and of subscribers at one address. A further relay ends the oldest relay of
+the address with the most relays. So an address with many relays takes none from other addresses."""
 TRIES = 64
-"""Ports that are tried for one relay."""
+"""The highest number of ports that the proxy tries for a relay."""
 
 
 class UdprosSubscription(msgspec.Struct, frozen=True):
-    """A subscription that datagrams serve.
+    """A subscription by datagrams.
 
-    ``port`` is the publisher's, lease or stand-in, ``peer`` the subscriber's address, ``target``
-    where it wants its datagrams. ``inside_asks``: it is a node inside.
+    ``port`` is the lease or stand-in of the publisher, ``peer`` the address of the subscriber,
+    ``target`` where the subscriber receives datagrams. ``inside_asks``: the subscriber is inside.
     """
 
     port: int
@@ -68,7 +72,7 @@ class UdprosSubscription(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class _RelayCondition:
-    """Checked anew each time: whether both ends are registered, and the policy allows the relay."""
+    """Checks anew each time whether both ends are registered, and the policy allows the relay."""
 
     is_registered: Callable[[], bool]
     is_allowed: Callable[[], bool]
@@ -79,7 +83,7 @@ class _RelayCondition:
 
 
 class UdprosRelays:
-    """Opens relays for the offers that pass, and ends them."""
+    """Opens relays for offers, and ends these relays."""
 
     def __init__(self, context: Context, outside: Outside) -> None:
         self._context = context
@@ -88,21 +92,21 @@ class UdprosRelays:
         self._open: dict[UdprosSubscription, tuple[DatagramRelay, _RelayCondition]] = {}
 
     def __iter__(self) -> Iterator[tuple[UdprosSubscription, DatagramRelay]]:
-        """All that are open."""
+        """All open relays with their subscriptions."""
         return iter([(s, relay) for s, (relay, _) in self._open.items()])
 
     def __len__(self) -> int:
-        """How many there are."""
+        """The number of open relays."""
         return len(self._open)
 
     def connections(self) -> set[tuple[int, str, str]]:
-        """The publisher's port, the topic and the subscriber's name of each."""
+        """The publisher's port, the topic and the subscriber's name, of each open relay."""
         return {(s.port, s.topic, s.caller_id) for s in self._open}
 
     async def lead_outwards(
         self, endpoint: Endpoint, call: Call, body: bytes, source: str
     ) -> bytes:
-        """The call of a subscriber, for a node inside: its offers lead to ports of the proxy."""
+        """The call of a subscriber to a node inside, with offers that lead to the proxy."""
         proxy = self._context.caller_at(endpoint).proxy
         topic = call.string(1) or ""
         caller_id = call.string(0) or ""
@@ -131,7 +135,7 @@ class UdprosRelays:
         return await _rewritten(call, body, condition, redirect)
 
     async def lead_inwards(self, stand_in: StandIn, call: Call, body: bytes, source: str) -> bytes:
-        """The call of a subscriber inside, for a node outside: its offers lead to the proxy."""
+        """The call of a subscriber inside to a node outside, with offers that lead to the proxy."""
         topic = call.string(1) or ""
         caller_id = call.string(0) or ""
         settings = self._context.settings
@@ -149,8 +153,8 @@ class UdprosRelays:
         condition = _RelayCondition(is_registered, is_allowed)
 
         async def redirect(offered: HostPort) -> HostPort | None:
-            # To the address that asks, whatever host the offer names: nobody has datagrams sent to
-            # another machine inside.
+            # The target is the source of the call, whatever host the offer names. So no subscriber
+            # directs datagrams to another machine inside.
             target = HostPort(source, offered.port)
             port = stand_in.local.port
             subscription = UdprosSubscription(port, topic, caller_id, source, target, True)
@@ -163,12 +167,12 @@ class UdprosRelays:
         return await _rewritten(call, body, condition, redirect)
 
     def sweep(self) -> None:
-        """End those whose publisher or subscriber is not registered any more."""
+        """End relays whose publisher or subscriber is no longer registered."""
         for subscription in [s for s, (_, c) in self._open.items() if not c.is_registered()]:
             self._end(subscription)
 
     def cut_denied(self) -> int:
-        """End those whose subscribers may not have the topic any more; how many."""
+        """End relays whose topic the policy denies now; return their number."""
         self.sweep()
         denied = [s for s, (_, c) in self._open.items() if not c.is_allowed()]
         for subscription in denied:
@@ -176,14 +180,14 @@ class UdprosRelays:
         return len(denied)
 
     def close(self) -> None:
-        """End all."""
+        """End all relays."""
         for subscription in list(self._open):
             self._end(subscription)
 
     async def _reachable(self, offered: HostPort, source: str) -> HostPort | None:
-        """Where the datagrams go for a subscriber that asks from an address; None if nowhere.
+        """The receiver of datagrams for a subscriber at an address; None if it is unreachable.
 
-        That is outside or, on another inside network, at the very address that asks.
+        The receiver is outside or, for a subscriber inside, at the source of the call.
         """
         if self._context.client_kind(source) is ClientKind.ADMITTED:
             return HostPort(source, offered.port)
@@ -201,9 +205,10 @@ class UdprosRelays:
         ports: Iterable[int],
         sources: Collection[str],
     ) -> int | None:
-        """The port of the relay for a subscription, opened if there is none; None if none can be.
+        """The port of the relay for a subscription, which is opened if necessary; None on failure.
 
-        ``address`` and ``ports`` are where it may be, ``sources`` from where datagrams may come.
+        The relay binds ``address`` and one of ``ports``, and accepts datagrams from ``sources``
+        alone.
         """
         if existing := self._open.get(subscription):
             return existing[0].port
@@ -228,7 +233,7 @@ class UdprosRelays:
         return None
 
     def _make_room(self, peer: str) -> None:
-        """End a relay if there are too many of a subscriber's address, or at all."""
+        """End a relay if there are too many for the subscriber's address, or in all."""
         counts = Counter(s.peer for s in self._open)
         if counts[peer] < MOST_RELAYS_EACH:
             if len(self._open) < MOST_RELAYS:
@@ -243,7 +248,7 @@ class UdprosRelays:
 
 
 def _candidates(subscription: UdprosSubscription, ports: range) -> list[int]:
-    """The ports to try for a subscription: after a restart the same comes first."""
+    """The ports to try for a subscription, in the same order after a restart."""
     seed = blake2b(
         f"{subscription.port} {subscription.topic} {subscription.caller_id}".encode(), digest_size=8
     ).digest()
@@ -258,7 +263,7 @@ async def _rewritten(
     condition: _RelayCondition,
     redirect: Callable[[HostPort], Awaitable[HostPort | None]],
 ) -> bytes:
-    """A call with each of its offers redirected, or taken out if there may or can be no relay."""
+    """A call with redirected offers; offers are removed if no relay is allowed or possible."""
     topic = call.string(1) or ""
     edits = list[Edit]()
     for offer in read_offers(call):
