@@ -1,7 +1,7 @@
 """Which callers may use the master port, which is for nodes inside alone.
 
 `rosproxy.ros1.registry.client_kinds` decides by the source address of a connection, before the
-proxy reads any byte. Programs on the proxy's own machine may always use the port.
+proxy reads the body of a call. Programs on the proxy's own machine may always use the port.
 
 An operator reports a container some tenths of a second after the start of the container, and the
 first call of the container may come earlier. So a call from an address that is not selected waits

@@ -102,7 +102,7 @@ XmlRpcService = Callable[[IncomingCall], Awaitable[bytes | LongReply]]
 
 
 Guard = Callable[[str], Awaitable[str | None]]
-"""Why the server refuses calls from a source, in one line, before a read; None to accept."""
+"""Why the server refuses a source, in one line, before it reads a body; None to accept."""
 
 
 async def count_reply(
