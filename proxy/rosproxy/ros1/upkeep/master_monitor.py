@@ -27,7 +27,7 @@ LOOKS_PER_CHECK = 5
 
 
 MASTER_PATHS = ("", "/", "/RPC2")
-"""Paths at which ROS masters answer. Both XML-RPC libraries of ROS 1 refuse all other paths."""
+"""Paths at which rosmaster answers. Python's xmlrpc.server refuses other paths (rpc_paths)."""
 
 
 class MasterMonitor:
