@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 from xmlrpc.client import dumps, loads
 
 TOPICS = 10
-AT_ONCE = 8
+AT_ONCE = "8"
 NAME = "crowd"
 STRING = "std_msgs/String"
 
@@ -75,14 +75,15 @@ def register(master: str, uri: str, name: str, number: int) -> None:
 
 
 async def main(
-    master: str, address: str, port: int, count: int, at_once: int = AT_ONCE, name: str = NAME
+    master: str, address: str, port: str, count: str, at_once: str = AT_ONCE, name: str = NAME
 ) -> None:
     loop = asyncio.get_running_loop()
-    loop.set_default_executor(ThreadPoolExecutor(at_once))
-    for number in range(count):
-        await loop.create_server(partial(Slave, name, number), address, port + number)
+    loop.set_default_executor(ThreadPoolExecutor(int(at_once)))
+    ports = range(int(port), int(port) + int(count))
+    for number, own in enumerate(ports):
+        await loop.create_server(partial(Slave, name, number), address, own)
     started = time.perf_counter()
-    uris = [f"http://{address}:{port + number}/" for number in range(count)]
+    uris = [f"http://{address}:{own}/" for own in ports]
     await asyncio.gather(
         *(asyncio.to_thread(register, master, uri, name, n) for n, uri in enumerate(uris))
     )
@@ -91,4 +92,4 @@ async def main(
 
 
 if __name__ == "__main__":
-    asyncio.run(main(*sys.argv[1:3], *map(int, sys.argv[3:6]), *sys.argv[6:]))
+    asyncio.run(main(*sys.argv[1:]))

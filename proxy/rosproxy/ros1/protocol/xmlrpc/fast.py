@@ -34,12 +34,12 @@ _SCALARS_CALL = re.compile(
     + rb"(?:\s*<param>\s*%b\s*</param>)*+" % _SCALAR
     + _CALL_END.pattern
 )
-_LIST = rb"<value>\s*<array>\s*<data>(?:\s*%b)*+\s*</data>\s*</array>\s*</value>"
+_LIST_OF = rb"<value>\s*<array>\s*<data>(?:\s*%b)*+\s*</data>\s*</array>\s*</value>"
 _METHOD = rb"<name>methodName</name>\s*<value>\s*(?:<string>[\w./]+</string>|[\w./]+)\s*</value>"
 _INNER_CALL = (
     rb"\s*<value>\s*<struct>\s*<member>\s*%b\s*</member>\s*<member>\s*<name>params</name>\s*%b\s*"
     rb"</member>\s*</struct>\s*</value>"
-) % (_METHOD, _LIST % (rb"(?:%b|%b)" % (_SCALAR, _LIST % _SCALAR)))
+) % (_METHOD, _LIST_OF % (rb"(?:%b|%b)" % (_SCALAR, _LIST_OF % _SCALAR)))
 _MULTICALL = re.compile(
     _PROLOG
     + rb"<methodCall>\s*<methodName>\s*system\.multicall\s*</methodName>\s*<params>\s*<param>\s*"
