@@ -1,7 +1,8 @@
-"""Whom a message is for, and whether it has to be read: known without reading its samples.
+"""For which participants an RTPS message is, and whether the proxy has to read the message.
 
-Each submessage but those that only tell of the others names a reader and a writer by their entity
-ids, and INFO_DST in front of it whose they are.
+Both follow from the headers of the submessages, without the samples. DATA, HEARTBEAT, ACKNACK and
+the like name a reader and a writer by their entity ids. An INFO_DST before such a submessage names
+the participant that is to receive it.
 """
 
 from rosproxy.ros2.protocol.rtps import (
@@ -22,10 +23,10 @@ from rosproxy.ros2.protocol.rtps import (
 )
 
 MOST_OF_USERS = 16
-"""Submessages of a datagram that may pass unread; of users' data there are half a dozen."""
+"""Submessages of a datagram that may pass unread. User data has half a dozen."""
 
 LONGEST_HEARTBEAT = 160
-"""Bytes of a message that may count as a heartbeat alone. Those of Fast DDS have 112: header 20,
+"""Bytes of a message that can count as a heartbeat alone. Messages of Fast DDS have 112: header 20,
 INFO_DST 16, heartbeat 32, statistics 44."""
 
 _WRITER_AT: dict[int, int] = {
@@ -37,7 +38,8 @@ _WRITER_AT: dict[int, int] = {
     SubmessageId.NACK_FRAG: 4,
     SubmessageId.HEARTBEAT_FRAG: 4,
 }
-"""Where in its body a submessage has the writer's entity id; in front of it stands the reader's."""
+"""Offset of the writer's entity id in the body of each submessage. The four bytes before are the
+reader's entity id."""
 _NAMELESS = frozenset(
     kind.value
     for kind in (
@@ -47,20 +49,23 @@ _NAMELESS = frozenset(
         SubmessageId.INFO_DST,
     )
 )
-"""Submessages that are from no writer, and only tell of those that follow."""
+"""Submessages without a reader and a writer. Such a submessage qualifies the next submessages."""
 _NAMELESS_OF = {FAST_DDS: _NAMELESS | {STATISTICS}}
-"""The same of vendors that have others."""
+"""Submessages without a reader and a writer, by vendor, for vendors with submessages of their
+own."""
 _ENTITY_ID = 4
+"""Bytes of an entity id."""
 _HEARTBEAT = 28
-"""Bytes of an entity id, and of the body of a heartbeat (9.4.5.7)."""
+"""Bytes of the body of a heartbeat (DDSI-RTPS 2.5, 9.4.5.7)."""
 _BUILT_IN = 0xC0
-"""The bits of an entity id's last byte that built-in readers and writers have (9.3.1.2)."""
+"""Bits that are set in the last byte of the entity id of each builtin endpoint (9.3.1.2)."""
 
 
 def destination(datagram: bytes) -> bytes | None:
-    """The GUID prefix of whom a message is for; None if it is for all. Raises RtpsError.
+    """The GUID prefix of the participant that a message is for; None if the message is for all.
 
-    The first INFO_DST counts: what follows may be for others, who are then at the same locator.
+    Only the first INFO_DST counts. The submessages after a second INFO_DST are for another
+    participant at the same locator. Raises RtpsError.
     """
     for kind, _, body in submessages(datagram):
         if kind == INFO_DST:
@@ -70,18 +75,19 @@ def destination(datagram: bytes) -> bytes | None:
 
 
 def is_destination(datagram: bytes, prefix: bytes) -> bool:
-    """Whether some of a message is for the participant with a GUID prefix. Raises RtpsError.
+    """Whether a part of a message is for the participant with a GUID prefix. Raises RtpsError.
 
-    Cyclone DDS puts into one message what goes to several participants at one locator.
+    Cyclone DDS puts submessages for several participants at the same locator into one message.
     """
     info_dst = (body.start for kind, _, body in submessages(datagram) if kind == INFO_DST)
     return any(datagram[start : start + PREFIX] == prefix for start in info_dst)
 
 
 def destinations(datagram: bytes) -> set[bytes]:
-    """The GUID prefixes of all whom a message is for; none if some of it is for all. RtpsError.
+    """The GUID prefixes of all participants that a message is for; empty if a part is for all.
 
-    Cyclone DDS puts into one message what goes to one address, whoever is there.
+    Cyclone DDS puts submessages for several participants at the same address into one message.
+    Raises RtpsError.
     """
     prefixes = set[bytes]()
     prefix = bytes(PREFIX)
@@ -96,16 +102,20 @@ def destinations(datagram: bytes) -> set[bytes]:
 
 
 def for_all(datagram: bytes) -> bytes:
-    """The message without its destinations, so that everybody takes it. Raises RtpsError."""
+    """The message without its destinations, so that all participants accept the message.
+
+    Raises RtpsError.
+    """
     destinations = [body for kind, _, body in submessages(datagram) if kind == INFO_DST]
-    # GUIDPREFIX_UNKNOWN, which is all zero, means everybody.
+    # GUIDPREFIX_UNKNOWN, which is all zero, addresses all participants.
     return apply(datagram, [Overwrite(body.start, bytes(PREFIX)) for body in destinations])
 
 
 def of_built_in_writer(datagram: bytes) -> bool | None:
-    """Whether a message is from or to a built-in writer, as discovery is; None if to no writer.
+    """Whether a message is from or to a builtin writer; None if the message names no writer.
 
-    The first submessage that names a writer counts. Raises RtpsError.
+    All discovery is from or to a builtin writer. The first submessage with a writer counts. Raises
+    RtpsError.
     """
     for kind, _, body in submessages(datagram):
         offset = _WRITER_AT.get(kind)
@@ -116,10 +126,11 @@ def of_built_in_writer(datagram: bytes) -> bool | None:
 
 
 def heartbeat_stream(datagram: bytes) -> bytes | None:
-    """From and to whom a message is that is a heartbeat and nothing else; None if it is another.
+    """The stream of a message that is a single heartbeat; None if the message is anything else.
 
-    A later heartbeat of the same stream says all that an earlier one did (8.3.8.6). The flags are
-    part of the stream: they say whether an answer is wanted, and whether the writer is alive.
+    A stream is the sender, the destination, the reader, the writer and the flags. A later heartbeat
+    of the same stream replaces an earlier one (8.3.8.6). The flags say whether the writer wants an
+    answer, and whether the writer is alive.
     """
     if len(datagram) > LONGEST_HEARTBEAT:
         return None
@@ -141,10 +152,11 @@ def heartbeat_stream(datagram: bytes) -> bytes | None:
 
 
 def may_be_discovery(datagram: bytes) -> bool:
-    """Whether a message has to be read: whether a built-in writer or reader may be named in it.
+    """Whether the proxy has to read a message: a builtin reader or writer may be named there.
 
-    So it may where it is no message, has more submessages than users' data has, or such as nobody
-    can look into: those of DDS Security, and unknown ones.
+    The proxy also has to read a datagram that is malformed, that has more than MOST_OF_USERS
+    submessages, or that has submessages of an unknown kind. The submessages of DDS Security are of
+    an unknown kind.
     """
     try:
         nameless = _NAMELESS_OF.get(source_vendor(datagram), _NAMELESS)
@@ -159,7 +171,7 @@ def may_be_discovery(datagram: bytes) -> bool:
 
 
 def _names_built_in(datagram: bytes, kind: int, body: Span) -> bool:
-    """Whether a submessage names a built-in reader or writer, or may. Raises RtpsError."""
+    """Whether a submessage may name a builtin reader or writer. Raises RtpsError."""
     offset = _WRITER_AT.get(kind)
     if offset is None:
         return True

@@ -1,7 +1,7 @@
-"""A participant's announcement made by hand: the proxy's own.
+"""Announcements of the proxy's own participants, and dispose messages.
 
-Participants that hear of a new one announce themselves to it at once, instead of with their next
-regular announcement, which may be seconds away.
+Participants that discover a new participant announce themselves to it at once. Their next regular
+announcement may be seconds away.
 """
 
 import struct
@@ -17,17 +17,23 @@ _SPDP_READER = 0x000100C7
 _SPDP_WRITER = 0x000100C2
 _PARTICIPANT = bytes([0, 0, 1, 0xC1])
 SPDP_ENDPOINTS = 0x01 | 0x02
+"""The builtin endpoints of SPDP, as bits of PID_BUILTIN_ENDPOINT_SET (DDSI-RTPS 2.5, 9.3.2.12)."""
 READER_ENDPOINTS = SPDP_ENDPOINTS | 0x08 | 0x20
+"""SPDP, and the readers of SEDP for publications and subscriptions."""
 WRITER_ENDPOINTS = SPDP_ENDPOINTS | 0x04
+"""SPDP, and the writer of SEDP for publications."""
 PORT_STORE_ENDPOINTS = WRITER_ENDPOINTS | 0x10
-"""Built-in endpoints that a participant has (9.3.2.12): those of SPDP, and with them the readers of
-SEDP, its writer of publications, or its writers of publications and of subscriptions."""
+"""SPDP, and the writers of SEDP for publications and subscriptions."""
 
 
 def announcement(
     prefix: bytes, reached_at: Iterable[HostPort], lease_duration: float, endpoints: int
 ) -> bytes:
-    """The datagram by which a participant announces itself, for ``lease_duration`` seconds."""
+    """The datagram in which a participant of the proxy announces itself.
+
+    ``reached_at`` are its locators. ``lease_duration`` is in whole seconds; ``endpoints`` are bits
+    of PID_BUILTIN_ENDPOINT_SET. Raises ValueError if the host of a locator is a name.
+    """
     locators = [pack_locator(host_port, "<") for host_port in reached_at]
     return _message(
         prefix,
@@ -37,8 +43,8 @@ def announcement(
             (Pid.PROTOCOL_VERSION, VERSION + bytes(2)),
             (Pid.VENDOR_ID, NO_VENDOR + bytes(2)),
             (Pid.PARTICIPANT_GUID, prefix + _PARTICIPANT),
-            # Without a default locator as well, Cyclone DDS does not take the participant
-            # (ddsi_discovery_spdp.c, get_locators).
+            # Cyclone DDS refuses a participant without a default locator (ddsi_discovery_spdp.c,
+            # get_locators).
             *((Pid.METATRAFFIC_UNICAST_LOCATOR, locator) for locator in locators),
             *((Pid.DEFAULT_UNICAST_LOCATOR, locator) for locator in locators),
             (Pid.PARTICIPANT_LEASE_DURATION, struct.pack("<iI", int(lease_duration), 0)),
@@ -49,10 +55,11 @@ def announcement(
 
 @lru_cache(1024)
 def dispose_message(prefix: bytes, vendor: bytes = NO_VENDOR, sequence: int = 2) -> bytes:
-    """The datagram by which a participant says that it has ended: its key, with that status.
+    """The datagram with which a participant ends: the key of the participant, and the status.
 
-    Sent for another participant it has that one's vendor, and a sequence number beyond its own:
-    Fast DDS takes no sample older than the last of the same writer (StatelessReader.cpp).
+    If the proxy ends another participant, ``vendor`` is the vendor of that participant, and
+    ``sequence`` is greater than its last sequence number. Fast DDS ignores a sample that is older
+    than the last sample of the same writer (StatelessReader.cpp).
     """
     guid = prefix + _PARTICIPANT
     # Disposed and unregistered (9.6.3.9).

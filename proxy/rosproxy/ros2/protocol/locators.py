@@ -1,7 +1,7 @@
-"""Locators: where a participant, a reader or a writer is reached. The addresses of DDS.
+"""Locators: the addresses at which participants, readers and writers receive datagrams.
 
-24 bytes: kind 4, port 4, address 16; of IPv4 the address is in the last four (DDSI-RTPS 2.5,
-9.3.2.4). A vendor may have kinds of its own (Fast DDS: 16 is shared memory).
+A locator has 24 bytes: kind 4, port 4, address 16. An IPv4 address is in the last four bytes
+(DDSI-RTPS 2.5, 9.3.2.4). Vendors define further kinds (16 is shared memory of Fast DDS).
 """
 
 import struct
@@ -16,6 +16,7 @@ from rosproxy.ros2.protocol.parameters import Parameter, ParameterList
 from rosproxy.ros2.protocol.rtps import Overwrite
 
 SIZE = 24
+"""Bytes of a locator."""
 
 
 class LocatorKind(IntEnum):
@@ -28,7 +29,7 @@ class LocatorKind(IntEnum):
 
 
 class Locator(msgspec.Struct, frozen=True):
-    """A locator as it stands in a parameter; ``address`` has 16 bytes, whatever the kind."""
+    """A locator in a parameter. ``address`` has 16 bytes for each kind."""
 
     kind: int
     port: int
@@ -49,7 +50,7 @@ class Locator(msgspec.Struct, frozen=True):
 def read_locator(
     datagram: bytes, parameters: ParameterList, parameter: Parameter
 ) -> Locator | None:
-    """The locator in a parameter; None if that is too short to be one."""
+    """The locator in a parameter; None if the parameter is too short."""
     start = parameter.value.start
     if parameter.value.end - start < SIZE:
         return None
@@ -58,12 +59,15 @@ def read_locator(
 
 
 def replaced(parameters: ParameterList, parameter: Parameter, target: HostPort) -> Overwrite:
-    """The edit that makes a locator lead to ``target``. Raises ValueError if its host is a name."""
+    """The edit that replaces a locator by ``target``. Raises ValueError if the host is a name."""
     return Overwrite(parameter.value.start, pack_locator(target, parameters.order))
 
 
 def pack_locator(host_port: HostPort, order: str) -> bytes:
-    """A locator of UDP, in a byte order as `struct` has it. Raises ValueError for a name."""
+    """A locator of UDP in the byte order ``order``, in the notation of `struct`.
+
+    Raises ValueError if the host is a name.
+    """
     kind, address = _packed(host_port.host)
     return struct.pack(order + "iI", kind, host_port.port) + address
 

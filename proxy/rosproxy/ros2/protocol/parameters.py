@@ -1,9 +1,9 @@
-"""Parameter lists: what a participant and its readers and writers say of themselves.
+"""Parameter lists: the descriptions of participants, readers and writers.
 
-A list is a row of parameters, each an id, a length and a value, up to PID_SENTINEL. The samples of
-discovery have one as their payload, after four bytes that tell its byte order; DATA may have one in
-front as *inline QoS*. A parameter is taken out by giving it the id PID_PAD, which everybody skips
-(DDSI-RTPS 2.5, 9.4.2.11).
+A list is a row of parameters up to PID_SENTINEL. Each parameter has an id, a length and a value.
+The payload of a discovery sample is a list after four bytes, which state the byte order. A DATA may
+also have a list before the payload, the *inline QoS*. To remove a parameter, the proxy overwrites
+the id with PID_PAD, which receivers skip (DDSI-RTPS 2.5, 9.4.2.11).
 """
 
 import struct
@@ -20,8 +20,9 @@ from rosproxy.ros2.protocol.rtps import (
 )
 
 _BIG = 0x0002
+"""PL_CDR_BE, the encoding of a big-endian parameter list."""
 _LITTLE = 0x0003
-"""PL_CDR_BE and PL_CDR_LE, the encodings of a parameter list."""
+"""PL_CDR_LE, the encoding of a little-endian parameter list."""
 
 
 class Pid(IntEnum):
@@ -59,9 +60,9 @@ class Pid(IntEnum):
 
 
 class FastDdsPid(IntEnum):
-    """Parameters of Fast DDS that tell what it shares with others on its machine.
+    """Parameters of Fast DDS about the machine of a participant, and the memory shared there.
 
-    Ids from 0x8000 on have a meaning for each vendor (ParameterTypes.hpp).
+    The meaning of ids from 0x8000 on depends on the vendor (ParameterTypes.hpp).
     """
 
     MACHINE_ID = 0x8003
@@ -70,12 +71,12 @@ class FastDdsPid(IntEnum):
 
 
 OLD_LOCATORS = (0x0B, 0x0C, 0x0D, 0x0E, 0x11, 0x45, 0x46)
-"""Addresses and ports of locators, each a parameter of its own: RTPS 2.1 had them, and Cyclone DDS
-still goes by them (ddsi_plist.c)."""
+"""The addresses and ports of locators as separate parameters. RTPS 2.1 had these, and Cyclone DDS
+still uses them (ddsi_plist.c)."""
 
 
 class Parameter(msgspec.Struct, frozen=True):
-    """A parameter: its id, where that stands in the datagram, and where its value is."""
+    """A parameter, with the position of the id (``offset``) and of the value in the datagram."""
 
     pid: int
     offset: int
@@ -83,17 +84,17 @@ class Parameter(msgspec.Struct, frozen=True):
 
 
 class ParameterList(msgspec.Struct, frozen=True):
-    """The parameters of a list in a datagram; ``little`` tells their byte order."""
+    """The parameters of a list in a datagram; ``little`` means little-endian."""
 
     little: bool
     parameters: tuple[Parameter, ...]
 
     def all(self, *pids: int) -> list[Parameter]:
-        """The parameters with one of these ids, in their order."""
+        """The parameters with one of these ids, in the order of the list."""
         return [p for p in self.parameters if p.pid in pids]
 
     def number(self, datagram: bytes, pid: int) -> int | None:
-        """The first 32-bit number with an id; None if there is none, or it is too short."""
+        """The first 32-bit number with an id; None if the list has none of sufficient length."""
         for param in self.all(pid):
             if param.value.end - param.value.start >= 4:
                 number: int = struct.unpack_from(self.order + "I", datagram, param.value.start)[0]
@@ -101,7 +102,10 @@ class ParameterList(msgspec.Struct, frozen=True):
         return None
 
     def seconds(self, datagram: bytes, pid: int) -> float | None:
-        """The first duration with an id: whole seconds and 2**-32 of them; it may be infinite."""
+        """The first duration with an id, in seconds, or infinite; None if the list has none.
+
+        On the wire, a duration is whole seconds and a number of 2**-32 seconds.
+        """
         for param in self.all(pid):
             if param.value.end - param.value.start >= 8:
                 whole, fraction = struct.unpack_from(self.order + "iI", datagram, param.value.start)
@@ -109,7 +113,10 @@ class ParameterList(msgspec.Struct, frozen=True):
         return None
 
     def text(self, datagram: bytes, pid: int) -> str | None:
-        """The first string with an id: its length, and so many bytes, the last of them zero."""
+        """The first string with an id; None if the list has none of sufficient length.
+
+        On the wire, a string is a length and so many bytes, of which the last is zero.
+        """
         size = self.number(datagram, pid)
         for param in self.all(pid) if size else ():
             start = param.value.start + 4
@@ -119,25 +126,25 @@ class ParameterList(msgspec.Struct, frozen=True):
 
     @property
     def order(self) -> str:
-        """The byte order as `struct` has it."""
+        """The byte order in the notation of `struct`."""
         return "<" if self.little else ">"
 
     def removed(self, parameter: Parameter) -> Overwrite:
-        """The edit that takes a parameter out."""
+        """The edit that removes a parameter."""
         return Overwrite(parameter.offset, struct.pack(self.order + "H", Pid.PAD))
 
     def zeroed(self, parameter: Parameter) -> Overwrite:
-        """The edit that leaves nothing of a parameter's value."""
+        """The edit that sets all bytes of a parameter's value to zero."""
         start = parameter.value.start
         end = parameter.value.end
         return Overwrite(start, bytes(end - start))
 
 
 def payload_parameters(datagram: bytes, sample: Sample) -> ParameterList | None:
-    """The list that is a sample's payload; None if its payload is something else.
+    """The parameter list in a sample's payload; None if the payload is not a parameter list.
 
-    Raises RtpsError if the list has no end, or a length leads outside. A DATA_FRAG can be read only
-    if it carries the whole sample.
+    Raises RtpsError if the list has no end, or a length leads outside the list. A DATA_FRAG has to
+    carry the whole sample.
     """
     span = sample.payload
     if span is None or span.end - span.start < 4:
@@ -149,7 +156,7 @@ def payload_parameters(datagram: bytes, sample: Sample) -> ParameterList | None:
 
 
 def inline_parameters(datagram: bytes, sample: Sample) -> ParameterList | None:
-    """The list in front of a sample's payload; None if it has none. Raises RtpsError."""
+    """The inline QoS of a sample; None if the sample has none. Raises RtpsError."""
     return _read(datagram, sample.inline_qos, sample.little) if sample.inline_qos else None
 
 

@@ -1,12 +1,12 @@
-"""The QoS of a reader or writer, as far as it decides who matches whom.
+"""The QoS of a reader or writer, limited to the policies that decide matching.
 
-SEDP carries it, a parameter for each policy; one that is left out has its default (DDSI-RTPS 2.5,
-9.6.3.2; Fast DDS sends all policies, Cyclone DDS only what differs). A policy that can't be read
-counts as left out: QoS decides nothing but what the user is told.
+SEDP carries a parameter for each policy. A policy that is left out has its default (DDSI-RTPS 2.5,
+9.6.3.2). Fast DDS sends all policies, Cyclone DDS only those with another value. A malformed policy
+counts as left out: the proxy uses QoS only for reports to the user.
 
     reliability          kind 4 (1 best effort, 2 reliable), the longest blocking 8
     durability           kind 4 (0 volatile, 1 transient local, 2 transient, 3 persistent)
-    liveliness           kind 4 (0 automatic, 1 by participant, 2 by topic), lease 8
+    liveliness           kind 4 (0 automatic, 1 by participant, 2 by topic), lease duration 8
     deadline             period 8
     ownership            kind 4 (0 shared, 1 exclusive)
     partition            count 4, so many strings
@@ -22,15 +22,17 @@ import msgspec
 from rosproxy.ros2.protocol.parameters import Parameter, ParameterList, Pid
 
 MOST_PARTITIONS = 4
+"""Partitions of a reader or writer that the proxy reads. ROS 2 itself uses no partitions."""
 LONGEST_PARTITION = 64
-"""Partitions that are read, and the bytes of each; ROS 2 itself uses none."""
+"""Bytes of a partition's name that the proxy reads."""
 MOST_REPRESENTATIONS = 3
+"""Data representations of a reader or writer that the proxy reads."""
 _RELIABLE = 2
 _EXCLUSIVE = 1
 
 
 class Durability(IntEnum):
-    """Whether a reader gets what was written before it came; each kind offers more."""
+    """Whether a reader receives samples from before its start. A greater kind offers more."""
 
     VOLATILE = 0
     TRANSIENT_LOCAL = 1
@@ -39,7 +41,7 @@ class Durability(IntEnum):
 
 
 class Liveliness(IntEnum):
-    """Who asserts that a writer is alive; each kind is more exact than the one before."""
+    """What asserts that a writer is alive. A greater kind is more exact."""
 
     AUTOMATIC = 0
     MANUAL_BY_PARTICIPANT = 1
@@ -47,10 +49,10 @@ class Liveliness(IntEnum):
 
 
 class EndpointQos(msgspec.Struct, frozen=True):
-    """What a writer offers, or a reader requests. Times are in seconds.
+    """The QoS that a writer offers, or that a reader requests. Times are in seconds.
 
-    ``partitions`` is None where there are more, or longer ones, than are read.
-    ``representations`` are kinds; none is the same as XCDR alone.
+    ``partitions`` is None if the endpoint has more or longer partitions than the proxy reads.
+    ``representations`` are kinds; an empty tuple means XCDR alone.
     """
 
     reliable: bool = False
@@ -64,11 +66,12 @@ class EndpointQos(msgspec.Struct, frozen=True):
 
 
 def read_qos(datagram: bytes, parameters: ParameterList, is_writer: bool) -> EndpointQos:
-    """The QoS in what a reader or writer announces; never raises.
+    """The QoS in the announcement of a reader or writer. Never raises.
 
-    A writer is reliable, and a reader is not, unless it says otherwise (DDS 1.4, 2.2.3.14).
+    By default a writer is reliable, and a reader is not (DDS 1.4, 2.2.3.14).
     """
-    by_pid = {p.pid: p for p in reversed(parameters.parameters)}  # the first of each id
+    # If an id is repeated, the first parameter counts.
+    by_pid = {p.pid: p for p in reversed(parameters.parameters)}
 
     def kind(pid: Pid, default: int) -> int:
         numbers = _unpacked(datagram, parameters, by_pid.get(pid), "I")
@@ -95,7 +98,7 @@ def read_qos(datagram: bytes, parameters: ParameterList, is_writer: bool) -> End
 def _unpacked(
     datagram: bytes, parameters: ParameterList, parameter: Parameter | None, layout: str
 ) -> tuple[int, ...]:
-    """Numbers at the start of a parameter; none if it is too short, or not there."""
+    """The numbers at the start of a parameter; empty if the parameter is too short or None."""
     if parameter is None:
         return ()
     start = parameter.value.start
@@ -120,7 +123,10 @@ def _partitions(
 def _strings(
     datagram: bytes, parameters: ParameterList, parameter: Parameter, count: int
 ) -> Iterator[str]:
-    """The strings of a sequence, up to a bad one: a length, so many bytes, padded to four."""
+    """Yield the strings of a sequence, up to the first malformed one.
+
+    On the wire, a string is a length and so many bytes, padded to a multiple of four.
+    """
     offset = parameter.value.start + 4
     end = parameter.value.end
     for _ in range(count):

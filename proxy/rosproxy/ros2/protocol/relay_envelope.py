@@ -1,11 +1,12 @@
-"""The envelope that the LAN relay puts around an announcement: the address that it came from.
+"""The envelope that the LAN relay puts around an announcement: the source address.
 
-16 bytes before the datagram: the address, IPv4 as IPv4-in-IPv6. The proxy uses a participant
-outside only at the address that it sends from, which is lost when the LAN relay passes a datagram
-on.
+The envelope is 16 bytes before the datagram: an IPv6 address, or an IPv4-mapped IPv6 address. The
+proxy sends to a participant outside only at the source address of its announcement. This address is
+lost when the LAN relay passes the datagram on.
 
-The other way, the proxy tells the relay which addresses have proved to receive: `LIST_MAGIC`, and
-16 bytes for each address. An announcement begins with the letters RTPS.
+In the other direction, the proxy tells the relay which addresses are proven: `LIST_MAGIC`, and 16
+bytes for each address. A list and an announcement differ in the first bytes: an announcement begins
+with the letters RTPS.
 """
 
 from collections.abc import Iterable, Iterator
@@ -16,31 +17,34 @@ from rosproxy.ros2.protocol.rtps import RtpsError
 
 LIST_MAGIC = b"ADDR"
 MOST_LISTED = 256
-"""Addresses in a list; the datagram has 4 KiB."""
+"""Addresses in a list; the datagram then has 4 KiB."""
 _SIZE = 16
 
 
 def wrapped(source: str, datagram: bytes) -> bytes:
-    """A datagram with the address that it came from. Raises ValueError if ``source`` is none."""
+    """A datagram after its source address. Raises ValueError if ``source`` is not an address."""
     return _packed(source) + datagram
 
 
 def unwrapped(data: bytes) -> tuple[str, bytes]:
-    """The address and the datagram. Raises RtpsError if it is too short."""
+    """The source address and the datagram. Raises RtpsError if ``data`` is too short."""
     if len(data) < _SIZE:
         raise RtpsError("the datagram is too short for the address of its source")
     return _unpacked(data[:_SIZE]), data[_SIZE:]
 
 
 def address_lists(addresses: Iterable[str]) -> Iterator[bytes]:
-    """Yield lists of addresses, each for one datagram. Raises ValueError if one is no address."""
+    """Yield lists of addresses, each for one datagram.
+
+    Raises ValueError if an item is not an address.
+    """
     packed = list(map(_packed, addresses))
     for start in range(0, len(packed), MOST_LISTED):
         yield LIST_MAGIC + b"".join(packed[start : start + MOST_LISTED])
 
 
 def listed_addresses(content: bytes) -> list[str] | None:
-    """Return the addresses of a list; None if the content is no list."""
+    """Return the addresses in a list; None if the content is not a list."""
     if not content.startswith(LIST_MAGIC):
         return None
     starts = range(len(LIST_MAGIC), len(content) - _SIZE + 1, _SIZE)

@@ -1,18 +1,19 @@
-"""The proof that a datagram comes from the LAN relay, or from the relay's proxy.
+"""The proof that a datagram comes from the LAN relay, or from the proxy of this relay.
 
-Both programs know one secret. An address proves nothing: behind Docker's port proxy, and where
-Kubernetes masquerades, each client has the address of the relay.
+Both programs know one secret. A source address proves nothing: behind Docker's port proxy, and
+where Kubernetes masquerades, each client has the address of the relay.
 
     magic 4, time stamp 8 (milliseconds of Unix time, big-endian), proof 16, then the content
 
 The proof is a keyed BLAKE2b (RFC 7693) of the time stamp and the content. The direction is the
 *person* parameter of the hash, so that the proof of one direction is wrong in the other.
 
-A proof is good for `WINDOW_S` seconds before and after the receiver's clock. Neither program keeps
-state, so either may start anew at any time. Within the window a datagram may be repeated. Such a
-datagram only says what its participant has just said to the whole LAN. At worst a participant that
-has ended lives for one lease duration more, or a live one is forgotten until its next announcement,
-seconds later. The relay runs on the proxy's machine, so both have one clock, also where that jumps.
+A proof is valid for `WINDOW_S` seconds before and after the receiver's clock. Neither program keeps
+state, so each program may restart at any time. Within the window, an attacker may repeat a
+datagram. The repeated datagram says what its participant has just said to the whole LAN. At worst,
+a participant that has ended lives for one lease duration more, or the proxy forgets a live
+participant until the next announcement, seconds later. The relay runs on the proxy's machine, so
+both programs have the same clock, also if the clock jumps.
 """
 
 import hmac
@@ -27,25 +28,25 @@ MAGIC = b"RPX1"
 WINDOW_S = 30.0
 """Seconds by which the time stamp may differ from the receiver's clock."""
 LONGEST_CONTENT = 8192 + 16
-"""Bytes of a content that is read: an announcement of the greatest length, and its address."""
+"""Bytes of a content that the receiver reads: the longest announcement, and its address."""
 _PROOF_SIZE = 16
 _STAMP = struct.Struct(">Q")
 _CONTENT_AT = len(MAGIC) + _STAMP.size + _PROOF_SIZE
 
 
 class ProofError(RtpsError):
-    """A datagram without a proof that is good now."""
+    """A datagram without a valid proof."""
 
 
 class Direction(Enum):
-    """Which way a datagram goes. A value has 16 bytes at most (RFC 7693, 2.8)."""
+    """The direction of a datagram. A value has at most 16 bytes (RFC 7693, 2.8)."""
 
     TO_PROXY = b"LAN to proxy"
     TO_LAN = b"proxy to LAN"
 
 
 class RelayProof:
-    """Proves datagrams, and checks proofs. ``unix_time`` is the wall clock, in seconds."""
+    """Adds proofs to contents, and checks proofs. ``unix_time`` is the wall clock, in seconds."""
 
     __slots__ = ("_key", "_unix_time")
 
@@ -54,12 +55,12 @@ class RelayProof:
         self._unix_time = unix_time
 
     def sealed(self, direction: Direction, content: bytes) -> bytes:
-        """Return a content with its proof."""
+        """Return the datagram with a content and its proof."""
         stamp = _STAMP.pack(int(self._unix_time() * 1000))
         return MAGIC + stamp + self._proof(direction, stamp, content) + content
 
     def opened(self, direction: Direction, datagram: bytes) -> bytes:
-        """Return the content of a datagram that has a good proof. Raises ProofError."""
+        """Return the content of a datagram. Raises ProofError if the proof is not valid."""
         if not datagram.startswith(MAGIC) or len(datagram) < _CONTENT_AT:
             raise ProofError(
                 "the datagram has no proof. Use the same version for the proxy and its LAN relay"

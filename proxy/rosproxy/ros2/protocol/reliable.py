@@ -1,13 +1,14 @@
-"""What reliable readers and writers tell each other: heartbeats, and which samples are missing.
+"""The submessages of the reliable protocol: heartbeats, acknowledgements and gaps.
 
     HEARTBEAT  reader 4, writer 4, first number 8, last number 8, count 4
     ACKNACK    reader 4, writer 4, a set of numbers (base 8, bits 4, words), count 4
     GAP        reader 4, writer 4, first number 8, a set of numbers
     NACK_FRAG  reader 4, writer 4, number 8, a set of fragments (base 4, bits 4, words), count 4
 
-A writer says by a heartbeat which samples it has; a reader answers with those that it lacks, and so
-confirms all before them (DDSI-RTPS 2.5, 8.3.8.1 and 8.3.8.6). By a GAP the writer says that samples
-are not for the reader, which then goes on without them (8.3.8.4).
+A HEARTBEAT of a writer states which samples the writer has. The reader answers with an ACKNACK,
+which names the missing samples and confirms all samples before these (DDSI-RTPS 2.5, 8.3.8.1 and
+8.3.8.6). A GAP of a writer states that samples are not for the reader. The reader then continues
+without these samples (8.3.8.4).
 """
 
 import struct
@@ -27,17 +28,17 @@ from rosproxy.ros2.protocol.rtps import (
 )
 
 MOST_ASKED = 256
-"""Samples that may be asked for at once: the bits of a set (9.4.2.6)."""
+"""Samples that a reader may request at once: the bits of a set (9.4.2.6)."""
 _LITTLE = 0x01
 _FINAL = 0x02
 _GAP_SIZE = 28
 """Bytes of a GAP with one number."""
 _TO_READER = 5
-"""What makes a built-in writer's entity id (…c2) that of its reader (…c7)."""
+"""The entity id of a builtin writer (…c2) plus this is the entity id of its reader (…c7)."""
 
 
 class Heartbeat(msgspec.Struct, frozen=True):
-    """The numbers of the first and the last sample that a writer has; none if first > last."""
+    """The numbers of the first and last sample of a writer. The writer has none if first > last."""
 
     writer: int
     first: int
@@ -45,7 +46,7 @@ class Heartbeat(msgspec.Struct, frozen=True):
 
 
 def heartbeats(datagram: bytes) -> Iterator[Heartbeat]:
-    """All heartbeats in a message. Raises RtpsError if a length or a number can't be."""
+    """Yield all heartbeats in a message. Raises RtpsError for an impossible length or number."""
     for kind, flags, body in submessages(datagram):
         if kind == SubmessageId.HEARTBEAT and body.end - body.start >= 28:
             order = "<" if flags & _LITTLE else ">"
@@ -59,9 +60,10 @@ def heartbeats(datagram: bytes) -> Iterator[Heartbeat]:
 
 
 def heartbeat(own: bytes, to: bytes, writer: int, first: int, count: int) -> bytes:
-    """The message by which a built-in writer tells a participant that it has no sample.
+    """The message in which a builtin writer tells a participant that the writer has no sample.
 
-    The next would be ``first``. It is answered with what the reader expects.
+    ``first`` is the number of the writer's next sample. The reader answers with the number of the
+    sample that the reader expects.
     """
     body = struct.pack(">II", writer + _TO_READER, writer)
     last = first - 1
@@ -70,10 +72,11 @@ def heartbeat(own: bytes, to: bytes, writer: int, first: int, count: int) -> byt
 
 
 def acknowledged(datagram: bytes, prefix: bytes, writer: int) -> list[int]:
-    """The numbers that a message's readers expect next of a writer of the participant ``prefix``.
+    """The next numbers that the readers in a message expect from a writer of a participant.
 
-    Cyclone DDS puts answers to several participants at one locator into one message. Each answer is
-    for the participant of the INFO_DST before it. Raises RtpsError if a length leads outside.
+    ``prefix`` is the GUID prefix of the participant. Cyclone DDS puts answers to several
+    participants at one locator into one message. Each answer is for the participant of the last
+    INFO_DST before the answer. Raises RtpsError if a length leads outside the datagram.
     """
     numbers = []
     addressee = b""
@@ -92,12 +95,12 @@ def acknowledged(datagram: bytes, prefix: bytes, writer: int) -> list[int]:
 def acknack(
     own: bytes, to: bytes, writer: int, base: int, missing: Collection[int], count: int, final: bool
 ) -> bytes:
-    """The message by which a built-in reader asks a participant's writer for samples.
+    """The message in which a builtin reader requests samples from a participant's writer.
 
-    It has all before ``base``. ``missing`` are at most MOST_ASKED from there on. Unless it is
-    ``final`` the writer answers with a heartbeat.
+    The reader has all samples before ``base``. ``missing`` are at most MOST_ASKED numbers from
+    ``base`` on. Unless ``final`` is set, the writer answers with a heartbeat.
     """
-    # Cyclone DDS ignores one without a reader (ddsi_receive.c, validate_AckNack).
+    # Cyclone DDS ignores an ACKNACK without a reader (ddsi_receive.c, validate_AckNack).
     body = struct.pack(">II", writer + _TO_READER, writer)
     body += struct.pack("<iI", base >> 32, base & 0xFFFFFFFF)
     body += _bits([number - base for number in missing]) + _packed_count(count)
@@ -108,9 +111,10 @@ def acknack(
 def nack_frag(
     own: bytes, to: bytes, writer: int, sequence: int, missing: Sequence[int], count: int
 ) -> bytes:
-    """The message by which a built-in reader asks for fragments of a sample (8.3.8.10).
+    """The message in which a builtin reader requests fragments of a sample (8.3.8.10).
 
-    ``missing`` are their numbers, in order; the first MOST_ASKED are asked for.
+    ``missing`` are the numbers of the fragments, in ascending order and at least one. The message
+    requests only numbers less than MOST_ASKED above the first.
     """
     body = struct.pack(">II", writer + _TO_READER, writer)
     body += struct.pack("<iII", sequence >> 32, sequence & 0xFFFFFFFF, missing[0])
@@ -119,17 +123,17 @@ def nack_frag(
 
 
 def withheld(sample: Sample) -> Overwrite:
-    """The edit that makes a DATA or DATA_FRAG a GAP: the sample is not for this reader.
+    """The edit that turns a DATA or DATA_FRAG into a GAP: the sample is not for this reader.
 
-    The rest of the submessage's bytes becomes a PAD, and zero. Raises RtpsError if it is too short
-    for that, which no announcement of a reader or writer is.
+    The other bytes of the submessage become a PAD of zeros. Raises RtpsError if the submessage is
+    too short for a GAP. Announcements of readers and writers are long enough.
     """
     order, flag = ("<", _LITTLE) if sample.little else (">", 0)
     size = sample.body.end - sample.body.start
     next_sequence = sample.sequence + 1
     if size < _GAP_SIZE + 4:
         raise RtpsError(f"a sample of discovery has {size} bytes, which is too short")
-    # It may be 0: the length 0 of a PAD means none, not up to the end (9.4.5.1.3).
+    # A PAD may have the length 0. Here 0 does not mean "up to the end" (9.4.5.1.3).
     pad = size - _GAP_SIZE - 4
     gap = struct.pack(order + "BBH", SubmessageId.GAP, flag, _GAP_SIZE)
     gap += struct.pack(">II", sample.reader, sample.writer)
@@ -140,13 +144,16 @@ def withheld(sample: Sample) -> Overwrite:
 
 
 def _directed(own: bytes, to: bytes, kind: int, flags: int, body: bytes) -> bytes:
-    """A message of the proxy's own with one submessage for one participant."""
+    """A message of the proxy with one submessage for one participant."""
     info_dst = struct.pack("<BBH", SubmessageId.INFO_DST, _LITTLE, len(to)) + to
     return message_header(own) + info_dst + struct.pack("<BBH", kind, flags, len(body)) + body
 
 
 def _bits(numbers: Collection[int]) -> bytes:
-    """A set of numbers from 0 on: how many bits, and these in 32-bit words (9.4.2.6, 9.4.2.8)."""
+    """The set of these numbers: the count of bits, and the bits in 32-bit words (9.4.2.6, 9.4.2.8).
+
+    Numbers below 0 and from MOST_ASKED on are left out.
+    """
     requested = [n for n in numbers if 0 <= n < MOST_ASKED]
     bit_count = max(requested, default=-1) + 1
     bitmap = [0] * -(-bit_count // 32)
@@ -156,7 +163,7 @@ def _bits(numbers: Collection[int]) -> bytes:
 
 
 def _packed_count(count: int) -> bytes:
-    """A count, which begins anew after 2^32: a reader tells by the count what it has seen."""
+    """A count modulo 2**32. Receivers use the count to recognise repeated submessages."""
     return struct.pack("<I", count & 0xFFFFFFFF)
 
 

@@ -1,7 +1,8 @@
-"""Names of ROS 2 from names of DDS.
+"""The ROS 2 names for DDS names.
 
-Topics are called ``rt/chatter`` in DDS; a service has two topics, ``rq/addRequest`` and
-``rr/addReply``; an action has services and topics below ``_action``. Types have a namespace more.
+DDS calls the topic ``/chatter`` ``rt/chatter``. A service has two topics, ``rq/addRequest`` and
+``rr/addReply``. An action has services and topics below ``_action``. A DDS type has an additional
+namespace, ``dds_``.
 """
 
 _TOPIC = "rt/"
@@ -11,17 +12,20 @@ _DDS_NAMESPACE = "::dds_::"
 
 
 def ros_topic(dds_topic: str) -> str | None:
-    """The topic of ROS that a topic of DDS carries, others as they are; None if a service's."""
+    """The ROS topic for a DDS topic; None if the DDS topic belongs to a service.
+
+    A topic that is not of ROS stays unchanged.
+    """
     return None if is_of_service(dds_topic) else ros_name(dds_topic)
 
 
 def ros_service(dds_topic: str) -> str | None:
-    """The service of ROS whose requests a topic of DDS carries; None if it carries none."""
+    """The ROS service whose requests a DDS topic carries; None for other topics."""
     return ros_name(dds_topic) if is_of_requests(dds_topic) else None
 
 
 def ros_name(dds_topic: str) -> str:
-    """The topic or service of ROS that a topic of DDS belongs to."""
+    """The ROS topic or service to which a DDS topic belongs; other topics unchanged."""
     for prefix, suffix in ((_REQUEST, "Request"), (_REPLY, "Reply")):
         if dds_topic.startswith(prefix):
             return f"/{dds_topic.removeprefix(prefix).removesuffix(suffix)}"
@@ -29,19 +33,20 @@ def ros_name(dds_topic: str) -> str:
 
 
 def is_of_service(dds_topic: str) -> bool:
-    """Whether a topic of DDS carries requests or replies."""
+    """Whether a DDS topic carries requests or replies of a service."""
     return dds_topic.startswith((_REQUEST, _REPLY))
 
 
 def is_of_requests(dds_topic: str) -> bool:
-    """Whether a topic of DDS carries a service's requests."""
+    """Whether a DDS topic carries the requests of a service."""
     return dds_topic.startswith(_REQUEST)
 
 
 def ros_type(dds_type: str) -> str:
-    """The type of ROS for one of DDS: ``std_msgs::msg::dds_::String_`` is std_msgs/msg/String.
+    """The ROS type for a DDS type: std_msgs/msg/String for ``std_msgs::msg::dds_::String_``.
 
-    A service has the same type for its requests and replies. Other types stay as they are.
+    The request and the reply of a service have the same ROS type. Types that are not of ROS stay
+    unchanged.
     """
     package, separator, name = dds_type.partition(_DDS_NAMESPACE)
     if not separator:

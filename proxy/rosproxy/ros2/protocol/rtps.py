@@ -1,19 +1,20 @@
-"""RTPS messages: what a datagram carries, and where in it.
+"""RTPS messages: the submessages and samples of a datagram, and their positions.
 
-A message is a header and a row of *submessages*. Two of them carry *samples*, what a writer has
-written: DATA a whole one, DATA_FRAG a part. All others (heartbeats, acknowledgements, what a
-vendor has of its own) are none of the proxy's business and pass as they are.
+A message is a header and a row of *submessages*. A *sample* is what a writer has written. Two kinds
+of submessage carry samples: DATA carries a whole sample, DATA_FRAG a part. The proxy passes all
+other submessages unchanged: heartbeats, acknowledgements, and submessages of a vendor.
 
-Nothing is decoded and encoded again: what is read are positions, and whatever changes has the same
-length after as before (`Overwrite`). So every byte that the proxy does not mean to change stays,
-those of versions and vendors that it does not know among them.
+The proxy never encodes a received message anew. This module returns positions, and an edit
+(`Overwrite`) keeps the length of the datagram. So all bytes outside the edits stay, also those of
+unknown versions and vendors.
 
     header      "RTPS", version 2, vendor 2, GUID prefix 12
     submessage  id 1, flags 1, length 2, then so many bytes; bit 0 of flags: little-endian
     DATA        extra flags 2, octets to inline QoS 2, reader 4, writer 4, sequence number 8,
                 inline QoS if flag 2, payload if flag 4 (or 8: the key alone)
-    DATA_FRAG   the same up to the sequence number, first fragment 4, fragments 2, fragment size 2,
-                sample size 4, inline QoS if flag 2, a part of the payload (flag 4: of the key)
+    DATA_FRAG   as DATA up to the sequence number, then first fragment 4, fragments 2,
+                fragment size 2, sample size 4, inline QoS if flag 2, a part of the payload
+                (flag 4: of the key)
 """
 
 import struct
@@ -32,25 +33,28 @@ CYCLONE_DDS = b"\x01\x10"
 HEADER = 20
 """Bytes of a message's header."""
 ALIGNMENT = 4
-"""The length of a parameter is a multiple of this (9.4.2.11), and that of each submessage but the
-last (9.4.1). Fast DDS rounds others up (ParameterList.cpp, MessageReceiver.cpp), so that it finds
-what follows elsewhere than who does not."""
+"""The length of each parameter is a multiple of these bytes (9.4.2.11), and so is the length of
+each submessage but the last (9.4.1). Fast DDS rounds other lengths up (ParameterList.cpp,
+MessageReceiver.cpp). So Fast DDS would find the next parameter at another place than other
+implementations."""
 PREFIX = 12
 """Bytes of a GUID prefix."""
 VERSION_TO_PREFIX = HEADER - len(MAGIC)
-"""Bytes of what a header and an INFO_SRC both have: version, vendor, GUID prefix."""
+"""Bytes of version, vendor and GUID prefix, which both a header and an INFO_SRC contain."""
 MOST_SUBMESSAGES = 256
-"""Submessages of a datagram that are read; real ones have a dozen."""
+"""Submessages of a datagram that the proxy accepts; real datagrams have a dozen."""
 
 LAST_NUMBER = 2**63 - 2
-"""The greatest sequence number that is accepted: it has a next one. They begin with 1."""
+"""The greatest sequence number that the proxy accepts: it still has a successor. The least is 1."""
 
 SENTINEL = 1
-"""The id that ends a parameter list; its length means nothing."""
+"""The id that ends a parameter list. Its length field has no meaning."""
 MOST_PARAMETERS = 512
-"""Parameters of a list that are read, its end among them; real ones have less than a hundred."""
+"""Parameters of a list that the proxy accepts, including the sentinel. Real lists have less than
+100."""
 MOST_INLINE_BYTES = 16 * 1024
-"""Bytes of all inline QoS in a datagram. A sample of discovery has 24 to 36."""
+"""Bytes of all inline QoS in a datagram. The inline QoS of a discovery sample has 24 to 36
+bytes."""
 _LITTLE_HEADER = struct.Struct("<HH")
 _BIG_HEADER = struct.Struct(">HH")
 
@@ -60,11 +64,11 @@ _DATA = 0x04
 _KEY = 0x08
 _FRAGMENT_KEY = 0x04
 _CHECKSUM = 0x60
-"""Which checksum a HEADER_EXTENSION has, if any (DDSI-RTPS 2.5, 9.4.5.2)."""
+"""Flags of a HEADER_EXTENSION for the kind of checksum; 0: no checksum (DDSI-RTPS 2.5, 9.4.5.2)."""
 
 
 class RtpsError(ValueError):
-    """A datagram that is no RTPS message, or one whose lengths lead outside of it."""
+    """A datagram that is no RTPS message, or is one that the proxy does not accept."""
 
 
 class SubmessageId(IntEnum):
@@ -86,10 +90,10 @@ class SubmessageId(IntEnum):
 
 STATISTICS = 0x80
 RTI_CRC = 0x80
-"""Submessages from 0x80 on have a meaning for each vendor. Of Fast DDS it is at the end of each
-message, where that went and how many bytes; of RTI Connext a checksum."""
+"""The meaning of submessages from 0x80 on depends on the vendor. Fast DDS ends each message with
+the destination and byte counts; RTI Connext sends a checksum."""
 
-# Plain numbers: a member of an enumeration is slow to look up, and this is done for each datagram.
+# Plain numbers, because members of an enumeration are slow to look up for each datagram.
 _INFO_SRC = SubmessageId.INFO_SRC.value
 INFO_DST = SubmessageId.INFO_DST.value
 _DATA_FRAG = SubmessageId.DATA_FRAG.value
@@ -98,17 +102,18 @@ _MAY_BE_EMPTY = frozenset({SubmessageId.PAD.value, SubmessageId.INFO_TS.value})
 
 
 class Span(msgspec.Struct, frozen=True):
-    """A part of a datagram: from ``start`` up to and without ``end``."""
+    """The bytes of a datagram from ``start`` up to, but not including, ``end``."""
 
     start: int
     end: int
 
 
 class Fragments(msgspec.Struct, frozen=True):
-    """Which part of a sample a DATA_FRAG carries.
+    """The part of a sample that a DATA_FRAG carries.
 
-    ``first`` is the number of its first fragment, from 1 on, ``count`` how many it has, ``size``
-    the bytes of each but a sample's last, ``total`` those of the whole sample.
+    ``first`` is the number of the first fragment, from 1 on. ``count`` is the number of fragments.
+    ``size`` is the bytes of each fragment except a sample's last, and ``total`` the bytes of the
+    whole sample.
     """
 
     first: int
@@ -118,12 +123,13 @@ class Fragments(msgspec.Struct, frozen=True):
 
 
 class Sample(msgspec.Struct, frozen=True):
-    """What a DATA or DATA_FRAG carries, and where.
+    """A sample, or a part of one, in a DATA or DATA_FRAG, with its positions in the datagram.
 
-    ``body`` is all of the submessage but its header. ``prefix`` is the GUID prefix of the
-    participant that has written it, ``writer`` and ``reader`` are entity ids (0: any reader).
-    ``little``: the byte order of the submessage, which is that of ``inline_qos``; the payload has
-    one of its own. ``key``: the payload is the key alone, of something that has ended.
+    ``body`` is the submessage without its header. ``prefix`` is the GUID prefix of the participant
+    that has written the sample. ``writer`` and ``reader`` are entity ids (0: any reader).
+    ``little`` tells whether the submessage and ``inline_qos`` are little-endian; the payload states
+    its own byte order. ``is_key_only`` tells whether the payload is the key alone, which names an
+    instance that has ended. ``fragments`` is None for DATA.
     """
 
     prefix: bytes
@@ -139,14 +145,14 @@ class Sample(msgspec.Struct, frozen=True):
 
 
 class Overwrite(msgspec.Struct, frozen=True):
-    """Bytes at a position of a datagram that replace as many others."""
+    """Bytes that replace as many bytes at a position of a datagram."""
 
     offset: int
     replacement: bytes
 
 
 def source_prefix(datagram: bytes) -> bytes:
-    """The GUID prefix in the header of a message. Raises RtpsError if it is none."""
+    """The GUID prefix in the header of a message. Raises RtpsError for other datagrams."""
     if len(datagram) < HEADER or datagram[:4] != MAGIC:
         raise RtpsError("the datagram is not an RTPS message")
     if datagram[4] != 2:
@@ -155,18 +161,18 @@ def source_prefix(datagram: bytes) -> bytes:
 
 
 def message_header(prefix: bytes, vendor: bytes = NO_VENDOR) -> bytes:
-    """The header of a message that the proxy makes; its own have no vendor (VENDORID_UNKNOWN)."""
+    """The header of a message that the proxy makes, by default with VENDORID_UNKNOWN."""
     return MAGIC + VERSION + vendor + prefix
 
 
 def source_vendor(datagram: bytes) -> bytes:
-    """The vendor id in the header of a message. Raises RtpsError if it is none."""
+    """The vendor id in the header of a message. Raises RtpsError for other datagrams."""
     source_prefix(datagram)
     return datagram[6:8]
 
 
 def has_checksum(datagram: bytes) -> bool:
-    """Whether a message carries a checksum of itself. Raises RtpsError."""
+    """Whether a message contains a checksum of the message. Raises RtpsError."""
     is_of_rti = source_vendor(datagram) == RTI
     return any(
         (kind == SubmessageId.HEADER_EXTENSION and flags & _CHECKSUM)
@@ -178,7 +184,8 @@ def has_checksum(datagram: bytes) -> bool:
 def samples(datagram: bytes) -> list[Sample]:
     """All samples in a message, in their order.
 
-    Raises RtpsError if a length leads outside, or the inline QoS is longer than MOST_INLINE_BYTES.
+    Raises RtpsError if a length leads outside the datagram, or if the inline QoS is longer than
+    MOST_INLINE_BYTES.
     """
     all_samples = list[Sample]()
     prefix = source_prefix(datagram)
@@ -201,12 +208,12 @@ def samples(datagram: bytes) -> list[Sample]:
 
 
 def by_source(datagram: bytes) -> list[bytes]:
-    """Split a message into one for each participant that sends in it, in their order.
+    """Split a message into one for each source participant, in their order.
 
-    Cyclone DDS has the participants of a program share a message (INFO_SRC, 8.3.8.9). A destination
-    holds until the message names another one, so each part repeats the destination: 16 bytes, where
-    the INFO_SRC had 24 with its header. All parts together are at most half as long again as the
-    message. Raises RtpsError if a length leads outside.
+    With Cyclone DDS, the participants of a process share a message (INFO_SRC, 8.3.8.9). A
+    destination holds until the message names another one. So each part repeats the destination in
+    16 bytes, in place of an INFO_SRC of 24 bytes with its header. All parts together are at most
+    half as long again as the message. Raises RtpsError if a length leads outside the datagram.
     """
     source_prefix(datagram)
     header = datagram[:HEADER]
@@ -222,7 +229,7 @@ def by_source(datagram: bytes) -> list[bytes]:
             header = MAGIC + datagram[source_offset : source_offset + VERSION_TO_PREFIX] + info_dst
             start = body.end
         elif kind == INFO_DST:
-            # The prefix alone: an INFO_DST may be longer, and each part repeats it.
+            # Only the prefix: an INFO_DST may be longer, and each part repeats this submessage.
             info_dst = _info_dst(datagram[body.start : body.start + PREFIX])
     if not messages and start == HEADER:
         return [datagram]
@@ -230,12 +237,12 @@ def by_source(datagram: bytes) -> list[bytes]:
 
 
 def _info_dst(prefix: bytes) -> bytes:
-    """A submessage that says for which participant the next ones are."""
+    """The submessage that names the destination of the next submessages."""
     return struct.pack("<BBH", INFO_DST, _LITTLE, PREFIX) + prefix
 
 
 def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:
-    """The datagram with all edits made. Raises ValueError if one leads outside of it."""
+    """The datagram after all edits. Raises ValueError if an edit leads outside the datagram."""
     changed = bytearray(datagram)
     for edit in edits:
         end = edit.offset + len(edit.replacement)
@@ -247,18 +254,20 @@ def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:
 
 @lru_cache(maxsize=4)
 def submessages(datagram: bytes) -> tuple[tuple[int, int, Span], ...]:
-    """Each submessage's id, flags and body. Raises RtpsError as `walk_submessages` does.
+    """The id, flags and body of each submessage. Raises RtpsError as `walk_submessages` does.
 
-    Discovery is looked at ten times in a row, so the last results are kept.
+    The cache holds the last datagrams, because the proxy looks at a datagram of discovery ten times
+    in a row.
     """
     return tuple(walk_submessages(datagram))
 
 
 def walk_submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
-    """Each submessage's id, flags and body, one after the other.
+    """Yield the id, flags and body of each submessage.
 
-    Raises RtpsError if a length leads outside, is none that all read alike, or an INFO_DST is too
-    short: so what is kept of a message can be read again later.
+    Raises RtpsError if a length leads outside the datagram, if implementations may read a length
+    differently, or if an INFO_DST is too short. So the proxy can keep a message and read it again
+    without an error.
     """
     offset = HEADER
     count = 0
@@ -273,7 +282,7 @@ def walk_submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
         length = first + (second << 8) if flags & _LITTLE else (first << 8) + second
         offset = body + length
         if length == 0 and kind not in _MAY_BE_EMPTY:
-            offset = size  # the last one may say so (9.4.5.1.3)
+            offset = size  # length 0: the last submessage, up to the end (9.4.5.1.3)
         if offset > size:
             raise RtpsError(f"submessage {kind:#x} is longer than the message")
         if (offset - body) % ALIGNMENT and offset < size:
@@ -285,10 +294,11 @@ def walk_submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
 
 
 def walk_parameters(datagram: bytes, span: Span, little: bool) -> Iterator[tuple[int, int, int]]:
-    """Each parameter of a list: its id, where that stands, and where its value ends.
+    """Yield the id, the offset and the end of the value of each parameter in a list.
 
-    The last is the sentinel, which ends with its header. Raises RtpsError if there is none, a
-    length leads outside or is none that all read alike, or there are too many.
+    The last parameter is the sentinel, which ends after its header. Raises RtpsError if the list
+    has no sentinel or more than MOST_PARAMETERS, if a length leads outside the list, or if
+    implementations may read a length differently.
     """
     unpack = (_LITTLE_HEADER if little else _BIG_HEADER).unpack_from
     offset = span.start
@@ -330,11 +340,11 @@ def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment:
         qos = Span(offset, end)
         offset = end
     key = bool(flags & (_FRAGMENT_KEY if is_fragment else _KEY))
-    # DATA_FRAG has no flag for it: it always carries some (9.4.5.4).
+    # DATA_FRAG has no flag for a payload, because each DATA_FRAG has one (9.4.5.4).
     has_payload = is_fragment or bool(flags & (_DATA | _KEY))
     return Sample(
         prefix=prefix,
-        # Entity ids are octets: their order does not depend on the flag.
+        # Entity ids are arrays of octets, without a byte order.
         reader=int.from_bytes(datagram[start + 4 : start + 8], "big"),
         writer=int.from_bytes(datagram[start + 8 : start + 12], "big"),
         sequence=sequence,
@@ -357,7 +367,7 @@ def _fragments(datagram: bytes, offset: int, flags: int) -> Fragments:
 
 
 def require_size(body: Span, size: int) -> None:
-    """Raise RtpsError unless a submessage has so many bytes."""
+    """Raise RtpsError if the body of a submessage has fewer than ``size`` bytes."""
     if body.end - body.start < size:
         raise RtpsError(f"a submessage has {body.end - body.start} bytes and needs {size}")
 
