@@ -1,1 +1,1 @@
-"""What is changed in the messages that pass."""
+"""Changes in the messages that pass the proxy."""

@@ -1,4 +1,4 @@
-"""What a datagram announces of the participant that sends it."""
+"""Read what a datagram announces about a participant and its readers and writers."""
 
 from collections.abc import Iterable
 
@@ -18,20 +18,20 @@ from rosproxy.ros2.registry.participants import (
 from rosproxy.ros2.rewriting.discovery import Announcement
 
 LONGEST_LEASE_DURATION_S = 300.0
-"""Seconds after which a participant that is not heard counts as gone, whatever it says itself."""
+"""Upper bound in seconds for the lease duration that a participant announces."""
 DEFAULT_LEASE_DURATION_S = 100.0
-"""The same if it says nothing (DDSI-RTPS 2.5, 9.6.3.2)."""
+"""The lease duration in seconds of a participant that announces none (DDSI-RTPS 2.5, 9.6.3.2)."""
 _UNKNOWN_DOMAIN = 0xFFFF_FFFF
-"""What Fast DDS calls a domain that it does not know."""
+"""The domain that Fast DDS announces if the domain is unknown."""
 _PROTECTED = 0x01 | 0x02
-"""Of a participant's security attributes: whole messages are protected, or discovery is
-(DDS Security 1.1, 7.4.1.6)."""
+"""Security attributes of a participant: whole messages are protected, or discovery is (DDS Security
+1.1, 7.4.1.6)."""
 _VALID = 0x8000_0000
-"""The attributes mean anything only with this bit."""
+"""The bit without which the security attributes have no meaning."""
 
 
 def lease_duration(spdp: Announcement, datagram: bytes) -> float:
-    """For how many seconds a participant counts as there without being heard, within bounds."""
+    """The lease duration of a participant, from 1 second to LONGEST_LEASE_DURATION_S."""
     seconds = spdp.parameters.seconds(datagram, Pid.PARTICIPANT_LEASE_DURATION)
     return min(
         max(DEFAULT_LEASE_DURATION_S if seconds is None else seconds, 1.0), LONGEST_LEASE_DURATION_S
@@ -39,7 +39,7 @@ def lease_duration(spdp: Announcement, datagram: bytes) -> float:
 
 
 def first_metatraffic(spdp: Announcement, datagram: bytes, address: str) -> HostPort | None:
-    """Where a participant's discovery is reached at an address; None if not there."""
+    """The first metatraffic locator of a participant at an address; None if there is none."""
     locators = (
         locator
         for pid, locator in spdp.reached_at(datagram)
@@ -49,7 +49,7 @@ def first_metatraffic(spdp: Announcement, datagram: bytes, address: str) -> Host
 
 
 def traits(spdp: Announcement, datagram: bytes, address: str) -> ParticipantTraits:
-    """What a participant at an address says of itself that may keep others from meeting it."""
+    """The traits of a participant at an address, which may prevent its discovery."""
     domain = spdp.parameters.number(datagram, Pid.DOMAIN_ID)
     return ParticipantTraits(
         None if domain == _UNKNOWN_DOMAIN else domain,
@@ -73,15 +73,15 @@ def note_endpoints(
         topic = announcement.topic(datagram)
         type_name = announcement.parameters.text(datagram, Pid.TYPE_NAME) or ""
         qos = read_qos(datagram, announcement.parameters, kind is EndpointKind.WRITER)
-        # For the status alone, which needs no more: a topic of ROS 2 has 255 bytes at most.
+        # Only the status uses these texts. A topic of ROS 2 has at most 255 bytes.
         endpoint = DdsEndpoint(kind, topic[:256], type_name[:256], qos)
         notes.note(participant, entity, None if announcement.ended else endpoint)
 
 
 def _security(spdp: Announcement, datagram: bytes) -> DdsSecurity:
-    """Whether a participant authenticates others, and whether its discovery can be read.
+    """How DDS Security affects a participant: authentication of others, protection of discovery.
 
-    SPDP tells by parameters of its own what DDS Security protects (1.1, 7.4.1.4 and 7.4.1.6).
+    SPDP has parameters for what DDS Security protects (DDS Security 1.1, 7.4.1.4 and 7.4.1.6).
     """
     attributes = spdp.parameters.number(datagram, Pid.PARTICIPANT_SECURITY_INFO)
     if attributes is not None and attributes & _VALID and attributes & _PROTECTED:
@@ -91,7 +91,7 @@ def _security(spdp: Announcement, datagram: bytes) -> DdsSecurity:
 
 
 def _locator_fault(spdp: Announcement, datagram: bytes, address: str) -> LocatorFault:
-    """Why nothing can be passed on to a participant at an address; the first reason."""
+    """The first reason for which the proxy can't pass datagrams to a participant at an address."""
     for pid in (Pid.METATRAFFIC_UNICAST_LOCATOR, Pid.DEFAULT_UNICAST_LOCATOR):
         locators = [read_locator(datagram, spdp.parameters, p) for p in spdp.parameters.all(pid)]
         hosts = {locator.host_port.host for locator in locators if locator and locator.host_port}
@@ -102,7 +102,7 @@ def _locator_fault(spdp: Announcement, datagram: bytes, address: str) -> Locator
             return LocatorFault.LOOPBACK if all_loopback else LocatorFault.ELSEWHERE
         if any(loc.kind in (LocatorKind.TCP_V4, LocatorKind.TCP_V6) for loc in locators if loc):
             return LocatorFault.TCP
-        # There need be no default locators: a reader may have its own (DDSI-RTPS 2.5, 8.5.3.2).
+        # Default locators are optional: a reader may have separate ones (DDSI-RTPS 2.5, 8.5.3.2).
         if locators or pid == Pid.METATRAFFIC_UNICAST_LOCATOR:
             return LocatorFault.MISSING
     return LocatorFault.NO

@@ -1,13 +1,16 @@
-"""DDS discovery: what participants say of themselves, with their locators led elsewhere.
+"""DDS discovery: read announcements, and replace the locators in these.
 
-Participants find each other by SPDP and tell each other of their readers and writers by SEDP. Both
-are samples of built-in writers, known by their entity ids (DDSI-RTPS 2.5, 8.5 and 9.3.1.2), whose
-payload is a parameter list. An *announcement* goes on as it is but for its locators: each that a
-participant can be reached at is led elsewhere, and all others are taken out. These are multicast
-ones, which end at the next router, and those of transports that can't be passed on (shared memory).
-So are marks by which Fast DDS knows programs of its own machine.
-An announcement that is to be hidden goes on as a GAP, so that its reader does not ask for it again
-and again.
+Participants discover each other by SPDP, and each other's readers and writers by SEDP. Both consist
+of samples of builtin writers, which have fixed entity ids (DDSI-RTPS 2.5, 8.5 and 9.3.1.2). The
+payload of such a sample is a parameter list.
+
+In an *announcement* the proxy replaces, keeps or removes each unicast locator of UDP
+(`LocatorRedirect`), and removes all other locators. Multicast locators end at the next router. The
+proxy can't pass on data of other transports, such as shared memory. The proxy also removes the
+parameters by which Fast DDS recognises programs on the same machine. All other bytes stay.
+
+The proxy turns a hidden announcement into a GAP. Otherwise the reader would request the
+announcement again and again.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -58,29 +61,32 @@ MULTICAST = (
     Pid.METATRAFFIC_MULTICAST_LOCATOR,
 )
 _IDENTITIES = (Pid.PARTICIPANT_GUID, Pid.ENDPOINT_GUID, Pid.KEY_HASH)
-"""Parameters by which an announcement says what it is about; each begins with a GUID prefix.
-Receivers act on these, whoever has sent the message (Fast DDS: EDPSimplePUBListener)."""
+"""Parameters that name the participant, reader or writer of an announcement. Each value begins with
+a GUID prefix. Receivers act on these values, whatever the source of the message is (Fast DDS:
+EDPSimplePUBListener)."""
 TAKEN_FOR_FAST_DDS = (FAST_DDS, NO_VENDOR)
-"""Vendors whose parameters Fast DDS reads as its own."""
+"""Vendors whose vendor-specific parameters Fast DDS interprets."""
 _DISPOSED_OR_UNREGISTERED = 0x03
 LONGEST_OF_PARTICIPANT = 8192
-"""Bytes of a datagram in which a participant announces itself; it is kept. Some have 1,500."""
+"""Bytes of a datagram in which a participant announces itself. The proxy keeps this datagram. Some
+have 1,500 bytes."""
 _OF_ANOTHER = "the datagram announces another participant than its sender"
 LONGEST_TOPIC = 1024
-"""Bytes of a topic's name; those of ROS 2 have 255."""
+"""Bytes of a topic's name. Names of ROS 2 have at most 255."""
 MOST_PARAMETERS_OF_ALL = 4096
-"""Parameters of all announcements in a datagram. A reader or writer has 25 in 600 bytes, so a
-datagram of 64 KiB has 2,700."""
+"""Parameters of all announcements in a datagram. The announcement of a reader or writer has 25
+parameters in 600 bytes, so a datagram of 64 KiB has 2,700."""
 MOST_LOCATORS_OF_ALL = 1024
-"""Locators of all announcements in a datagram. Fast DDS writes five for a reader or writer."""
+"""Locators of all announcements in a datagram. Fast DDS announces five for a reader or writer."""
 
 MOST_ANNOUNCED = 48
-"""Participants that announce themselves in a datagram; all of the other side are told of each.
-Cyclone DDS sends 14,720 bytes at most (MaxMessageSize), and announces a participant in 400."""
+"""Participants that announce themselves in one datagram. The proxy announces each to all
+participants of the other side. Cyclone DDS sends at most 14,720 bytes (MaxMessageSize), 400 for
+each participant."""
 
 
 class BuiltinWriter(IntEnum):
-    """The writers of discovery."""
+    """The builtin writers that discovery uses."""
 
     PARTICIPANTS = 0x000100C2
     PUBLICATIONS = 0x000003C2
@@ -95,14 +101,16 @@ _KINDS = {
 }
 
 LocatorRedirect = Callable[[int, HostPort], HostPort | None]
-"""Where a locator is to lead, by its parameter's id and where it leads; None: take it out."""
+"""Returns the target for a locator, from the parameter's id and the present target. None removes
+the locator."""
 
 
 class Announcement(msgspec.Struct, frozen=True):
-    """What a participant says of itself, or of one of its readers or writers.
+    """The announcement of a participant, or of one of its readers or writers.
 
-    ``parameters`` are the payload's parameters; none if it only tells an end. ``inline_parameters``
-    are those of the inline QoS. ``ended``: what it is about is disposed of, or unregistered.
+    ``parameters`` are the parameters of the payload; none if the announcement only reports an end.
+    ``inline_parameters`` are those of the inline QoS. ``ended`` means that the participant, reader
+    or writer is disposed or unregistered.
     """
 
     writer: BuiltinWriter
@@ -113,17 +121,17 @@ class Announcement(msgspec.Struct, frozen=True):
 
     @property
     def kind(self) -> EndpointKind | None:
-        """What it is about, a reader or a writer; None if about the participant."""
+        """Whether a reader or a writer is announced; None for a participant."""
         return _KINDS.get(self.writer)
 
     def topic(self, datagram: bytes) -> str:
-        """The topic of DDS that its reader or writer is of; empty if it does not say."""
+        """The DDS topic of the reader or writer; empty if the announcement names none."""
         return self.parameters.text(datagram, Pid.TOPIC_NAME) or ""
 
     def endpoint(self, datagram: bytes) -> bytes | None:
-        """The entity id of the reader or writer that it is about; None if it does not say.
+        """The entity id of the reader or writer; None if the announcement names none.
 
-        One that has ended is named by its key, in the payload or in the inline QoS (9.6.3.8).
+        If the reader or writer has ended, its key is in the payload or in the inline QoS (9.6.3.8).
         """
         for parameters in (self.parameters, self.inline_parameters):
             for parameter in parameters.all(Pid.ENDPOINT_GUID, Pid.KEY_HASH) if parameters else ():
@@ -133,11 +141,11 @@ class Announcement(msgspec.Struct, frozen=True):
 
     @property
     def locator_count(self) -> int:
-        """How many locators it names, of all kinds."""
+        """The number of locators of all kinds."""
         return len(self.parameters.all(*UNICAST, *MULTICAST))
 
     def reached_at(self, datagram: bytes) -> Iterator[tuple[int, HostPort]]:
-        """The unicast locators of UDP, each with its parameter's id."""
+        """Yield the unicast locators of UDP, each after the id of its parameter."""
         for parameter in self.parameters.all(*UNICAST):
             locator = read_locator(datagram, self.parameters, parameter)
             host_port = locator.host_port if locator else None
@@ -146,9 +154,10 @@ class Announcement(msgspec.Struct, frozen=True):
 
 
 class DiscoveryMessage(msgspec.Struct, frozen=True):
-    """A message of a participant's, and what it announces of itself there.
+    """A message of a participant, with the announcements in the message.
 
-    ``fragments`` are parts of announcements, which are read once they are whole.
+    ``fragments`` are parts of announcements. The proxy reads an announcement when all its parts
+    have come.
     """
 
     datagram: bytes
@@ -158,16 +167,16 @@ class DiscoveryMessage(msgspec.Struct, frozen=True):
 
     @property
     def of_participant(self) -> Announcement | None:
-        """What the participant says of itself, the last of it; None if nothing (SPDP)."""
+        """The last announcement of the participant itself (SPDP); None if the message has none."""
         spdp = (a for a in reversed(self.announcements) if a.writer is BuiltinWriter.PARTICIPANTS)
         return next(spdp, None)
 
 
 def read_discovery(datagram: bytes) -> DiscoveryMessage:
-    """What a datagram announces.
+    """Read the announcements in a datagram.
 
-    Raises RtpsError if it or an announcement is malformed, or is of or about another participant
-    than the sender.
+    Raises RtpsError if the datagram or an announcement is malformed, and if an announcement is from
+    or about another participant than the sender.
     """
     prefix = source_prefix(datagram)
     builtin_samples = [sample for sample in samples(datagram) if sample.writer in _BUILTIN_WRITERS]
@@ -190,7 +199,7 @@ def read_discovery(datagram: bytes) -> DiscoveryMessage:
 
 
 def read_messages(datagram: bytes) -> Iterator[DiscoveryMessage]:
-    """Each participant's message in a datagram. Raises RtpsError."""
+    """Yield the message of each participant in a datagram. Raises RtpsError."""
     announced_count = 0
     for message in map(read_discovery, by_source(datagram)):
         announced_count += message.of_participant is not None
@@ -201,10 +210,11 @@ def read_messages(datagram: bytes) -> Iterator[DiscoveryMessage]:
 
 
 def credited_messages(datagram: bytes) -> Iterator[tuple[DiscoveryMessage, int]]:
-    """Each participant's message in a datagram, and how many of the received bytes are its own.
+    """Yield the message of each participant, and the count of received bytes for the message.
 
-    The messages together may be longer than the datagram (`by_source`); the numbers together are
-    not, so no participant is sent more than came in its name. Raises RtpsError.
+    The messages together may be longer than the datagram (`by_source`). The sum of the counts is at
+    most the length of the datagram. So the proxy sends a participant no more bytes than came in its
+    name. Raises RtpsError.
     """
     remaining = len(datagram)
     for message in read_messages(datagram):
@@ -216,9 +226,9 @@ def credited_messages(datagram: bytes) -> Iterator[tuple[DiscoveryMessage, int]]
 def rewritten(
     message: DiscoveryMessage, lead: LocatorRedirect, is_hidden: Callable[[Announcement], bool]
 ) -> bytes:
-    """The message with the locators in its announcements led elsewhere, and some of these hidden.
+    """The message with replaced locators, and with a GAP for each hidden announcement.
 
-    Raises ValueError if ``lead`` gives a host that is no address.
+    Raises ValueError if ``lead`` returns a host that is no address.
     """
     edits = list[Overwrite]()
     for announcement in message.announcements:
@@ -230,11 +240,12 @@ def rewritten(
 
 
 def participant_alone(message: DiscoveryMessage) -> bytes:
-    """What a participant announces of itself, without what else the message holds, and for all.
+    """The SPDP announcement in a message, without other submessages and without a destination.
 
-    Cyclone DDS answers the discovery participant with an announcement that is for this participant
-    alone (ddsi_discovery_spdp.c, respond_to_spdp). Readers ask again for the readers and writers
-    that were announced beside it (DDSI-RTPS 2.5, 8.4.9).
+    Cyclone DDS answers the discovery participant with an announcement for this participant alone
+    (ddsi_discovery_spdp.c, respond_to_spdp). Without the destination, all participants accept the
+    announcement. If the message also announced readers and writers, other readers request these
+    announcements again (DDSI-RTPS 2.5, 8.4.9).
     """
     datagram = message.datagram
     spdp = message.of_participant
@@ -251,10 +262,11 @@ def participant_alone(message: DiscoveryMessage) -> bytes:
 
 
 def require_rewritable(message: DiscoveryMessage) -> None:
-    """Raise RtpsError unless all that a message announces can be led elsewhere, and be hidden.
+    """Raise RtpsError unless the proxy can rewrite and hide all announcements in a message.
 
-    Before anything of it is kept, which is rewritten again and again later. Fragments are not: they
-    are read once all are there, and nobody waits for that with a participant's announcement.
+    Call this before the proxy keeps the message, because the proxy rewrites a kept message again
+    and again. Fragments count as not rewritable: the proxy reads fragments only when all have come,
+    and the announcement of a participant does not wait for that.
     """
     if message.fragments:
         raise RtpsError("the message by which a participant announces itself has fragments")
@@ -262,7 +274,10 @@ def require_rewritable(message: DiscoveryMessage) -> None:
 
 
 def _announcements(datagram: bytes, builtin_samples: Iterable[Sample]) -> tuple[Announcement, ...]:
-    """The announcements in samples. Raises RtpsError if one is malformed, or they take too long."""
+    """The announcements in samples.
+
+    Raises RtpsError if an announcement is malformed, or if all together have too many parameters.
+    """
     announcements = list[Announcement]()
     parameter_count = 0
     locator_count = 0
@@ -282,13 +297,14 @@ def _announcement(datagram: bytes, sample: Sample) -> Announcement:
     parameters = payload_parameters(datagram, sample)
     inline = inline_parameters(datagram, sample)
     ended = sample.is_key_only or _tells_an_end(datagram, inline)
-    # An end may have no payload, but not one in which nobody has looked for whose it is.
+    # An end may have no payload. A payload has to be a parameter list, because the list may name
+    # another participant (`_require_own`).
     if parameters is None and (sample.payload or not ended):
         raise RtpsError("an announcement is not a parameter list")
     parameters = parameters or ParameterList(sample.little, ())
     _require_own(datagram, sample, parameters)
     topics = parameters.all(Pid.TOPIC_NAME)
-    # The policy is asked of the first alone, and a receiver may take another one.
+    # The policy judges the first topic, and a receiver may use another one.
     if len(topics) > 1:
         raise RtpsError("an announcement names more than one topic")
     is_endpoint = sample.writer in _KINDS
@@ -300,7 +316,7 @@ def _announcement(datagram: bytes, sample: Sample) -> Announcement:
 
 
 def _require_own(datagram: bytes, sample: Sample, parameters: ParameterList | None) -> None:
-    """Raise RtpsError if an announcement is about another participant than the one it is of."""
+    """Raise RtpsError if an announcement names another participant than the sample's source."""
     for parameter in parameters.all(*_IDENTITIES) if parameters else ():
         start = parameter.value.start
         end = parameter.value.end
@@ -309,10 +325,10 @@ def _require_own(datagram: bytes, sample: Sample, parameters: ParameterList | No
 
 
 def _tells_an_end(datagram: bytes, inline_qos: ParameterList | None) -> bool:
-    """Whether the status in the inline QoS says that what a sample is about has ended (9.6.3.9)."""
+    """Whether the inline QoS reports the end of a participant, reader or writer (9.6.3.9)."""
     for param in inline_qos.all(Pid.STATUS_INFO) if inline_qos else ():
         if param.value.end - param.value.start >= 4:
-            # Four octets, of which the last has the flags, in either byte order.
+            # Four octets without a byte order. The last octet has the flags.
             status = int.from_bytes(datagram[param.value.start : param.value.start + 4], "big")
             return bool(status & _DISPOSED_OR_UNREGISTERED)
     return False
@@ -330,11 +346,12 @@ def _edits(
 
 
 def _edits_of_machine(parameters: ParameterList) -> Iterator[Overwrite]:
-    """What keeps participants of Fast DDS from taking each other for programs of one machine.
+    """Remove what makes two participants of Fast DDS assume that both run on one machine.
 
-    Two containers may have the same machine id, and the same MAC addresses, from which that of data
-    sharing follows: no message would leave the machine. A participant on the proxy's own machine
-    would take its locators for loopback (UDPv4Transport.cpp, transform_remote_locator).
+    Two containers may have the same machine id and the same MAC addresses, from which the id for
+    data sharing follows. The participants would use shared memory, and no message would leave the
+    machine. A participant on the proxy's machine would replace the locators by loopback
+    (UDPv4Transport.cpp, transform_remote_locator).
     """
     yield from map(parameters.removed, parameters.all(FastDdsPid.MACHINE_ID))
     yield from map(parameters.removed, parameters.all(FastDdsPid.DATA_SHARING))
@@ -344,7 +361,7 @@ def _edits_of_machine(parameters: ParameterList) -> Iterator[Overwrite]:
 def _target(
     datagram: bytes, parameters: ParameterList, parameter: Parameter, lead: LocatorRedirect
 ) -> HostPort | None:
-    """Where a locator is to lead; None if it is taken out."""
+    """The target for a locator; None if the edit removes the locator."""
     locator = read_locator(datagram, parameters, parameter)
     if locator is None or locator.host_port is None or parameter.pid in MULTICAST:
         return None
