@@ -1,1 +1,1 @@
-"""What the proxy knows of the participants on each side, and of their readers and writers."""
+"""The participants of each side, and their readers and writers."""

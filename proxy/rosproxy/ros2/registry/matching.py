@@ -1,15 +1,16 @@
-"""Which writer and reader of a topic match, by the rule of DDS.
+"""Which writers and readers of a topic match, by the rules of DDS.
 
-A writer *offers* and a reader *requests* (DDS 1.4, 2.2.3): they match where the topic and the type
-are the same, both have a partition in common, and of each policy no less is offered than requested.
-Both sides decide it by themselves, and neither tells the other, so that a mismatch looks like
-silence. Only pairs of one inside and one outside are looked at: no others pass the proxy.
+A writer *offers* and a reader *requests* QoS (DDS 1.4, 2.2.3). A writer and a reader match under
+three conditions: topic and type are the same, both have a partition in common, and the writer
+offers no less of each policy than the reader requests. Each side decides alone, and reports nothing
+to the other. So a mismatch looks like silence. This module looks only at pairs of one endpoint
+inside and one outside, because no other pairs pass the proxy.
 
-Types are compared by their names, as ROS 2 has them: another definition has the same name.
+Types are compared by name, as ROS 2 does. Two definitions of a type may have the same name.
 
-One participant may have thousands of readers and writers, and so millions of pairs. So addresses
-take turns, and what is left out is counted: no address keeps a pair of another one from being
-compared.
+A participant may have thousands of readers and writers, and so there may be millions of pairs. So
+the addresses take turns, and the result counts what is left out. No address can prevent the
+comparison of another address's pairs.
 """
 
 from collections import defaultdict, deque
@@ -24,11 +25,11 @@ from rosproxy.ros2.protocol.ros_names import ros_name, ros_type
 from rosproxy.ros2.registry.participants import DdsEndpoint, EndpointKind, Participant
 
 MOST_LOOKED_AT = 10_000
-"""Readers and writers of a side that are looked at, in 0.1 s at most. A participant of ROS 2 has
+"""Readers and writers of a side that are looked at, in at most 0.1 s. A participant of ROS 2 has
 some tens. The addresses of the side take turns."""
 MOST_COMPARED = 20_000
-"""Pairs that are compared at a time. The addresses inside take turns, and in the turns of each of
-them its readers and writers; each meets those outside in the order of their addresses' turns."""
+"""Pairs that are compared at a time. The addresses inside take turns, and so do the readers and
+writers of an address. Each meets the endpoints outside in the order of the turns outside."""
 _OPPOSITE = {
     EndpointKind.READER: EndpointKind.WRITER,
     EndpointKind.WRITER: EndpointKind.READER,
@@ -39,7 +40,7 @@ _REPRESENTATIONS = {0: "XCDR", 1: "XML", 2: "XCDR2"}
 
 
 class Mismatch(msgspec.Struct, frozen=True):
-    """Why a writer and a reader don't match: the policy, what is offered, and what is requested."""
+    """Why a writer and a reader do not match: the policy, the offer, and the request."""
 
     policy: str
     offered: str
@@ -47,7 +48,7 @@ class Mismatch(msgspec.Struct, frozen=True):
 
 
 class MismatchedPair(msgspec.Struct, frozen=True):
-    """A writer and a reader that don't match, whose they are, and why; one is inside."""
+    """A writer and a reader that do not match, with their participants, of which one is inside."""
 
     mismatch: Mismatch
     topic: str
@@ -56,14 +57,14 @@ class MismatchedPair(msgspec.Struct, frozen=True):
 
 
 def mismatch(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
-    """The first reason for which a writer and a reader of a topic don't match; None if they do."""
+    """The first mismatch of a writer and a reader of the same topic; None if they match."""
     return next((reason for rule in _RULES if (reason := rule(writer, reader))), None)
 
 
 class Comparison(msgspec.Struct, frozen=True):
-    """The pairs that don't match, and how many pairs are not compared.
+    """The pairs that do not match, and how many pairs are not compared.
 
-    A reader or writer that is not looked at counts as one pair.
+    A reader or writer that is left out counts as one pair.
     """
 
     mismatched: list[MismatchedPair] = []
@@ -71,9 +72,9 @@ class Comparison(msgspec.Struct, frozen=True):
 
 
 def compare(inside: Iterable[Participant], outside: Iterable[Participant]) -> Comparison:
-    """Compare the readers and writers of a topic, of which one is inside and one outside.
+    """Compare the readers and writers inside with those outside, topic by topic.
 
-    Each mismatch of the same two participants is there once for each topic or service.
+    The result has a mismatch of a policy between two participants once for each topic or service.
     """
     insiders, not_looked_at_inside = _endpoints(inside)
     outsiders, not_looked_at_outside = _endpoints(outside)
@@ -107,9 +108,9 @@ _Item = TypeVar("_Item")
 
 
 def _endpoints(side: Iterable[Participant]) -> tuple[list[_Owned], int]:
-    """Return the readers and writers of a side in turn, and how many are not looked at.
+    """Return the readers and writers of a side in turn, and how many are left out.
 
-    Equal ones of a participant count as one.
+    Equal endpoints of a participant count as one.
     """
     by_address: defaultdict[str, list[Iterator[_Owned]]] = defaultdict(list)
     count = 0
@@ -125,7 +126,7 @@ def _endpoints(side: Iterable[Participant]) -> tuple[list[_Owned], int]:
 
 
 def _in_turn(sequences: Iterable[Iterable[_Item]]) -> Iterator[_Item]:
-    """Yield the first item of each, then the second item of each, and so on."""
+    """Yield the first item of each sequence, then the second item of each, and so on."""
     waiting = deque(map(iter, sequences))
     while waiting:
         items = waiting.popleft()
@@ -142,7 +143,7 @@ def _type(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
 
 
 def _partition(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
-    """Whether they have no partition in common; the default is the partition with an empty name."""
+    """The mismatch if there is no common partition. The default partition has an empty name."""
     offered = writer.qos.partitions
     requested = reader.qos.partitions
     if offered is None or requested is None:
@@ -153,10 +154,10 @@ def _partition(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
 
 
 def _may_be_same_partition(offered: str, requested: str) -> bool:
-    """Whether two names of partitions match, or may: one may be a pattern, as of file names.
+    """Whether two names of partitions match or may match. One of the names may be a pattern.
 
-    Implementations differ in what patterns mean. If both are some, they match only if they are the
-    same (DDS 1.4, 2.2.3.13).
+    Implementations interpret patterns differently. Two patterns match only if both are the same
+    (DDS 1.4, 2.2.3.13).
     """
     wild = [bool(_WILDCARDS & {*name}) for name in (offered, requested)]
     return offered == requested or wild[0] != wild[1]
@@ -197,7 +198,7 @@ def _ownership(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
 
 
 def _representation(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
-    """Whether a reader does not take what a writer writes: its first kind (XTypes 1.3)."""
+    """The mismatch if the reader does not accept the writer's first representation (XTypes 1.3)."""
     offered = writer.qos.representations or (_XCDR,)
     requested = reader.qos.representations or (_XCDR,)
     if offered[0] in requested:
@@ -207,7 +208,7 @@ def _representation(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None
 
 
 def _longer(policy: str, offered: float, requested: float) -> Mismatch | None:
-    """Whether the period that a writer offers is longer than the one that a reader requests."""
+    """The mismatch if the offered period is longer than the requested period."""
     if offered <= requested:
         return None
     return Mismatch(policy, *(_seconds_text(seconds) for seconds in (offered, requested)))

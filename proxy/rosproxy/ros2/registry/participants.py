@@ -1,7 +1,7 @@
-"""Participants: what the proxy knows of those inside and of those outside.
+"""Participants: what the proxy knows about the participants inside and outside.
 
-A participant is known by its GUID prefix, and only together with the address that it was found at:
-each sender may write any prefix into a datagram.
+A GUID prefix and an address identify a participant together. A GUID prefix alone identifies
+nothing, because each sender may write any prefix into a datagram.
 """
 
 from collections import Counter
@@ -28,31 +28,31 @@ VENDORS = {
     b"\x01\x12": "RustDDS",
     b"\x01\x14": "Dust DDS",
 }
-"""Names of implementations, by the vendor id in each message's header (OMG's list). Zero stands for
-none; a proxy's own participants have it."""
+"""Names of implementations, by the vendor id in the header of each message (list of the OMG). The
+proxy's own participants have the id zero, which means "unknown"."""
 PROCESS_LENGTHS = {FAST_DDS: 8, CYCLONE_DDS: 4}
-"""Bytes that the GUID prefixes of all participants of a process begin with.
+"""Bytes at the start of a GUID prefix that all participants of a process have in common.
 
-Fast DDS: GuidUtils.hpp; Cyclone DDS: ddsi_generate_participant_guid (ddsi_participant.c).
+Sources: Fast DDS: GuidUtils.hpp; Cyclone DDS: ddsi_generate_participant_guid (ddsi_participant.c).
 
-A process of these implementations has the port of its metatraffic locator for itself. Only sockets
-for multicast have SO_REUSEADDR (Fast DDS: UDPv4Transport.cpp, UDPv6Transport.cpp; Cyclone DDS:
-ddsi_udp.c).
-"""
+With these implementations, no other process can bind the port of a process's metatraffic locator.
+Only sockets for multicast have SO_REUSEADDR (Fast DDS: UDPv4Transport.cpp, UDPv6Transport.cpp;
+Cyclone DDS: ddsi_udp.c)."""
 MOST_ENDPOINTS = 2048
+"""Readers and writers of a participant that the proxy remembers, only for status and findings."""
 MOST_ENDPOINT_BYTES_PER_ADDRESS = 4 * 1024 * 1024
+"""Bytes for the readers and writers of all participants at an address."""
 MOST_ENDPOINT_BYTES = 32 * 1024 * 1024
-"""Readers and writers of a participant that are remembered, which is for the status alone, and the
-bytes that those at an address and on a side take."""
+"""Bytes for the readers and writers of a side."""
 ENDPOINT_OVERHEAD = 500
-"""Bytes that a reader or writer takes beside its texts."""
+"""Bytes that a reader or writer takes besides its texts."""
 
 
 class TrafficKind(StrEnum):
-    """What a participant announces a locator for: discovery, or user data.
+    """The purpose of a locator: discovery or user data.
 
-    The proxy reads discovery at a port for user data as well, unless the participant ignores
-    discovery there (`Participant.reads_discovery_at`).
+    The proxy also reads discovery at a port for user data, unless the participant ignores discovery
+    there (`Participant.reads_discovery_at`).
     """
 
     METATRAFFIC = "metatraffic"
@@ -60,14 +60,18 @@ class TrafficKind(StrEnum):
 
 
 class EndpointKind(StrEnum):
-    """What a participant has announced."""
+    """Whether an endpoint is a reader or a writer."""
 
     READER = "reader"
     WRITER = "writer"
 
 
 class ShortageKind(StrEnum):
-    """What there is too little of for a locator: ``RANGE``, or ``BOUND``, ports for one alone."""
+    """What a locator lacks.
+
+    ``RANGE``: no port of the range is left for the locator. ``BOUND``: the participant has as many
+    ports as one participant may have.
+    """
 
     NONE = ""
     RANGE = "range"
@@ -82,7 +86,7 @@ class PortShortage(msgspec.Struct, frozen=True):
 
 
 class DdsEndpoint(msgspec.Struct, frozen=True):
-    """A reader or writer of a participant, as its SEDP tells."""
+    """A reader or writer of a participant, as announced by SEDP."""
 
     kind: EndpointKind
     topic: str
@@ -91,13 +95,16 @@ class DdsEndpoint(msgspec.Struct, frozen=True):
 
     @property
     def size(self) -> int:
-        """The bytes that it takes: one character may make all of a text take four bytes each."""
+        """The bytes that the endpoint takes.
+
+        A single wide character makes all characters of a text take four bytes each.
+        """
         texts = (self.topic, self.type_name, *(self.qos.partitions or ()))
         return ENDPOINT_OVERHEAD + sum(map(getsizeof, texts))
 
 
 class DdsSecurity(StrEnum):
-    """What a participant says of DDS Security. ``PROTECTED``: its discovery is, too."""
+    """Whether a participant uses DDS Security. ``PROTECTED``: discovery is protected, too."""
 
     NONE = ""
     AUTHENTICATED = "authenticated"
@@ -105,10 +112,11 @@ class DdsSecurity(StrEnum):
 
 
 class LocatorFault(StrEnum):
-    """Why the proxy can't pass anything on to a participant, as its locators tell.
+    """Why the proxy can't pass datagrams to a participant, judging by its locators.
 
-    ``TCP``: it has no UDP; ``LOOPBACK``: only addresses that mean its own machine; ``ELSEWHERE``:
-    addresses, but not the one that it sends from; ``MISSING``: none at all.
+    ``TCP``: the locators are of TCP, and none is of UDP. ``LOOPBACK``: all UDP addresses are
+    loopback addresses. ``ELSEWHERE``: the source of the announcement is not among the UDP
+    addresses. ``MISSING``: there is no locator of UDP or TCP.
     """
 
     NO = ""
@@ -119,9 +127,9 @@ class LocatorFault(StrEnum):
 
 
 class ParticipantTraits(msgspec.Struct, frozen=True):
-    """What a participant says of itself that may keep others from meeting it.
+    """The properties of a participant that may prevent its discovery by others.
 
-    ``domain`` is its domain's id, None if it does not say.
+    ``domain`` is the announced domain; None if the participant announces none.
     """
 
     domain: int | None = None
@@ -130,7 +138,7 @@ class ParticipantTraits(msgspec.Struct, frozen=True):
 
 
 UNKNOWN_TRAITS = ParticipantTraits()
-"""Of a participant that has said nothing yet."""
+"""The traits of a participant that has announced nothing yet."""
 
 
 @dataclass(slots=True)
@@ -138,9 +146,9 @@ class PortMapping:
     """A port of the proxy that leads to one locator of a participant.
 
     A locator inside has a port of the range. A locator outside has a *stand-in*, a port that inside
-    reaches. ``is_read`` (inside alone): a participant there may act on discovery. ``bytes`` and
-    ``datagrams`` are those that were passed on; ``rate`` is in bytes per second, as of the last
-    `sample`.
+    reaches. ``is_read`` (only inside) means that a participant at the locator may act on discovery.
+    ``bytes`` and ``datagrams`` count what the proxy has passed on. ``rate`` is in bytes per second,
+    as of the last `sample`.
     """
 
     port: int
@@ -160,20 +168,21 @@ class PortMapping:
             self.rate = round((self.bytes - last_bytes) / (now - last_time), 1)
 
     def note_passed(self, size: int) -> None:
-        """Count a datagram of so many bytes that is passed on."""
+        """Count a datagram of ``size`` bytes that the proxy passes on."""
         self.datagrams += 1
         self.bytes += size
 
 
 @dataclass(slots=True)
 class Participant:
-    """What is known of a participant on either side.
+    """A participant on either side.
 
-    ``address`` is where it was found, ``until`` when it counts as gone unless it is heard again.
-    ``announcement`` is its last SPDP datagram: of one inside as outside gets it, of one outside as
-    it came, without what else the datagram held (`participant_alone`). ``next_number`` is the
-    sequence number after that of the announcement. ``endpoints`` are by their entity ids,
-    ``mappings`` by its locators.
+    ``address`` is the source of its announcements. ``until`` is the time at which the participant
+    counts as gone, unless it announces itself again. ``announcement`` is its last SPDP datagram.
+    For a participant inside, this is the rewritten datagram for outside. For a participant outside,
+    this is the received datagram, without other submessages (`participant_alone`). ``next_number``
+    is the sequence number after that of the announcement. ``endpoints`` are by entity id, and
+    ``mappings`` by locator.
     """
 
     prefix: bytes
@@ -189,30 +198,31 @@ class Participant:
 
     @property
     def guid_prefix(self) -> str:
-        """The GUID prefix as tools of DDS print it."""
+        """The GUID prefix in the notation of DDS tools."""
         return ".".join(f"{byte:02x}" for byte in self.prefix)
 
     @property
     def vendor_name(self) -> str:
-        """The implementation's name, or its id."""
+        """The name of the implementation, or the vendor id in hexadecimal."""
         return VENDORS.get(self.vendor, self.vendor.hex())
 
     def reads_discovery_at(self, mapping: PortMapping) -> bool:
-        """Whether the participant may act on discovery that arrives where a mapping leads.
+        """Whether the participant may act on discovery that arrives at the target of a mapping.
 
-        Fast DDS gives a datagram only to the readers that have the port among their own locators.
-        The built-in readers have the ports for metatraffic alone (RTPSParticipantImpl.cpp,
+        Fast DDS gives a datagram only to the readers that have the port among their locators. The
+        builtin readers have only the ports for metatraffic (RTPSParticipantImpl.cpp,
         assignEndpoint2LocatorList; MessageReceiver.cpp, associated_readers_; from 1.8 to 3.2).
         Cyclone DDS finds the writer of a datagram in one table for all sockets (ddsi_receive.c,
-        handle_submsg_sequence). Other implementations count as Cyclone DDS does.
+        handle_submsg_sequence). Other implementations count as Cyclone DDS.
         """
         return mapping.kind is TrafficKind.METATRAFFIC or self.vendor != FAST_DDS
 
     def note_vendor(self, vendor: bytes) -> bool:
         """Note the vendor in a later announcement. Return whether the vendor has changed.
 
-        Another vendor outweighs Fast DDS, and the first other vendor stays. So a forger that
-        announces the participant first, as one of Fast DDS, gains nothing for long.
+        Another vendor outweighs Fast DDS, and the first other vendor stays. So if a forger
+        announces the participant first, as a participant of Fast DDS, the next true announcement
+        corrects the vendor.
         """
         if self.vendor != FAST_DDS or vendor == FAST_DDS:
             return False
@@ -222,7 +232,7 @@ class Participant:
 
 @dataclass(slots=True)
 class EndpointNotes:
-    """Notes the readers and writers of participants, within bounds for each address and in all.
+    """The remembered readers and writers of participants, within bounds for each address and side.
 
     ``size_by_address`` and ``size`` are in bytes.
     """
@@ -231,7 +241,7 @@ class EndpointNotes:
     size: int = 0
 
     def note(self, participant: Participant, entity: bytes, endpoint: DdsEndpoint | None) -> None:
-        """Remember a reader or writer; with None, that it has ended."""
+        """Remember a reader or writer; with None, forget a reader or writer that has ended."""
         former = participant.endpoints.pop(entity, None)
         if former is not None:
             self._count(participant.address, -former.size)
@@ -240,7 +250,7 @@ class EndpointNotes:
             self._count(participant.address, endpoint.size)
 
     def forget(self, participant: Participant) -> None:
-        """Forget those of a participant that has gone."""
+        """Forget the readers and writers of a participant that has gone."""
         size = sum(endpoint.size for endpoint in participant.endpoints.values())
         self._count(participant.address, -size)
         participant.endpoints.clear()
@@ -264,14 +274,18 @@ class EndpointNotes:
 class InsideParticipant(Participant):
     """A participant inside, with a port of the range for each of its locators.
 
-    ``verdicts``: whether the policy allows a topic or service, by rule; of its own endpoints and of
-    those outside that it was to be told of; ``has_more_verdicts``: some are not remembered.
-    ``proxy_address`` is the proxy's address on its network; ``is_in_group``: it was heard there by
-    multicast. ``was_inside``: a former process served it, as more than its own word says.
-    ``announced_at`` is when outside was last told of it.
-    The rest is None if it does not apply (`Rediscovery`). ``separation_due_from``: since when it
-    waits to be separated from outside. ``separated_until``: when the separation ends.
-    ``dispose_message_times``: when it was last told to forget each participant outside, by prefix.
+    ``verdicts`` tell by rule whether the policy allows a topic or service. There is a verdict for
+    each endpoint of the participant, and for each endpoint outside that the proxy was to announce
+    to the participant. ``has_more_verdicts`` means that some are not remembered. ``proxy_address``
+    is the proxy's address on the network of the participant. ``is_in_group`` means that the
+    participant was heard there by multicast. ``was_inside`` means that a former process of the
+    proxy served the participant, by better evidence than the participant's own word.
+    ``announced_at`` is the time of the last announcement to outside.
+
+    The other attributes belong to `Rediscovery`, and are None outside of a rediscovery.
+    ``separation_due_from`` is the time from which the participant waits for its separation.
+    ``separated_until`` is the end of the separation. ``dispose_message_times`` has the time of the
+    last dispose message for each participant outside, by prefix.
     """
 
     verdicts: dict[tuple[RuleKind, str], bool] = field(default_factory=dict)
@@ -286,33 +300,36 @@ class InsideParticipant(Participant):
 
     @property
     def is_separated(self) -> bool:
-        """Whether nothing of discovery passes between it and outside."""
+        """Whether no discovery passes between the participant and outside."""
         return self.separation_due_from is not None or self.separated_until is not None
 
     @property
     def ports(self) -> list[int]:
-        """The ports that it has, in the order in which they were given."""
+        """The ports of the participant, in the order of their mapping."""
         return [mapping.port for mapping in self.mappings.values()]
 
 
 COMES_IN_WITHIN_S = 2.0
-"""Seconds after which a participant that announces itself has sent discovery to the range."""
+"""Seconds within which a participant that announces itself sends discovery to the range."""
 ANSWERED_FACTOR = 3
-"""Bytes for each byte that has come, to a participant that has answered but not proved to receive.
-Where DDS Security authenticates participants, they don't answer the question that proves it."""
+"""Bytes that the proxy may send for each received byte, to a participant that has answered but
+whose address is not proven. With authentication by DDS Security, participants do not answer the
+question that proves the address."""
 
 
 @dataclass(slots=True)
 class OutsideParticipant(Participant):
-    """A participant outside, with a stand-in for each locator that inside does not reach by itself.
+    """A participant outside, with a stand-in for each locator that inside can't reach directly.
 
-    A participant may be sent anything if it is ``trusted``, at a peer's address, or its address is
-    ``proven`` to receive. All others are sent no more bytes than came from there; ``credit`` is how
-    many are left. ``has_answered``: it has named the proxy's participant, or one inside, and may be
-    sent `ANSWERED_FACTOR` times as much. ``has_come_in``: discovery from it has arrived at a port
-    of the range. ``is_announced``: participants inside are told of it. ``announcement_inside`` is
-    the announcement as inside gets it, with the proxy's address inside for which it is made.
-    ``met_at`` and ``heard_at`` are when it announced itself for the first and for the last time.
+    The proxy may send any number of bytes to a participant that is ``trusted`` (at the address of a
+    peer) or ``proven`` (at a proven address). To all others, the proxy sends no more bytes than
+    came from the participant; ``credit`` is the number of bytes left. ``has_answered`` means that
+    the participant has named the discovery participant, or a participant inside. The factor
+    `ANSWERED_FACTOR` then applies to received bytes. ``has_come_in`` means that discovery of the
+    participant has arrived at a port of the range. ``is_announced`` means that the proxy announces
+    the participant inside. ``announcement_inside`` is the rewritten announcement, after the proxy's
+    address for which it was rewritten. ``met_at`` and ``heard_at`` are the times of the first and
+    the last announcement.
     """
 
     trusted: bool = False
@@ -327,29 +344,31 @@ class OutsideParticipant(Participant):
 
     @property
     def is_known(self) -> bool:
-        """Whether its address is a peer's, or has proved to receive."""
+        """Whether the address of the participant is that of a peer, or proven."""
         return self.trusted or self.proven
 
     @property
     def comes_in(self) -> bool:
-        """Whether discovery from it arrives at ports of the range, or still may.
+        """Whether discovery of the participant arrives at ports of the range, or still may arrive.
 
-        A participant that does not announce itself again may have crashed at once.
+        If the participant does not announce itself again, it counts as coming in: it may have
+        crashed at once.
         """
         return self.has_come_in or self.heard_at - self.met_at < COMES_IN_WITHIN_S
 
     def note_received(self, datagram: bytes, size: int, addressee: bytes) -> None:
-        """Note a message of the participant's, for which ``size`` bytes have come.
+        """Note a message of the participant, for which ``size`` bytes have come.
 
-        A message to ``addressee`` answers one of the proxy's. A forger on the LAN can send it too,
-        where it hears the same announcements. Raises RtpsError.
+        If the destination is ``addressee``, the message answers a participant of the proxy or
+        inside. A forger on the LAN could send this message, too, because the forger hears the same
+        announcements. Raises RtpsError.
         """
         if not self.has_answered and is_destination(datagram, addressee):
             self.has_answered = True
         self.credit += size * (ANSWERED_FACTOR if self.has_answered else 1)
 
     def may_be_sent(self, size: int) -> bool:
-        """Whether so many bytes may go to it; if so, they are taken off its credit."""
+        """Whether ``size`` bytes may go to the participant. If so, charge its credit."""
         if self.is_known:
             return True
         if self.credit < size:
@@ -363,9 +382,9 @@ AnyParticipant = TypeVar("AnyParticipant", bound=Participant)
 
 @dataclass(slots=True, kw_only=True)
 class ParticipantTable(Generic[AnyParticipant]):
-    """The participants of one side by GUID prefix, and how many there are at each address.
+    """The participants of a side by GUID prefix, and their number at each address.
 
-    ``notes`` holds how many readers and writers of theirs are remembered.
+    ``notes`` bounds the remembered readers and writers of these participants.
     """
 
     by_prefix: dict[bytes, AnyParticipant] = field(default_factory=dict)
@@ -373,7 +392,7 @@ class ParticipantTable(Generic[AnyParticipant]):
     notes: EndpointNotes = field(default_factory=EndpointNotes)
 
     def find(self, prefix: bytes, source: str) -> AnyParticipant | None:
-        """The participant with a prefix, if it is at the address that a datagram came from."""
+        """The participant with a prefix; None if there is none at this source address."""
         participant = self.by_prefix.get(prefix)
         return participant if participant is not None and participant.address == source else None
 
@@ -384,9 +403,9 @@ class ParticipantTable(Generic[AnyParticipant]):
         return [p for p in self.by_prefix.values() if p.address == address]
 
     def former_processes(self, prefix: bytes, address: str) -> list[AnyParticipant]:
-        """The participants of processes that had the port which a participant has now.
+        """The participants of former processes at the port that a participant has now.
 
-        Empty if the participant is unknown, or if other processes may have the port as well.
+        Empty if the participant is unknown, or if several processes may use the port.
         """
         holder = self.find(prefix, address)
         if holder is None or holder.metatraffic is None:
@@ -402,12 +421,12 @@ class ParticipantTable(Generic[AnyParticipant]):
         ]
 
     def add(self, participant: AnyParticipant) -> None:
-        """Add a participant that has come."""
+        """Add a participant."""
         self.by_prefix[participant.prefix] = participant
         self.count_by_address[participant.address] += 1
 
     def remove(self, participant: AnyParticipant) -> None:
-        """Forget a participant that has gone."""
+        """Remove a participant, with its readers and writers."""
         del self.by_prefix[participant.prefix]
         self.notes.forget(participant)
         self.count_by_address[participant.address] -= 1
