@@ -1,1 +1,1 @@
-"""What becomes of a datagram: pure decisions over the participants of a domain."""
+"""Discovery: what the proxy does with each datagram. Pure decisions over a domain."""

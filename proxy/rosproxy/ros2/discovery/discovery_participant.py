@@ -1,11 +1,12 @@
-"""The participant by which the proxy takes part in discovery, on both sides.
+"""The discovery participant: the proxy's participant that reads discovery on both sides.
 
-The discovery participant announces itself, and has the readers of SPDP and SEDP alone. So
-participants that announced themselves before the proxy started do so again at once. The proxy also
-learns what they told others long ago of their readers and writers: the locators and the topics.
+The discovery participant announces itself, and has no endpoints but the readers of SPDP and SEDP.
+So participants that announced themselves before the proxy started announce themselves again at
+once. They also repeat the announcements of their readers and writers, from which the proxy learns
+locators and topics.
 
-It reads reliably in the plainest form: it asks for each sample that a writer has by its heartbeat
-and that has not come.
+The reliable protocol is reduced to one rule: request each sample that a heartbeat of the writer
+names, and that has not come.
 """
 
 from collections.abc import Sequence
@@ -18,17 +19,20 @@ from rosproxy.ros2.protocol.rtps import samples
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 LEASE_DURATION_S = 12.0
-"""Seconds after which others that do not hear it forget it: the proxy may have been killed."""
+"""Seconds after the last announcement until other participants forget the discovery participant. It
+is short because the proxy may be killed."""
 ANNOUNCE_INTERVAL = 3.0
+"""Seconds between announcements of the discovery participant."""
 SEDP_WRITERS = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
 
 
 @dataclass(slots=True)
 class _Received:
-    """Which samples of a writer have come: all before ``base``, and some of those that follow.
+    """The samples of a writer that have come: all before ``base``, and some of the following.
 
-    A sample has a bit in ``later``, of `MOST_ASKED` bits. Those further ahead are asked for later.
-    ``behind`` counts the last heartbeats in a row that told of no sample from ``base`` on.
+    ``later`` has a bit for each of the `MOST_ASKED` samples from ``base`` on. Samples beyond these
+    are requested later. ``behind`` counts the last heartbeats in a row whose last sample is before
+    the last received one.
     """
 
     base: int = 1
@@ -36,15 +40,16 @@ class _Received:
     behind: int = 0
 
     def note(self, number: int) -> None:
-        """Note that a sample has come."""
+        """Note the number of a sample that has come."""
         if 0 <= number - self.base < MOST_ASKED:
             self.later |= 1 << number - self.base
             self._pass_over_received()
 
     def note_range(self, first: int, last: int) -> None:
-        """Note which samples the writer has."""
+        """Note the first and the last number in a heartbeat of the writer."""
         self.behind = self.behind + 1 if last < self.base - 1 else 0
-        # One heartbeat may be late; two in a row mean that a forged one told of greater numbers.
+        # A single such heartbeat may be late. Two in a row mean that a forged heartbeat has named
+        # greater numbers before.
         if self.behind > 1:
             self.base = 1
             self.later = 0
@@ -54,7 +59,7 @@ class _Received:
             self._pass_over_received()
 
     def missing(self, last: int) -> list[int]:
-        """The samples up to ``last`` that have not come, at most `MOST_ASKED`."""
+        """The numbers up to ``last`` of samples that have not come, at most `MOST_ASKED`."""
         end = min(last + 1, self.base + MOST_ASKED)
         return [n for n in range(self.base, end) if not self.later >> n - self.base & 1]
 
@@ -66,46 +71,50 @@ class _Received:
 
 @dataclass(slots=True)
 class DiscoveryParticipant:
-    """Asks participants for their readers and writers; ``prefix`` is its GUID prefix, random."""
+    """Requests the announcements of readers and writers; ``prefix`` is its random GUID prefix."""
 
     prefix: bytes
     _received: dict[tuple[bytes, int], _Received] = field(default_factory=dict)
     _count: int = 0
 
     def announcement(self, *reached_at: HostPort) -> bytes:
-        """The datagram by which it announces itself; ``reached_at`` is where it is answered."""
+        """The announcement of the discovery participant, with its locators ``reached_at``."""
         return announcement(self.prefix, reached_at, LEASE_DURATION_S, READER_ENDPOINTS)
 
     def dispose_message(self) -> bytes:
-        """The datagram by which it says that it has ended."""
+        """The dispose message of the discovery participant."""
         return dispose_message(self.prefix)
 
     def first_question(self, prefix: bytes) -> list[bytes]:
-        """What asks a participant's writers what they have."""
+        """The requests for heartbeats to the SEDP writers of a participant.
+
+        Writers that have sent something already are left out.
+        """
         return [
             self._ask(prefix, w, 1, ()) for w in SEDP_WRITERS if (prefix, w) not in self._received
         ]
 
     def take(self, prefix: bytes, datagram: bytes) -> list[bytes]:
-        """Note a participant's message; what to ask it for. Raises RtpsError.
+        """Note a message of a participant. Return the requests for missing samples.
 
-        Of samples in fragments the last comes when all are there (`FragmentStore`).
+        A fragment counts as the whole sample: `FragmentStore` releases fragments only when all have
+        come. Raises RtpsError.
         """
         for sample in samples(datagram):
             if sample.writer in SEDP_WRITERS and sample.prefix == prefix:
                 self._of_writer(prefix, sample.writer).note(sample.sequence)
-        # One answer to each writer: a datagram has room for 256 heartbeats, all of one writer.
+        # A single answer to each writer: a datagram may have 256 heartbeats of the same writer.
         by_writer = {heartbeat.writer: heartbeat for heartbeat in heartbeats(datagram)}
         answers = []
         for writer, heartbeat in by_writer.items():
             if writer in SEDP_WRITERS:
                 received = self._of_writer(prefix, writer)
-                if heartbeat.last > 0:  # an empty writer would take an answer for a question
+                if heartbeat.last > 0:  # an answer to a writer without samples would be a request
                     answers.append(self._answer(prefix, heartbeat, received))
         return answers
 
     def forget(self, prefix: bytes) -> None:
-        """Forget a participant that has gone."""
+        """Forget the samples of a participant that has gone."""
         for writer in SEDP_WRITERS:
             self._received.pop((prefix, writer), None)
 

@@ -1,9 +1,9 @@
-"""The end of participants: the proxy forgets a participant, and tells the other side that it ended.
+"""The end of participants: the proxy forgets a participant, and informs the other side.
 
-A participant that ends itself says so by a dispose message. In the cases here the proxy sends this
-message on behalf of the participant: its process was killed, its container is gone, or the proxy
-gives its place, its ports or its GUID prefix to another participant. The participant may live all
-the same, and come back.
+A participant that ends regularly sends a dispose message. This module has the other ends. The
+process was killed, or the container is gone. Or the proxy gives the place, the ports or the GUID
+prefix to another participant. Then the proxy sends the dispose message on behalf of the
+participant. The participant may be alive all the same, and come back.
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 @dataclass(frozen=True, slots=True)
 class Disposal:
-    """Ends participants of both sides; the methods return what the other side is told."""
+    """Ends participants of both sides. The methods return the datagrams for the other side."""
 
     settings: DomainSettings
     inside: InsideParticipants
@@ -36,11 +36,12 @@ class Disposal:
     refused: Refused
 
     def end_former_processes(self, prefix: bytes, source: str) -> list[Outgoing]:
-        """End the participants of crashed processes at the port of a participant.
+        """End the participants of crashed processes at the port that a participant has now.
 
-        A crashed process sends no dispose message, and would be known until its lease duration is
-        over. A participant that has answered has bound the port, so the former process has gone.
-        The answer of the former process counts no longer: its announcement may be repeated.
+        A crashed process sends no dispose message, and would stay known until the end of its lease
+        duration. A participant that has answered has bound the port, so the former process is gone.
+        The answer of the former process does not count any longer, because its announcement may be
+        repeated.
         """
         if not self.proofs.has_answered(source, prefix):
             return []
@@ -54,9 +55,10 @@ class Disposal:
         return sent
 
     def end_inside(self, insider: InsideParticipant) -> list[Outgoing]:
-        """End a participant inside on its behalf.
+        """Forget a participant inside, and send outside a dispose message.
 
-        It may live, and come back by other ports. Outside has to rediscover it then.
+        The participant may be alive, and come back with other ports. Outside then has to rediscover
+        it.
         """
         ended = _dispose_message_of(insider)
         self.forget_inside(insider)
@@ -66,17 +68,18 @@ class Disposal:
     def end_outside(
         self, outsider: OutsideParticipant, inside: Iterable[InsideParticipant]
     ) -> list[Outgoing]:
-        """Forget a participant outside, and tell some inside that it has ended."""
+        """Forget a participant outside, and send a dispose message to these participants inside."""
         ended = _dispose_message_of(outsider)
         told = list(inside) if outsider.is_announced else []
         self.forget_outside(outsider)
         return [sent for insider in told for sent in sent_to(insider.metatraffic, [ended])]
 
     def give_prefix_to_inside(self, prefix: bytes, source: str) -> list[Outgoing]:
-        """End the participant outside, if any, with the prefix of one at an address inside.
+        """End the participant outside, if any, with the prefix of a participant inside.
 
-        Only participants on other networks are told of the end. Those on the network of the address
-        know the rightful participant, and would forget it.
+        ``source`` is the address of the participant inside. Only participants on other networks get
+        a dispose message. Participants on the network of ``source`` know the rightful participant,
+        and would forget that participant.
         """
         outsider = self.outside.by_prefix.get(prefix)
         if outsider is None:
@@ -88,9 +91,10 @@ class Disposal:
         return self.end_outside(outsider, elsewhere)
 
     def give_prefix_to_outside(self, prefix: bytes, source: str) -> None:
-        """Forget the participant inside, if any, with the prefix of one at an address outside.
+        """Forget the participant inside, if any, with the prefix of a participant outside.
 
-        Outside is told of no end: it knows the rightful participant, and would forget it.
+        ``source`` is the address of the participant outside. Outside gets no dispose message: it
+        knows the rightful participant, and would forget that participant.
         """
         insider = self.inside.by_prefix.get(prefix)
         if insider is not None:
@@ -103,7 +107,7 @@ class Disposal:
     def give_up_ports(self, insider: InsideParticipant) -> list[Outgoing]:
         """End a participant inside that has ports of another participant.
 
-        It is let in again with its next announcement, and gets other ports.
+        With its next announcement the participant gets other ports.
         """
         text = (
             f"participant {insider.guid_prefix} loses a port that another participant has claimed"
@@ -112,24 +116,26 @@ class Disposal:
         return self.end_inside(insider)
 
     def forget_inside(self, insider: InsideParticipant) -> None:
-        """Forget a participant inside, and tell nothing."""
+        """Forget a participant inside without a dispose message."""
         self.inside.forget(insider)
         self.proxy_participants.forget(insider.prefix)
         self.fragments.forget(insider.prefix)
 
     def forget_outside(self, outsider: OutsideParticipant) -> None:
-        """Forget a participant outside, and tell nothing."""
+        """Forget a participant outside without a dispose message."""
         self.rediscovery.forget(self.inside.by_prefix.values(), outsider.prefix)
         self.outside.forget(outsider)
-        # What is known of ports belongs to a participant inside, which may have the same prefix.
+        # Former ports belong to a participant inside, which may have the same prefix. So these
+        # are not forgotten here.
         self.proxy_participants.discovery_participant.forget(outsider.prefix)
         self.fragments.forget(outsider.prefix)
 
 
 def _dispose_message_of(participant: Participant) -> bytes:
-    """The dispose message of a participant that may come back.
+    """The dispose message for a participant that may come back.
 
-    The number is the next one after that of its last announcement: Fast DDS takes no older sample
-    of the same writer (StatelessReader.cpp), so a greater one would keep it out for good.
+    Its number follows that of the participant's last announcement. Fast DDS ignores older samples
+    of the same writer (StatelessReader.cpp), so with a greater number the participant could never
+    come back.
     """
     return dispose_message(participant.prefix, participant.vendor, participant.next_number)

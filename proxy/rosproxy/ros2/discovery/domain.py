@@ -1,31 +1,33 @@
-"""One DDS domain: what the proxy does with each datagram of discovery, and as time passes.
+"""A DDS domain: what the proxy does with each datagram of discovery, and as time passes.
 
 Participants inside announce themselves to a multicast group, or to the well-known port of a peer
 (SPDP). The proxy maps a port of the range to each of their locators (`PortMappings`), and announces
-the participants outside with these ports (`AnnouncementsToOutside`). An announcement that outside
-sends to a port for metatraffic goes on to the participant inside, with a *stand-in* in place of the
-locator for metatraffic (`AnnouncementsToInside`). So all of discovery passes the proxy, in both
-directions, and the proxy can rewrite it. User data passes unread: to inside through the range, to
-outside without the proxy. Discovery among user data is read like any other where the receiver would
-read it (`Participant.reads_discovery_at`).
+the participants to outside with these ports (`AnnouncementsToOutside`). An announcement that
+outside sends to a port for metatraffic goes on to the participant inside, with a *stand-in* in
+place of the locator for metatraffic (`AnnouncementsToInside`). So all discovery passes the proxy,
+in both directions, and the proxy can rewrite all of it. User data passes unread: to inside through
+the range, to outside without the proxy. If the receiver would read discovery at a port for user
+data, the proxy reads discovery there, too (`Participant.reads_discovery_at`).
 
-Nothing here does I/O: each method takes a datagram, its source and the time, and returns the
-datagrams to send. After each, `stand_ins` tells which ports have to be open.
+This module does no I/O: each method takes a datagram, the source and the time, and returns the
+datagrams to send. After each call, `stand_ins` has the ports that have to be open.
 
-Each datagram may be forged. So
+Each datagram may be forged. So these rules hold:
 
-- a participant inside is one whose address is inside. Only locators at this very address get a
-  port: no announcement makes the proxy a way to another host;
-- no participant at another address or on the other side gets the GUID prefix of a participant that
-  is there (`PrefixOwners`);
-- a participant outside is one whose address is a peer's, or that the LAN relay has heard from
-  there. The proxy itself sends to its locators at this very address alone;
-- the proxy knows the LAN relay by the proof of a shared secret. The address that the relay claims
-  for a participant is neither inside nor the proxy's own;
-- a participant outside is sent no more bytes than came from its address, until it has shown that it
-  receives them (it names the GUID prefix that it answers). So no sender can make the proxy flood
-  another machine;
-- each source may make only so much discovery in a second, with all that it leads to.
+- A participant inside has an address inside. Only locators at this address get a port: no
+  announcement makes the proxy a way to another host.
+- While a participant has a GUID prefix, no participant at another address or on the other side gets
+  this prefix (`PrefixOwners` has the exceptions).
+- The proxy accepts three kinds of participants outside: those at the address of a peer, those that
+  the LAN relay has heard, and those that answer the discovery participant from an address at which
+  a participant is known. The proxy sends only to locators at the participant's own address.
+- A proof with a shared secret identifies the LAN relay. The address that the relay states for a
+  participant must neither be inside nor belong to the proxy.
+- A participant outside gets no more bytes than came from its address, until the participant names
+  the secret GUID prefix of a question (`OutsideParticipant` has the details). So no sender can make
+  the proxy flood another machine.
+- Each source has an allowance for discovery, which includes the datagrams that the proxy sends in
+  consequence.
 """
 
 from collections import Counter
@@ -85,18 +87,19 @@ from rosproxy.ros2.sources.claimed_addresses import claim_fault
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing, cost
 
 ENDED_AT_ONCE = 64
-"""Participants of a side that are forgotten at a time. The proxy looks twice a second."""
+"""Participants of a side that `Domain.expire` ends in one call. Calls come twice a second."""
 
 _Passing = tuple[list[bytes], list[Outgoing]]
-"""Datagrams that go on, and what goes back to where they came from."""
+"""Datagrams to pass on, and datagrams to send back."""
 
 
 class Domain:
-    """A domain: its participants, what the proxy knows of them, and what becomes of datagrams.
+    """A domain with its participants.
 
-    It starts without participants. ``own`` is the GUID prefix of the discovery participant, which
-    is random. ``secret`` are random bytes, ``when`` is Unix time. ``passed`` counts bytes, by kind
-    and whether inwards.
+    A domain starts without participants. ``own`` is the random GUID prefix of the discovery
+    participant. ``secret`` are random bytes. ``now`` is the clock in seconds, and ``when`` is Unix
+    time at that moment. ``passed`` counts bytes that passed, by kind and by whether they went
+    inwards.
     """
 
     def __init__(
@@ -108,7 +111,7 @@ class Domain:
         now: float,
         when: float = 0.0,
     ) -> None:
-        pool.claim(settings.discovery_port)  # where outside announces itself: no locator gets it
+        pool.claim(settings.discovery_port)  # never for a locator: outside announces itself there
         self.settings = settings
         self.refused = refused = Refused(settings.note)
         self.proofs = proofs = AddressProofs(secret)
@@ -147,11 +150,11 @@ class Domain:
 
     @property
     def is_busy(self) -> bool:
-        """Whether `Domain.go_on` has more to do: hundreds may have to meet hundreds."""
+        """Whether `Domain.go_on` has more to do: hundreds may have to discover hundreds."""
         return self.rediscovery.is_busy
 
     def heard_inside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
-        """What came to the group on an inside network, or to the well-known port, from inside."""
+        """Handle a datagram from inside, at the multicast group or at the well-known port."""
         is_answer = self.proofs.is_answer(source, datagram)
         if not is_answer and self._is_too_much(datagram, source, now):
             return []
@@ -165,22 +168,22 @@ class Domain:
         return sent
 
     def heard_outside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
-        """What came to the discovery port.
+        """Handle a datagram at the discovery port.
 
-        Participants announce themselves there, if the LAN relay has heard them or they are a
-        peer's; and those that are known answer the discovery participant.
+        Participants outside announce themselves there, directly or through the LAN relay. Known
+        participants send their answers to the discovery participant there.
         """
         relay = self.settings.relay
-        # Other programs have the relay's address, too. What they send has no proof.
+        # Other programs have the relay's address, too. Their datagrams have no proof.
         if relay and source == relay.address.host and not datagram.startswith(MAGIC):
             return self._heard_by_relay(relay, datagram, now)
-        # An answer counts also where a flood has taken the place of its participant meanwhile.
+        # A flood may have taken the place of the participant. Its answer counts all the same.
         if not self.proofs.is_answer(source, datagram) and self.outside.is_strange(source):
             return []
         return self._heard_at_discovery(datagram, source, False, now)
 
     def source_of(self, datagram: bytes, source: str) -> str:
-        """The address at which a datagram was heard, by the LAN relay or the proxy itself."""
+        """The original source of a datagram: the LAN relay may have passed the datagram on."""
         relay = self.settings.relay
         if relay is None or source != relay.address.host or datagram.startswith(MAGIC):
             return source
@@ -191,7 +194,10 @@ class Domain:
         return heard_at
 
     def _heard_by_relay(self, relay: LanRelayLink, datagram: bytes, now: float) -> list[Outgoing]:
-        """What the LAN relay has heard, if the proof is good and the claimed address can be."""
+        """Handle a datagram of the LAN relay.
+
+        The proxy refuses a datagram without a valid proof, and an impossible claimed address.
+        """
         try:
             content = relay.proof.opened(Direction.TO_PROXY, datagram)
             source, announcement = unwrapped(content)
@@ -200,7 +206,8 @@ class Domain:
             return self._drop("relay_proof", relay.address.host, str(error))
         self.rediscovery.lan_relay_heard = True
         if fault := claim_fault(source, self.settings):
-            # With IPv6 the relay may hear the inside network, too (groups.py, _IP_MULTICAST_ALL).
+            # With IPv6 the relay may receive from the inside network (groups.py,
+            # _IP_MULTICAST_ALL).
             return [] if is_known else self._drop("claimed_address", source, fault)
         return self._heard_at_discovery(announcement, source, True, now)
 
@@ -222,17 +229,17 @@ class Domain:
         return sent
 
     def is_read_at_discovery(self, datagram: bytes, source: str) -> bool:
-        """Whether `heard_outside` reads a datagram, which takes long."""
+        """Whether `heard_outside` parses a datagram, so that the datagram has to wait."""
         if self.proofs.is_answer(source, datagram):
             return False
         return self.outside.is_met(source) or self.source_of(datagram, source) != source
 
     def is_read_of_inside(self, datagram: bytes, source: str) -> bool:
-        """Whether `heard_inside` reads a datagram, which takes long."""
+        """Whether `heard_inside` parses a datagram, so that the datagram has to wait."""
         return not self.proofs.is_answer(source, datagram)
 
     def is_read_at_range_port(self, port: int, datagram: bytes, source: str) -> bool:
-        """Whether `at_range_port` reads a datagram, which takes long, and does not just pass it."""
+        """Whether `at_range_port` parses a datagram, so that the datagram has to wait."""
         mapped = self.mappings.by_port.get(port)
         if mapped is None:
             return False
@@ -241,16 +248,16 @@ class Domain:
         return may_be_read and may_be_discovery(datagram)
 
     def is_read_at_stand_in(self, port: int, datagram: bytes, _: str) -> bool:
-        """Whether `at_stand_in` reads a datagram, which takes long, and does not just pass it."""
+        """Whether `at_stand_in` parses a datagram, so that the datagram has to wait."""
         users = self.stand_ins.by_port.get(port, ())
         may_be_read = any(outsider.reads_discovery_at(mapping) for outsider, mapping in users)
         return may_be_read and may_be_discovery(datagram)
 
     def at_range_port(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
-        """What outside sends to a port of the range."""
+        """Handle a datagram from outside at a port of the range."""
         mapped = self.mappings.by_port.get(port)
         try:
-            if mapped is None:  # outside may mean a participant of before the start
+            if mapped is None:  # the port may belong to a participant from before the start
                 self._note_former_use(port, datagram, source, now)
                 return []
             insider, mapping = mapped
@@ -270,7 +277,7 @@ class Domain:
         return [self._passed(mapping, d, True) for d in passed] + back
 
     def at_stand_in(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
-        """What inside sends to a port that stands for locators outside."""
+        """Handle a datagram from inside at a stand-in."""
         users = list(self.stand_ins.by_port.get(port, ()))
         sent = list[Outgoing]()
         if not self.is_read_at_stand_in(port, datagram, source):
@@ -286,24 +293,24 @@ class Domain:
         return sent
 
     def settle(self, now: float) -> list[Outgoing]:
-        """Ask participants that wait again, and have others meet."""
+        """Repeat questions about former ports, and continue rediscoveries."""
         sent = self.former_ports.repeated_questions(now)
         for insider in list(self.inside.by_prefix.values()):
             try:
                 sent += self.rediscovery.proceed(insider, now)
-            except RtpsError as error:  # the others go on
+            except RtpsError as error:  # continue with the other participants
                 sent += self._drop("malformed", insider.address, str(error))
         return sent + self.rediscovery.next_datagrams(now)
 
     def go_on(self, now: float) -> list[Outgoing]:
-        """Do the next part, of some milliseconds, of what takes long; see `is_busy`."""
+        """Do the next part of a rediscovery, which takes some milliseconds; see `is_busy`."""
         return self.rediscovery.next_datagrams(now)
 
     def admit(self, prefix: bytes, now: float) -> list[Outgoing]:
-        """Let in a participant that has waited until it was known which ports it had."""
+        """Serve a participant that has waited for the answer about its former ports."""
         waited = self.former_ports.end_wait(prefix)
         if waited is None:
-            return []  # it has ended meanwhile
+            return []  # the participant has ended meanwhile
         source, message = waited
         try:
             return self._admitted_inside(message, source, now)
@@ -311,16 +318,16 @@ class Domain:
             return self._drop("malformed", source, str(error))
 
     def apply_policy(self, now: float) -> list[Outgoing]:
-        """Have participants meet anew of which the policy says something else than before."""
-        self.fragments.clear()  # they were judged by the former policy
+        """Start the rediscovery of the participants for which a verdict has changed."""
+        self.fragments.clear()  # the former policy has judged these
         self.rediscovery.review()
         return self.rediscovery.next_datagrams(now)
 
     def move_to(self, hosts: tuple[str, ...], now: float) -> list[Outgoing]:
         """Announce the participants inside at other addresses of the advertised host.
 
-        Fast DDS takes no new locators of a participant that it knows (PDPListener.cpp), so all
-        outside meet the participants and the discovery participant anew.
+        Fast DDS accepts no new locators of a known participant (PDPListener.cpp). So all
+        participants outside rediscover the participants inside and the discovery participant.
         """
         sent = self.settings.to_outside(
             self.proxy_participants.discovery_participant.dispose_message()
@@ -329,15 +336,15 @@ class Domain:
         for insider in self.inside.by_prefix.values():
             try:
                 sent += self.rediscovery.move(insider)
-            except RtpsError as error:  # the others go on
+            except RtpsError as error:  # continue with the other participants
                 sent += self._drop("malformed", insider.address, str(error))
         return sent + self.rediscovery.next_datagrams(now)
 
     def retire(self, now: float) -> list[Outgoing]:
-        """Have all inside and all outside forget each other, as no proxy takes over.
+        """End all participants inside on both sides, because no proxy takes over.
 
-        Participants may go on, and meet anew by a proxy that is started later. So both sides have
-        to forget (`Rediscovery`).
+        The participants may live on, and a proxy that is started later may serve them. Then they
+        have to rediscover each other, so both sides have to forget (`Rediscovery`).
         """
         sent = list[Outgoing]()
         self.former_ports.forget({insider.address for insider in self.inside.by_prefix.values()})
@@ -347,7 +354,7 @@ class Domain:
         return sent + self.rediscovery.next_datagrams(now)
 
     def standing(self, source: str) -> Standing:
-        """How far an address has proved to be what it claims; its rate of discovery follows."""
+        """The standing of a source, on which its allowance for discovery depends."""
         if self.settings.is_peer(source):
             return Standing.PROVEN
         is_proven = self.proofs.has(source)
@@ -356,14 +363,14 @@ class Domain:
         return Standing.STRANGER if is_proven else Standing.OUTSIDE
 
     def is_kept(self, participant: InsideParticipant) -> bool:
-        """Whether a participant inside keeps all the ports that it has, for the next process."""
+        """Whether a participant inside has confirmed that it keeps all its ports."""
         return self.proxy_participants.port_store.keeps(participant.prefix, participant.ports)
 
     def expire(self, now: float) -> list[Outgoing]:
-        """Forget participants that have not been heard for as long as they said.
+        """End participants whose lease duration is over. Return the datagrams for outside.
 
-        Return what outside is told. A participant on two networks may have lost the one at which it
-        was served, and is let in again at the other.
+        If a participant on two networks has lost the network on which the proxy served the
+        participant, its next announcement on the other network is accepted.
         """
         sent = list[Outgoing]()
         insiders = [p for p in self.inside.by_prefix.values() if p.until < now]
@@ -376,9 +383,9 @@ class Domain:
         return sent
 
     def gone(self, addresses: Collection[str]) -> list[Outgoing]:
-        """End the participants at addresses inside that are gone. Return what outside is told.
+        """End the participants at inside addresses that are gone. Return the datagrams for outside.
 
-        They can't say so themselves, and would be believed to be there for many seconds.
+        Without this, outside would keep these participants until the end of their lease durations.
         """
         self.former_ports.forget(addresses)
         sent = list[Outgoing]()
@@ -392,7 +399,7 @@ class Domain:
         if source_vendor(message.datagram) == NO_VENDOR or self.proxy_participants.is_of_proxy(
             prefix
         ):
-            return []  # a proxy's own participants are not passed on
+            return []  # participants of a proxy are not announced to the other side
         if self.proofs.note(source, message.datagram, now):
             sent = self.disposal.end_former_processes(prefix, source)
             return sent + [out for p in self.inside.prove() for out in self.disposal.end_inside(p)]
@@ -408,7 +415,7 @@ class Domain:
     def _admitted_inside(
         self, message: DiscoveryMessage, source: str, now: float
     ) -> list[Outgoing]:
-        """Let in a participant inside, unless its prefix is that of a participant outside."""
+        """Serve a participant inside, unless its prefix belongs to a participant outside."""
         if not self.owners.yields_to_inside(message.prefix):
             outsider = self.outside.by_prefix[message.prefix]
             self.former_ports.forget_participant(message.prefix)
@@ -418,7 +425,7 @@ class Domain:
         return sent + self._announced_inside(message, source, now)
 
     def _wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        """Have a participant inside wait until it has answered the proxy."""
+        """Let a participant inside wait until it has answered the proxy."""
         if message.prefix in self.former_ports.waiting:
             return []
         sent = self.former_ports.wait(message, source, now)
@@ -456,10 +463,10 @@ class Domain:
     def _claimed_by_outside(
         self, message: DiscoveryMessage, source: str, received: int, now: float
     ) -> list[Outgoing]:
-        """Take in an announcement from outside with a prefix that inside uses. Raises RtpsError."""
+        """Handle an announcement from outside with a prefix of inside. Raises RtpsError."""
         claimant = self.outside.claimant(message, source, received, now)
         if claimant is None:
-            return []  # the LAN relay hears what it has sent to the LAN itself, or an end
+            return []  # the relay has heard an announcement of the proxy, or the message is an end
         if self.owners.yields_to_outside(message.prefix, source, now):
             self.disposal.give_prefix_to_outside(message.prefix, source)
             return self._announced_outside(message, source, received, now)
@@ -470,7 +477,7 @@ class Domain:
     def _told_outside(
         self, message: DiscoveryMessage, source: str, received: int, now: float
     ) -> list[Outgoing]:
-        """Take in what a participant outside tells the proxy's own. Raises RtpsError."""
+        """Handle a message from outside to a participant of the proxy. Raises RtpsError."""
         sent = list[Outgoing]()
         if self.proofs.note(source, message.datagram, now):
             sent += self.disposal.end_former_processes(message.prefix, source)
@@ -485,7 +492,10 @@ class Domain:
     def _announced_outside(
         self, message: DiscoveryMessage, source: str, received: int, now: float
     ) -> list[Outgoing]:
-        """Note what a participant outside announces, and tell inside. Raises RtpsError."""
+        """Handle the announcement of a participant outside, and announce it inside.
+
+        Raises RtpsError.
+        """
         outsider, sent = self._meet_outside(message, source, now)
         if outsider is None:
             return sent
@@ -493,18 +503,21 @@ class Domain:
         sent += self.to_inside.of_outside([outsider], self.inside.by_prefix.values(), now)
         if message.of_participant is None or not message.of_participant.ended:
             return sent + self.proxy_participants.question_to_outside(outsider)
-        self.disposal.forget_outside(outsider)  # those inside are told of that, too
+        self.disposal.forget_outside(outsider)  # inside has just got this end as an announcement
         return sent
 
     def _meet_outside(
         self, message: DiscoveryMessage, source: str, now: float
     ) -> tuple[OutsideParticipant | None, list[Outgoing]]:
-        """The participant that announces itself, and what ends the one whose place it gets."""
+        """The participant in an announcement, and the datagrams that end another participant.
+
+        The other participant ends to make room.
+        """
         made_room = self._make_room(message, source)
         return self.outside.meet(message, source, now), made_room
 
     def _make_room(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
-        """End the participant outside whose place a new one gets, if there is one."""
+        """End a participant outside in favour of a new one, if necessary."""
         spdp = message.of_participant
         if spdp is None or spdp.ended or message.prefix in self.outside.by_prefix:
             return []
@@ -516,18 +529,19 @@ class Domain:
     def _announced_inside(
         self, message: DiscoveryMessage, source: str, now: float
     ) -> list[Outgoing]:
-        """Note what a participant inside announces of itself, and tell outside."""
+        """Handle the announcement of a participant inside, and announce the participant outside."""
         prefix = message.prefix
         is_new = prefix not in self.inside.by_prefix
         if is_new and self.mappings.lacks_proof(prefix, source):
-            # It is announced with all of its ports or not at all: outside takes up no new locators
-            # of a participant that it knows. It announces itself again.
+            # The proxy announces the participant with all ports or not at all, because Fast DDS
+            # accepts no new locators of a known participant. The participant will announce itself
+            # again.
             return self.proxy_participants.question_to_announced(message, source)
         gives_place = self.inside.gives_place(prefix, source) if is_new else None
         sent = self.disposal.end_inside(gives_place) if gives_place else []
         insider = self.inside.meet(message, source, now)
         if insider is None:
-            if prefix not in self.inside.by_prefix:  # it may get a place once it has answered
+            if prefix not in self.inside.by_prefix:  # its answer may give the participant a place
                 sent += self.proxy_participants.question_to_announced(message, source)
             return sent
         if is_new:
@@ -536,15 +550,17 @@ class Domain:
         for_outside = ForOutside(self.inside, insider, now, self.former_ports.of(prefix))
         exported = for_outside.rewritten(message)
         sent += self.to_inside.of_neighbour(insider, message)
-        # It knew the proxy elsewhere: it forgets the port store there, and meets all outside anew.
+        # Outside knows former ports of the participant, so all participants outside have to
+        # rediscover it. The participant also has to forget the port store, perhaps at a former
+        # address of the proxy.
         if is_new and self.former_ports.must_be_rediscovered(prefix):
             sent += self.proxy_participants.port_store_dispose_message(insider)
             insider.separation_due_from = now
         else:
             sent += self._reminders(insider, mapping_count, now)
         if not is_new and len(insider.mappings) > mapping_count:
-            insider.separation_due_from = now  # outside takes up no new locators of it
-        # For all: it may be an answer to the discovery participant.
+            insider.separation_due_from = now  # Fast DDS outside accepts no new locators
+        # `for_all`, because the message may be an answer to the discovery participant.
         sent += self.to_outside.of_inside(insider, for_all(exported), now)
         if is_new:
             sent += self.to_inside.of_outside(self.outside.by_prefix.values(), [insider], now)
@@ -554,12 +570,12 @@ class Domain:
         return sent + self.proxy_participants.first_questions(insider)
 
     def _make_way(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
-        """End participants that stand where a new participant inside is: at its port, or its ports.
+        """End former processes at the port of a new participant inside, and holders of its ports.
 
-        Return what outside is told.
+        Return the datagrams for outside.
         """
         prefix = insider.prefix
-        # It may have answered while it waited.
+        # The participant may have answered while it waited.
         sent = self.disposal.end_former_processes(prefix, insider.address)
         insider.was_inside = self.former_ports.was_inside(prefix)
         for holder in self.ports.displaced_by(prefix, now):
@@ -572,7 +588,7 @@ class Domain:
         if insider is None:
             return []
         require_rewritable(message)
-        # It may tell other things as well.
+        # The message may have other announcements as well.
         exported = ForOutside(self.inside, insider, now).rewritten(message)
         self.disposal.forget_inside(insider)
         return self.settings.to_outside(exported)
@@ -585,7 +601,10 @@ class Domain:
         message: DiscoveryMessage,
         now: float,
     ) -> list[Outgoing]:
-        """Metatraffic from inside as outside gets it, and what goes back. Raises RtpsError."""
+        """Rewrite discovery from inside for outside.
+
+        Return the rewritten datagrams, and the requests to inside. Raises RtpsError.
+        """
         insider = self.inside.find(message.prefix, source)
         if insider is None:
             return self._drop(
@@ -609,9 +628,10 @@ class Domain:
     def _reminders(
         self, insider: InsideParticipant, former_count: int, now: float
     ) -> list[Outgoing]:
-        """What makes a participant keep new ports at once, if it has more than ``former_count``.
+        """The datagrams with which a participant keeps new ports at once.
 
-        The proxy may be killed before the next round; what is lost on its way comes again then.
+        Empty if the participant has no more than ``former_count`` ports. The proxy may be killed
+        before the next regular reminders, which repeat lost datagrams.
         """
         has_more = len(insider.mappings) > former_count
         if not has_more or insider not in self.former_ports.keepers(
@@ -623,7 +643,7 @@ class Domain:
     def _read_at_range_port(
         self, port: int, source: str, insider: InsideParticipant, datagram: bytes, now: float
     ) -> _Passing:
-        """What becomes of discovery from outside at a port of the range. Raises RtpsError."""
+        """Handle discovery from outside at a port of the range. Raises RtpsError."""
         passed = list[bytes]()
         back = list[Outgoing]()
         for message, received in credited_messages(datagram):
@@ -644,7 +664,10 @@ class Domain:
         message: DiscoveryMessage,
         received: int,
     ) -> _Passing:
-        """Metatraffic from outside as a participant inside gets it. Raises RtpsError."""
+        """Rewrite discovery from outside for a participant inside.
+
+        Return the rewritten datagrams, and the requests to outside. Raises RtpsError.
+        """
         outsider = self.outside.find(message.prefix, source)
         spdp = message.of_participant
         if outsider is not None:
@@ -678,7 +701,7 @@ class Domain:
         return passed, back
 
     def _to_outside(self, users: Sequence[StandInUser], datagram: bytes) -> list[Outgoing]:
-        """A datagram that goes to participants outside, as far as they may be sent any."""
+        """The datagrams for participants outside, as far as their credit allows."""
         sent = list[Outgoing]()
         for target, mapping in users:
             if target.may_be_sent(len(datagram)):
@@ -691,13 +714,13 @@ class Domain:
         return sent
 
     def _passed(self, mapping: PortMapping, datagram: bytes, inwards: bool) -> Outgoing:
-        """A datagram that goes to where a mapping leads."""
+        """Count a datagram that passes, and return it for the target of a mapping."""
         mapping.note_passed(len(datagram))
         self.passed[mapping.kind, inwards] += len(datagram)
         return Outgoing(mapping.target, datagram)
 
     def _note_former_use(self, port: int, datagram: bytes, source: str, now: float) -> None:
-        """Note which participant outside means by a port without a mapping. Raises RtpsError."""
+        """Note the destination of a datagram at a port without a mapping. Raises RtpsError."""
         if not self.ports.is_restoring(now):
             return
         if may_be_discovery(datagram) and self._is_too_much(datagram, source, now):
@@ -705,12 +728,12 @@ class Domain:
         self.ports.note_use(port, datagram, self._named_by(source), now)
 
     def _charge(self, source: str, sent: Sequence[Outgoing]) -> None:
-        """Charge a source with the datagrams that its own have led to."""
+        """Charge a source for the datagrams that the proxy sends in consequence."""
         total = sum(cost(len(out.datagram)) for out in sent)
         self.rates.charge(source, total, self.standing(source))
 
     def _is_too_much(self, datagram: bytes, source: str, now: float) -> bool:
-        """Whether a source makes more discovery than it may; what is not is charged to it."""
+        """Charge a source for a datagram. Return whether the allowance is used up."""
         if self.rates.take(source, len(datagram), now, self.standing(source)):
             return False
         text = "the source sends more discovery in a second than one source may send"
@@ -718,10 +741,10 @@ class Domain:
         return True
 
     def _named_by(self, source: str) -> NamedBy:
-        """How much it counts that an address outside names a participant."""
+        """How reliable a source is when it names a participant at a port."""
         if self.settings.is_peer(source):
             return NamedBy.PEER
-        # A participant inside proves its address, too, and sends to ports of the range.
+        # A participant inside may have a proven address, too, and send to ports of the range.
         is_proven = self.proofs.has(source) and not self.settings.is_inside(source)
         return NamedBy.PROVEN if is_proven else NamedBy.OTHERS
 
@@ -731,9 +754,9 @@ class Domain:
 
 
 def _meant(users: Sequence[StandInUser], datagram: bytes) -> Sequence[StandInUser]:
-    """Those of a stand-in that a message names; all if it names none. Raises RtpsError.
+    """The users of a stand-in that a message names; all users if the message names none.
 
-    One that stands for a single participant takes everything, as that one does itself.
+    A single user gets all messages, and ignores messages for other participants. Raises RtpsError.
     """
     named = destinations(datagram) if len(users) > 1 else None
     return [user for user in users if user[0].prefix in named] if named else users

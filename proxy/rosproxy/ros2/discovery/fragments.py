@@ -1,15 +1,17 @@
-"""Announcements in fragments: they wait until they are whole, and go on as the fragments they were.
+"""Announcements in fragments: hold these until all fragments have come, then rewrite and pass them.
 
-A reader or writer with a long description is announced in several DATA_FRAG, each in a datagram of
-its own or several in one (Cyclone DDS: of 1,344 bytes each). A locator may begin in one and end in
-the next. So the datagrams are held until the announcement is whole; that is rewritten as any other,
-and each fragment gets its part of it. Fragments that are sent again later get theirs at once.
+A long announcement of a reader or writer comes in several DATA_FRAG, of one or several datagrams.
+Cyclone DDS makes fragments of 1,344 bytes. A locator may begin in one fragment and end in the next.
+So the proxy holds the datagrams until the announcement is whole, and rewrites the announcement like
+any other. Then each fragment gets its part of the result. Fragments that the writer repeats later
+pass at once.
 
-A writer that is asked for an announcement anew sends its first fragment alone, and waits to be
-asked for the others. The reader, which has not got that one, can't: so the proxy asks in its name.
+If a reader requests an announcement again, the writer sends the first fragment alone, and waits for
+requests for the others. But the reader has not received the first fragment, which the proxy holds,
+and requests nothing. So the proxy requests the other fragments on behalf of the reader.
 
-Each participant has a store of its own, so that it can't push out what others have sent; if all
-take too much together, the largest goes first.
+Each participant has a store. So a participant can't displace the fragments of another one, until
+all stores together are too large. Then the largest store goes first.
 """
 
 import struct
@@ -32,28 +34,31 @@ from rosproxy.ros2.protocol.rtps import (
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 
 LONGEST = 60_000
+"""Bytes of the longest announcement that the proxy accepts in fragments. Real ones have some
+thousand."""
 SHORTEST = 128
-"""Bytes of an announcement, and of a fragment. Real ones have some thousand."""
+"""Bytes of the shortest fragment that the proxy accepts. Real ones have some thousand."""
 MOST_BYTES = 1024 * 1024
+"""Bytes of a participant's announcements in a store, and bytes of its datagrams that wait. Beyond
+either bound, the oldest go."""
 MOST_OF_ALL = 16 * 1024 * 1024
-"""Bytes of a participant's announcements that are remembered, and as many of datagrams that wait;
-of more the oldest go. Then the bytes of all participants."""
+"""Bytes of all stores together."""
 MOST_FRAGMENTS = 64
-"""DATA_FRAG in a datagram: one of 64 KB has as many of Cyclone DDS."""
+"""DATA_FRAG in a datagram. A datagram of 64 KB holds fewer than 50 of Cyclone DDS."""
 OVERHEAD = 1024
-"""Bytes that are counted for each announcement and each datagram beside its own."""
+"""Bytes that are added to the length of each announcement, and of each DATA_FRAG that waits."""
 
 Rewrite = Callable[[DiscoveryMessage], bytes]
-"""Rewrites the whole announcements in a message, and leaves its length."""
+"""Rewrites the whole announcements in a message. The length of the message stays."""
 
 _PAYLOAD_AT = HEADER + 24
-"""Where the payload of a DATA begins that is a message's first, and has no inline QoS."""
+"""Offset of the payload of a DATA without inline QoS that is the first submessage of a message."""
 
 _Key = tuple[int, bytes, int, int]
 
 
 class PassedFragments(NamedTuple):
-    """Datagrams that go on, and those that go back to ask for missing fragments."""
+    """Datagrams to pass on, and requests for missing fragments to send back."""
 
     forwarded: list[bytes]
     questions: list[bytes]
@@ -61,9 +66,10 @@ class PassedFragments(NamedTuple):
 
 @dataclass(slots=True)
 class _PendingSample:
-    """The fragments of a sample, by their numbers; ``whole`` is its payload once all are there.
+    """The fragments of a sample, by their numbers.
 
-    It is rewritten then, and empty if the announcement is to be hidden.
+    ``whole`` is the rewritten payload when all fragments have come; empty if the announcement is
+    hidden.
     """
 
     total: int
@@ -73,12 +79,15 @@ class _PendingSample:
 
     @property
     def cost(self) -> int:
-        """The bytes that it counts for."""
+        """The bytes that the sample counts for."""
         return self.total + OVERHEAD
 
 
 class _WaitingDatagram(msgspec.Struct, frozen=True):
-    """A datagram that waits, rewritten but for its fragments; ``port`` is where it came."""
+    """A datagram that waits, rewritten except for the fragments.
+
+    ``port`` is the port of the proxy at which the datagram came.
+    """
 
     port: int
     fragments: tuple[tuple[Sample, Fragments], ...]
@@ -86,12 +95,12 @@ class _WaitingDatagram(msgspec.Struct, frozen=True):
 
     @property
     def cost(self) -> int:
-        """The bytes that it counts for."""
+        """The bytes that the datagram counts for."""
         return len(self.datagram) + len(self.fragments) * OVERHEAD
 
     @property
     def keys(self) -> set[_Key]:
-        """The announcements that it has fragments of."""
+        """The keys of the announcements of which the datagram has fragments."""
         return {_key(self.port, sample) for sample, _ in self.fragments}
 
 
@@ -106,10 +115,11 @@ class FragmentStores:
     def rewritten(
         self, port: int, message: DiscoveryMessage, reader: bytes, rewrite: Rewrite
     ) -> PassedFragments:
-        """The datagrams of a participant that may go on now, rewritten. Raises RtpsError.
+        """The rewritten datagrams of a participant that may pass now. Raises RtpsError.
 
-        ``port`` is where the message came: each way has fragments of its own. ``reader`` is the
-        GUID prefix of the participant that is to get them.
+        ``port`` is the port of the proxy at which the message came. Each port has separate
+        fragments, because the rewritten announcements differ. ``reader`` is the GUID prefix of the
+        participant that is to receive the datagrams.
         """
         if not message.fragments:
             # Most messages announce nothing: acknowledgements and heartbeats.
@@ -118,11 +128,11 @@ class FragmentStores:
         store = self.by_prefix.setdefault(message.prefix, FragmentStore())
         before = store.size
         try:
-            # Before the message is taken in: then all its fragments would be known ones.
+            # Before the store gathers these fragments, or each would count as repeated.
             missing = store.missing(port, message)
             released = store.rewritten(port, message, rewrite)
         finally:
-            # Also of a malformed message some fragments may have been kept.
+            # The store may have kept some fragments of a malformed message, too.
             self.size += store.size - before
             while self.size > MOST_OF_ALL:
                 self.forget(max(self.by_prefix, key=lambda prefix: self.by_prefix[prefix].size))
@@ -138,22 +148,22 @@ class FragmentStores:
         return nack_frag(reader, message.prefix, *fields)
 
     def forget(self, prefix: bytes) -> None:
-        """Forget what a participant has sent."""
+        """Forget the fragments of a participant."""
         store = self.by_prefix.pop(prefix, None)
         self.size -= store.size if store else 0
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Forget all fragments."""
         self.by_prefix.clear()
         self.size = 0
 
 
 @dataclass(slots=True)
 class FragmentStore:
-    """Announcements of a participant of which fragments have come, and the datagrams that wait.
+    """The announcements of a participant that came in fragments, and the datagrams that wait.
 
-    These have numbers, in the order in which they came; ``_waiting_by_key`` has the numbers of
-    those with fragments of an announcement.
+    The waiting datagrams have ascending numbers. ``_waiting_by_key`` has the numbers of the
+    datagrams with fragments of an announcement.
     """
 
     _samples: dict[_Key, _PendingSample] = field(default_factory=dict)
@@ -165,11 +175,11 @@ class FragmentStore:
 
     @property
     def size(self) -> int:
-        """The bytes that are remembered, and those of datagrams that wait."""
+        """The bytes of the announcements, and of the datagrams that wait."""
         return self._sample_bytes + self._waiting_bytes
 
     def missing(self, port: int, message: DiscoveryMessage) -> list[tuple[Sample, list[int]]]:
-        """Samples of which a fragment comes again, and the numbers of those that are missing."""
+        """The samples of which a fragment came again, and the numbers of the missing fragments."""
         missing_by_key = dict[_Key, tuple[Sample, list[int]]]()
         for sample, frags in message.fragments:
             key = _key(port, sample)
@@ -182,10 +192,13 @@ class FragmentStore:
         return list(missing_by_key.values())
 
     def rewritten(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> list[bytes]:
-        """As `FragmentStores.rewritten`, for a message with fragments."""
+        """Gather the fragments of a message, and return the rewritten datagrams that may pass now.
+
+        See `FragmentStores.rewritten`.
+        """
         if len(message.fragments) > MOST_FRAGMENTS:
             raise RtpsError(f"the datagram has more than {MOST_FRAGMENTS} fragments")
-        # Whole announcements beside the fragments are rewritten now, fragments in `_filled`.
+        # This rewrites the whole announcements of the datagram; `_filled` rewrites the fragments.
         arrived = _WaitingDatagram(port, message.fragments, rewrite(message))
         completed = {
             _key(port, sample)
@@ -193,19 +206,22 @@ class FragmentStore:
             if self._gather(port, message, sample, frags, rewrite)
         }
         released = [self._filled(datagram) for datagram in self._released(completed)]
-        if self._is_whole(arrived):  # it may also be of what was whole before, sent again
+        if self._is_whole(arrived):  # also if the fragments repeat whole announcements
             return [*released, self._filled(arrived)]
         self._hold(arrived)
         return released
 
     def _released(self, completed: Iterable[_Key]) -> list[_WaitingDatagram]:
-        """The datagrams that waited for announcements that are whole now, and for no others."""
+        """The waiting datagrams whose announcements are all whole now, in order of arrival.
+
+        ``completed`` are the announcements that have just become whole.
+        """
         numbers = set[int]().union(*(self._waiting_by_key.get(key, ()) for key in completed))
         whole = [n for n in sorted(numbers) if self._is_whole(self._waiting_datagrams[n])]
         return [self._let_go(number) for number in whole]
 
     def _hold(self, datagram: _WaitingDatagram) -> None:
-        """Have a datagram wait."""
+        """Let a datagram wait. Drop the oldest datagrams beyond MOST_BYTES."""
         self._last_number += 1
         self._waiting_datagrams[self._last_number] = datagram
         self._waiting_bytes += datagram.cost
@@ -215,7 +231,7 @@ class FragmentStore:
             self._let_go(next(iter(self._waiting_datagrams)))
 
     def _let_go(self, number: int) -> _WaitingDatagram:
-        """The datagram with a number, which waits no longer."""
+        """Take a datagram out of those that wait."""
         datagram = self._waiting_datagrams.pop(number)
         self._waiting_bytes -= datagram.cost
         for key in datagram.keys:
@@ -233,7 +249,7 @@ class FragmentStore:
         frags: Fragments,
         rewrite: Rewrite,
     ) -> bool:
-        """Note the fragments of one submessage; whether the sample has become whole by them."""
+        """Gather the fragments of a DATA_FRAG. Return whether these make the sample whole."""
         gathered = self._gathered(port, sample, frags)
         payloads = dict(_payloads(message.datagram, sample, frags))
         if gathered.whole is not None:
@@ -243,14 +259,18 @@ class FragmentStore:
             return False
         payload = b"".join(gathered.fragments[number] for number in sorted(gathered.fragments))
         edited = rewrite(read_discovery(_as_data(message.datagram, sample, payload)))
-        # What is hidden has become a GAP (`withheld`).
+        # `rewrite` has turned a hidden announcement into a GAP (`withheld`).
         hidden = edited[HEADER] == SubmessageId.GAP
         gathered.whole = b"" if hidden else edited[_PAYLOAD_AT:]
         gathered.fragments.clear()
         return True
 
     def _gathered(self, port: int, sample: Sample, frags: Fragments) -> _PendingSample:
-        """What has come of a fragment's sample. Raises RtpsError if the fragment can't be one."""
+        """The gathered fragments of a sample.
+
+        Raises RtpsError if the size is outside the limits, or differs from that of a former
+        fragment.
+        """
         if frags.size < SHORTEST or not 0 < frags.total <= LONGEST:
             text = f"an announcement has {frags.total} bytes in fragments of {frags.size} bytes"
             raise RtpsError(f"{text}, which is outside the limits")
@@ -272,7 +292,7 @@ class FragmentStore:
         return all(self._whole(datagram.port, s) is not None for s, _ in datagram.fragments)
 
     def _filled(self, datagram: _WaitingDatagram) -> bytes:
-        """A datagram with its fragments of the rewritten samples."""
+        """The datagram with its parts of the rewritten announcements."""
         edits = list[Overwrite]()
         for sample, frags in datagram.fragments:
             whole = self._whole(datagram.port, sample)
@@ -290,7 +310,7 @@ def _key(port: int, sample: Sample) -> _Key:
 
 
 def _payloads(datagram: bytes, sample: Sample, frags: Fragments) -> Iterator[tuple[int, bytes]]:
-    """The fragments in a DATA_FRAG, each with its number. Raises RtpsError."""
+    """Yield the number and the bytes of each fragment in a DATA_FRAG. Raises RtpsError."""
     count = -(-frags.total // frags.size)
     last = frags.first + frags.count - 1
     if sample.payload is None or not 0 < frags.first <= last <= count:
@@ -308,7 +328,7 @@ def _payloads(datagram: bytes, sample: Sample, frags: Fragments) -> Iterator[tup
 
 
 def _as_data(datagram: bytes, sample: Sample, payload: bytes) -> bytes:
-    """The message that would carry a sample in one DATA."""
+    """The message that carries the whole payload of a sample in a DATA."""
     payload_flag = 0x08 if sample.is_key_only else 0x04
     head = struct.pack("<BBHHH", SubmessageId.DATA, 0x01 | payload_flag, 0, 0, 16)
     head += struct.pack(">II", sample.reader, sample.writer)

@@ -1,9 +1,9 @@
-"""The proxy's own participants in a domain: what they send, and what they are told.
+"""The proxy's own participants in a domain: their datagrams, and the datagrams to them.
 
-The *discovery participant* reads which readers and writers others have, on both sides. The *port
-store* has participants inside keep their ports for the next process. Neither has a reader or writer
-for a topic, and the proxy announces neither on behalf of the other side: each side discovers them
-as participants of its own.
+The *discovery participant* learns the readers and writers of all participants, on both sides. With
+the *port store*, participants inside keep their ports for the next process of the proxy. Neither
+has a reader or writer for a topic. Each side discovers these participants directly; the proxy does
+not announce them on behalf of the other side.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 @dataclass(slots=True)
 class ProxyParticipants:
-    """The discovery participant and the port store of a domain, and the tables that they fill."""
+    """The discovery participant and the port store of a domain."""
 
     settings: DomainSettings
     discovery_participant: DiscoveryParticipant
@@ -44,10 +44,10 @@ class ProxyParticipants:
         return self.former_ports.port_store
 
     def is_of_proxy(self, prefix: bytes) -> bool:
-        """Whether a GUID prefix is that of one of the proxy's own participants.
+        """Whether a GUID prefix is that of a participant of the proxy.
 
-        No other participant may use it. The prefix of the port store follows from what all can see.
-        A dispose message for the port store makes participants inside forget their ports.
+        No other participant may use such a prefix. The prefix of the port store follows from public
+        data, and a dispose message for the port store makes participants inside forget their ports.
         """
         return prefix in (
             self.discovery_participant.prefix,
@@ -56,20 +56,23 @@ class ProxyParticipants:
         )
 
     def announced_inside(self, near: str) -> bytes:
-        """Announce the discovery participant on a network inside.
+        """The announcement of the discovery participant for a network inside.
 
         ``near`` is the address of the proxy there.
         """
         return self.discovery_participant.announcement(HostPort(near, self.settings.unicast_port))
 
     def announced_outside(self) -> list[Outgoing]:
-        """The discovery participant's announcement for the LAN relay and the peers."""
+        """The datagrams that announce the discovery participant to the LAN relay and the peers."""
         return self.settings.to_outside(
             self.discovery_participant.announcement(*self._reached_from_outside())
         )
 
     def question_to_outside(self, outsider: OutsideParticipant) -> list[Outgoing]:
-        """What asks a participant outside to prove that it receives, if that is to be."""
+        """The question by which a participant outside proves an address.
+
+        Empty if the participant has answered, or if its credit is too small.
+        """
         if self.proofs.has_answered(outsider.address, outsider.prefix):
             return []
         question = self.proofs.question(
@@ -80,7 +83,10 @@ class ProxyParticipants:
     def question_to_inside(
         self, address: str, prefix: bytes, metatraffic: HostPort | None
     ) -> list[Outgoing]:
-        """What asks a participant inside to prove that it receives, if that is to be."""
+        """The question by which a participant inside proves an address.
+
+        Empty if the participant has answered, or if ``metatraffic`` is None.
+        """
         if self.proofs.has_answered(address, prefix):
             return []
         near = self.settings.proxy_address_for(address)
@@ -88,7 +94,7 @@ class ProxyParticipants:
         return sent_to(metatraffic, [self.proofs.question(address, prefix, reached_at)])
 
     def question_to_announced(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
-        """What asks a participant inside that announces itself to prove that it receives."""
+        """The question to a participant inside, at the metatraffic locator in its announcement."""
         spdp = message.of_participant
         metatraffic = first_metatraffic(spdp, message.datagram, source) if spdp else None
         return self.question_to_inside(source, message.prefix, metatraffic)
@@ -98,27 +104,33 @@ class ProxyParticipants:
         return [HostPort(host, port) for host in self.settings.hosts]
 
     def first_questions(self, participant: InsideParticipant) -> list[Outgoing]:
-        """What asks a participant inside that has announced itself for its readers and writers."""
+        """The requests for the readers and writers of a participant inside."""
         return sent_to(
             participant.metatraffic, self.discovery_participant.first_question(participant.prefix)
         )
 
     def port_store_dispose_message(self, participant: InsideParticipant) -> list[Outgoing]:
-        """What makes a participant forget the port store, which it knows at a former address."""
+        """The dispose messages with which a participant forgets the port store.
+
+        The participant knows the port store at a former address of the proxy.
+        """
         return sent_to(
             participant.metatraffic, self.port_store.dispose_messages(participant.prefix)
         )
 
     def port_reminders(self, now: float) -> list[Outgoing]:
-        """What makes participants inside keep the ports that they have now."""
+        """The datagrams with which participants inside keep their present ports."""
         participants = self.former_ports.keepers(self.inside.by_prefix.values())
         return [sent for p in participants for sent in self.former_ports.reminders(p, now)]
 
     def told_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        """Take in what a participant inside tells the proxy's participants. Raises RtpsError."""
+        """Handle a message from a participant inside to the proxy's participants.
+
+        Return the answers. Raises RtpsError.
+        """
         prefix = message.prefix
         insider = self.inside.find(prefix, source)
-        # One that waits to be let in is in no table yet, and its answer is what it waits for.
+        # A participant that waits for ports is in no table yet. The answer ends the wait.
         is_waiting = self.former_ports.is_waiting(prefix, source)
         if (is_waiting or insider) and self.former_ports.take_answer(
             prefix, source, message.datagram
@@ -133,9 +145,10 @@ class ProxyParticipants:
         return sent_to(insider.metatraffic, questions)
 
     def told_outside(self, message: DiscoveryMessage, source: str, received: int) -> list[Outgoing]:
-        """Take in what a participant outside tells the discovery participant. Raises RtpsError.
+        """Handle a message from a participant outside to the discovery participant.
 
-        ``received`` is how many bytes came from the participant.
+        Return the answers. ``received`` is the number of bytes that came from the participant.
+        Raises RtpsError.
         """
         outsider = self.outside.find(message.prefix, source)
         if outsider is None:
@@ -151,12 +164,13 @@ class ProxyParticipants:
     def answer_to_proxy(
         self, prefix: bytes, message: DiscoveryMessage, source: str
     ) -> list[Outgoing]:
-        """The answer to another proxy that asks a participant to prove that it receives.
+        """The answer to another proxy whose question proves the address of a participant.
 
         ``prefix`` is the GUID prefix of the discovery participant, or of the participant inside at
-        whose port the question came. Nothing is sent if the question is for another
-        participant. The participant that asks is announced to no side: two proxies would ask each
-        other without end. The answer is shorter than the question. Raises RtpsError.
+        whose port the question came. The result is empty if the question is for another
+        participant. The proxy does not announce the participant of the question, or two proxies
+        would question each other without end. The answer is shorter than the question. Raises
+        RtpsError.
         """
         spdp = message.of_participant
         target = first_metatraffic(spdp, message.datagram, source) if spdp else None
@@ -167,12 +181,12 @@ class ProxyParticipants:
         return sent_to(target, [answer])
 
     def forget(self, prefix: bytes) -> None:
-        """Forget what a participant that has gone has told."""
+        """Forget the samples and ports of a participant that has gone."""
         self.discovery_participant.forget(prefix)
         self.former_ports.forget_participant(prefix)
 
     def _ask(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> list[bytes]:
-        """Give the discovery participant a message that came at a port; what it asks for then."""
+        """Pass a message at a port to the discovery participant. Return its requests."""
         passed, questions = self.fragments.rewritten(
             port, message, self.discovery_participant.prefix, rewrite
         )

@@ -1,22 +1,25 @@
 """Rediscovery: a participant inside and the participants outside discover each other anew.
 
-A writer does not send again what a reader has confirmed (DDSI-RTPS 2.5, 8.4.9). So before two
-participants can learn all of each other once more, both have to forget the other. If one of the two
-forgets later, it confirms from memory what the other begins anew, and is not sent it again once it
-has forgotten as well. The two then never find each other's readers and writers. So the proxy
-*separates* them for a moment: it tells both that the other has ended, and passes no discovery
-between them. Only then it announces each to the other.
+A writer does not repeat a sample that a reader has confirmed (DDSI-RTPS 2.5, 8.4.9). So before two
+participants can exchange all announcements again, each has to forget the other.
 
-The proxy does so if a verdict of the policy has changed, if outside knows a participant by other
-ports or at another address (`FormerPorts`), and if the advertised host has moved. The separation
-waits for the first datagram of the LAN relay, which starts after the proxy: before that, outside
-would not hear that the participant has ended. While so many participants discover each other, not
-every datagram arrives. So a participant inside is told again to forget one outside, with each
-announcement of the latter, until it sends something to where the proxy announces this one now.
+Suppose participant A forgets B first. A begins anew, and B confirms the samples of A from memory.
+Then B forgets A, but A does not repeat confirmed samples. B never discovers the readers and writers
+of A. So the proxy *separates* the two for a moment: it sends both a dispose message for the other,
+and passes no discovery between them. Only then the proxy announces each to the other.
 
-Hundreds inside may have to rediscover hundreds outside, which takes many seconds. So dispose
-messages and announcements wait, and are made a few at a time (`next_datagrams`). Addresses inside
-take turns.
+The proxy does so in three cases: a verdict of the policy has changed, outside knows other ports or
+another address of a participant (`FormerPorts`), or the advertised host has moved. The separation
+waits for the first datagram of the LAN relay, which starts after the proxy. Before that, outside
+would not receive the dispose message.
+
+While many participants rediscover each other, datagrams are lost. So the proxy repeats the dispose
+message of a participant outside with each of its announcements. The repetition ends when the
+participant inside sends a datagram to the present stand-in.
+
+Hundreds of participants inside may have to rediscover hundreds outside, which takes many seconds.
+So the proxy makes a few dispose messages and announcements at a time (`next_datagrams`). The
+addresses inside take turns.
 """
 
 from collections import deque
@@ -36,18 +39,19 @@ from rosproxy.ros2.registry.participants import InsideParticipant, OutsidePartic
 from rosproxy.ros2.rewriting.discovery import read_discovery, rewritten
 
 SEPARATION_S = 0.4
-"""Seconds in which a dispose message arrives, and is taken in, on both sides."""
+"""Seconds in which a dispose message arrives and takes effect on both sides."""
 VERDICTS_AT_ONCE = 32
-"""Verdicts that are judged again at a time. With 1,000 rules one takes 0.7 ms."""
+"""Verdicts that the policy judges again at a time. With 1,000 rules a verdict takes 0.7 ms."""
 PAIRS_AT_ONCE = 32
-"""Participants outside that participants inside are told of at a time. One takes 0.1 ms."""
+"""Pairs of a participant inside and one outside that are handled at a time. A pair takes 0.1 ms."""
 LAN_RELAY_TIME = 30.0
-"""Seconds that the LAN relay may take to be heard. Without a participant on its LAN it is not."""
+"""Seconds for which a separation waits for the LAN relay. If no participant is on its LAN, the
+relay sends nothing."""
 
 
 @dataclass(slots=True)
 class Rediscovery:
-    """Separates participants inside from all outside, and announces them to each other again."""
+    """Separates participants inside from all outside, and then announces each to the other."""
 
     settings: DomainSettings
     inside: InsideParticipants
@@ -55,23 +59,23 @@ class Rediscovery:
     to_inside: AnnouncementsToInside
     lan_relay_heard: bool = False
     _waiting: dict[str, deque[Iterator[list[Outgoing]]]] = field(default_factory=dict)
-    """What is sent inwards, by the address of the participant inside."""
+    """Datagrams for participants inside that wait, by address."""
     _review: Iterator[InsideParticipant | None] = field(default_factory=lambda: iter(()))
     _has_verdicts: bool = False
     _now: float = 0.0
 
     def separate(self, insider: InsideParticipant) -> list[Outgoing]:
-        """Have a participant inside and all outside forget each other."""
+        """Let a participant inside and all participants outside forget each other."""
         datagram = dispose_message(insider.prefix, insider.vendor, insider.next_number)
         insider.separation_due_from = None
         insider.separated_until = inf  # until the last dispose message
-        insider.dispose_message_times = {}  # it was told to forget no participant yet
+        insider.dispose_message_times = {}  # no dispose message has been sent yet
         outsiders = [o for o in self.outside.by_prefix.values() if o.is_announced]
         self._put(insider, self._dispose_messages(insider, outsiders))
         return self.settings.to_outside(datagram)
 
     def review(self) -> None:
-        """Separate the participants inside of which the policy says something else than before."""
+        """Start to judge all verdicts again. A changed verdict leads to a separation."""
         self._review = self.inside.verdicts.review(list(self.inside.by_prefix.values()))
         self._has_verdicts = True
 
@@ -81,7 +85,7 @@ class Rediscovery:
         return self._has_verdicts or bool(self._waiting)
 
     def next_datagrams(self, now: float) -> list[Outgoing]:
-        """What the next part of what waits leads to."""
+        """The datagrams of the next part of the work."""
         self._now = now
         verdicts = list(islice(self._review, VERDICTS_AT_ONCE))
         self._has_verdicts = len(verdicts) == VERDICTS_AT_ONCE
@@ -93,16 +97,16 @@ class Rediscovery:
         return sent
 
     def move(self, insider: InsideParticipant) -> list[Outgoing]:
-        """Announce a participant at the present addresses of the advertised host. RtpsError.
+        """Announce a participant at the present addresses of the advertised host.
 
-        All outside have to meet it anew.
+        The announcement follows a separation. Raises RtpsError.
         """
         message = read_discovery(insider.announcement)
         insider.announcement = rewritten(message, self._at_present_host, lambda _: False)
         return self.separate(insider)
 
     def proceed(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
-        """Separate a participant if that is due, or announce it after the separation."""
+        """Separate a participant if this is due, or announce it after the separation."""
         if insider.separation_due_from is not None and self._may_separate(
             insider.separation_due_from, now
         ):
@@ -114,32 +118,36 @@ class Rediscovery:
         return self.settings.to_outside(insider.announcement)
 
     def note_met(self, insider: InsideParticipant, prefix: bytes) -> None:
-        """Note that a participant inside has sent something to where one outside is found now."""
+        """Note that a participant inside has sent a datagram to a participant outside.
+
+        So the participant inside knows the present stand-in of the participant outside, which has
+        the GUID prefix ``prefix``.
+        """
         if insider.dispose_message_times is not None and prefix in insider.dispose_message_times:
             insider.dispose_message_times[prefix] = inf
 
     def forget(self, insiders: Iterable[InsideParticipant], prefix: bytes) -> None:
-        """Forget that those inside were told to forget a participant outside, which has gone."""
+        """Forget the times of dispose messages for a participant outside that has gone."""
         for insider in insiders:
             if insider.dispose_message_times is not None:
                 insider.dispose_message_times.pop(prefix, None)
 
     def _separate_known(self, insider: InsideParticipant) -> list[Outgoing]:
-        """Separate a participant unless it has gone. The policy is asked about it anew then."""
+        """Separate a participant and forget its verdicts, unless the participant has gone."""
         if self.inside.by_prefix.get(insider.prefix) is not insider:
             return []
         self.inside.verdicts.forget(insider)
         return self.separate(insider)
 
     def _next_pair(self) -> list[Outgoing]:
-        """What the next participant outside leads to, for one at the address whose turn it is."""
+        """The datagrams for the next pair of participants, at the address whose turn it is."""
         address = next(iter(self._waiting))
         waiting = self._waiting.pop(address)
         sent = next(waiting[0], None)
         if sent is None:
             waiting.popleft()
         if waiting:
-            self._waiting[address] = waiting  # the other addresses have their turns first
+            self._waiting[address] = waiting  # at the end: the other addresses have turns first
         return sent or []
 
     def _put(self, insider: InsideParticipant, steps: Iterator[list[Outgoing]]) -> None:
@@ -158,7 +166,7 @@ class Rediscovery:
     ) -> Iterator[list[Outgoing]]:
         for outsider in outsiders:
             if self.outside.by_prefix.get(outsider.prefix) is not outsider:
-                continue  # it has gone meanwhile
+                continue  # the participant has gone meanwhile
             try:
                 yield self.to_inside.of_outside([outsider], [insider], self._now)
             except RtpsError as error:

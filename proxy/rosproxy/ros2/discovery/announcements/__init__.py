@@ -1,1 +1,1 @@
-"""Announcements on their way: what each side is told of the participants of the other."""
+"""The announcements that the proxy sends to one side about participants of the other side."""

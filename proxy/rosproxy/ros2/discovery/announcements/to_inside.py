@@ -1,12 +1,12 @@
-"""Announcements to inside: which locators of a participant outside a participant inside gets.
+"""Announcements to inside: which locators of a participant outside a participant inside receives.
 
-A locator for metatraffic is replaced by a stand-in, so that all discovery passes the proxy. A
-locator for user data stays, and inside sends there without the proxy. With the direction both a
+The proxy replaces each locator for metatraffic by a stand-in, so that all discovery passes the
+proxy. A locator for user data stays, and inside sends there directly. With the direction both, a
 stand-in replaces this locator as well, and inside needs no route.
 
-Of several addresses inside gets the one that the participant was heard from. Each machine has
-other addresses that mean another machine inside: the address of a container network may be that of
-the gateway of the reader.
+Of several addresses, inside receives only the source of the participant's announcement. The other
+addresses of a machine may mean another machine inside: the address of a container network may be
+that of the receiver's gateway.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -30,16 +30,17 @@ from rosproxy.ros2.rewriting.discovery import (
 )
 
 DISPOSE_MESSAGE_INTERVAL = 2.0
-"""Seconds after which a participant inside is told again to forget one outside, until they meet."""
+"""Seconds until a participant inside gets the next dispose message for the same participant
+outside. The proxy repeats the message until the two have rediscovered each other."""
 
 
 @dataclass(slots=True)
 class ForInside:
     """Rewrites the discovery of a participant outside for inside.
 
-    ``near`` is the address at which inside reaches the proxy. ``insider`` is the participant that
-    the policy judges; with None nothing is hidden. The discovery participant is given all: it would
-    ask for hidden announcements again and again.
+    ``near`` is the address at which inside reaches the proxy. ``insider`` is the participant whose
+    policy applies; with None nothing is hidden. Nothing is hidden from the discovery participant,
+    which would request hidden announcements again and again.
     """
 
     outside: OutsideParticipants
@@ -48,7 +49,7 @@ class ForInside:
     insider: InsideParticipant | None = None
 
     def rewritten(self, message: DiscoveryMessage) -> bytes:
-        """A message as inside gets it; its readers and writers are noted. Raises RtpsError."""
+        """A message as inside receives it, with its readers and writers noted. Raises RtpsError."""
         datagram = message.datagram
         note_endpoints(self.outside.notes, self.outsider, datagram, message.announcements)
         has_source = self.outsider.address in set(_user_data_hosts(message))
@@ -59,13 +60,14 @@ class ForInside:
         )
 
     def _led(self, pid: int, locator: HostPort, has_source: bool) -> HostPort | None:
-        """Where inside reaches a locator of the participant; None if it does not.
+        """The address at which inside reaches a locator of the participant; None if there is none.
 
-        ``has_source``: the message has a locator for user data at the source of the participant.
+        ``has_source`` means that the message has a locator for user data at the source address of
+        the participant.
         """
         stand_ins = self.outside.stand_ins
         if pid == Pid.METATRAFFIC_UNICAST_LOCATOR:
-            # Whichever locator it is, discovery goes to the one at the address that it sends from.
+            # All metatraffic goes to the locator at the source address of the participant.
             mapping = self.outsider.metatraffic and stand_ins.open(
                 self.outsider, self.outsider.metatraffic, TrafficKind.METATRAFFIC
             )
@@ -79,17 +81,18 @@ class ForInside:
         return HostPort(self.near, mapping.port) if mapping else None
 
     def _means_another(self, locator: HostPort, has_source: bool) -> bool:
-        """Whether a locator may mean another machine where inside reaches the proxy.
+        """Whether a locator may lead inside to another machine.
 
-        Without a locator at its source (``has_source``) the participant is behind NAT, as it seems,
-        and may be reached by those that it has. So it may be by those of the other family, in which
-        it was not heard.
+        Without a locator at its source (``has_source``), the participant seems to be behind NAT,
+        and its locators stay. Locators of the address family in which the participant was not heard
+        stay, too. Loopback and link-local addresses never stay, unless both participants run on the
+        proxy's machine.
         """
         source = self.outsider.address
         host = locator.host
         if has_source and (":" in host) == (":" in source) and host != source:
             return True
-        # These addresses mean the reader's own machine or link, unless all is on one machine.
+        # These addresses lead to the machine or the link of the receiver.
         is_same_host = is_loopback(self.near) and is_loopback(source)
         return not is_same_host and (is_loopback(host) or is_of_link(host))
 
@@ -102,7 +105,7 @@ class ForInside:
 
 @dataclass(frozen=True, slots=True)
 class AnnouncementsToInside:
-    """What participants inside are told of others."""
+    """The announcements and dispose messages that participants inside receive."""
 
     settings: DomainSettings
     inside: InsideParticipants
@@ -114,7 +117,12 @@ class AnnouncementsToInside:
         inside: Collection[InsideParticipant],
         now: float,
     ) -> list[Outgoing]:
-        """The announcements of participants outside for some inside, as far as these may know."""
+        """The announcements of participants outside for participants inside.
+
+        Left out are separated participants inside, and participants outside that the proxy does not
+        announce (`OutsideParticipants.may_be_announced`). If a participant inside has to forget a
+        participant outside, a dispose message precedes the announcement.
+        """
         sent = list[Outgoing]()
         by_near = dict[str, list[InsideParticipant]]()
         for insider in inside:
@@ -132,7 +140,11 @@ class AnnouncementsToInside:
     def dispose_message(
         self, outsider: OutsideParticipant, insider: InsideParticipant, now: float
     ) -> list[Outgoing]:
-        """What makes one inside forget one outside, if it has to and was not told just now."""
+        """The dispose message for a participant outside, if a participant inside has to forget it.
+
+        Empty outside of a rediscovery, and if the last such message is more recent than
+        `DISPOSE_MESSAGE_INTERVAL`.
+        """
         if (
             insider.dispose_message_times is None
             or now - insider.dispose_message_times.get(outsider.prefix, -inf)
@@ -146,11 +158,12 @@ class AnnouncementsToInside:
     def of_neighbour(
         self, newcomer: InsideParticipant, message: DiscoveryMessage
     ) -> list[Outgoing]:
-        """A participant's announcement for others on its network, if that passes on no multicast.
+        """The unchanged announcement of a participant inside, for others on the same network.
 
-        It goes on as it is: they reach each other without the proxy. So do those at one address, as
-        the processes of a pod are: Fast DDS sends no multicast where it has peers. What one names
-        as its own may be where the proxy itself hears announcements: nothing goes there.
+        Empty if the announcement came by multicast. These participants reach each other without the
+        proxy. The processes of a pod, which share an address, need this, too: Fast DDS sends no
+        multicast if it has peers. A participant may announce an address of the proxy as a locator.
+        Nothing goes to the ports at which the proxy itself receives announcements.
         """
         if newcomer.is_in_group:
             return []
@@ -163,15 +176,16 @@ class AnnouncementsToInside:
             for p in self.inside.by_prefix.values()
             if p.proxy_address == near
             and p is not newcomer
-            # Cyclone DDS has one locator for all participants of a process, which know each other.
+            # The participants of a Cyclone DDS process share a locator, and know each other.
             and p.metatraffic
             and p.metatraffic not in {newcomer.metatraffic, *own}
         ]
 
     def _announcement(self, outsider: OutsideParticipant, near: str) -> bytes:
-        """The announcement of a participant for those that reach the proxy at ``near``. RtpsError.
+        """The announcement of a participant for receivers that reach the proxy at ``near``.
 
-        It is made once for all of them: with many parameters that takes a millisecond.
+        The result is kept for all these receivers, because rewriting many parameters takes a
+        millisecond. Raises RtpsError.
         """
         if outsider.announcement_inside is None or outsider.announcement_inside[0] != near:
             for_inside = ForInside(self.outside, outsider, near)
@@ -181,7 +195,7 @@ class AnnouncementsToInside:
 
 
 def _user_data_hosts(message: DiscoveryMessage) -> Iterator[str]:
-    """The hosts at which a message says that user data is received."""
+    """Yield the hosts of all locators for user data in a message."""
     for announcement in message.announcements:
         for pid, locator in announcement.reached_at(message.datagram):
             if pid != Pid.METATRAFFIC_UNICAST_LOCATOR:

@@ -1,7 +1,7 @@
-"""Announcements to outside: which ports outside gets in place of the locators inside.
+"""Announcements to outside: which ports replace the locators of a participant inside.
 
-Each locator of a participant inside is replaced by the advertised host and a port of the range. A
-locator without a port is taken out. The peers and the LAN relay get the announcement.
+The proxy replaces each locator of a participant inside by the advertised host and a port of the
+range, and removes a locator that has no port. The announcement goes to the peers and the LAN relay.
 """
 
 from collections.abc import Sequence
@@ -17,16 +17,17 @@ from rosproxy.ros2.rewriting.announced_participant import note_endpoints
 from rosproxy.ros2.rewriting.discovery import Announcement, DiscoveryMessage, rewritten
 
 ANNOUNCED_AGAIN = 0.5
-"""Seconds in which outside is told the same announcement only once."""
+"""Seconds in which the proxy sends the same announcement outside only once."""
 
 
 @dataclass(slots=True)
 class ForOutside:
     """Rewrites the discovery of a participant inside for outside.
 
-    ``former_ports`` are the ports that the participant is known to have had before the proxy
-    started, in the order of its locators. ``is_hiding``: the policy hides readers and writers. The
-    discovery participant is given all: it would ask for hidden announcements again and again.
+    ``former_ports`` are the ports that the participant had before the proxy started, as far as
+    these are known, in the order of its locators. ``is_hiding`` means that the policy applies.
+    Nothing is hidden from the discovery participant, which would request hidden announcements again
+    and again.
     """
 
     inside: InsideParticipants
@@ -36,9 +37,9 @@ class ForOutside:
     is_hiding: bool = True
 
     def rewritten(self, message: DiscoveryMessage) -> bytes:
-        """A message as outside gets it; its readers and writers are noted. Raises RtpsError.
+        """A message as outside receives it, with its readers and writers noted. Raises RtpsError.
 
-        Locators without a port get one.
+        Maps a port to each locator that has none.
         """
         datagram = message.datagram
         note_endpoints(self.inside.notes, self.insider, datagram, message.announcements)
@@ -49,7 +50,7 @@ class ForOutside:
         )
 
     def _led(self, pid: int, locator: HostPort) -> HostPort | None:
-        """The address and port at which outside reaches a locator; None if it does not."""
+        """The address and port at which outside reaches a locator; None if there is no port."""
         is_metatraffic = pid == Pid.METATRAFFIC_UNICAST_LOCATOR
         kind = TrafficKind.METATRAFFIC if is_metatraffic else TrafficKind.USER_DATA
         mappings = self.inside.mappings
@@ -64,7 +65,7 @@ class ForOutside:
 
 @dataclass(frozen=True, slots=True)
 class AnnouncementsToOutside:
-    """What outside is told of participants inside."""
+    """The announcements that outside receives."""
 
     settings: DomainSettings
     outside: OutsideParticipants
@@ -72,9 +73,11 @@ class AnnouncementsToOutside:
     def of_inside(
         self, insider: InsideParticipant, announcement: bytes, now: float
     ) -> list[Outgoing]:
-        """What tells outside of a participant inside, unless that was told the same just now.
+        """The datagrams that announce a participant inside to outside.
 
-        Participants repeat themselves while many meet, and each time it goes to all ports of peers.
+        Empty if the same announcement has just been sent: participants repeat announcements while
+        many discover each other, and each goes to all ports of the peers. Empty during a
+        separation, too.
         """
         if announcement == insider.announcement and now - insider.announced_at < ANNOUNCED_AGAIN:
             return []
@@ -88,13 +91,13 @@ class AnnouncementsToOutside:
         return self._to_met(announcement)
 
     def _to_met(self, datagram: bytes) -> list[Outgoing]:
-        """An announcement of a participant inside, after the first, for all outside.
+        """The datagrams for an announcement of a participant inside that is not the first.
 
-        Of a peer without a port it goes where participants of the peer receive discovery, and to
-        the next well-known ports, which participants take one after the other (DDSI-RTPS 2.5,
-        9.6.2.3). The discovery participant announces itself to all ports of peers, so participants
-        at other ports are met nevertheless. As long as no participant of a peer is known, all its
-        well-known ports are used.
+        For a peer without a port, the announcement goes to the locators of known participants, and
+        to the next well-known ports, which participants bind one after the other (DDSI-RTPS 2.5,
+        9.6.2.3). Participants at other ports are discovered all the same, because the discovery
+        participant announces itself to all ports of the peers. If no participant of a peer is
+        known, the announcement goes to all its well-known ports.
         """
         sent = self.settings.to_lan(datagram)
         for peer in self.settings.peers:

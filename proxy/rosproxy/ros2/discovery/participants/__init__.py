@@ -1,1 +1,1 @@
-"""The participants that the proxy serves: which get a place, and which a GUID prefix belongs to."""
+"""The participants that the proxy serves: their places, and the owners of GUID prefixes."""

@@ -1,4 +1,4 @@
-"""The participants inside: which of them the proxy serves."""
+"""The participants inside that the proxy serves."""
 
 import contextlib
 from dataclasses import dataclass
@@ -41,9 +41,9 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     verdicts: Verdicts
 
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> InsideParticipant | None:
-        """The participant that announces itself from an address; None if it is not accepted.
+        """The participant in an announcement, added if necessary; None if the proxy refuses it.
 
-        One that is on several networks itself is served at the first. Raises RtpsError.
+        A participant on several networks is served at the first. Raises RtpsError.
         """
         prefix = message.prefix
         datagram = message.datagram
@@ -72,9 +72,9 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         return participant
 
     def gives_place(self, prefix: bytes, source: str) -> InsideParticipant | None:
-        """The participant that ends for a new one at an address; None if there is none.
+        """The participant that ends in favour of a new one; None if no participant has to end.
 
-        Either there is room without, or the new one gets no place.
+        Then there is room for the new participant, or the new participant gets no place.
         """
         has_answered = self.proofs.has_answered(source, prefix)
         if self.count_by_address[source] >= MOST_PER_ADDRESS:
@@ -85,11 +85,11 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         return oldest_unproven(self._answering(False), MOST_INSIDE_UNPROVEN)
 
     def prove(self) -> list[InsideParticipant]:
-        """The participants that end, as more than have room have answered now."""
+        """The participants that end because more have answered than may have a place."""
         return surplus(self._answering(True), MOST_INSIDE, str)
 
     def _why_no_place(self, prefix: bytes, source: str) -> str:
-        """Why a new participant at an address gets no place; empty if it gets one."""
+        """Why a new participant at an address gets no place; empty if it gets a place."""
         if self.count_by_address[source] >= MOST_PER_ADDRESS:
             return f"the address already has {MOST_PER_ADDRESS} participants"
         has_answered = self.proofs.has_answered(source, prefix)
@@ -98,7 +98,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         return f"the proxy already has {most} participants inside" if is_full else ""
 
     def _answering(self, has_answered: bool) -> list[InsideParticipant]:
-        """The participants that have proved to receive, or all others, in the order they came."""
+        """The participants that have answered a question, or all others, in order of arrival."""
         return [
             p
             for p in self.by_prefix.values()
@@ -106,14 +106,14 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         ]
 
     def note_in_group(self, datagram: bytes, source: str) -> None:
-        """Note the participants that were heard from an address by multicast."""
+        """Note that the participants in a datagram were heard by multicast."""
         with contextlib.suppress(RtpsError):
             for message in by_source(datagram):
                 if participant := self.find(source_prefix(message), source):
                     participant.is_in_group = True
 
     def forget(self, participant: InsideParticipant) -> None:
-        """Forget a participant that has gone, and take its ports back."""
+        """Forget a participant that has gone, and take back the ports of the participant."""
         self.mappings.end(participant)
         self.remove(participant)
         self.verdicts.forget(participant)

@@ -1,4 +1,4 @@
-"""The participants outside: which of them the proxy knows, and which it announces inside."""
+"""The participants outside that the proxy knows, and those that it announces inside."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -53,9 +53,9 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     verdicts: Verdicts
 
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> OutsideParticipant | None:
-        """The participant that announces itself or its end at an address; None if not accepted.
+        """The participant in an announcement, added if necessary; None if the proxy refuses it.
 
-        Raises RtpsError.
+        An announcement of the end adds no participant. Raises RtpsError.
         """
         require_rewritable(message)
         prefix = message.prefix
@@ -64,7 +64,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         participant = self.find(prefix, source)
         if spdp is None or spdp.ended or (participant is None and prefix in self.by_prefix):
             if participant is not None:
-                # Its end: `AnnouncementsToInside` tells inside of it as of any announcement.
+                # `AnnouncementsToInside` passes on an end like any other announcement.
                 self._keep(participant, message)
             return participant
         metatraffic = first_metatraffic(spdp, datagram, source)
@@ -91,10 +91,11 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def claimant(
         self, message: DiscoveryMessage, source: str, received: int, now: float
     ) -> OutsideParticipant | None:
-        """A participant that announces itself with a prefix that inside uses, which is not added.
+        """A participant outside that announces itself with a prefix of inside, not added.
 
-        There is none if the message is an end, or leads to the proxy itself, as one that the LAN
-        relay hears of its own. ``received`` is how many bytes came. Raises RtpsError.
+        None if the message reports an end. None also if the announced locator is a port of the
+        proxy: the LAN relay hears the proxy's own announcements. ``received`` is the number of
+        bytes that came. Raises RtpsError.
         """
         require_rewritable(message)
         spdp = message.of_participant
@@ -111,9 +112,10 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         return claimant
 
     def prove(self, address: str) -> tuple[list[OutsideParticipant], list[OutsideParticipant]]:
-        """Note that an address has proved to receive.
+        """Note that an address is proven.
 
-        Return the participants that inside has to be told of, and those that end for them.
+        Return two lists: the participants to announce inside now, and the participants that end
+        because more are proven than may have a place.
         """
         for outsider in self.at(address):
             outsider.proven = True
@@ -122,10 +124,10 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         return told, ended
 
     def may_be_announced(self, outsider: OutsideParticipant) -> bool:
-        """Whether inside is told of a participant.
+        """Whether the proxy announces a participant inside.
 
-        Where many have not proved to receive, inside is told of no more of these: a forger may have
-        made them up, and each participant inside would remember all of them.
+        If many participants are at unproven addresses, the proxy announces no more of these. A
+        forger may have invented them, and each participant inside would remember all.
         """
         if not outsider.is_announced:
             outsider.is_announced = (
@@ -134,11 +136,14 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         return outsider.is_announced
 
     def is_met(self, source: str) -> bool:
-        """Whether a participant is known at an address, or it is a peer's."""
+        """Whether a participant is known at an address, or the address is that of a peer."""
         return source in self.count_by_address or self.settings.is_peer(source)
 
     def is_strange(self, source: str) -> bool:
-        """Whether nothing from an address is read, since no participant is known there."""
+        """Whether the proxy ignores an address, because no participant is known there.
+
+        If so, count a refusal.
+        """
         if self.is_met(source):
             return False
         text = "the address is not a peer, and no participant there has announced itself"
@@ -146,9 +151,9 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         return True
 
     def refuse_stranger(self, source: str, text: str) -> None:
-        """Refuse discovery from an address of which the proxy does not know a participant.
+        """Refuse discovery from an address at which no participant is known.
 
-        Docker's userland proxy and RootlessKit's port driver `builtin` send datagrams on with the
+        Docker's userland proxy and RootlessKit's port driver `builtin` forward datagrams with the
         address of the network's gateway.
         """
         if source in self.settings.gateways:
@@ -157,10 +162,11 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             self.refused("not_a_peer", source, text)
 
     def may_announce(self, message: DiscoveryMessage, source: str, asked_by: bytes) -> bool:
-        """Whether a participant outside may announce itself to the proxy directly.
+        """Whether a participant outside may announce itself directly at the discovery port.
 
-        A message that names ``asked_by``, the GUID prefix of the discovery participant, answers its
-        announcement, which goes to peers and the LAN relay alone.
+        Allowed are known participants, peers, and messages to ``asked_by``, the GUID prefix of the
+        discovery participant. Such a message answers an announcement, which goes only to peers and
+        the LAN relay.
         """
         is_met = self.find(message.prefix, source) is not None
         is_named = is_destination(message.datagram, asked_by)
@@ -169,7 +175,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def allowed_questions(
         self, outsider: OutsideParticipant, questions: Iterable[bytes]
     ) -> list[Outgoing]:
-        """Questions to a participant about its discovery, as many as it may be sent."""
+        """Requests to a participant about its discovery, as many as its credit allows."""
         target = outsider.metatraffic
         allowed = [q for q in questions if target and outsider.may_be_sent(len(q))]
         return [Outgoing(target, question) for question in allowed] if target else []
@@ -180,9 +186,9 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         self.stand_ins.close(participant)
 
     def gives_place(self, source: str) -> OutsideParticipant | None:
-        """The participant that ends for a new one at an address; None if there is none.
+        """The participant that ends in favour of a new one; None if no participant has to end.
 
-        Either there is room without, or the new one gets no place.
+        Then there is room for the new participant, or the new participant gets no place.
         """
         if self.settings.is_peer(source) or self._is_full(source):
             return None
@@ -191,7 +197,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         return oldest_unproven(self._unproven_strangers(), MOST_OUTSIDE_UNPROVEN)
 
     def _why_no_place(self, source: str) -> str:
-        """Why a new participant at an address gets no place; empty if it gets one."""
+        """Why a new participant at an address gets no place; empty if it gets a place."""
         if self._is_full(source):
             return f"the address already has {self.count_by_address[source]} participants"
         if self.settings.is_peer(source):
@@ -206,7 +212,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         return f"the proxy already has {most} participants outside" if len(present) >= most else ""
 
     def _is_full(self, source: str) -> bool:
-        """Whether an address has as many participants as it may."""
+        """Whether an address has as many participants as it may have."""
         is_proven = self.settings.is_peer(source) or self.proofs.has(source)
         return self.count_by_address[source] >= (MOST_PER_HOST if is_proven else MOST_PER_UNPROVEN)
 
@@ -231,7 +237,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         return outsider
 
     def _keep(self, outsider: OutsideParticipant, message: DiscoveryMessage) -> None:
-        """Keep what a participant announces of itself, for those inside that come later."""
+        """Keep the announcement of a participant, for participants inside that come later."""
         announcement = participant_alone(message)
         if announcement != outsider.announcement:
             outsider.announcement = announcement

@@ -1,8 +1,8 @@
-"""Which participant gives its place to a new one, so that no source takes the places of all others.
+"""Which participant gives its place to a new participant, so that no source takes all places.
 
-Places are of two kinds, and neither takes those of the other: for participants at addresses that
-have proved to receive what the proxy sends, and for all others, whose sources may be forged. The
-``owner`` of an address is what has a share of the places, such as the address itself.
+There are two kinds of places, for proven participants and for all others, whose sources may be
+forged. A participant takes no place of the other kind. Proven places are shared out fairly among
+*owners*. The owner of an address is the address itself, or its subnet.
 """
 
 from collections import Counter
@@ -11,14 +11,14 @@ from collections.abc import Callable, Sequence
 from rosproxy.ros2.registry.participants import AnyParticipant
 
 Owner = Callable[[str], str]
-"""The owner of an address."""
+"""Returns the owner of an address."""
 
 
 def oldest_unproven(unproven: Sequence[AnyParticipant], most: int) -> AnyParticipant | None:
-    """The unproven participant that ends for a new one, if there are as many as there may be.
+    """The unproven participant that ends in favour of a new participant; None if there is room.
 
-    The oldest goes: it has had the longest time to prove that it receives. ``unproven`` are in the
-    order in which they came.
+    There is room for ``most`` participants. The oldest ends, because this participant has had the
+    longest time to prove its address. ``unproven`` are in order of arrival.
     """
     return unproven[0] if len(unproven) >= most else None
 
@@ -26,10 +26,11 @@ def oldest_unproven(unproven: Sequence[AnyParticipant], most: int) -> AnyPartici
 def fairer_place(
     proven: Sequence[AnyParticipant], most: int, source: str, owner: Owner
 ) -> AnyParticipant | None:
-    """The proven participant that ends for a new one at ``source``, if there are ``most`` already.
+    """The proven participant that ends in favour of a new participant at ``source``; or None.
 
-    It is the newest of the owner with most participants; None if that of ``source`` would have as
-    many.
+    This is the newest participant of the largest owner, which has most participants. None if there
+    is room for a further participant, up to ``most``. None also if the owner of ``source`` would
+    then have at least as many participants as the largest owner.
     """
     if len(proven) < most:
         return None
@@ -41,7 +42,10 @@ def fairer_place(
 
 
 def surplus(proven: Sequence[AnyParticipant], most: int, owner: Owner) -> list[AnyParticipant]:
-    """The participants that end so that ``most`` are left: the newest, of the largest owner."""
+    """The participants that have to end so that ``most`` remain.
+
+    In each step this is the newest participant of the owner with most participants.
+    """
     left = list(proven)
     ended = list[AnyParticipant]()
     while len(left) > most:

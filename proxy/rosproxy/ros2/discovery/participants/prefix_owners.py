@@ -1,17 +1,17 @@
-"""Which side a GUID prefix belongs to, if participants on both sides use it.
+"""Which side a GUID prefix belongs to, if participants on both sides use the same prefix.
 
-A prefix is random, and each participant has its own. So one of two participants with the same
-prefix has copied it, from an announcement that it has heard. The proxy serves one of the two, best
-first:
+A prefix is random, and each participant has a different prefix. So if two participants have the
+same, one has copied it from an announcement. The proxy serves only one of the two. The order of
+preference is:
 
-1. the participant inside, if a former process of the proxy served it (`was_inside`);
+1. the participant inside, if a former process of the proxy served this participant (`was_inside`);
 2. the participant outside at the address of a configured peer;
-3. the participant outside at an address that has proved to receive;
+3. the participant outside at a proven address;
 4. the participant inside;
 5. the participant outside at any other address.
 
-A participant inside that is served keeps its place, but for `REMEMBERED` seconds from the start: in
-these seconds it may have come before the participant outside whose prefix it copied.
+A served participant inside keeps its place, except in the first `REMEMBERED` seconds after the
+start. In these seconds, a copy of the prefix may have come before the participant outside.
 """
 
 from dataclasses import dataclass
@@ -34,17 +34,20 @@ class PrefixOwners:
     proofs: AddressProofs
 
     def is_inside(self, prefix: bytes) -> bool:
-        """Whether a participant inside uses a prefix; it may wait to be served."""
+        """Whether a participant inside uses a prefix, or waits for ports with this prefix."""
         return prefix in self.inside.by_prefix or prefix in self.former_ports.waiting
 
     def yields_to_inside(self, prefix: bytes) -> bool:
-        """Whether a prefix that outside may use belongs to a participant inside."""
+        """Whether a participant inside may have a prefix, which a participant outside may use."""
         outsider = self.outside.by_prefix.get(prefix)
         is_weak = outsider is None or not (outsider.trusted or outsider.proven)
         return is_weak or self.former_ports.was_inside(prefix)
 
     def yields_to_outside(self, prefix: bytes, source: str, now: float) -> bool:
-        """Whether a prefix that inside uses belongs to a participant outside at an address."""
+        """Whether a participant outside may have a prefix, which a participant inside uses.
+
+        ``source`` is the address of the participant outside.
+        """
         if not (self.settings.is_peer(source) or self.proofs.has(source)):
             return False
         insider = self.inside.by_prefix.get(prefix)
