@@ -1,1 +1,1 @@
-"""The proxy's ports: which of them leads to which locator, also after the proxy was killed."""
+"""The ports of the proxy: which port leads to which locator, also after the proxy was killed."""

@@ -1,10 +1,10 @@
-"""Restores ports after a start: participants get the ports again that they had before.
+"""Restores ports after a start: participants get their former ports again.
 
-For `REMEMBERED` seconds from the start the first announcement of a participant inside waits. The
-proxy asks the participant for its former ports (`rosproxy.ros2.ports.store` explains how it knows
-them). The wait ends with the answer, or after `ANSWER_TIME` without one. It does not end before
-outside has had `SETTLING` seconds to send to the ports that it knows (`LocatorPorts`). Later,
-reminders make participants remember the ports that they have now.
+In the first `REMEMBERED` seconds, the first announcement of a participant inside waits. The proxy
+asks the participant for its former ports (`rosproxy.ros2.ports.store` explains how the participant
+remembers these). The wait ends with the answer, or after `ANSWER_TIME` without an answer. The wait
+lasts at least until outside has had `SETTLING` seconds to send to former ports (`LocatorPorts`).
+Later, reminders make participants remember their present ports.
 """
 
 from collections import Counter
@@ -27,21 +27,22 @@ from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 ANSWER_TIME = 5.0
-"""Seconds that a participant has to say which ports it had."""
+"""Seconds that a participant has to name its former ports."""
 
 
 @dataclass(slots=True)
 class FormerPorts:
-    """The participants inside that wait, and the ports that they had before the start.
+    """The participants inside that wait, and their ports from before the start.
 
-    ``waiting``, by prefix: the source of the announcement, the announcement, and since when it
-    waits. At one address as many may wait as there may be participants. ``recorded``: ports that
-    the operator has recorded of participants that knew the proxy at another address, or with
-    another range, by prefix, until the participants have gone. ``displaced``: the last participants
-    that the proxy has ended, and that may live.
-    Fast DDS takes no new locators of a participant that it knows (PDPListener.cpp,
-    PDPSimple::updateInfoMatchesEDP). So ``recorded`` and ``displaced`` participants must be
-    rediscovered by all outside.
+    ``waiting`` has by prefix: the source of the announcement, the announcement, and the start of
+    the wait. At an address, as many participants may wait as may be served. ``recorded`` has ports
+    by prefix, until the participant has gone: the operator has recorded these for participants that
+    knew the proxy at another address, or with another range. ``displaced`` are the last
+    participants that the proxy has ended, and that may be alive.
+
+    Fast DDS accepts no new locators of a known participant (PDPListener.cpp,
+    PDPSimple::updateInfoMatchesEDP). So all participants outside must rediscover the ``recorded``
+    and ``displaced`` participants.
     """
 
     settings: DomainSettings
@@ -61,9 +62,9 @@ class FormerPorts:
         proofs: AddressProofs,
         unix_offset: float,
     ) -> Self:
-        """The former ports of a proxy that starts, with the port store that knows them.
+        """The former ports of a proxy that starts, with the port store that asks for them.
 
-        ``unix_offset`` is Unix time less the time that the methods are given, in seconds.
+        ``unix_offset`` is Unix time minus the time ``now`` of the methods, in seconds.
         """
         port_store = PortStore.of(
             settings.host,
@@ -79,17 +80,19 @@ class FormerPorts:
         return prefix in self.waiting and self.waiting[prefix][0] == source
 
     def wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        """Keep an announcement until ports are given; meanwhile ask which ports it had."""
+        """Hold an announcement until ports may be given. Return questions for the former ports."""
         if not self._has_room(message.prefix, source):
-            return []  # it announces itself again, when there may be room
+            return []  # the participant announces itself again, and there may be room then
         self.waiting[message.prefix] = source, message, now
         self._counts[source] += 1
         return self._questions(message, source, now)
 
     def _has_room(self, prefix: bytes, source: str) -> bool:
-        """Whether one more may wait at an address; the first that has not answered leaves for it.
+        """Whether a further participant may wait at an address.
 
-        Where the address is full, a participant leaves that waits there, and for one alone that has
+        If necessary, another wait ends. If only the number of all waiting participants is too
+        great, the first participant that has not proved an address leaves. If the address is full,
+        such a participant at this address leaves, and only in favour of a participant that has
         answered.
         """
         is_full = self._counts[source] >= MOST_PER_ADDRESS
@@ -108,7 +111,7 @@ class FormerPorts:
         return leaver is not None
 
     def repeated_questions(self, now: float) -> list[Outgoing]:
-        """Questions again to those that have not answered."""
+        """The questions to waiting participants that have not answered."""
         return [
             question
             for source, message, since in self.waiting.values()
@@ -117,13 +120,16 @@ class FormerPorts:
         ]
 
     def ready(self, now: float) -> list[bytes]:
-        """The participants that may get ports now; each waits until it is let in."""
+        """The waiting participants that may get ports now. Each waits on until `end_wait`."""
         if not self.ports.may_give_ports(now):
             return []
         return [p for p, (*_, since) in self.waiting.items() if self._has_answered(p, since, now)]
 
     def end_wait(self, prefix: bytes) -> tuple[str, DiscoveryMessage] | None:
-        """The address and announcement of a participant, which waits no longer; None if it has."""
+        """End the wait of a participant. Return the source and the announcement.
+
+        None if the participant does not wait.
+        """
         if prefix not in self.waiting:
             return None
         source, message, _ = self.waiting.pop(prefix)
@@ -131,21 +137,21 @@ class FormerPorts:
         return source, message
 
     def forget(self, addresses: Collection[str]) -> None:
-        """Forget those that wait at addresses that are gone."""
+        """Forget the waiting participants at addresses that are gone."""
         for prefix in [p for p, (source, *_) in self.waiting.items() if source in addresses]:
             self._forget_waiting(prefix)
 
     def end(self, prefix: bytes, source: str) -> None:
-        """Forget a participant at an address that waits and has ended."""
+        """Forget a waiting participant that has ended."""
         if self.is_waiting(prefix, source):
             self._forget_waiting(prefix)
 
     def note_recorded(
         self, recorded: Mapping[bytes, Sequence[int]], present: Container[bytes]
     ) -> None:
-        """Note the ports that the operator has recorded, but of no participant in ``present``.
+        """Note the ports that the operator has recorded, except for participants in ``present``.
 
-        A participant whose ports are not all in this range gets others.
+        If not all ports of a participant are in this range, the participant gets other ports.
         """
         for prefix, ports in recorded.items():
             in_range = all(port in self.ports.pool.range for port in ports)
@@ -154,13 +160,14 @@ class FormerPorts:
                 self.ports.note_claims(prefix, self.recorded[prefix], len(ports))
 
     def of(self, prefix: bytes) -> Sequence[int]:
-        """The ports that a participant had before the start, in the order of its locators."""
+        """The ports of a participant from before the start, in the order of its locators."""
         return self.recorded.get(prefix) or self.port_store.former_ports(prefix)
 
     def take_answer(self, prefix: bytes, source: str, datagram: bytes) -> bool:
-        """Note what a participant tells the port store; return whether it does. Raises RtpsError.
+        """If a datagram is an answer of a participant to the port store, note the answer.
 
-        What it tells once it has its ports follows from these, and is no claim.
+        Return whether the datagram is an answer. Only an answer of a waiting participant is a
+        claim. Later answers follow from the present ports. Raises RtpsError.
         """
         if not self.port_store.take(prefix, datagram):
             return False
@@ -170,9 +177,10 @@ class FormerPorts:
         return True
 
     def was_inside(self, prefix: bytes) -> bool:
-        """Whether a former process served a participant inside, as more than its word says.
+        """Whether there is evidence that a former process served a participant inside.
 
-        The kernel's table tells nothing of it: this has addresses, and no prefixes.
+        The participant's own word does not count. The kernel's table does not count either: it has
+        addresses, but no GUID prefixes.
         """
         return (
             prefix in self.recorded
@@ -181,11 +189,14 @@ class FormerPorts:
         )
 
     def must_be_rediscovered(self, prefix: bytes) -> bool:
-        """Whether outside knows a participant by other ports than those that it gets."""
+        """Whether outside knows a participant by former ports.
+
+        If so, all participants outside have to rediscover the participant.
+        """
         return prefix in self.recorded or prefix in self.displaced
 
     def displace(self, prefix: bytes) -> None:
-        """Note that a participant has lost its ports, and with them all that is known of it."""
+        """Note that the proxy has ended a participant that may be alive, and may come back."""
         if len(self.displaced) >= MOST_WAITING:
             del self.displaced[next(iter(self.displaced))]
         self.displaced[prefix] = None
@@ -198,7 +209,7 @@ class FormerPorts:
         self.ports.forget_claims(prefix)
 
     def reminders(self, participant: InsideParticipant, now: float) -> list[Outgoing]:
-        """What makes a participant keep the ports that it has now."""
+        """The datagrams with which a participant keeps its present ports."""
         if participant.metatraffic is None:
             return []
         datagrams = self.port_store.reminders(
@@ -207,12 +218,13 @@ class FormerPorts:
         return [Outgoing(participant.metatraffic, datagram) for datagram in datagrams]
 
     def keepers(self, participants: Iterable[InsideParticipant]) -> list[InsideParticipant]:
-        """The participants that can keep their ports: one of each process of Cyclone DDS.
+        """The participants that can keep their ports.
 
-        The participants of a process have the same locator for metatraffic, and the same number of
-        the sample that they expect next of a writer, whichever of them a heartbeat is for
-        (ddsi_receive.c, handle_Heartbeat). The first that has answered keeps its ports; one that
-        has not may have been forged.
+        Of each process of Cyclone DDS this is a single participant. The participants of a process
+        share the locator for metatraffic. They also share the number that is expected next from a
+        writer, whichever participant a heartbeat is for (ddsi_receive.c, handle_Heartbeat). The
+        first participant that has answered keeps its ports. A participant that has not answered may
+        be forged.
         """
         ordered = list(participants)
         keepers = dict[tuple[str, HostPort | None], InsideParticipant]()
@@ -241,5 +253,5 @@ class FormerPorts:
         return [Outgoing(target, datagram) for datagram in questions]
 
     def _reply_target(self, address: str) -> HostPort:
-        """Where a participant inside reaches the proxy's own participants."""
+        """The address and port at which a participant inside reaches the port store."""
         return HostPort(self.settings.proxy_address_for(address), self.settings.unicast_port)

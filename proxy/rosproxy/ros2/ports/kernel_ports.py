@@ -1,10 +1,11 @@
-"""The ports of the range that the kernel may forward, each with its locator: those of user data.
+"""The ports of the range that the kernel may forward, with their locators: ports for user data.
 
 The proxy reads and rewrites discovery. So the kernel forwards a port only if the participant
 ignores discovery there: a port for user data of Fast DDS (`Participant.reads_discovery_at`). All
-that arrives at such a port goes to one locator. A port that the kernel forwarded before the proxy
-started is here until the proxy maps the port, or until no participant is left that could claim the
-port. Meanwhile the kernel goes on forwarding as the former process had told it to.
+datagrams at such a port go to one locator.
+
+A port that the kernel forwarded before the start stays in the list until the proxy maps the port,
+or until no participant is left that could claim it. Meanwhile the kernel goes on forwarding.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,10 +18,10 @@ from rosproxy.ros2.ports.mappings import PortMappings
 
 @dataclass(eq=False, slots=True)
 class ForwardedPort:
-    """A port and the locator that it leads to, as `rosproxy.leases.fast_ports.LeaseHolder`.
+    """A port and its locator, as `rosproxy.leases.fast_ports.LeaseHolder`.
 
-    Nothing tells by itself whether a locator is answered. ``fast_peers`` stays empty: datagrams
-    have no connections.
+    ``is_down`` stays False, because nothing reports whether a locator answers. ``fast_peers`` stays
+    empty, because datagrams have no connections.
     """
 
     port: int
@@ -34,7 +35,7 @@ class ForwardedPort:
     fast_connections: int = 0
 
     def __post_init__(self) -> None:
-        """The port is its own fast port: user space and the kernel share it."""
+        """Make the port its own fast port: user space and the kernel share the port."""
         self.fast_port = self.port
 
     @property
@@ -49,14 +50,14 @@ class ForwardedPort:
 
     @property
     def caller_ids(self) -> list[str]:
-        """What its bytes are counted under."""
+        """The label under which the bytes are counted."""
         return [self.label]
 
 
 class KernelPorts:
-    """The kernel ports of all domains, as `rosproxy.leases.fast_ports.LeaseHolders`.
+    """The ports that the kernel may forward, as `rosproxy.leases.fast_ports.LeaseHolders`.
 
-    ``domains`` are the port mappings of each; ``pool`` are the ports of all.
+    ``domains`` are the port mappings of each domain. ``pool`` has the ports of all domains.
     """
 
     def __init__(self, pool: PortPool) -> None:
@@ -68,7 +69,7 @@ class KernelPorts:
 
     @property
     def by_port(self) -> Mapping[int, ForwardedPort]:
-        """All of them by their ports."""
+        """The forwarded ports, by number."""
         changes = sum(mappings.changes for mappings in self.domains)
         if changes != self._cached_changes:
             self._cached_changes = changes
@@ -80,26 +81,26 @@ class KernelPorts:
         return self._cached
 
     def __iter__(self) -> Iterator[ForwardedPort]:
-        """All of them."""
+        """Iterate over the forwarded ports."""
         return iter(list(self.by_port.values()))
 
     def note_former(self, forwards: Mapping[int, HostPort]) -> None:
-        """Note what a former process had the kernel forward; with an empty mapping, forget it."""
+        """Note the forwards of a former process; an empty mapping ends all former forwards."""
         self._former = {
             port: ForwardedPort(port, target, "a participant from before the start of the proxy")
             for port, target in forwards.items()
         }
-        self._cached_changes = -1  # none: all is looked at anew
+        self._cached_changes = -1  # so that `by_port` is computed again
 
     def _mapped(self) -> Iterator[ForwardedPort]:
-        """The mapped ports, each the same object for as long as it leads to the same locator."""
+        """Yield the mapped ports. A port with the same locator stays the same object."""
         for mappings in self.domains:
             for port, (participant, mapping) in mappings.by_port.items():
                 if mapping.is_read:
                     continue
                 label = f"{participant.guid_prefix} at {participant.address}"
                 cached = self._cached.get(port)
-                # The kernel plane takes another object for another lease (`ForwardSyncer`).
+                # For the kernel plane, another object is another lease (`ForwardSyncer`).
                 if cached is not None and (cached.target, cached.label) == (mapping.target, label):
                     yield cached
                 else:

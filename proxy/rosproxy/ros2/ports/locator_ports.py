@@ -1,21 +1,21 @@
-"""Which port stands for a locator: found anew after a restart, with nothing kept on disk.
+"""Which port stands for a locator. After a restart the proxy finds the same port, without a file.
 
-The order in which ports are tried follows from the participant's GUID prefix and from the locator.
-So a proxy that has lost all memory gives the same ports again, unless two participants want the
-same port first. Then the evidence of the time before the start decides, best first:
+The order in which ports are tried follows from the GUID prefix of the participant and from the
+locator. So a proxy without any memory gives the same ports again, unless two participants have the
+same first port. Then the evidence from before the start decides, best first:
 
-- the kernel's table, which the former process left there, leads the port to that very locator;
-- the participant *keeps* the port: a number that the former process has signed, or the operator's
-  record, says so (`rosproxy.ros2.ports.store`);
-- the participant *says* that it had the port, without a proof;
-- outside goes on sending to the port and names the participant (INFO_DST). A peer's word counts
-  more than that of an address that has proved to receive, and that more than any other, since
-  every sender may forge its source.
+- the kernel's table, which the former process left, leads the port to this very locator;
+- the participant *keeps* the port: this is shown by a number that the former process has signed, or
+  by the record of the operator (`rosproxy.ros2.ports.store`);
+- the participant *states* without a proof that this was its port;
+- outside still sends to the port, and names the participant (INFO_DST). A peer outweighs a proven
+  address, and a proven address outweighs all others, because every sender may forge a source.
 
-No port is given in the first second, in which outside may name participants. A word without a proof
-is void where outside names other participants alone. Two participants that claim one port with
-equal evidence both get other ports: one of the two lies, and the proxy can't tell which. A
-participant that comes later with a proof gets its port back from one without.
+The proxy gives no port in the first second, so that outside has time to name participants. A
+statement without a proof is void if outside names only other participants. If two participants
+claim a port with equal evidence, both get other ports: one of the two lies, and the proxy can't
+tell which. If a participant with a proof comes later, it gets its port back from a participant
+without.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -31,85 +31,92 @@ from rosproxy.ros2.protocol.addressing import destination, of_built_in_writer
 from rosproxy.ros2.registry.participants import TrafficKind
 
 MOST_NAMED = 8
-"""Participants that may be named at one port; more tell nothing. One that is named for both kinds
-counts twice."""
+"""Participants that may be named at one port. If more are named, the names count for nothing. A
+participant that is named for metatraffic and for user data counts twice."""
 SETTLING = 1.0
-"""Seconds from the start in which no port is given, to hear first what outside means by each."""
+"""Seconds from the start in which the proxy gives no port, and waits for datagrams from outside."""
 REMEMBERED = 30.0
-"""Seconds from the start in which a port is rather given to the participant that had it before."""
+"""Seconds from the start in which the proxy considers evidence from before the start."""
 
 
 def order_for(key: str, ports: PortRange) -> Iterator[int]:
-    """All ports of a range, in the order in which they are tried for a key."""
+    """Yield all ports of a range, in the order in which they are tried for a key."""
     start = int.from_bytes(blake2b(key.encode(), digest_size=8).digest(), "big")
     for number in range(len(ports)):
         yield ports.first + (start + number) % len(ports)
 
 
 _User = tuple[bytes, TrafficKind]
-"""A participant's prefix, and what arrives at its port."""
+"""The GUID prefix of a participant, and the kind of traffic at its port."""
 
 
 class NamedBy(IntEnum):
-    """What names a participant at a port, from outside; the greatest counts."""
+    """The kind of source that names a participant at a port. The greatest counts."""
 
     OTHERS = 0
-    """An address whose datagrams may be forged."""
+    """Any other address. Its datagrams may be forged."""
     PROVEN = 1
-    """An address that has proved to receive."""
+    """A proven address outside."""
     PEER = 2
+    """The address of a peer."""
 
 
 class _Claim(IntEnum):
-    """Whose a port was, as it seems to a participant that wants a port; the least goes first."""
+    """The evidence with which a participant claims a port. The least value wins."""
 
     FORWARDED = 0
-    """Its own: the kernel led there."""
+    """The kernel forwarded the port to the locator of the participant."""
     KEPT_AND_NAMED = 1
     KEPT = 2
-    """Its own, as a former process has signed, or the operator has recorded."""
+    """The participant had the port, as a former process has signed, or the operator has
+    recorded."""
     SAID_AND_NAMED = 3
     SAID = 4
-    """Its own, as it says itself; outside names no other participant there."""
+    """The participant states that this was its port. No reliable source names another
+    participant."""
     NAMED = 5
-    """Its own, as outside says; perhaps that of another of its locators."""
+    """Outside names the participant. The port may belong to another locator of the participant."""
     NOBODYS = 6
+    """There is no evidence for any participant."""
     ANOTHERS = 7
     """Another participant has better evidence, or may still come back."""
     DISPUTED = 8
-    """Several participants have claimed the port, with equal evidence."""
+    """Several participants have claimed the port with equal evidence."""
 
 
 _SAID_BY_ITSELF = range(_Claim.KEPT_AND_NAMED, _Claim.NAMED)
-"""Claims of a participant that says itself that it had the port."""
+"""The claims from `LocatorPorts.note_claims`."""
 
 
 @dataclass(slots=True)
 class _FormerUsers:
-    """The participants that were named at a port, and for what, by what named them."""
+    """The participants that are named at a port, by the kind of source."""
 
     users_by: dict[NamedBy, set[_User]] = field(default_factory=dict)
 
     def note(self, user: _User, by: NamedBy) -> None:
-        """Note a participant that was named, up to one more than `MOST_NAMED`."""
+        """Note a named participant, up to `MOST_NAMED` and one more."""
         users = self.users_by.setdefault(by, set())
         if len(users) <= MOST_NAMED:
             users.add(user)
 
     @property
     def best(self) -> NamedBy:
-        """The best of those that have named a participant."""
+        """The best kind of source that has named a participant."""
         return max(self.users_by, default=NamedBy.OTHERS)
 
     @property
     def users(self) -> Collection[_User]:
-        """Those to believe in: none where so many were named that it tells nothing."""
+        """The participants that the best kind of source names.
+
+        Empty if these are more than `MOST_NAMED`.
+        """
         users = self.users_by.get(self.best, set())
         return users if len(users) <= MOST_NAMED else ()
 
     @property
     def prefixes(self) -> set[bytes]:
-        """The participants to believe in."""
+        """The GUID prefixes of `users`."""
         return {prefix for prefix, _ in self.users}
 
 
@@ -117,7 +124,7 @@ _NO_USERS = _FormerUsers()
 
 
 class LocatorPorts:
-    """Lends the ports of the range to locators; ``started`` is when the proxy did, in seconds."""
+    """Chooses ports of the range for locators. ``started`` is the start of the proxy in seconds."""
 
     def __init__(self, pool: PortPool, started: float) -> None:
         self.pool = pool
@@ -125,23 +132,26 @@ class LocatorPorts:
         self._former_users: dict[int, _FormerUsers] = {}
         self._forwarded: dict[int, HostPort] = {}
         self._claims: dict[int, dict[bytes, bool]] = {}
-        """Which participants claim each port, and whether each has a proof."""
+        """The participants that claim each port, and whether each has a proof."""
         self._ports_claimed: dict[bytes, Sequence[int]] = {}
         self._lent: dict[int, tuple[bytes, _Claim]] = {}
-        """Which participant has each port since the start, and by which claim."""
+        """The participant that has got each port since the start, and the claim of then."""
         self._disputed: dict[int, _Claim] = {}
-        """Ports that several have claimed, with which evidence."""
+        """Ports that several participants claim, and the evidence of these claims."""
 
     def may_give_ports(self, now: float) -> bool:
-        """Whether ports may be given."""
+        """Whether the proxy may give ports: `SETTLING` seconds are over."""
         return now - self._started >= SETTLING
 
     def is_restoring(self, now: float) -> bool:
-        """Whether there may still be participants that had ports before the start."""
+        """Whether `REMEMBERED` seconds are not over, so that former evidence counts."""
         return now - self._started < REMEMBERED
 
     def note_use(self, port: int, datagram: bytes, by: NamedBy, now: float) -> None:
-        """Note the addressee of a datagram from outside at a port without a mapping. RtpsError."""
+        """Note the destination of a datagram from outside at a port without a mapping.
+
+        Raises RtpsError.
+        """
         prefix = destination(datagram)
         is_built_in = of_built_in_writer(datagram)
         if prefix is not None and is_built_in is not None:
@@ -151,23 +161,23 @@ class LocatorPorts:
     def note_former_user(
         self, port: int, prefix: bytes, kind: TrafficKind, by: NamedBy, now: float
     ) -> None:
-        """Note that a participant was named at a port."""
+        """Note that a source has named a participant at a port."""
         if self.is_restoring(now) and port in self.pool.range:
             self._former_users.setdefault(port, _FormerUsers()).note((prefix, kind), by)
 
     def note_forwarded(self, forwards: Mapping[int, HostPort]) -> None:
-        """Note what the kernel was told to forward before the start, by port."""
+        """Note the ports that the kernel forwarded before the start, and their locators."""
         self._forwarded = {p: locator for p, locator in forwards.items() if p in self.pool.range}
 
     def note_claims(self, prefix: bytes, ports: Sequence[int], proven_count: int) -> None:
-        """Note which ports a participant had: the first ones by a proof, all others by its word."""
+        """Note the ports that a participant claims; the first ``proven_count`` have a proof."""
         self.forget_claims(prefix)
         self._ports_claimed[prefix] = ports
         for index, port in enumerate(ports):
             self._claims.setdefault(port, {})[prefix] = index < proven_count
 
     def forget_claims(self, prefix: bytes) -> None:
-        """Forget what a participant claims that has gone."""
+        """Forget the claims of a participant that has gone."""
         for port in self._ports_claimed.pop(prefix, ()):
             claimants = self._claims.get(port, {})
             claimants.pop(prefix, None)
@@ -175,7 +185,7 @@ class LocatorPorts:
                 self._claims.pop(port, None)
 
     def is_named(self, prefix: bytes) -> bool:
-        """Whether a peer, or an address that has proved to receive, names a participant."""
+        """Whether a peer or a proven address names a participant."""
         return any(
             prefix in users.prefixes
             for users in self._former_users.values()
@@ -183,9 +193,10 @@ class LocatorPorts:
         )
 
     def displaced_by(self, prefix: bytes, now: float) -> set[bytes]:
-        """Return the participants that have to give back a port that another one claims.
+        """Return the participants that have to give back a port that a new participant claims.
 
-        That one has a proof and they have none; or the evidence is equal: then neither gets it.
+        There are two cases. The new participant has a proof and better evidence. Or the evidence is
+        equal: then neither participant gets the port.
         """
         if not self.is_restoring(now):
             return set()
@@ -210,14 +221,14 @@ class LocatorPorts:
         now: float,
         had: int | None = None,
     ) -> int | None:
-        """A port for a locator of a participant; None if all are taken.
+        """Choose a port for a locator of a participant; None if all ports are taken.
 
-        ``had`` is the port that the participant had, by a proof or its own word (`note_claims`).
+        ``had`` is the port that the participant claims for this locator (`note_claims`).
         """
         if not self.is_restoring(now):
             self._forget_former()
         if not self.pool.free:
-            return None  # looking takes long, and one datagram may name a thousand locators
+            return None  # the search takes long, and a datagram may name a thousand locators
         claims = self._seen_by((prefix, kind), locator, had)
         order = partial(order_for, f"{prefix.hex()} {locator}", self.pool.range)
         nobodys = (port for port in order() if claims.get(port) in (None, _Claim.NOBODYS))
@@ -235,7 +246,7 @@ class LocatorPorts:
         return port
 
     def _forget_former(self) -> None:
-        """Forget the time before the start, since no participant of then comes back any more."""
+        """Forget the evidence from before the start, because `REMEMBERED` seconds are over."""
         self._former_users.clear()
         self._forwarded.clear()
         self._claims.clear()
@@ -244,13 +255,13 @@ class LocatorPorts:
         self._disputed.clear()
 
     def _seen_by(self, user: _User, locator: HostPort, had: int | None) -> dict[int, _Claim]:
-        """Whose the ports were of which anything is known, as it seems to a participant."""
+        """The claim of a participant to each port for which there is any evidence."""
         told_of = {*self._former_users, *self._forwarded, *self._claims, *self._disputed}
         told_of |= {had} if had else set()
         return {port: self._claim(port, user, locator, had) for port in told_of}
 
     def _claim(self, port: int, user: _User, locator: HostPort, had: int | None) -> _Claim:
-        """Whose a port was, as it seems to a participant that wants one for a locator."""
+        """The claim of a participant to a port, for a locator."""
         prefix, kind = user
         if (former_locator := self._forwarded.get(port)) is not None:
             is_own = former_locator == locator and kind is TrafficKind.USER_DATA
@@ -265,14 +276,16 @@ class LocatorPorts:
         if any(claims[rival] for rival in rivals):
             return _Claim.ANOTHERS
         if user in named.users:
-            # Every sender may forge its source: such a name is worth no more than a rival's word.
+            # Every sender may forge a source. So a name from an unproven address is worth no more
+            # than the word of a rival.
             is_doubtful = rivals and named.best is NamedBy.OTHERS
             return _Claim.ANOTHERS if is_doubtful else _Claim.NAMED
-        # Of its own for the other kind: Cyclone DDS has one locator for both, Fast DDS has not.
+        # The participant may be named for the other kind of traffic: Cyclone DDS has one locator
+        # for both kinds, Fast DDS has two.
         return _Claim.ANOTHERS if rivals or named.prefixes - {prefix} else _Claim.NOBODYS
 
     def _judged(self, port: int, prefix: bytes) -> _Claim:
-        """A participant's claim for a port, beside those of others for the same port."""
+        """The claim of a participant to a port that it states or has proved, against its rivals."""
         claim = self._said(port, prefix)
         rivals = self._claims.get(port, {}).keys() - {prefix}
         best_rival = min((self._said(port, rival) for rival in rivals), default=_Claim.NOBODYS)
@@ -287,9 +300,9 @@ class LocatorPorts:
         return _Claim.ANOTHERS if is_void or claim > best_rival else claim
 
     def _said(self, port: int, prefix: bytes) -> _Claim:
-        """What a participant's claim for a port is worth beside those of others.
+        """The worth of a participant's statement or proof for a port.
 
-        Names that may be forged count for none and against none.
+        Names from unproven addresses count neither for nor against the participant.
         """
         named = self._former_users.get(port, _NO_USERS)
         prefixes = named.prefixes if named.best > NamedBy.OTHERS else set[bytes]()
@@ -300,6 +313,6 @@ class LocatorPorts:
         return _Claim.ANOTHERS if prefixes else _Claim.SAID
 
     def give_back(self, port: int) -> None:
-        """Take a port back."""
+        """Make a port available again."""
         self._lent.pop(port, None)
         self.pool.give_back(port)

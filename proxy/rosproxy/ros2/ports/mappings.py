@@ -1,8 +1,8 @@
 """The port mappings of a domain: which port of the range leads to which locator inside.
 
-A participant inside gets a port for each of its locators at the address that it sends from, and for
-no other: no announcement makes the proxy a way to another host. Outside sees these ports in place
-of the locators. `rosproxy.ros2.ports.locator_ports` chooses the port.
+A participant inside gets a port for each locator at the source address of the announcement, and for
+no other locator. So no announcement makes the proxy a way to another host. Outside sees these ports
+in place of the locators. `rosproxy.ros2.ports.locator_ports` chooses the port.
 """
 
 from collections.abc import Sequence
@@ -22,21 +22,22 @@ from rosproxy.ros2.rewriting.discovery import Announcement
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 PART_FOR_PROVEN = 4
-"""One of so many parts of the range is for addresses that have proved to receive."""
+"""If no more free ports are left than one part in so many of the range, only participants that have
+answered get ports."""
 PART_FOR_OTHERS = 8
-"""One of so many parts of the range is out of reach for a single address: a container that takes
-all that it can get leaves something for others."""
+"""One part in so many of the range is not available to a single address. So a container that takes
+all available ports leaves some to others."""
 
 Holder = tuple[InsideParticipant, PortMapping]
-"""A participant, and one of its port mappings."""
+"""A participant and one of its port mappings."""
 
 
 @dataclass(slots=True)
 class PortMappings:
-    """The port mappings, ``by_port``, each with its participant.
+    """The port mappings of a domain.
 
-    ``shortages`` tells why a locator got no port, by the GUID prefix of its participant.
-    ``changes`` counts how often the mappings have changed.
+    ``by_port`` has each mapping with its participant. ``shortages`` tells by GUID prefix why a
+    locator of the participant got no port. ``changes`` counts the changes of the mappings.
     """
 
     settings: DomainSettings
@@ -49,7 +50,7 @@ class PortMappings:
     _by_address: dict[str, dict[int, Holder]] = field(default_factory=dict)
 
     def lacks_proof(self, prefix: bytes, address: str) -> bool:
-        """Whether a participant gets no port before it has answered: ports are scarce."""
+        """Whether a participant gets no port because ports are scarce and no answer has come."""
         kept = len(self.settings.ports.listen) // PART_FOR_PROVEN
         return self.ports.pool.free <= kept and not self.proofs.has_answered(address, prefix)
 
@@ -61,36 +62,38 @@ class PortMappings:
         former_ports: Sequence[int],
         now: float,
     ) -> HostPort | None:
-        """Return where outside reaches a locator; None if it does not. Maps a port if necessary.
+        """Return the address and port at which outside reaches a locator; map a port if necessary.
 
-        ``former_ports`` are the ports that the participant is known to have had before the proxy
-        started, in the order of its locators.
+        None if the locator is at another address than the participant, is a port of the range, or
+        gets no port. ``former_ports`` are the known ports of the participant from before the start,
+        in the order of the participant's locators.
         """
         if locator.host != participant.address or self._is_own(locator):
             return None
         mapping = participant.mappings.get(locator)
         if mapping is None:
-            # Ports are kept in the order in which they were mapped (`ports` of a participant).
+            # The port store keeps the ports in the order of their mapping
+            # (`InsideParticipant.ports`).
             index = len(participant.mappings)
             former_port = former_ports[index] if index < len(former_ports) else None
             mapping = self._map(participant, locator, kind, former_port, now)
         if mapping is None:
             return None
         if kind is TrafficKind.METATRAFFIC and mapping.kind is not kind:
-            mapping.kind = kind  # Cyclone DDS has one locator for both
+            mapping.kind = kind  # Cyclone DDS has one locator for both kinds
             self.mark_read(participant.address)
         host = self.settings.host_for(locator.host)
         return HostPort(host, self.settings.ports.advertised(mapping.port))
 
     def add(self, participant: InsideParticipant, mapping: PortMapping) -> None:
-        """Have a port lead to a locator of a participant."""
+        """Add a mapping of a participant."""
         participant.mappings[mapping.target] = mapping
         self.by_port[mapping.port] = participant, mapping
         self._by_address.setdefault(participant.address, {})[mapping.port] = participant, mapping
         self.mark_read(participant.address)
 
     def end(self, participant: InsideParticipant) -> None:
-        """Take back all ports of a participant that has gone."""
+        """End all mappings of a participant that has gone."""
         for mapping in participant.mappings.values():
             self._take_back(participant.address, mapping)
         self.shortages.pop(participant.prefix, None)
@@ -99,9 +102,9 @@ class PortMappings:
     def make_room(
         self, participant: InsideParticipant, spdp: Announcement, datagram: bytes
     ) -> None:
-        """Take back ports of locators that a participant no longer names, if it has too many.
+        """End mappings to locators that a participant with too many no longer announces.
 
-        A forged announcement may have named them.
+        A forged announcement may have caused these mappings.
         """
         address = participant.address
         named = {locator for _, locator in spdp.reached_at(datagram) if locator.host == address}
@@ -114,7 +117,7 @@ class PortMappings:
     def mark_read(self, address: str) -> None:
         """Mark the mappings to locators at which a participant at an address reads discovery.
 
-        A participant may name the locator of another participant at the same address.
+        A participant may announce the locator of another participant at the same address.
         """
         holders = self._by_address.get(address, {}).values()
         read = {mapping.target for p, mapping in holders if p.reads_discovery_at(mapping)}
@@ -130,7 +133,7 @@ class PortMappings:
         former_port: int | None,
         now: float,
     ) -> PortMapping | None:
-        """Map a port to a locator; None, with a shortage, if the locator gets none."""
+        """Map a port to a locator. If no port may be given, note the shortage, and return None."""
         if shortage := self._shortage(participant, locator):
             self.shortages[participant.prefix] = shortage
             return None
@@ -146,7 +149,7 @@ class PortMappings:
         return mapping
 
     def _shortage(self, participant: InsideParticipant, locator: HostPort) -> PortShortage | None:
-        """Return why a locator may get no port; None if it may."""
+        """Return why a locator may not get a port; None if there is no reason."""
         if len(participant.mappings) >= MOST_MAPPINGS:
             text = f"{locator} got no port: the participant has more than {MOST_MAPPINGS} locators"
             return PortShortage(ShortageKind.BOUND, text)
@@ -164,21 +167,24 @@ class PortMappings:
         return None
 
     def _has_its_share(self, address: str) -> bool:
-        """Whether the participants at an address have as many ports as they may together.
+        """Whether the participants at an address have as many ports as one address may have.
 
-        That does not depend on what others have. So after a restart all get the same again, in
-        whichever order they come.
+        This limit does not depend on the ports of other addresses. So after a restart all
+        participants get the same ports again, in whichever order they come.
         """
         size = len(self.settings.ports.listen)
         return len(self._by_address.get(address, ())) >= size - size // PART_FOR_OTHERS
 
     def _is_own(self, locator: HostPort) -> bool:
-        """Whether a locator is a port of the range itself: a datagram there would never end."""
+        """Whether a locator is a port of the range.
+
+        A datagram to this port would circulate without end.
+        """
         in_range = locator.port in self.settings.ports.listen
         return in_range and locator.host == self.settings.proxy_address_for(locator.host)
 
     def _lose(self, participant: InsideParticipant, former_port: int | None, now: float) -> None:
-        """Have all outside rediscover a participant, which they know by a port that it lost."""
+        """Let all participants outside rediscover a participant that has lost a former port."""
         participant.separation_due_from = now
         text = f"participant {participant.guid_prefix} gets another port than {former_port}, which "
         text += "another participant claims as well; outside discovers the participant anew"

@@ -2,7 +2,7 @@
 
 The discovery of a participant outside always passes the proxy, through a stand-in. User data passes
 a stand-in only if the direction is both. The port follows from the locator, so that the next
-process of the proxy opens the same one. A stand-in may serve several locators.
+process of the proxy opens the same port. A stand-in may serve several locators.
 """
 
 from collections.abc import Callable
@@ -18,21 +18,22 @@ from rosproxy.ros2.registry.participants import OutsideParticipant, PortMapping,
 from rosproxy.ros2.sources.claimed_addresses import is_proxy_port
 
 STAND_INS = PortRange(20_000, 32_767)
-"""Where ports for participants outside are chosen from: below those that Linux gives away."""
+"""The range of stand-ins. It ends below the ephemeral ports of Linux."""
 TRIES = 32
-"""How many ports are tried for a locator outside."""
+"""Ports that are tried for a locator outside."""
 MOST_SHARING = 3
-"""Locators outside that one port may stand for; as many of forged participants do not count."""
+"""Locators outside that a stand-in may serve. For a known participant, the locators of unknown
+participants do not count."""
 
 StandInUser = tuple[OutsideParticipant, PortMapping]
-"""A participant outside that a stand-in leads to, with the mapping of its locator."""
+"""A participant outside that a stand-in serves, and the mapping of the participant's locator."""
 
 
 @dataclass(slots=True)
 class LocatorStandIns:
-    """The stand-ins, ``by_port``, each with the participants that it leads to.
+    """The stand-ins of a domain, ``by_port``, each with the participants that it serves.
 
-    ``blocked`` are ports that other programs hold. ``changes`` counts the changes of ``by_port``.
+    ``blocked`` are ports of other programs. ``changes`` counts the changes of ``by_port``.
     """
 
     settings: DomainSettings
@@ -44,9 +45,10 @@ class LocatorStandIns:
     def open(
         self, outsider: OutsideParticipant, locator: HostPort, kind: TrafficKind
     ) -> PortMapping | None:
-        """Return the stand-in for a locator, which is opened if necessary; None if none is left.
+        """Return the stand-in for a locator, and open one if necessary; None if no port is left.
 
-        Cyclone DDS has one locator for both kinds: the stand-in is for metatraffic then.
+        Cyclone DDS has one locator for metatraffic and user data. Such a stand-in counts as one for
+        metatraffic.
         """
         mapping = outsider.mappings.get(locator)
         if mapping is None and len(outsider.mappings) < MOST_MAPPINGS:
@@ -69,9 +71,10 @@ class LocatorStandIns:
             self._close(outsider, locator)
 
     def block(self, port: int, for_good: bool = True) -> None:
-        """Note that a port can't be opened; its locators get one by the next announcement.
+        """Note that a port can't be opened. The next announcement opens a stand-in again.
 
-        It is another one if this is ``for_good``, not where the process has no more sockets.
+        ``for_good`` means that another program has the port: the next stand-in has another port.
+        Otherwise the process lacks sockets, and the same port may be opened later.
         """
         if for_good:
             self.blocked.add(port)
@@ -79,14 +82,15 @@ class LocatorStandIns:
             self._close(outsider, mapping.target)
 
     def is_own_port(self, locator: HostPort) -> bool:
-        """Whether a locator is a port of the proxy itself: a stand-in there would lead inside."""
+        """Whether a locator is a port of the proxy. A stand-in for it would lead inside."""
         return is_proxy_port(locator, self.by_port, self.settings)
 
     def _users(self, for_known: bool, port: int) -> int:
-        """How many participants keep one more from a port; ``for_known`` is what that one is.
+        """The number of participants at a port that count for a new participant (`MOST_SHARING`).
 
-        A forger can choose prefixes that lead to the port of another participant. If that one lost
-        the port after a restart, Fast DDS inside would go on sending there (PDPListener.cpp).
+        ``for_known`` means that the new participant is known. Then only known participants count. A
+        forger can choose prefixes that lead to the port of another participant. If that participant
+        lost the port after a restart, Fast DDS inside would go on sending there (PDPListener.cpp).
         """
         users = self.by_port.get(port, ())
         return sum(outsider.is_known or not for_known for outsider, _ in users)
@@ -104,12 +108,13 @@ class LocatorStandIns:
 
 
 def stand_in_port(key: str, users: Callable[[int], int], busy: Callable[[int], bool]) -> int | None:
-    """A port for a locator outside; None if there are too many of them.
+    """The port for a locator outside; None if too many locators share the ports that are tried.
 
-    ``users`` tells how many locators a port stands for already. It may be several: so the port
-    follows from the locator alone, and a proxy that starts again chooses the same. Each of these
-    gets users' data that is meant for the others as well, and skips it, as with multicast.
-    ``busy`` tells which ports can't be had; they don't count as tries, as there may be many.
+    ``users`` returns the number of locators at a port. Several locators may share a port: so the
+    port follows from the locator alone, and the next process of the proxy chooses the same port.
+    Each participant at a shared port receives the user data of the others as well, and ignores this
+    data, as with multicast. ``busy`` returns whether a port is not available. Such ports do not
+    count as tries, because there may be many.
     """
     order = (port for port in order_for(key, STAND_INS) if not busy(port))
     return next((port for port in islice(order, TRIES) if users(port) < MOST_SHARING), None)

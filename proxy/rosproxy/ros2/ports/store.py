@@ -1,17 +1,17 @@
 """The port store: participants inside remember their ports for the next process of the proxy.
 
 After a restart of the proxy each participant must get its former ports again. Participants outside
-go on sending there, and Fast DDS takes no new locators of a participant that it knows
-(PDPListener.cpp). The proxy writes no file: the file would be lost with the container. Instead the
-participant itself remembers its ports, in a number that each reliable reader keeps of a writer: the
-sequence number of the sample that it expects next (DDSI-RTPS 2.5, 8.3.8.6 and 8.4.9).
+go on sending there, and Fast DDS accepts no new locators of a known participant (PDPListener.cpp).
+The proxy writes no file: the file would be lost with the container. Instead the participant
+remembers the ports, in a number that each reliable reader keeps of a writer: the sequence number of
+the sample that the reader expects next (DDSI-RTPS 2.5, 8.3.8.6 and 8.4.9).
 
 **What is written.** The proxy has a participant, the *port store*, with the two writers of SEDP.
-They never write a sample. A heartbeat tells the reader that all samples before a number are gone,
+These never write a sample. A heartbeat tells the reader that all samples before a number are gone,
 so the reader expects that number next. The number holds the ports::
 
     port store                                            participant inside
-      SPDP: participant, writers of SEDP       ------->   takes the port store into its memory
+      SPDP: participant, writers of SEDP       ------->   remembers the port store
       HEARTBEAT publications, first 98949      ------->   reader: next is 98949
       HEARTBEAT subscriptions, first 1         ------->   reader: next is 1
                                                <-------   ACKNACK: next is 98949; next is 1
@@ -21,41 +21,43 @@ so the reader expects that number next. The number holds the ports::
       98949 - 1  =   0000110   0000101   0000100         lower half, of the writer of publications
                      11405     11404     11403           upper half: 0, as no further port follows
 
-**Where it lies.** In the built-in readers of the participant, as long as the participant lives and
-`LEASE_DURATION_S` is not over. `FormerPorts.reminders` writes the numbers: as soon as a participant
-has a further port, and then with each announcement of the proxy until the participant confirms
-them.
+**Where the number is.** The number is in the builtin readers of the participant, while the
+participant lives and `LEASE_DURATION_S` is not over. `FormerPorts.reminders` writes the numbers:
+when a participant gets a further port, and then with each announcement of the proxy until the
+participant confirms the numbers.
 
-**How the next process reads it.** The GUID prefix of the port store follows from the advertised
-host, the range and the domain. So the next process is the same port store to the participant::
+**How the next process reads the number.** The GUID prefix of the port store follows from the
+advertised host, the range and the domain. So to the participant, the next process has the same port
+store::
 
     port store, next process                              participant inside
-      SPDP; HEARTBEAT with first 1             ------->   expects 98949, and heeds no smaller number
+      SPDP; HEARTBEAT with first 1             ------->   expects 98949, ignores smaller numbers
                                                <-------   ACKNACK: next is 98949
 
-`FormerPorts.wait` asks before the participant is announced outside, `FormerPorts.take_answer` takes
-the answer, and `LocatorPorts.take` gives the ports again.
+`FormerPorts.wait` asks before the proxy announces the participant outside,
+`FormerPorts.take_answer` handles the answer, and `LocatorPorts.take` gives the ports again.
 
-**Why it is safe.**
+**Why this is safe.**
 
-- *A number only grows.* A reader heeds no smaller number (8.4.12.1). The first port has the lowest
+- *A number only grows.* A reader ignores smaller numbers (8.4.12.1). The first port has the lowest
   bits, so a further port makes neither half smaller. For a smaller number the participant first has
   to forget the port store, by a dispose message (`reminders`).
-- *A lost datagram does no harm.* Each heartbeat is repeated until the participant has confirmed the
-  number (`keeps`).
-- *A former heartbeat does no harm.* A reader heeds only heartbeats with a greater count than the
-  last, which another process may have sent. So the count follows from the time (`_told`).
-- *A longer range keeps the ports.* Its first port stays, and a port takes the same bits up to a
-  length of the range. So the port store stays the same.
+- *A lost datagram does no harm.* The proxy repeats each heartbeat until the participant has
+  confirmed the number (`keeps`).
+- *A former heartbeat does no harm.* A reader ignores a heartbeat unless the count is greater than
+  that of the last heartbeat, which another process may have sent. So the count follows from the
+  time (`_told`).
+- *A longer range keeps the ports.* The first port of the range stays, and a port takes the same
+  bits up to a length of the range. So the port store stays the same.
 - *A lie is worth less than a proof.* Each participant can compute the number for the ports of
-  another one. So a proxy with a secret has a second such participant, the *port proof*. Its number
-  has the count of the ports, and a keyed hash of the participant's GUID prefix and its ports. The
-  GUID prefix of the port proof follows from the secret, too: a proxy with another secret asks as
-  another port proof. `LocatorPorts` prefers a claim with a proof.
+  another participant. So a proxy with a secret has a second such participant, the *port proof*. The
+  number of the port proof has the count of the ports, and a keyed hash of the participant's GUID
+  prefix and ports. The GUID prefix of the port proof follows from the secret, too: a proxy with
+  another secret asks as another port proof. `LocatorPorts` prefers a claim with a proof.
 - *No participant hangs.* No half is longer than `HALF_BITS`. Fast DDS before 2.14.6, 3.2.4, 3.3.1
-  and 3.4.2 counts up to the number of a writer one by one, under a lock (StatefulReader.cpp,
+  and 3.4.2 counts up to the number of a writer in steps of 1, under a lock (StatefulReader.cpp,
   NotifyChanges). Up to 2^24 takes some hundredths of a second, up to 2^32 ten seconds, and up to
-  2^48 days. Cyclone DDS does not count: a heartbeat makes one gap there (ddsi_receive.c,
+  2^48 days. Cyclone DDS does not count: a heartbeat makes a single gap there (ddsi_receive.c,
   handle_Heartbeat).
 """
 
@@ -71,21 +73,22 @@ from rosproxy.ros2.protocol.rtps import HEADER, NO_VENDOR, PREFIX
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 COUNTS_EACH_SECOND = 4
+"""Heartbeat counts per second of Unix time (`PortStore._told`)."""
 LEASE_DURATION_S = 24 * 3600.0
-"""Seconds for which participants remember the port store without hearing it."""
+"""Seconds for which participants remember the port store without an announcement."""
 WRITERS = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
-"""The writers of a participant that keeps a number: for its lower half, and for its upper half."""
+"""The writers of the port store: for the lower half of a number, and for the upper half."""
 HALF_BITS = 24
-"""Bits of each half. Few: see Fast DDS above."""
+"""Bits of each half. More bits would block Fast DDS (see above)."""
 _WIDTHS = (7, 10, 12, 16)
-"""Bits that a port may take, by how long the range is: 6, 4, 4 or 2 ports are kept."""
+"""Bits of a port, by the length of the range. A number then has 6, 4, 4 or 2 ports."""
 _HASH_BITS = 20
-"""Bits of the keyed hash in each half of a proof; above these stands the number of ports."""
+"""Bits of the keyed hash in each half of a proof. The number of ports is above these bits."""
 _HALF_MASK = (1 << HALF_BITS) - 1
 _HASH_MASK = (1 << _HASH_BITS) - 1
 _KEY_ROUNDS = 100_000
-"""Rounds in which the key is made, some 40 ms. A participant can try secrets by its own proof: this
-makes each try slow."""
+"""Rounds of the key derivation, which take some 40 ms. A participant can test secrets against its
+own proof, and the rounds make each test slow."""
 
 
 _Writer = tuple[bytes, int]
@@ -93,24 +96,24 @@ _Writer = tuple[bytes, int]
 
 
 def port_store_key(secret: str | None) -> bytes:
-    """Return the key of the proofs; empty without a secret. It takes some 40 ms."""
+    """Return the key of the proofs; empty without a secret. Takes some 40 ms."""
     if not secret:
         return b""
     return pbkdf2_hmac("sha256", secret.encode(), b"rosproxy: ports of participants", _KEY_ROUNDS)
 
 
 def halves(number: int, bits: int) -> tuple[int, int]:
-    """Return the numbers of both writers for a number, whose lower half has so many bits."""
+    """Return the numbers for both writers. ``bits`` is the length of the lower half."""
     upper, lower = divmod(number - 1, 1 << bits)
     return lower + 1, upper + 1
 
 
 @dataclass(slots=True)
 class PortStore:
-    """Keeps ports of a range in participants; ``prefix`` is its GUID prefix.
+    """Lets participants keep ports of a range; ``prefix`` is the GUID prefix of the port store.
 
-    ``key`` makes the proofs; without a key there are none. ``unix_offset`` is Unix time less the
-    time that the methods are given, in seconds.
+    ``key`` makes the proofs; without a key there are no proofs. ``unix_offset`` is Unix time minus
+    the time ``now`` of the methods, in seconds.
     """
 
     prefix: bytes
@@ -118,14 +121,14 @@ class PortStore:
     key: bytes = field(default=b"", repr=False)
     unix_offset: float = 0.0
     _answers: dict[bytes, dict[_Writer, int]] = field(default_factory=dict)
-    """What each participant has answered last, by its GUID prefix and by writer."""
+    """The last answers of each participant, by GUID prefix and by writer."""
     _counts: dict[bytes, int] = field(default_factory=dict)
 
     @classmethod
     def of(
         cls, host: str, ports: PortRange, domain: int, unix_offset: float, key: bytes = b""
     ) -> "PortStore":
-        """Return the port store of a host, a range and a domain; any process gets the same."""
+        """Return the port store of a host, a range and a domain, the same in each process."""
         identity = f"{host} {ports.first} {_width(ports)} {domain}"
         digest = blake2b(identity.encode(), digest_size=PREFIX - 2).digest()
         # A GUID prefix begins with the vendor's id (DDSI 2.2; so in Cyclone DDS, ddsi_init.c).
@@ -144,13 +147,19 @@ class PortStore:
         return self._answers.keys()
 
     def questions(self, prefix: bytes, reached_at: HostPort, now: float) -> list[bytes]:
-        """What asks a participant for its ports; ``reached_at`` is where it answers."""
+        """The datagrams that ask a participant for its ports.
+
+        ``reached_at`` is where the participant reaches the port store.
+        """
         return self._told(prefix, dict.fromkeys(self._writers, 1), reached_at, now)
 
     def reminders(
         self, prefix: bytes, ports: Sequence[int], reached_at: HostPort, now: float
     ) -> list[bytes]:
-        """What makes a participant keep its ports; nothing if it does already."""
+        """The datagrams with which a participant keeps its ports; empty if nothing is missing.
+
+        ``reached_at`` is where the participant reaches the port store.
+        """
         if self.keeps(prefix, ports):
             return []
         wanted = self.numbers(prefix, ports)
@@ -160,23 +169,23 @@ class PortStore:
         }
         answers = self._answers.get(prefix, {})
         if any(is_missing[w[0]] and n < answers.get(w, 1) for w, n in wanted.items()):
-            # A reader heeds no smaller number (DDSI-RTPS 2.5, 8.4.12.1): it has to forget the
-            # port store first, and is told the number the next time.
+            # A reader ignores smaller numbers (DDSI-RTPS 2.5, 8.4.12.1). So the participant has to
+            # forget the port store first, and gets the number with the next reminders.
             return self.dispose_messages(prefix)
         return self._told(prefix, wanted, reached_at, now)
 
     def dispose_messages(self, prefix: bytes) -> list[bytes]:
-        """What makes a participant forget the port store, with what it keeps."""
+        """The datagrams with which a participant forgets the port store and the ports."""
         self.forget(prefix)
         return [dispose_message(own) for own in self._own_prefixes]
 
     def keeps(self, prefix: bytes, ports: Sequence[int]) -> bool:
-        """Whether a participant keeps all these ports, as many of them as fit."""
+        """Whether a participant keeps all these ports, or as many as fit into a number."""
         is_proven = not self.key or not ports or self._is_proven(prefix, ports)
         return prefix in self._answers and is_proven and self._has_kept(prefix, ports)
 
     def take(self, prefix: bytes, datagram: bytes) -> bool:
-        """Note what a participant answers; whether it is an answer. Raises RtpsError."""
+        """Note the answers of a participant. Return whether there are any. Raises RtpsError."""
         is_answer = False
         for own, writer in self._writers:
             for number in acknowledged(datagram, own, writer):
@@ -193,7 +202,7 @@ class PortStore:
         return list(self._ports(self._answer(prefix, self.prefix, self.port_bits)))
 
     def proven_count(self, prefix: bytes) -> int:
-        """How many of these ports a participant has proved that it had."""
+        """How many of `former_ports` a participant has proved."""
         ports = self.former_ports(prefix)
         proof = self._answer(prefix, self.proof_prefix, HALF_BITS)
         count = (proof - 1 & _HALF_MASK) >> _HASH_BITS
@@ -202,28 +211,28 @@ class PortStore:
         return count if proof == self.proof(prefix, ports[:count]) else 0
 
     def forget(self, prefix: bytes) -> None:
-        """Forget a participant that has gone."""
+        """Forget the answers of a participant."""
         self._answers.pop(prefix, None)
         self._counts.pop(prefix, None)
 
     def numbers(self, prefix: bytes, ports: Sequence[int]) -> dict[_Writer, int]:
-        """The number of each writer that holds, or proves, the ports of a participant."""
+        """The numbers of the port store and the port proof for a participant's ports, by writer."""
         numbers = [*halves(self.number(ports), self.port_bits)]
         if self.key:
             numbers += halves(self.proof(prefix, ports), HALF_BITS)
         return dict(zip(self._writers, numbers, strict=True))
 
     def number(self, ports: Sequence[int]) -> int:
-        """The number that holds these ports, as many of them as fit."""
+        """The number that holds these ports, or as many as fit."""
         number = 0
         width = _width(self.ports)
         for index, port in enumerate(ports[: _most(self.ports)]):
-            # The first port is 1: zero means that no port follows (`_ports`).
+            # The first port of the range is 1, because 0 means that no port follows (`_ports`).
             number |= (port - self.ports.first + 1) << index * width
         return number + 1
 
     def proof(self, prefix: bytes, ports: Sequence[int]) -> int:
-        """The number that proves the ports of a participant; 1 for none, and without a key."""
+        """The number that proves the ports of a participant; 1 without ports or without a key."""
         count = min(len(ports), _most(self.ports))
         if not self.key or not count:
             return 1
@@ -232,7 +241,7 @@ class PortStore:
         digest = int.from_bytes(blake2b(content, key=self.key, digest_size=8).digest(), "big")
         lower = digest & _HASH_MASK
         upper = digest >> _HASH_BITS & _HASH_MASK
-        # The number of ports in both halves: so both grow with each port.
+        # Both halves have the number of ports, so that both grow with each port.
         return ((count << _HASH_BITS | upper) << HALF_BITS | count << _HASH_BITS | lower) + 1
 
     @property
@@ -245,27 +254,31 @@ class PortStore:
 
     @property
     def port_bits(self) -> int:
-        """Bits of the lower half of a number that holds ports: no port lies in both halves."""
+        """Bits of the lower half of a number that holds ports. Each port lies in one half."""
         return _most(self.ports) // 2 * _width(self.ports)
 
     def _answer(self, prefix: bytes, own: bytes, bits: int) -> int:
-        """The number that a participant has answered last, made of its halves."""
+        """The last number of a participant for the port store or the port proof.
+
+        ``own`` is the GUID prefix of port store or port proof, and ``bits`` the length of the lower
+        half.
+        """
         answers = self._answers.get(prefix, {})
         lower, upper = (answers.get((own, writer), 1) for writer in WRITERS)
-        # Of a former version the lower half may have all the ports, in more bits.
+        # In the answer to a former version, the lower half may have all ports, in more bits.
         return lower + (upper - 1 << bits)
 
     def _has_kept(self, prefix: bytes, ports: Sequence[int]) -> bool:
-        """Whether the number of a participant holds these ports, as many of them as fit."""
+        """Whether the number of a participant holds these ports, or as many as fit."""
         fitting = list(ports[: _most(self.ports)])
         return self.former_ports(prefix)[: len(fitting)] == fitting
 
     def _is_proven(self, prefix: bytes, ports: Sequence[int]) -> bool:
-        """Whether a participant has answered the proof of these ports, or of more."""
+        """Whether a participant has proved these ports, or more."""
         return self.proven_count(prefix) >= min(len(ports), _most(self.ports))
 
     def _ports(self, number: int) -> Iterator[int]:
-        """The ports that a number holds; none if it can't be one of `number`."""
+        """Yield the ports that a number holds, up to the first that is not in the range."""
         bits = number - 1
         width = _width(self.ports)
         while bits > 0:
@@ -278,10 +291,10 @@ class PortStore:
     def _told(
         self, prefix: bytes, numbers: Mapping[_Writer, int], reached_at: HostPort, now: float
     ) -> list[bytes]:
-        """What tells a participant where the samples of the proxy's own participants begin.
+        """The datagrams that give a participant the numbers of the writers.
 
-        A participant heeds only heartbeats with a greater count than the last, which another
-        process may have sent. So the count follows from the time.
+        A reader ignores a heartbeat unless the count is greater than that of the last heartbeat,
+        which another process may have sent. So the count follows from the time.
         """
         time_count = int((self.unix_offset + now) * COUNTS_EACH_SECOND)
         count = max(self._counts.get(prefix, 0) + 1, time_count)
@@ -303,5 +316,5 @@ def _width(ports: PortRange) -> int:
 
 
 def _most(ports: PortRange) -> int:
-    """How many ports of a range are kept of a participant."""
+    """How many ports of a range a number can hold."""
     return 2 * (HALF_BITS // _width(ports))
