@@ -1,1 +1,1 @@
-"""Sockets: datagrams in, and out."""
+"""The sockets for ROS 2, and the order in which discovery is read."""

@@ -1,8 +1,8 @@
-"""Reads the discovery that has come in, a little in each round of the event loop.
+"""Reads received discovery in small parts, one part in each round of the event loop.
 
-User data and the admin endpoint come first: sockets are read at once, and what is discovery waits
-(`DiscoveryQueue`), unless no other discovery waits and the round has bytes left. Between two rounds
-the event loop serves whatever else is ready.
+User data and the admin endpoint come first. The sockets are read at once, and discovery waits in a
+`DiscoveryQueue`. If no other discovery waits and the round has bytes left, discovery does not wait
+either. Between two rounds the event loop serves all that is ready.
 """
 
 import asyncio
@@ -13,42 +13,44 @@ from rosproxy.ros2.sources.fair_queue import OVERHEAD, DiscoveryQueue
 from rosproxy.ros2.sources.rates import Standing
 
 ROUND = 8 * 1024
-"""Bytes that are read and sent in a round. The longest datagram has a round of its own, of 5 ms."""
+"""Bytes that a round reads and sends. A datagram of the greatest length takes a round of 5 ms."""
 
 LONGEST_ROUND = 64 * 1024
+"""Bytes of the longest round."""
 PER_RECEIVED = 512
-"""Bytes of a round for each datagram that has come since the last one, up to `LONGEST_ROUND`. To
-read so many takes about as long as to receive a datagram. With rounds of one length, a crowd of
-sockets leaves no time to read what they receive (receive livelock; Mogul, Ramakrishnan: TOCS 1997).
-"""
+"""Bytes of a round for each datagram that has come since the last round, up to `LONGEST_ROUND`.
+Reading these bytes takes about as long as receiving a datagram. With rounds of constant length,
+many sockets would leave no time to read what they receive (receive livelock; Mogul, Ramakrishnan:
+TOCS 1997)."""
 
 Read = Callable[[], Sequence[Outgoing]]
-"""Reads a datagram, sends what follows from it, and returns that."""
+"""Reads a datagram, sends the datagrams that follow from it, and returns these."""
 
 
 class DiscoveryScheduler:
-    """Reads datagrams in a fair order, until it is closed. Needs a running event loop."""
+    """Reads datagrams in a fair order, until `close`. Needs a running event loop."""
 
     def __init__(self) -> None:
         self._queue = DiscoveryQueue[Read]()
         self._loop = asyncio.get_running_loop()
         self._round: asyncio.Handle | None = None
         self._spent = 0
-        """Bytes that were read and sent in this round."""
+        """Bytes that this round has read and sent."""
         self._received = 0
-        """Datagrams that have come since this round."""
+        """Datagrams that have come since the start of this round."""
 
     @property
     def is_behind(self) -> bool:
-        """Whether a datagram that comes now has to wait."""
+        """Whether a new datagram has to wait."""
         return bool(self._queue) or self._spent >= ROUND
 
     def read(
         self, source: str, standing: Standing, size: int, read: Read, key: Hashable = None
     ) -> bool:
-        """Read a datagram of so many bytes now if none waits, or when the turn of its source comes.
+        """Read a datagram now if none waits, or else when the turn of the source comes.
 
-        Return False if the datagram is lost. By its ``key`` it may be replaced while it waits.
+        ``size`` is the length in bytes. While a datagram with a ``key`` waits, `replace` may
+        replace it. Return False if the queue has no room for the datagram.
         """
         if self.is_behind:
             return self.put(source, standing, size, read, key)
@@ -59,25 +61,25 @@ class DiscoveryScheduler:
     def put(
         self, source: str, standing: Standing, size: int, read: Read, key: Hashable = None
     ) -> bool:
-        """Have a datagram of so many bytes read when the turn of its source comes; see `read`."""
+        """Let a datagram wait for the turn of the source; see `read`."""
         self._received += 1
         has_room = self._queue.put(source, standing, read, size, key)
         self._schedule()
         return has_room
 
     def replace(self, key: Hashable, read: Read) -> bool:
-        """Read another datagram instead of the one that waits with a key; False if none does."""
+        """Replace the waiting datagram with a key. Return False if there is none."""
         self._received += 1
         return self._queue.replace(key, read)
 
     def close(self) -> None:
-        """Read nothing more."""
+        """Stop reading, and drop the datagrams that wait."""
         if self._round:
             self._round.cancel()
         self._queue = DiscoveryQueue()
 
     def _schedule(self) -> None:
-        """Have another round begin, unless one is to begin already."""
+        """Schedule another round, unless a round is scheduled."""
         if self._round is None:
             self._round = self._loop.call_soon(self._begin_round)
 

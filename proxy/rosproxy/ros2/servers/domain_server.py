@@ -1,15 +1,16 @@
-"""The sockets of one domain: what they receive goes to `Domain`, what that returns is sent.
+"""The sockets of a domain: received datagrams go to `Domain`, and its datagrams are sent.
 
-User data passes at once. Discovery, which takes long to read, waits for its turn
+User data passes at once. Discovery takes long to read, and waits for its turn
 (`DiscoveryScheduler`).
 
-    the groups       at the domain's multicast port, on every inside network
-    well-known port  where those inside announce themselves that know the proxy as a peer
-    the range        all its ports, from the start: what comes to a port without a mapping tells
-                     which participant had the port
-    stand-ins        for the locators of participants outside, opened when they are first heard
+    the groups       at the domain's multicast port, on all inside networks
+    well-known port  participants inside with the proxy as a peer announce themselves there
+    the range        all ports, from the start: a datagram at a port without a mapping may name the
+                     participant that had the port
+    stand-ins        for the locators of participants outside
 
-Everything is sent from one socket: RTPS answers to locators, not to where a datagram came from.
+One socket of each family sends all datagrams: participants of RTPS answer to locators, not to the
+source of a datagram.
 """
 
 import asyncio
@@ -53,25 +54,27 @@ from rosproxy.ros2.sources.selected import SelectedAddresses
 log = logging.getLogger(__name__)
 
 EXPIRY_INTERVAL = 0.5
+"""Seconds between calls of `DomainServer.expire`."""
 ADMISSION_TIMEOUT = 5.0
-"""Seconds after which a participant is queued again that has waited and was not let in."""
+"""Seconds after which a participant that has waited is queued again, if it is not served yet."""
 PER_TURN = 16
-"""Datagrams that one socket passes on before the others have their turn."""
+"""Datagrams that a socket passes on before the other sockets have their turn."""
 QUEUED_FOR_PASSED = 8
-"""Datagrams that can be received to be read later, in the time in which one is passed on. What the
-kernel drops meanwhile is not shared fairly by source."""
+"""Datagrams that a socket may queue in place of a datagram that passes. Queueing is that much
+faster. Otherwise the kernel would drop datagrams, without fairness to the sources."""
 
 Take = Callable[[bytes, str, float], list[Outgoing]]
-"""Takes a datagram, the address it came from and the time; gives what is to be sent."""
+"""Handles a datagram with its source and the time, and returns the datagrams to send."""
 MustRead = Callable[[bytes, str], bool]
-"""Whether a datagram from an address is discovery, which has to be read."""
+"""Whether a datagram from a source is discovery that has to wait for its turn."""
 
 
 class DomainServer:
-    """Serves one domain. ``now`` is the clock; ``is_inside`` tells an address's side.
+    """Serves a domain.
 
-    ``changed`` is called when a mapping was given or has ended.
-    For ``awaited`` seconds no participant is let in unless an operator has selected addresses.
+    ``now`` is the clock in seconds, and ``is_inside`` tells the side of an address. ``changed`` is
+    called after each change of the port mappings. In the first ``awaited`` seconds no participant
+    is served, unless an operator has selected addresses.
     """
 
     def __init__(
@@ -89,9 +92,8 @@ class DomainServer:
         self._changed = changed
         self._told_changes = 0
         pool = PortPool(settings.ports.listen)
-        # A new prefix for each process: participants announce themselves at once only to a
-        # discovery participant that they do not know. They send it what they had told the former
-        # one.
+        # A new prefix for each process: participants announce themselves at once only to an
+        # unknown discovery participant, and repeat all announcements for it.
         self.domain = Domain(settings, pool, os.urandom(PREFIX), os.urandom(32), now(), time.time())
         self._selected = SelectedAddresses(now() + awaited)
         self._loop = asyncio.get_running_loop()
@@ -104,15 +106,15 @@ class DomainServer:
         self._scheduler = DiscoveryScheduler()
         self._next_part: asyncio.Handle | None = None
         self._admitting: dict[bytes, float] = {}
-        """Participants that have waited, and since when they wait for their turn."""
+        """Participants whose wait for former ports is over, and since when each is queued."""
         self._out = {f: _sending_socket(f) for f in (socket.AF_INET, socket.AF_INET6)}
         self.lost = 0
-        """Datagrams that the kernel did not take."""
+        """Datagrams that the kernel refused to send."""
 
     def start(self) -> list[int]:
-        """Open all sockets but the stand-ins'; the ports of the range that others hold.
+        """Open all sockets except stand-ins. Return the ports of the range that are not available.
 
-        Raises OSError if the group's port or the well-known one is taken.
+        Raises OSError if the multicast port or the well-known port is not available.
         """
         settings = self.domain.settings
         domain = self.domain
@@ -139,15 +141,19 @@ class DomainServer:
         return taken_ports
 
     async def hears(self, secret: bytes, trial: Callable[[asyncio.Event], Awaitable[str]]) -> str:
-        """What a trial finds out; its event is set when a secret comes in at the discovery port."""
+        """Return the outcome of a trial of the discovery port.
+
+        The event that ``trial`` gets is set when ``secret`` arrives at the discovery port.
+        """
         self._secret = secret
         self._heard = asyncio.Event()
         return await trial(self._heard)
 
     def join(self, addresses: Iterable[str]) -> None:
-        """Hear the group on the inside networks where the proxy has these addresses, and no others.
+        """Join the groups on the inside networks of these addresses, and leave all others.
 
-        On a network that it has left and joined again it has to join the group again, too.
+        The addresses are those of the proxy. If the proxy leaves a network and returns, it has to
+        join again. The discovery participant announces itself on each new network.
         """
         for address in self._groups.join(addresses):
             self._announce_on(address)
@@ -157,50 +163,56 @@ class DomainServer:
         self.domain.settings.gateways = gateways
 
     def ask_outside(self, peers: tuple[HostPort, ...]) -> None:
-        """Use these peers from now on; those that are new are asked to announce themselves."""
+        """Replace the peers. After a change, announce the discovery participant outside."""
         if peers != self.domain.settings.peers:
             self.domain.settings.peers = peers
             self._send(self.domain.proxy_participants.announced_outside())
 
     def move_to(self, hosts: tuple[str, ...]) -> None:
-        """Have outside reach the range at these addresses of the host from now on."""
+        """Announce the range at these addresses of the advertised host from now on."""
         self._send_and_go_on(self.domain.move_to(hosts, self._now()))
         self._send(self.domain.proxy_participants.announced_outside())
 
     def apply_policy(self) -> None:
-        """Have participants meet anew of which the policy says something else than before."""
+        """Start the rediscovery of the participants for which a verdict has changed."""
         self._send_and_go_on(self.domain.apply_policy(self._now()))
 
     def select(self, addresses: Iterable[str]) -> None:
-        """Let in participants at these addresses alone, from now on."""
+        """Serve only participants at these addresses from now on."""
         before = self._selected.selected or frozenset()
         self._selected.select(addresses)
         self._release()
         self._announce_to((self._selected.selected or frozenset()) - before)
 
     def note_former(self, former: Mapping[bytes, Sequence[int]]) -> None:
-        """Take in which ports participants had at a proxy with another address."""
+        """Note the ports that participants had at a proxy with another address."""
         self.domain.former_ports.note_recorded(former, self.domain.inside.by_prefix)
 
     def end(self, addresses: Collection[str]) -> int:
-        """End the participants at addresses that are gone. Return how many there were."""
+        """End the participants at addresses that are gone. Return the number of participants."""
         before = len(self.domain.inside.by_prefix)
         self._send(self.domain.gone(addresses))
         return before - len(self.domain.inside.by_prefix)
 
     def retire(self) -> int:
-        """End all participants inside, as no proxy takes over; returns how many there were."""
+        """End all participants inside, because no proxy takes over.
+
+        Return the number of participants.
+        """
         count = len(self.domain.inside.by_prefix)
         self._send_and_go_on(self.domain.retire(self._now()))
         return count
 
     async def finish(self) -> None:
-        """Wait until all have been told what follows from a change."""
+        """Wait until all datagrams that follow from a change are sent."""
         while self.domain.is_busy:  # noqa: ASYNC110 - each round of the event loop does a part
             await asyncio.sleep(0)
 
     async def expire(self) -> None:
-        """Let in participants that have waited, and forget those that have gone."""
+        """Serve participants that have waited, and end participants that have gone.
+
+        Continue rediscoveries, too.
+        """
         self._release()
         self._admit_waiting()
         self._send_and_go_on(self.domain.settle(self._now()))
@@ -209,7 +221,7 @@ class DomainServer:
         self._tell_changes()
 
     async def announce(self) -> None:
-        """Announce the discovery participant to all, and have participants keep their ports."""
+        """Announce the discovery participant to all, and send reminders of ports."""
         for address in self._groups.joined:
             self._announce_on(address)
         settings = self.domain.settings
@@ -234,7 +246,8 @@ class DomainServer:
         self._scheduler.close()
         if self._next_part:
             self._next_part.cancel()
-        # Participants must not forget the port store, by which they keep their ports.
+        # Only for the discovery participant: the port store has to stay known, because
+        # participants keep their ports with it.
         dispose_message = self.domain.proxy_participants.discovery_participant.dispose_message()
         for address in self._groups.joined:
             self._multicast(address, dispose_message)
@@ -246,16 +259,16 @@ class DomainServer:
             sock.close()
 
     def _tell_relay(self) -> None:
-        """Tell the LAN relay which addresses have proved to receive."""
+        """Send the proven addresses outside to the LAN relay."""
         proven = self.domain.proofs.addresses
         outside = [address for address in proven if not self._is_inside(address)]
         for listed in address_lists(outside):
             self._send(self.domain.settings.to_lan(listed))
 
     def _admit_waiting(self) -> None:
-        """Have participants let in when their turn comes: after a start they are many at once."""
+        """Queue the participants that may get ports now. After a start there are many at once."""
         now = self._now()
-        # The longest queue loses its last items without a word (`FairQueue`).
+        # The longest queue loses its last items without notice (`FairQueue`).
         admitting = {p: t for p, t in self._admitting.items() if now - t < ADMISSION_TIMEOUT}
         self._admitting = admitting
         former_ports = self.domain.former_ports
@@ -276,15 +289,16 @@ class DomainServer:
         return outgoing
 
     def _release(self) -> None:
-        """Take in what participants have announced that are let in now."""
+        """Handle the held announcements of addresses that are admitted now."""
         now = self._now()
         for source, datagram in self._selected.released(now):
             self._open_and_send(self.domain.heard_inside(datagram, source, now))
 
     def _announce_to(self, addresses: Iterable[str]) -> None:
-        """Announce the discovery participant to addresses that may not get multicast.
+        """Announce the discovery participant by unicast to addresses that may not get multicast.
 
-        Docker's internal networks do not, where bridged packets are filtered (br_netfilter).
+        Docker's internal networks pass no multicast if the host filters bridged packets
+        (br_netfilter).
         """
         settings = self.domain.settings
         counts = self.domain.inside.count_by_address
@@ -293,8 +307,8 @@ class DomainServer:
                 settings.proxy_address_for(address)
             )
             count = counts.get(address, 0)
-            # Participants of a machine take these ports one after the other (9.6.2.3): those that
-            # have not been heard yet are at the next ones.
+            # Participants of a machine bind the well-known ports one after the other (9.6.2.3). So
+            # unknown participants are at the next ports.
             targets = settings.well_known(
                 address, count + NEXT_PORTS if count else PARTICIPANTS_TRIED
             )
@@ -304,9 +318,9 @@ class DomainServer:
         self._multicast(near, self.domain.proxy_participants.announced_inside(near))
 
     def _multicast(self, near: str, datagram: bytes) -> None:
-        """Send to the group on the network where the proxy has an address, if it still has it."""
+        """Send a datagram to the groups on the network of an address of the proxy."""
         try:
-            # The interface is a setting of the socket, and one socket sends to all networks.
+            # The network is a setting of the socket, and the same socket sends to all networks.
             send_through(self._out[family_of(near)], near, loop=False)
         except OSError as error:
             log.debug("can't send multicast from %s, its network may have gone: %s", near, error)
@@ -342,14 +356,15 @@ class DomainServer:
         if not self._is_let_in(datagram, source, now):
             return []
         sent = self.domain.heard_inside(datagram, source, now)
-        # Only now: a participant that is new was not in the table before.
+        # After `heard_inside`, which adds new participants to the table.
         self.domain.inside.note_in_group(datagram, source)
         return sent
 
     def _is_let_in(self, datagram: bytes, source: str, now: float) -> bool:
-        """Whether discovery from inside is read now.
+        """Whether the proxy handles discovery from an inside address now.
 
-        Announcements of an address that is not selected wait, as the operator may select it soon.
+        If the address is not selected, hold its announcements, because the operator may select it
+        soon.
         """
         if not self._is_inside(source):
             return False
@@ -370,9 +385,10 @@ class DomainServer:
         return self.domain.heard_outside(datagram, source, now)
 
     def _take_in(self, sock: socket.socket, take: Take, must_read: MustRead) -> None:
-        """Receive what waits at a socket: discovery is read later, all else passes at once.
+        """Receive the datagrams at a socket: queue discovery, and pass all others at once.
 
-        At most `PER_TURN` datagrams, or one of the longest, before others have their turn.
+        A turn ends after `PER_TURN` datagrams, or after half the bytes of the longest datagram.
+        Then other sockets have their turn. A queued datagram counts less (`QUEUED_FOR_PASSED`).
         """
         spent_bytes = spent = 0.0
         with contextlib.suppress(BlockingIOError):
@@ -396,23 +412,23 @@ class DomainServer:
                 spent_bytes += weight * len(datagram)
 
     def _replaceable_as(self, take: Take, datagram: bytes, source: str) -> Hashable:
-        """The key of a datagram in the queue of discovery, if a later one may take its place.
+        """The key of a datagram in the queue, if a later datagram may replace it; else None.
 
         Fast DDS repeats a heartbeat 25 times a second until the reader has answered. If the proxy
-        is slow, heartbeats would leave no room for the samples that they are about. So only the
-        last heartbeat of a stream waits.
+        is slow, repeated heartbeats would leave no room for the announced samples. So only the last
+        heartbeat of a stream waits.
         """
         stream = heartbeat_stream(datagram) if self._scheduler.is_behind else None
         return (take, source, stream) if stream else None
 
     def _replaces(self, key: Hashable, take: Take, datagram: bytes, source: str) -> bool:
-        """Read a datagram instead of the one that waits with its key; False if none does."""
+        """Replace the waiting datagram with a key by a later one. Return False if there is none."""
         if key is None:
             return False
         return self._scheduler.replace(key, partial(self._carry_out, take, datagram, source))
 
     def _read_in_turn(self, take: Take, datagram: bytes, source: str, key: Hashable) -> None:
-        """Have discovery read, at the latest when the turn of its source comes."""
+        """Queue a datagram of discovery, or handle it at once if none waits."""
         heard_at = self.domain.source_of(datagram, source)
         standing = self.domain.standing(heard_at)
         read = partial(self._carry_out, take, datagram, source)
@@ -421,23 +437,23 @@ class DomainServer:
             self.domain.refused("rate", heard_at, text)
 
     def _carry_out(self, take: Take, datagram: bytes, source: str) -> list[Outgoing]:
-        """Send what follows from a datagram, and return that."""
+        """Handle a datagram. Send and return the datagrams that follow from it."""
         outgoing = take(datagram, source, self._now())
         self._tell_changes()
         self._open_and_send(outgoing)
         return outgoing
 
     def _open_and_send(self, outgoing: Iterable[Outgoing]) -> None:
-        """Send what may name new stand-ins.
+        """Open new stand-ins, and then send datagrams that may name the new stand-ins.
 
-        They have to be open before. What names one that can't be opened is not sent: inside would
-        believe it for good, and what outside has announced comes again.
+        Datagrams that name a stand-in that can't be opened are not sent, because inside would keep
+        a wrong locator for good. The announcement from outside will come again.
         """
         closed = self._sync_stand_ins()
         self._send(out for out in outgoing if not (closed and self._names_any(closed, out)))
 
     def _send_and_go_on(self, outgoing: Iterable[Outgoing]) -> None:
-        """Send the first part of what follows from a change, and the others in later rounds."""
+        """Send the first datagrams that follow from a change, and the others in later rounds."""
         self._open_and_send(outgoing)
         if self.domain.is_busy and self._next_part is None:
             self._next_part = self._loop.call_soon(self._go_on)
@@ -463,14 +479,14 @@ class DomainServer:
                 log.debug("can't send a datagram to %s: %s", out.target, error)
 
     def _tell_changes(self) -> None:
-        """Tell that mappings have changed, if they have."""
+        """Call ``changed`` if the port mappings have changed."""
         changes = self.domain.mappings.changes
         if changes != self._told_changes:
             self._told_changes = changes
             self._changed()
 
     def _sync_stand_ins(self) -> list[int]:
-        """Open and close the ports for participants outside; those that can't be opened."""
+        """Open and close the sockets of stand-ins. Return the ports that can't be opened."""
         stand_ins = self.domain.stand_ins
         closed = list[int]()
         if stand_ins.changes == self._synced_changes:
@@ -495,7 +511,7 @@ class DomainServer:
 
 
 def _families(bind: str) -> list[socket.AddressFamily]:
-    """The families of what comes to sockets that are bound to an address."""
+    """The families of the datagrams that arrive at a socket bound to an address."""
     return [socket.AF_INET, socket.AF_INET6] if bind == "::" else [family_of(bind)]
 
 

@@ -1,12 +1,13 @@
-"""Multicast groups: sockets that hear them, and that send to them through some network.
+"""Multicast groups: sockets that receive from the groups, and that send to the groups on a network.
 
-Participants announce themselves to one group with IPv4, and to one of two with IPv6, which has no
-standard there: Fast DDS has one of global scope (UDPv6Transport.cpp), Cyclone DDS one of link scope
-(ddsi_udp.c). A membership is by an own address with IPv4, by the interface's index with IPv6, and
-a group of link scope has a socket for each link.
+With IPv4, participants announce themselves to one group. With IPv6 there is no standard: Fast DDS
+has a group of global scope (UDPv6Transport.cpp), Cyclone DDS a group of link scope (ddsi_udp.c). A
+membership names the network by an address of this machine (IPv4), or by the index of the interface
+(IPv6). A group of link scope has a separate socket for each link.
 
-A membership stays with its socket when the network goes, and of those of IPv4 a socket has 20
-(igmp_max_memberships): so they are given up, and where one socket has no room the next one has.
+A membership stays with the socket when the network goes, and a socket has at most 20 memberships of
+IPv4 (igmp_max_memberships). So memberships of former networks are ended. If a socket has no room,
+the next socket gets the membership.
 """
 
 import contextlib
@@ -22,35 +23,38 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.net.interfaces import interface_index
 
 GROUP = "239.255.0.1"
+"""The IPv4 group for announcements (DDSI-RTPS 2.5, 9.6.2.4.1)."""
 GROUP_FAST_DDS6 = "ff1e::ffff:efff:1"
+"""The IPv6 group for announcements of Fast DDS."""
 GROUP_CYCLONE6 = "ff02::ffff:efff:1"
-"""Where participants announce themselves (DDSI-RTPS 2.5, 9.6.2.4.1)."""
+"""The IPv6 group for announcements of Cyclone DDS."""
 _SHARED = {socket.AF_INET: (GROUP,), socket.AF_INET6: (GROUP_FAST_DDS6,)}
 _OF_LINK = {socket.AF_INET: (), socket.AF_INET6: (GROUP_CYCLONE6,)}
 _IP_MULTICAST_ALL = 49
-"""Of linux/in.h: whether a socket hears the group on networks that only other sockets have joined.
-With IPv6 it does always: the kernel compares the address alone (inet6_mc_check)."""
+"""An option of linux/in.h: whether a socket receives from networks on which only other sockets have
+joined the group. With IPv6 a socket always does: the kernel compares only the address
+(inet6_mc_check)."""
 
 
 def family_of(address: str) -> socket.AddressFamily:
-    """The family of an address's sockets."""
+    """The socket family for an address."""
     return socket.AF_INET6 if ":" in address else socket.AF_INET
 
 
 def groups_of(address: str) -> tuple[str, ...]:
-    """The groups of the network where this machine has an address."""
+    """The groups on the network of an address of this machine."""
     family = family_of(address)
     return _SHARED[family] + _OF_LINK[family]
 
 
 class Membership(NamedTuple):
-    """A socket that hears a group on a network; ``request`` names both to the kernel."""
+    """The membership of a socket in a group on a network; ``request`` names group and network."""
 
     sock: socket.socket
     request: bytes
 
     def end(self) -> None:
-        """Hear it no more. The network may have gone."""
+        """End the membership, also if the network has gone."""
         is_v6 = self.sock.family == socket.AF_INET6
         level = socket.IPPROTO_IPV6 if is_v6 else socket.IPPROTO_IP
         option = socket.IPV6_LEAVE_GROUP if is_v6 else socket.IP_DROP_MEMBERSHIP
@@ -60,14 +64,17 @@ class Membership(NamedTuple):
 
 @dataclass(slots=True)
 class _Network:
-    """What hears the groups on a network: its own sockets, and memberships of shared ones."""
+    """The sockets for groups of link scope on a network, and the memberships of shared sockets."""
 
     sockets: list[socket.socket] = field(default_factory=list)
     memberships: list[Membership] = field(default_factory=list)
 
 
 class GroupSockets:
-    """Sockets that hear the groups of a port. ``begin`` is called with each, ``end`` closes it."""
+    """Sockets that receive from the groups at a port.
+
+    ``begin`` is called with each new socket. ``end`` is called to close a socket.
+    """
 
     def __init__(
         self,
@@ -83,19 +90,23 @@ class GroupSockets:
 
     @property
     def joined(self) -> list[str]:
-        """The addresses on whose networks they are heard."""
+        """The addresses of this machine on whose networks the groups are joined."""
         return list(self._networks)
 
     def open(self, families: Iterable[socket.AddressFamily]) -> None:
-        """Hear the groups whose sockets are shared by networks. Raises OSError."""
+        """Open the sockets for the groups that networks share. Raises OSError."""
         for group in (group for family in families for group in _SHARED[family]):
             self._shared[group] = [self._opened(group)]
 
     def join(self, addresses: Iterable[str]) -> list[str]:
-        """Hear them on the networks of these own addresses alone; the addresses that are new."""
+        """Join the groups on the networks of these addresses of this machine, and leave all others.
+
+        Return the addresses whose networks are new.
+        """
         present = {a for a in addresses if any(g in self._shared for g in groups_of(a))}
         gone = self._networks.keys() - present
-        # Another address of a network that has gone may have had its membership for both.
+        # On a network with two addresses, only one has the membership. If that one has gone, the
+        # other has to join.
         without = {a for a, network in self._networks.items() if gone and not network.memberships}
         for address in gone | without:
             self._leave(address)
@@ -103,7 +114,7 @@ class GroupSockets:
         return [address for address in new if self._join(address)]
 
     def close(self) -> None:
-        """Hear nothing any more."""
+        """Leave all groups and close all sockets."""
         self.join(())
         for socks in self._shared.values():
             for sock in socks:
@@ -111,7 +122,7 @@ class GroupSockets:
         self._shared.clear()
 
     def _join(self, address: str) -> bool:
-        """Hear them on one network, if it is still there."""
+        """Join the groups on a network. Return False if the network has gone."""
         family = family_of(address)
         network = self._networks[address] = _Network()
         try:
@@ -122,13 +133,16 @@ class GroupSockets:
                 if membership := self._join_shared(group, address):
                     network.memberships.append(membership)
         except OSError:
-            # Networks come and go: as it is not in `joined`, the next call tries it again.
+            # Networks come and go. The address is not in `joined`, so the next call tries again.
             self._leave(address)
             return False
         return True
 
     def _join_shared(self, group: str, address: str) -> Membership | None:
-        """Join a group by the first socket that has room for it. Raises OSError."""
+        """Join a group with the first shared socket that has room, or with a new socket.
+
+        None if the group is joined already on this network. Raises OSError.
+        """
         for sock in self._shared[group]:
             try:
                 return join(sock, address)
@@ -158,9 +172,10 @@ class GroupSockets:
 
 
 def group_socket(group: HostPort, link_of: str = "") -> socket.socket:
-    """A non-blocking socket that is bound to a group, and so gets nothing else. Raises OSError.
+    """A non-blocking socket that is bound to a group, and receives nothing else. Raises OSError.
 
-    Others on this machine may have the same. ``link_of`` is an own address on a group's link.
+    Other programs on this machine may bind the same group. For a group of link scope, ``link_of``
+    is an address of this machine on the link.
     """
     sock = socket.socket(family_of(group.host), socket.SOCK_DGRAM)
     try:
@@ -168,9 +183,9 @@ def group_socket(group: HostPort, link_of: str = "") -> socket.socket:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         if sock.family == socket.AF_INET:
-            with contextlib.suppress(OSError):  # else it hears more than it has to
+            with contextlib.suppress(OSError):  # without this option the socket receives too much
                 sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
-        # A group of link scope is another one on each link: the scope id tells which (ipv6(7)).
+        # The scope id selects the link of a group of link scope (ipv6(7)).
         link = (0, interface_index(link_of)) if link_of else ()
         sock.bind((group.host, group.port, *link))
     except OSError:
@@ -180,9 +195,9 @@ def group_socket(group: HostPort, link_of: str = "") -> socket.socket:
 
 
 def send_through(sock: socket.socket, address: str, loop: bool) -> None:
-    """Have what a socket sends to groups leave by the network of an own address. Raises OSError.
+    """Select the network on which a socket sends to groups, by an address of this machine.
 
-    ``loop``: programs on this machine hear it as well.
+    ``loop`` means that programs on this machine receive the datagrams as well. Raises OSError.
     """
     if sock.family == socket.AF_INET6:
         sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, interface_index(address))
@@ -193,9 +208,9 @@ def send_through(sock: socket.socket, address: str, loop: bool) -> None:
 
 
 def join(sock: socket.socket, address: str) -> Membership | None:
-    """Hear the group that a socket is bound to on the network of an own address. Raises OSError.
+    """Join the group that a socket is bound to, on the network of an address of this machine.
 
-    None if the socket does already, by another address of that network.
+    None if the socket has joined already, by another address on this network. Raises OSError.
     """
     packed = socket.inet_pton(sock.family, sock.getsockname()[0].partition("%")[0])
     if sock.family == socket.AF_INET6:
