@@ -1,1 +1,1 @@
-"""The policy over readers and writers: which rule applies, and what it says."""
+"""The policy for readers and writers: the rule that applies, and the verdict."""

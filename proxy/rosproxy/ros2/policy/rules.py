@@ -1,8 +1,8 @@
 """Which rule of the policy applies to a reader or writer of DDS (`rosproxy.access.rules`).
 
-The rules speak of topics and services as seen from inside. In DDS a service has two topics, and
-either end of each is a reader or a writer: so it follows from the topic's name, and from whether
-what is written there goes outwards or inwards.
+The rules name topics and services as seen from inside. A service has two topics in DDS, for
+requests and for replies, and each has readers and writers. So the kind of rule follows from the
+topic's name, and from the direction of its data.
 """
 
 from rosproxy.access.rules import RuleKind
@@ -10,13 +10,13 @@ from rosproxy.ros2.protocol.ros_names import is_of_requests, is_of_service, ros_
 from rosproxy.ros2.registry.participants import EndpointKind
 
 GRAPH_TOPIC = "ros_discovery_info"
-"""The topic on which participants tell their nodes; without it `ros2 node list` is empty."""
+"""The topic on which participants publish their nodes. Without it, `ros2 node list` is empty."""
 
 
 def rule_about(kind: EndpointKind, dds_topic: str, is_inside: bool) -> tuple[RuleKind, str] | None:
-    """The kind of rule that applies to a reader or writer, and the name it is for; None: no rule.
+    """The kind of rule for a reader or writer, and the name to judge; None if no rule applies.
 
-    ``is_inside`` tells the side of its participant.
+    ``is_inside`` tells whether the participant is inside.
     """
     if dds_topic == GRAPH_TOPIC:
         return None

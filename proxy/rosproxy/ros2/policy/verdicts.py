@@ -1,8 +1,7 @@
-"""The policy over discovery: a reader or writer that it denies is not told to the other side.
+"""The policy in discovery: the proxy hides denied readers and writers from the other side.
 
-So the two ends never match, and don't take what is sent to them nevertheless. When the policy
-changes, it is applied by having the participant and those of the other side lose sight of each
-other, and meet again: only for participants inside for which a verdict has changed.
+So a denied reader or writer never matches, and ignores data that is sent to it. When the policy
+changes, the participants inside with a changed verdict rediscover the participants outside.
 """
 
 from collections import Counter
@@ -16,18 +15,21 @@ from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import Announcement
 
 MOST_VERDICTS = 1024
+"""Remembered verdicts of a participant, which has some hundreds. A participant with more is
+rediscovered with each change of the policy."""
 MOST_VERDICTS_PER_ADDRESS = 16_384
+"""Remembered verdicts of all participants at an address."""
 MOST_VERDICTS_IN_ALL = 32_768
-"""Verdicts that are remembered of a participant, at an address, and in all; a participant has some
-hundreds. One that has more meets others anew with each change of the policy."""
+"""Remembered verdicts of all participants."""
 LONGEST_NAME = 256
-"""Characters of a name that is remembered with its verdict; all are of ASCII, as in ROS 2. One wide
-character would make each take four bytes. A topic of ROS 2 has 255 at most."""
+"""Characters of a name whose verdict is remembered. The name must be ASCII, as names of ROS 2 are:
+a
+wide character makes all characters take four bytes. A topic of ROS 2 has at most 255."""
 
 
 @dataclass(slots=True)
 class Verdicts:
-    """Judges topics and services of participants inside, and remembers verdicts within bounds."""
+    """Judges topics and services for participants inside. Remembers the verdicts within bounds."""
 
     judge: Judge
     count_by_address: Counter[str] = field(default_factory=Counter)
@@ -35,14 +37,14 @@ class Verdicts:
     def is_hidden(
         self, inside: InsideParticipant, announcement: Announcement, datagram: bytes, is_own: bool
     ) -> bool:
-        """Whether an announcement is not to be passed on.
+        """Whether the policy hides an announcement.
 
-        ``inside`` is the participant that makes it, if it ``is_own``, else the one that is to get
-        it.
+        ``inside`` is the participant inside: the sender of the announcement if ``is_own`` is set,
+        and the receiver otherwise.
         """
-        # An end names the key of a reader or writer, and no topic to judge it by. What names a
-        # topic others may not take for an end: they read the last status of several, or another
-        # flag.
+        # An end has the key of a reader or writer, and no topic, so no rule applies. If there is a
+        # topic, the policy applies, because a receiver may not consider the announcement an end: a
+        # receiver may read another one of several statuses, or another flag.
         topic = announcement.topic(datagram)
         if announcement.kind is None or (announcement.ended and not topic):
             return False
@@ -50,10 +52,10 @@ class Verdicts:
         return rule is not None and not self._is_allowed(inside, rule)
 
     def review(self, insiders: Iterable[InsideParticipant]) -> Iterator[InsideParticipant | None]:
-        """Judge the verdicts of participants again, one with each step.
+        """Judge the verdicts of participants again, one in each step.
 
-        Yield each participant of which the policy says something else than before, or may; None
-        for each verdict that is the same. One participant may have a thousand verdicts, and each
+        Yield each participant with a changed verdict, or with more verdicts than are remembered.
+        Yield None for each unchanged verdict. A participant may have a thousand verdicts, and each
         may take as many rules.
         """
         for insider in insiders:

@@ -1,1 +1,1 @@
-"""How far the source of a datagram is believed, and how much of the proxy's time it gets."""
+"""The reliability of a datagram's source, and the share of the source in the proxy's time."""

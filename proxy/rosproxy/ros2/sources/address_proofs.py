@@ -1,13 +1,14 @@
-"""Which addresses have proved that a participant there receives what the proxy sends.
+"""Which addresses are proven: a participant there receives the datagrams of the proxy.
 
-The source of a datagram is what its sender wrote there. So an address gets a question that no other
-address hears: the announcement of a participant whose GUID prefix follows from the address and from
-a secret of this process. An answer names that prefix (INFO_DST), so its sender has the question.
-The participant in the question has a writer of SEDP, whose heartbeat each reader answers
-(DDSI-RTPS 2.5, 8.4.9). It is forgotten after `LEASE_DURATION_S`.
+Each sender may forge the source of a datagram. So the proxy sends a question to the address alone:
+the announcement of a participant whose GUID prefix follows from the address and a secret of this
+process. An answer names this prefix (INFO_DST), so the sender of the answer has received the
+question. The participant in the question has a writer of SEDP, and each reader answers a heartbeat
+of this writer (DDSI-RTPS 2.5, 8.4.9). Other participants forget this participant after
+`LEASE_DURATION_S`.
 
-An address that has proved to receive may be forged as any other. So each participant inside answers
-for itself: a question names the participant (INFO_DST), and no other one answers.
+An attacker may forge datagrams from a proven address, too. So each participant inside has to answer
+itself: a question names the participant (INFO_DST), and no other participant answers.
 """
 
 from collections.abc import Iterable
@@ -33,50 +34,53 @@ from rosproxy.ros2.registry.participants import ParticipantTable
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, DiscoveryMessage
 
 LEASE_DURATION_S = 12.0
-"""Seconds for which a participant remembers the one in a question. Cyclone DDS announces itself
-each 8 s and is asked again then."""
+"""Seconds for which a participant remembers the participant in a question. Cyclone DDS announces
+itself each 8 s, and gets another question then if it has not answered."""
 KEPT = 60.0
-"""Seconds for which an address has proved to receive, after its last participant has gone."""
+"""Seconds for which an address stays proven after its last participant has gone."""
 MOST_ADDRESSES = 4096
-"""Addresses that count as proven; of more, the one goes that has had no participant for longest."""
+"""Proven addresses. Beyond this number, the address that has had no participant for longest
+goes."""
 ANSWER_KEPT = 30.0
-"""Seconds for which an answer counts of a participant that has lost its place, or has gone."""
+"""Seconds for which the answer of a participant counts after the participant has gone."""
 MOST_ANSWERED = 128
-"""Participants at an address that have answered; of more, the first one goes."""
+"""Participants at an address whose answers count. Beyond this number, the first one goes."""
 LONGEST_ANSWER = 256
-"""Bytes of a first answer, which is read at any rate; an answer of Fast DDS has 72."""
+"""Bytes of a first answer, which is read without an allowance. An answer of Fast DDS has 72."""
 _INFO_DST = bytes([SubmessageId.INFO_DST])
 _NOT_IN_ANSWERS = (SubmessageId.INFO_SRC, SubmessageId.DATA, SubmessageId.DATA_FRAG)
-"""After an INFO_SRC another participant speaks."""
+"""Submessages that a first answer must not have. After an INFO_SRC, the source is another
+participant."""
 
 
 @dataclass(slots=True)
 class AddressProofs:
-    """The addresses that have proved to receive; ``secret`` is random and of this process."""
+    """The proven addresses; ``secret`` is random, and another one in each process."""
 
     secret: bytes
     _until: dict[str, float] = field(default_factory=dict)
     _answered: dict[str, dict[bytes, float]] = field(default_factory=dict)
-    """Until when the answer of each participant counts, by address and GUID prefix."""
+    """The time until which the answer of each participant counts, by address and GUID prefix."""
     _count: int = 0
 
     def has(self, address: str) -> bool:
-        """Whether an address has proved to receive."""
+        """Whether an address is proven."""
         return address in self._until
 
     def has_answered(self, address: str, prefix: bytes) -> bool:
-        """Whether a participant at an address has answered a question itself."""
+        """Whether a participant at an address has answered a question."""
         return prefix in self._answered.get(address, ())
 
     @property
     def addresses(self) -> list[str]:
-        """The addresses that have proved to receive."""
+        """The proven addresses."""
         return list(self._until)
 
     def question(self, address: str, prefix: bytes, reached_at: Iterable[HostPort]) -> bytes:
-        """The datagram that asks a participant at an address.
+        """The question to a participant at an address.
 
-        ``prefix`` is the GUID prefix of the participant, ``reached_at`` where it answers.
+        ``prefix`` is the GUID prefix of the participant. ``reached_at`` are the locators for the
+        answer.
         """
         own = self._prefix(address)
         self._count += 1
@@ -86,10 +90,10 @@ class AddressProofs:
     def is_answer(self, address: str, datagram: bytes) -> bool:
         """Return whether a datagram is the first answer of a participant, and nothing else.
 
-        A flood of forged sources uses up what may be read of unproven addresses. Answers can't be
-        forged, so the first answer of a participant is taken in nevertheless. Later answers are
-        discovery like any other: a proven address could send them without end. An announcement
-        beside an answer has to wait.
+        A flood of forged sources uses up the common allowance of unproven addresses. An answer
+        can't be forged, so the first answer of a participant needs no allowance. Later answers need
+        an allowance, like all discovery: a proven address could send them without end. An
+        announcement in the same datagram needs an allowance, too.
         """
         answered = self._answered.get(address, {})
         return (
@@ -102,7 +106,7 @@ class AddressProofs:
         )
 
     def note(self, address: str, datagram: bytes, now: float) -> bool:
-        """Take in a datagram; return whether the address proves by it to receive. RtpsError."""
+        """Note an answer. Return whether the datagram is an answer. Raises RtpsError."""
         if not is_destination(datagram, self._prefix(address)):
             return False
         self._renew(address, now)
@@ -143,7 +147,7 @@ class AddressProofs:
                 del self._answered[address]
 
     def _renew(self, address: str, now: float) -> None:
-        """Have an address count as proven for longer; it is the last one that goes."""
+        """Let an address count as proven for `KEPT` seconds from now."""
         self._until.pop(address, None)
         self._until[address] = now + KEPT
 
@@ -153,7 +157,7 @@ class AddressProofs:
 
 
 def is_question_of_proxy(message: DiscoveryMessage) -> bool:
-    """Whether a message is the question of another proxy, as `AddressProofs.question` makes it.
+    """Whether a message is a question of another proxy (`AddressProofs.question`).
 
     Raises RtpsError.
     """
@@ -163,7 +167,7 @@ def is_question_of_proxy(message: DiscoveryMessage) -> bool:
 
 
 def _announces_nothing(datagram: bytes) -> bool:
-    """Whether a message is well-formed, has no sample, and is of one participant alone."""
+    """Whether a message is well-formed, has no samples, and is from a single participant."""
     try:
         return not any(kind in _NOT_IN_ANSWERS for kind, _, _ in submessages(datagram))
     except RtpsError:

@@ -1,8 +1,8 @@
-"""Where a participant outside can't be, whatever a datagram claims.
+"""Addresses at which no participant outside can be, whatever a datagram claims.
 
-The LAN relay passes on the source address of what it hears, and a source address may be forged. The
-proxy opens ports inside that lead to a participant outside: none may lead back inside, to the
-machine of the proxy, or to the proxy's own ports.
+The LAN relay passes on the source addresses of announcements, and source addresses may be forged.
+The proxy opens stand-ins inside that lead to a participant outside. No stand-in may lead back
+inside, to the machine of the proxy, or to the proxy's own ports.
 """
 
 from collections.abc import Container
@@ -32,9 +32,9 @@ def claim_fault(address: str, settings: DomainSettings) -> str | None:
 
 
 def is_proxy_port(locator: HostPort, stand_ins: Container[int], settings: DomainSettings) -> bool:
-    """Return whether a locator is a port of the proxy, as outside or the proxy's machine sees it.
+    """Return whether a locator is a port of the proxy, seen from outside or the proxy's machine.
 
-    A stand-in that led there would lead back inside. ``stand_ins`` are the ports that are open.
+    A stand-in for this locator would lead back inside. ``stand_ins`` are the open stand-ins.
     """
     if locator.port in settings.ports.advertise and locator.host in settings.hosts:
         return True

@@ -1,10 +1,10 @@
-"""Discovery that waits to be read, in an order that is fair to its sources.
+"""The queue of discovery, in an order that is fair to the sources.
 
-Reading discovery takes long, and any neighbour may send it. So datagrams wait, and the source goes
-first that has had least of the reading (start-time fair queueing; Goyal, Vin, Cheng: SIGCOMM 1996).
-A forged source costs its sender nothing, and one machine may have thousands of addresses. So the
-reading has four parts: for peers and proven sources inside, for proven sources outside, for other
-sources inside, and for other sources outside.
+Reading discovery takes long, and any machine on the network may send discovery. So datagrams wait,
+and the source that has had least of the reading goes first (start-time fair queueing; Goyal, Vin,
+Cheng: SIGCOMM 1996). Forged sources cost nothing, and a single machine may have thousands of
+addresses. So four groups of sources have a quarter of the reading each: peers and proven sources
+inside, proven sources outside, other sources inside, and other sources outside.
 """
 
 import heapq
@@ -16,25 +16,31 @@ from typing import Generic, TypeVar
 from rosproxy.ros2.sources.rates import Standing
 
 MOST_OF_SOURCE = 256 * 1024
-MOST_OF_ALL = 3 * 1024 * 1024
-"""Bytes of one source that wait, and bytes that wait of one standing.
+"""Bytes of a source that may wait.
 
-Participants repeat discovery that is late. So a longer queue of a source makes an overload worse:
-with 1 MiB, a proxy with 0.3 of a processor read 100 participants of Cyclone DDS in 5 to 8 s instead
-of 3 to 4 s. With 128 KiB, discovery is lost that only comes again after 2 s."""
+Participants repeat discovery that is late. So a longer queue makes an overload worse. With 1 MiB, a
+proxy with 0.3 of a processor read 100 participants of Cyclone DDS in 5 to 8 s instead of 3 to 4 s.
+With 128 KiB, discovery was lost that came again only after 2 s."""
+MOST_OF_ALL = 3 * 1024 * 1024
+"""Bytes of all sources with the same standing that may wait."""
 MOST_KNOWN = 2048
+"""Sources with the same proven standing that may wait. The proxy reads a few thousand datagrams in
+a
+second."""
 MOST_UNKNOWN = 256
-"""Sources of which datagrams wait, of proven and of any other standing. The proxy reads a few
-thousand datagrams in a second."""
+"""Sources with the same other standing that may wait."""
 OVERHEAD = 256
-"""Bytes that a datagram counts for beside its own."""
+"""Bytes that are added to the length of each datagram."""
 
 Item = TypeVar("Item")
 
 
 @dataclass(slots=True)
 class Waiting(Generic[Item]):
-    """An item with its source, and the bytes that it counts for; ``key`` as in `FairQueue.put`."""
+    """An item that waits. For ``key``, see `FairQueue.put`.
+
+    ``size`` is in bytes, and includes the overhead.
+    """
 
     source: str
     item: Item
@@ -44,11 +50,11 @@ class Waiting(Generic[Item]):
 
 @dataclass(slots=True)
 class FairQueue(Generic[Item]):
-    """Items by source; the source whose share is used least goes first.
+    """Items by source. The source with the smallest used share goes first.
 
-    A share is counted in bytes, as a point on a line: `_now` is where the item began that was taken
-    last, and `_next` is where the next item of a source begins. A source that was silent begins
-    at `_now`: silence saves nothing.
+    A share is a number of bytes on a line: `_now` is the start of the last item taken, and `_next`
+    the start of the next item of each source. A source that was silent starts at `_now`, so silence
+    saves nothing.
     """
 
     most_sources: int
@@ -67,9 +73,9 @@ class FairQueue(Generic[Item]):
         return bool(self._waiting)
 
     def put(self, source: str, item: Item, size: int, key: Hashable = None) -> bool:
-        """Add an item of so many bytes. Return False if there is no room for the item.
+        """Add an item of ``size`` bytes. Return False if the queue has no room.
 
-        An item with a ``key`` can be replaced while it waits (`replace`).
+        While an item with a ``key`` waits, `replace` may replace it.
         """
         waiting = Waiting(source, item, size + OVERHEAD, key)
         if not self._has_room(waiting):
@@ -85,7 +91,7 @@ class FairQueue(Generic[Item]):
         return True
 
     def replace(self, key: Hashable, item: Item) -> bool:
-        """Put an item in the place of the one that waits with a key; False if none does."""
+        """Replace the waiting item with a key. Return False if there is none."""
         former = self._replaceable.get(key)
         if former is None:
             return False
@@ -104,7 +110,7 @@ class FairQueue(Generic[Item]):
         return None
 
     def charge(self, source: str, size: int) -> None:
-        """Count bytes that the last item of a source has led to as its own."""
+        """Add bytes to the used share of a source."""
         if source in self._next:
             self._next[source] += size
 
@@ -120,7 +126,10 @@ class FairQueue(Generic[Item]):
         return waiting
 
     def _has_room(self, waiting: Waiting[Item]) -> bool:
-        """Whether an item fits; the source with most loses its last items to one with less."""
+        """Whether an item fits. If necessary, drop the last items of the largest source.
+
+        A source with fewer bytes than the largest source makes room in this way.
+        """
         source = waiting.source
         if source not in self._waiting and len(self._waiting) >= self.most_sources:
             return False
@@ -129,14 +138,14 @@ class FairQueue(Generic[Item]):
             return False
         while self._size + waiting.size > self.most_of_all:
             largest = max(self._sizes, key=self._sizes.__getitem__)
-            # A source is never emptied here: its place in `_order` would be left.
+            # Leave an item of each source, because `_order` has an entry for the source.
             if self._sizes[largest] <= size or len(self._waiting[largest]) == 1:
                 return False
             self._leave(self._waiting[largest].pop())
         return True
 
     def _leave(self, waiting: Waiting[Item]) -> None:
-        """Count an item no longer."""
+        """Remove an item from the counts and keys."""
         self._count(waiting.source, -waiting.size)
         self._replaceable.pop(waiting.key, None)
 
@@ -147,7 +156,7 @@ class FairQueue(Generic[Item]):
             del self._sizes[source]
 
     def _forget_silent(self) -> None:
-        """Forget how much silent sources have had, where that no longer holds them back."""
+        """Forget the used shares of silent sources, if these no longer matter."""
         if not self._waiting:
             self._next.clear()
         elif len(self._next) > 2 * self.most_sources:
@@ -158,7 +167,7 @@ class FairQueue(Generic[Item]):
 
 
 class DiscoveryQueue(Generic[Item]):
-    """Datagrams that wait, by the standing of their sources: each standing has the same share."""
+    """Datagrams that wait, by the standing of the source. All standings have the same share."""
 
     def __init__(self) -> None:
         self._queues = {
@@ -177,15 +186,15 @@ class DiscoveryQueue(Generic[Item]):
     def put(
         self, source: str, standing: Standing, item: Item, size: int, key: Hashable = None
     ) -> bool:
-        """Add a datagram of so many bytes; see `FairQueue.put`."""
+        """Add a datagram; see `FairQueue.put`."""
         if not self._queues[standing]:
             busy = [self._used[other] for other, queue in self._queues.items() if queue]
-            # A pause saves nothing.
+            # Silence saves nothing, as in `FairQueue`.
             self._used[standing] = max(self._used[standing], min(busy, default=0))
         return self._queues[standing].put(source, item, size, key)
 
     def replace(self, key: Hashable, item: Item) -> bool:
-        """Put a datagram in the place of the one that waits with a key; False if none does."""
+        """Replace the waiting datagram with a key. Return False if there is none."""
         return any(queue.replace(key, item) for queue in self._queues.values())
 
     def pop(self) -> Waiting[Item] | None:
@@ -199,6 +208,6 @@ class DiscoveryQueue(Generic[Item]):
         return waiting
 
     def charge(self, source: str, size: int) -> None:
-        """Count bytes that the datagram taken last, of a source, has led to."""
+        """Charge a source for datagrams in consequence of the datagram that was taken last."""
         self._queues[self._last].charge(source, size)
         self._used[self._last] += size

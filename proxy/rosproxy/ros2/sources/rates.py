@@ -1,32 +1,37 @@
-"""How much discovery one source may make: the datagrams that are read and those they lead to.
+"""The allowance of each source for discovery: received datagrams, and those sent in consequence.
 
-Reading discovery costs a hundred times what passing on a user's datagram does, and an announcement
-goes on to all participants of the other side. So each source has an allowance that fills up again
-with time. Datagrams are charged by their length, those of the source and those that they lead to.
-User data is not charged, also where it comes to a port for both, as that of Cyclone DDS. The proxy
-has to read some of it to tell: encrypted or unknown submessages, or more of them than is usual.
-A datagram over the allowance is lost. Participants repeat discovery, and readers ask for what they
-lack.
+Reading discovery costs a hundred times as much as passing on a datagram of user data, and an
+announcement goes to all participants of the other side. So each source has an allowance, which
+refills with time. The charge follows from the length of the datagrams that come from the source,
+and of those that the proxy sends in consequence.
+
+User data is not charged, with one exception: some user data at a port for both kinds (Cyclone DDS)
+has to be parsed to be recognised. This is the case for encrypted or unknown submessages, and for an
+unusual number of submessages.
+
+A datagram beyond the allowance is dropped. Participants repeat discovery, and readers request
+missing samples.
 """
 
 from dataclasses import dataclass, field
 from enum import IntEnum, auto
 
 PER_SECOND = 10_000.0
+"""The charge that a source may cause in a second."""
 BURST = 50_000.0
-"""What a source may be charged in a second, and at once. Fifty participants at one address that
-start at once are charged 10,000 with two peers, and some 1,200 a second from then on."""
+"""The charge that a source may cause at once. With two peers, fifty participants at an address that
+start together cause 10,000, and then some 1,200 a second."""
 STEP = 256
-"""Bytes of a datagram for each unit of its charge. An announcement takes two or three."""
+"""Bytes of a datagram for each unit of the charge. An announcement costs two or three units."""
 MOST_SOURCES = 4096
-"""Sources that are remembered. Of more, the source is forgotten that was remembered first."""
+"""Sources with an allowance. Beyond this number, the oldest allowance is forgotten."""
 
 
 class Standing(IntEnum):
-    """What is known of a source.
+    """The kinds of sources.
 
-    PROVEN: its address is a peer's, or lies inside and has proved to receive. STRANGER: its address
-    is another one outside, and has proved to receive. One machine may have thousands of these.
+    PROVEN: the address of a peer, or a proven address inside. STRANGER: another proven address
+    outside. A single machine may have thousands of these. INSIDE and OUTSIDE: all other addresses.
     """
 
     PROVEN = auto()
@@ -36,19 +41,19 @@ class Standing(IntEnum):
 
 
 def cost(size: int) -> int:
-    """What a datagram of so many bytes is charged."""
+    """The charge for a datagram of ``size`` bytes."""
     return 1 + size // STEP
 
 
 @dataclass(slots=True)
 class _Allowance:
-    """What is left of an allowance, and the time in seconds at which that was."""
+    """The rest of an allowance at a time in seconds."""
 
     remaining: float
     since: float
 
     def refill(self, per_second: float, burst: float, now: float) -> float:
-        """What is left now."""
+        """Refill the allowance up to ``now``, and return the rest."""
         passed = max(now - self.since, 0.0)
         self.remaining = min(self.remaining + passed * per_second, burst)
         self.since = now
@@ -57,10 +62,10 @@ class _Allowance:
 
 @dataclass(slots=True)
 class DiscoveryRates:
-    """The allowance of each source, and one for all unproven sources of a side together.
+    """The allowance of each source, and a common allowance of all unproven sources of a side.
 
-    A forger has as many sources as it likes; they share one allowance. ``unproven_per_second`` and
-    ``unproven_burst`` are that one.
+    A forger may use any number of sources, but these share one allowance. ``unproven_per_second``
+    and ``unproven_burst`` are its rate and size.
     """
 
     per_second: float = PER_SECOND
@@ -71,16 +76,19 @@ class DiscoveryRates:
     _of_unproven: dict[Standing, _Allowance] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Nothing has been used yet."""
+        """Begin with full allowances."""
         sides = (Standing.INSIDE, Standing.OUTSIDE)
         self._of_unproven = {side: _Allowance(self.unproven_burst, 0.0) for side in sides}
 
     def take(
         self, source: str, size: int, now: float, standing: Standing = Standing.PROVEN
     ) -> bool:
-        """Charge a source for a datagram of so many bytes. Return False if it may not be read."""
+        """Charge a source for a datagram of ``size`` bytes.
+
+        Return False if the allowance is used up.
+        """
         shared = self._of_unproven.get(standing)
-        # First: a forged source costs no place among those that are remembered.
+        # Checked first, so that forged sources do not fill `_by_source`.
         if shared and shared.refill(self.unproven_per_second, self.unproven_burst, now) < 1.0:
             return False
         own = self._allowance(source, now)
@@ -92,7 +100,10 @@ class DiscoveryRates:
         return True
 
     def charge(self, source: str, total: int, standing: Standing = Standing.PROVEN) -> None:
-        """Charge a source with what its datagrams have led to, as `cost`; it may go into debt."""
+        """Charge a source for datagrams in consequence. The allowance may become negative.
+
+        ``total`` is in the units of `cost`.
+        """
         if allowance := self._by_source.get(source):
             allowance.remaining -= total
         if standing in self._of_unproven:

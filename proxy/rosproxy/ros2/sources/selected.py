@@ -1,9 +1,10 @@
-"""Which addresses inside are let in, where an operator says so.
+"""The addresses inside that the operator has selected: the proxy serves only their participants.
 
-Participants of all containers on an inside network are heard, also of those that did not ask for a
-proxy. An operator tells the addresses of those that did. Until it has, all are let in; but where an
-operator is expected, announcements are first held back for some seconds. Those of an address that
-is not selected (yet) are held too, since the operator may select it in a moment.
+The proxy hears the participants of all containers on an inside network, also of containers that did
+not ask for a proxy. The operator names the addresses of containers that did. Without an operator,
+the proxy serves all addresses. If an operator is expected, the proxy waits some seconds for the
+first selection. The proxy holds announcements of other addresses, because the operator may select
+such an address soon.
 """
 
 from collections.abc import Iterable
@@ -12,19 +13,22 @@ from dataclasses import dataclass, field
 from rosproxy.ros2.protocol.rtps import source_prefix
 
 UPDATE_TIMEOUT = 3.0
-"""Seconds from the start that an operator has to tell the first time."""
+"""Seconds from the start that the operator has for the first selection."""
 MOST_HELD = 256
+"""Addresses whose announcements are held."""
 MOST_HELD_EACH = 8
+"""Participants at an address whose announcements are held."""
 LONGEST_HELD = 8192
-"""Addresses of which announcements are held, participants at each, and bytes of each."""
+"""Bytes of an announcement that is held."""
 
 
 @dataclass(slots=True)
 class SelectedAddresses:
-    """Which addresses are let in: ``selected``, or from ``until`` on all, if no operator names any.
+    """The addresses whose participants are served.
 
-    ``held_announcements`` are the last announcements of each address that is not let in, by GUID
-    prefix.
+    ``selected`` are the addresses, or None before the first selection. Without a selection, all
+    addresses are served from the time ``until`` on. ``held_announcements`` has the last
+    announcements from each address that is not served, by GUID prefix.
     """
 
     until: float
@@ -32,15 +36,15 @@ class SelectedAddresses:
     held_announcements: dict[str, dict[bytes, bytes]] = field(default_factory=dict)
 
     def select(self, addresses: Iterable[str]) -> None:
-        """Take in which addresses an operator has selected, instead of those before."""
+        """Replace the selected addresses."""
         self.selected = frozenset(addresses)
 
     def admits(self, address: str, now: float) -> bool:
-        """Whether participants at an address are let in."""
+        """Whether participants at an address are served."""
         return now >= self.until if self.selected is None else address in self.selected
 
     def hold(self, address: str, datagram: bytes) -> None:
-        """Keep an announcement from an address that is not let in. Raises RtpsError."""
+        """Hold an announcement from an address that is not served. Raises RtpsError."""
         prefix = source_prefix(datagram)
         if len(datagram) > LONGEST_HELD:
             return
@@ -51,7 +55,10 @@ class SelectedAddresses:
             by_prefix[prefix] = datagram
 
     def released(self, now: float) -> list[tuple[str, bytes]]:
-        """Announcements held of addresses that are let in now, each with its address."""
+        """Take out the held announcements of addresses that are served now.
+
+        Return each announcement after the address.
+        """
         admitted = [address for address in self.held_announcements if self.admits(address, now)]
         return [
             (a, datagram) for a in admitted for datagram in self.held_announcements.pop(a).values()
