@@ -1,1 +1,1 @@
-"""The LAN relay, a program of its own. It and the proxy share `rosproxy.ros2.protocol.relay_*`."""
+"""The LAN relay, a separate program. It shares `rosproxy.ros2.protocol.relay_*` with the proxy."""

@@ -1,12 +1,13 @@
-"""The LAN relay: carries announcements of participants between a LAN's multicast and the proxy.
+"""The LAN relay: passes announcements of participants between a LAN's multicast and the proxy.
 
-Multicast ends at the bridge of a container network. This program runs in the host's network, hears
-there what participants announce to the group (SPDP), and tells the proxy, with the address that it
-came from; what the proxy announces it tells the LAN. It carries nothing else: no discovery of
-readers and writers, no user's data. It needs no right but to be in that network, and keeps no
-state, so that it may be killed and started at any time. What it tells the proxy has a proof
-(`rosproxy.ros2.protocol.relay_proof`), and so has what the proxy tells it: other programs have the
-address of either.
+Multicast ends at the bridge of a container network. The LAN relay runs in the host's network, and
+receives the announcements of participants to the group (SPDP). The relay sends these to the proxy,
+with their source addresses. The announcements of the proxy go to the group on the LAN. The relay
+passes on nothing else: neither the discovery of readers and writers nor user data.
+
+The relay needs no right but to be in the host's network. The relay keeps no state, so it may be
+killed and started at any time. Each datagram between relay and proxy has a proof
+(`rosproxy.ros2.protocol.relay_proof`), because other programs have the addresses of both.
 """
 
 import asyncio
@@ -38,15 +39,16 @@ from rosproxy.ros2.sources.rates import DiscoveryRates
 log = logging.getLogger(__name__)
 
 QUIET_S = 60.0
-"""Seconds after which a refused proof is logged again."""
+"""Seconds until the relay logs a refused proof again."""
 
 
 @dataclass(frozen=True, slots=True)
 class LanRelaySettings:
     """The settings of a LAN relay.
 
-    ``lan`` is this host's address on the LAN, ``bind`` where the proxy's announcements come in,
-    ``proxy`` the address and port of the proxy that hears the LAN's, ``secret`` what both know.
+    ``lan`` is this host's address on the LAN. ``bind`` is the address and port for the proxy's
+    announcements. ``proxy`` is the address and port of the proxy for announcements of the LAN.
+    ``secret`` is known to both.
     """
 
     domain: int
@@ -57,7 +59,7 @@ class LanRelaySettings:
 
 
 class LanRelay:
-    """Carries announcements from `start` on, until it is closed; needs a running event loop."""
+    """Passes announcements on, from `start` to `close`. Needs a running event loop."""
 
     def __init__(self, settings: LanRelaySettings) -> None:
         self._settings = settings
@@ -80,7 +82,7 @@ class LanRelay:
         self._sockets.append(self._own)
         self._lan = datagrams.bind(settings.lan, 0)
         self._sockets.append(self._lan)
-        send_through(self._lan, settings.lan, loop=True)  # for participants on this very host, too
+        send_through(self._lan, settings.lan, loop=True)  # also to participants on this host
         self._groups.open([family_of(settings.lan)])
         if not self._groups.join([settings.lan]):
             text = f"can't join the multicast group on the network of the address {settings.lan}"
@@ -88,7 +90,7 @@ class LanRelay:
         self._loop.add_reader(self._own, self._take_in)
 
     def close(self) -> None:
-        """End."""
+        """Close all sockets."""
         self._scheduler.close()
         self._groups.close()
         for sock in self._sockets:
@@ -102,7 +104,7 @@ class LanRelay:
         sock.close()
 
     def _hear(self, lan: socket.socket) -> None:
-        """Receive what the LAN announces, which is read later, in an order fair to its sources."""
+        """Receive announcements of the LAN, and queue these in an order fair to the sources."""
         now = self._loop.time()
         with contextlib.suppress(BlockingIOError):
             for _ in range(DATAGRAMS_PER_TURN):
@@ -116,25 +118,25 @@ class LanRelay:
                 self.dropped += not is_read
 
     def _tell_proxy(self, datagram: bytes, source: str) -> list[Outgoing]:
-        """Tell the proxy what a source on the LAN announces, and return what was sent."""
-        # What `_tell_lan` has sent comes back here, by loop: the proxy leaves that out.
+        """Send the announcements of a source on the LAN to the proxy. Return the sent datagrams."""
+        # By the loop option, datagrams of `_tell_lan` come back here. The proxy ignores these.
         announcements = self._announcements(datagram)
         self.from_lan += len(announcements)
         carried = [wrapped(source, announcement) for announcement in announcements]
         sealed = [self._proof.sealed(Direction.TO_PROXY, content) for content in carried]
         sent = [Outgoing(self._settings.proxy, proven) for proven in sealed]
         for out in sent:
-            # The proxy takes a proof from the address of this socket alone.
+            # The proxy accepts a proof only from the address of this socket.
             self._send(self._own, out)
         return sent
 
     def _take_in(self) -> None:
-        """Take in what the proxy sends: announcements, and which addresses are proven."""
+        """Receive the datagrams of the proxy: announcements, and lists of proven addresses."""
         with contextlib.suppress(BlockingIOError):
             for _ in range(DATAGRAMS_PER_TURN):
                 try:
                     datagram, sender = self._own.recvfrom(LARGEST_DATAGRAM)
-                except ConnectionRefusedError:  # the proxy is away
+                except ConnectionRefusedError:  # the proxy does not run
                     continue
                 source = plain_address(sender[0])
                 content = self._proven(datagram, source)
@@ -148,14 +150,14 @@ class LanRelay:
                     self.dropped += 1
 
     def _tell_lan(self, content: bytes) -> None:
-        """Tell the LAN what the proxy announces."""
+        """Send announcements of the proxy to the groups on the LAN."""
         for announcement in self._announcements(content):
             self.to_lan += 1
             for group in groups_of(self._settings.lan):
                 self._send(self._lan, Outgoing(HostPort(group, self._port), announcement))
 
     def _proven(self, datagram: bytes, source: str) -> bytes | None:
-        """The content of a datagram of the proxy; None if the datagram is another program's."""
+        """The content of a datagram of the proxy; None for a datagram of another program."""
         if source != self._settings.proxy.host:
             return None
         try:
@@ -170,7 +172,7 @@ class LanRelay:
     def _announcements(self, datagram: bytes) -> list[bytes]:
         """The announcements of participants in a datagram.
 
-        Several participants of a program may share a datagram.
+        Several participants of a process may share a datagram.
         """
         announcements = list[bytes]()
         with contextlib.suppress(RtpsError):
