@@ -1,1 +1,1 @@
-"""ROS 2: nodes that find each other by DDS discovery, and how it is rewritten on its way."""
+"""ROS 2: nodes discover each other by DDS, and the proxy rewrites this discovery."""

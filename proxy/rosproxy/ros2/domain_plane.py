@@ -1,4 +1,4 @@
-"""What forwards user data of ROS 2, the proxy or the kernel: for ``/status``, and as metrics."""
+"""How user data of ROS 2 is forwarded, by the proxy or the kernel: for ``/status`` and metrics."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from rosproxy.ros2.registry.participants import (
 
 @dataclass(eq=False)
 class DomainPlane(Collector):
-    """The kernel's plane, and the mappings that it may forward, of all domains."""
+    """The kernel plane, and the ports of all domains that the kernel may forward."""
 
     _plane: KernelPlane
     _forwarded: KernelPorts
@@ -30,7 +30,7 @@ class DomainPlane(Collector):
         return msgspec.convert(self._plane.status(), document.DataPlaneStatus)
 
     def locator(self, participant: Participant, mapping: PortMapping) -> document.LocatorStatus:
-        """A port of a participant, where the port leads, and what forwards the datagrams there."""
+        """The status of a port mapping of a participant."""
         status = document.LocatorStatus(
             mapping.port,
             str(mapping.target),
@@ -55,7 +55,7 @@ class DomainPlane(Collector):
         )
 
     def collect(self) -> Iterator[Metric]:
-        """What the kernel forwards, of all domains."""
+        """The metrics of the kernel plane, for all domains."""
         text = "Whether the kernel forwards user data of ROS 2."
         usable = self._plane.syncer.usable
         yield GaugeMetricFamily("rosproxy_ros2_kernel_plane", text, value=usable)
@@ -68,7 +68,7 @@ class DomainPlane(Collector):
 
 
 def _reason(participant: Participant, mapping: PortMapping) -> str:
-    """Why the kernel may not forward a mapping, if it may not."""
+    """Why the kernel may not forward a mapping that `KernelPorts` leaves out."""
     if mapping.kind is TrafficKind.METATRAFFIC:
         return "the proxy reads and rewrites discovery"
     if not isinstance(participant, InsideParticipant):

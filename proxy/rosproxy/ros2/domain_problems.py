@@ -1,7 +1,8 @@
-"""The problems that keep participants of a domain from meeting: the cause, and the fix.
+"""The problems that prevent discovery or matching in a domain, with cause and fix.
 
-``rosproxy doctor`` reports it when it is run; the proxy, once it is so, in its log and in
-``rosproxy status``. Only the first cause is given for a participant: the others follow from it.
+``rosproxy doctor`` reports the problems when it runs. The proxy reports a problem in its log and in
+``rosproxy status``, when the problem appears. Each participant has at most one problem, the first
+cause, because further problems follow from it.
 """
 
 from collections.abc import Iterator
@@ -17,10 +18,10 @@ from rosproxy.telemetry.text import plural
 
 
 class DomainProblem(msgspec.Struct, frozen=True):
-    """A cause: the ``check`` that found it, the participant or name it is about, and its fix.
+    """A problem: the ``check`` that found it, the participant or name (``subject``), and the fix.
 
-    ``grave``: it keeps participants apart for certain. ``owner`` is the participant's address, and
-    of a pair the address inside.
+    ``grave`` means that participants certainly do not communicate. ``owner`` is the address of the
+    participant; for a pair, it is the address inside.
     """
 
     check: str
@@ -76,7 +77,7 @@ _FIXES = {
 
 
 def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
-    """All that keeps participants of a domain from meeting; what to mend first comes first."""
+    """Yield the problems of a domain, first the problem to fix first."""
     yield from (problem for _, problem in _participant_problems(domain))
     yield from (problem for _, problem in mismatch_problems(domain))
     if domain.mismatches_left_out:
@@ -88,7 +89,8 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
             "first correct the pairs that other findings name",
         )
     if domain.not_compared:
-        # The number changes with each look, and the watch reports each change of a text.
+        # No number in this text: the number would change with each check, and `DomainWatch` would
+        # report each change.
         text = "some pairs of a reader and a writer are not compared: the domain has too many"
         fix = (
             f"to see the readers and writers of each address, {how_to('status')}. Stop programs "
@@ -98,7 +100,10 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
 
 
 def mismatch_problems(domain: DomainStatus) -> Iterator[tuple[MismatchStatus, DomainProblem]]:
-    """The mismatches of pairs of which neither participant has a grave problem of its own."""
+    """Yield each mismatch with its problem.
+
+    A pair is left out if one of the participants has a grave problem.
+    """
     hindered = {p.guid_prefix for p, problem in _participant_problems(domain) if problem.grave}
     labels = {p.guid_prefix: participant_label(p, True) for p in domain.inside}
     labels |= {p.guid_prefix: participant_label(p, False) for p in domain.outside}
@@ -111,7 +116,7 @@ def mismatch_problems(domain: DomainStatus) -> Iterator[tuple[MismatchStatus, Do
 
 
 def participant_label(participant: ParticipantStatus, is_inside: bool) -> str:
-    """The address, implementation and side of a participant, for texts with its GUID prefix."""
+    """The address, implementation and side of a participant, for texts about its GUID prefix."""
     return (
         f"at {participant.address} ({participant.vendor}, {'inside' if is_inside else 'outside'})"
     )
@@ -130,7 +135,7 @@ def _participant_problems(
 def _problems(
     participant: ParticipantStatus, domain: DomainStatus, is_inside: bool
 ) -> Iterator[DomainProblem]:
-    """What is wrong with a participant, the first cause first."""
+    """Yield the problems of a participant, the first cause first."""
     label = f"participant {participant_label(participant, is_inside)}"
     if participant.domain is not None and participant.domain != domain.domain:
         text = (
@@ -145,7 +150,7 @@ def _problems(
     fault = _LOCATOR_FAULTS.get(participant.locator_fault)
     if fault:
         yield DomainProblem("transport", participant.guid_prefix, f"{label}: {fault[0]}", fault[1])
-    # Locators in the SEDP of one outside stay as they are, unless the direction is both.
+    # The proxy replaces locators in the SEDP of participants outside only with the direction both.
     if is_inside or domain.direction == "both":
         yield from _security(participant, label, is_inside)
     if participant.problem:
@@ -166,10 +171,10 @@ def _problems(
 def _security(
     participant: ParticipantStatus, label: str, is_inside: bool
 ) -> Iterator[DomainProblem]:
-    """What DDS Security keeps from a participant: the proxy can't change what is protected.
+    """Yield the problem of a participant with protected discovery, which the proxy can't change.
 
-    Fast DDS repeats its addresses with each reader and writer; Cyclone DDS only announces them with
-    the participant itself, which is never protected.
+    Fast DDS repeats its locators in the announcement of each reader and writer. Cyclone DDS has
+    locators only in the announcement of the participant, which is never protected.
     """
     if participant.security != DdsSecurity.PROTECTED or participant.vendor == _CYCLONE_DDS_NAME:
         return
@@ -180,7 +185,7 @@ def _security(
     fix += "set ROS_SECURITY_ENABLE=false"
     if not is_inside:
         fix += f"; or give participants inside a route outwards, and {how_to('direction out')}"
-    # Other vendors need not repeat their addresses, as Fast DDS does: then nothing is lost.
+    # Not grave for other vendors: if these do not repeat the locators, no connection fails.
     yield DomainProblem(
         "security", participant.guid_prefix, text, fix, grave=participant.vendor == _FAST_DDS_NAME
     )

@@ -1,4 +1,4 @@
-"""The settings of a domain, and which ports DDS gives it."""
+"""The settings of a domain, its ports (DDSI-RTPS), and the bounds for participants."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -11,53 +11,62 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 
 PORTS_PER_DOMAIN = 250
+"""Domain d has the ports from 7400 + 250 d on (DDSI-RTPS 2.5, 9.6.2.3)."""
 SPDP_MULTICAST = 7400
+"""The multicast port of domain 0 for announcements of participants."""
 SPDP_UNICAST = 7410
-"""DDSI-RTPS 2.5, 9.6.2.3: domain d has the ports from 7400 + 250 d on."""
+"""The first well-known port of domain 0."""
 PARTICIPANTS_TRIED = 32
-"""How many well-known ports of a peer are told of participants inside: each program has one. Where
-many participants are known, twice as many ports are told, up to `MOST_TRIED`."""
+"""Well-known ports of a peer to which announcements go. Each process binds one of these ports. If
+more than 16 participants are known there, announcements go to twice as many ports, up to
+`MOST_TRIED`."""
 MOST_TRIED = 120
-"""The well-known ports of a domain; the next ones belong to the next domain (9.6.2.3)."""
+"""Well-known ports of a domain. The next ports belong to the next domain (9.6.2.3)."""
 NEXT_PORTS = 2
-"""How many more well-known ports are used than participants are known at an address."""
+"""Well-known ports that are used beyond the number of known participants at an address."""
 
 MOST_INSIDE = 384
+"""Participants inside that have answered a question."""
 MOST_INSIDE_UNPROVEN = 128
-"""Participants inside: at addresses that have proved to receive, and at all others."""
+"""Participants inside that have not answered a question."""
 MOST_AT_PEERS = 1024
+"""Participants outside at the addresses of peers."""
 MOST_OUTSIDE = 512
+"""Participants outside at other proven addresses."""
 MOST_OUTSIDE_UNPROVEN = 256
-"""Participants outside: at peers' addresses, at others that have proved to receive, at the rest."""
+"""Participants outside at unproven addresses."""
 MOST_WAITING = 512
-"""Participants inside that wait after a start until it is known which ports they had."""
+"""Participants inside that wait after a start for the answer about their former ports."""
 MOST_PER_ADDRESS = 64
+"""Participants at an address inside."""
 MOST_PER_HOST = 256
-"""Participants at one address inside, and outside, where another proxy may be."""
+"""Participants at the address of a peer, or at another proven address outside. There may be another
+proxy at the address."""
 MOST_PER_UNPROVEN = 16
-"""Participants at one address outside that has not proved to receive."""
+"""Participants at an unproven address outside."""
 MOST_ANNOUNCED_UNPROVEN = 64
-"""While so many participants outside are at unproven addresses, inside is told of these, too."""
+"""Participants outside at unproven addresses up to which the proxy announces such participants
+inside."""
 MOST_MAPPINGS = 16
-"""Ports of the range for one participant; Fast DDS takes three for one address."""
+"""Ports of the range for a participant. Fast DDS announces three locators for an address."""
 
 Judge = Callable[[RuleKind, str, str], bool]
 """Whether a kind of rule allows a name to the participant inside at an address."""
 Note = Callable[[str, str, str], None]
-"""Called with each refusal: its reason in one word, the source, and a text."""
+"""Called for each refusal with the reason in one word, the source, and a text."""
 Settled = Callable[[str], None]
-"""Called with the address of each participant that is met."""
+"""Called with the address of each new participant."""
 
 
 @dataclass(slots=True)
 class Refused:
-    """Counts the datagrams that go nowhere, and tells of them."""
+    """Counts and reports what the proxy refuses."""
 
     note: Note
     count: int = 0
 
     def __call__(self, reason: str, source: str, text: str) -> None:
-        """Tell why a datagram from a source goes nowhere."""
+        """Report a refusal, with the reason in one word, the source, and a text."""
         self.count += 1
         self.note(reason, source, text)
 
@@ -70,13 +79,13 @@ class Outgoing(msgspec.Struct, frozen=True):
 
 
 def sent_to(target: HostPort | None, datagrams: Iterable[bytes]) -> list[Outgoing]:
-    """Datagrams for one target; none if it is not known."""
+    """Datagrams for a target; empty without a target."""
     return [Outgoing(target, datagram) for datagram in datagrams] if target else []
 
 
 @dataclass(frozen=True, slots=True)
 class LanRelayLink:
-    """The LAN relay of a domain: where it listens, and the proof that it shares with the proxy."""
+    """The address of the LAN relay of a domain, and the proof that it shares with the proxy."""
 
     address: HostPort
     proof: RelayProof
@@ -84,18 +93,17 @@ class LanRelayLink:
 
 @dataclass(slots=True)
 class DomainSettings:
-    """The settings of a domain; ``hosts``, ``peers`` and ``gateways`` may change.
+    """The settings of a domain. ``hosts``, ``peers`` and ``gateways`` may change.
 
-    ``hosts`` are the IP addresses at which outside reaches the ports of the range, one or one of
-    each family; a participant is led to that of its own family, if there is one. ``peers`` are
-    those outside that are told of participants inside, with port 0 at their well-known ports;
-    ``relay`` is the program that passes announcements on to the LAN.
-    ``proxy_address_for`` gives the proxy's own address that an address inside reaches.
-    ``is_inside`` tells whether an address lies in an inside network. ``participants_at`` counts the
-    participants outside that are known at an address. ``gateways`` are those of the proxy's
-    default routes. ``settled`` is called with the address of each participant that is met.
-    ``both_ways``: inside reaches the locators of those outside through the proxy alone.
-    ``port_store_key`` proves which ports participants had (`ports.store.port_store_key`).
+    ``hosts`` are the IP addresses at which outside reaches the range: a single address, or one of
+    each family. A participant gets the address of its own family, if there is one. ``peers`` are
+    the hosts outside that get the announcements of participants inside; the port 0 means their
+    well-known ports. ``relay`` is the LAN relay. ``proxy_address_for`` returns the proxy's address
+    for an address inside. ``is_inside`` tells whether an address is in an inside network.
+    ``participants_at`` returns the number of known participants at an address outside. ``gateways``
+    are those of the proxy's default routes. ``settled`` is called with the address of each new
+    participant. ``both_ways`` means that inside reaches the locators outside only through the
+    proxy. ``port_store_key`` proves the ports of participants (`ports.store.port_store_key`).
     """
 
     number: int
@@ -115,31 +123,34 @@ class DomainSettings:
 
     @property
     def host(self) -> str:
-        """The address by which the proxy is known."""
+        """The first address of the advertised host."""
         return self.hosts[0]
 
     def host_for(self, address: str) -> str:
-        """The address of the proxy's by which outside reaches a participant at an address."""
+        """The address of the advertised host for a participant at an address.
+
+        The family is that of the participant, if possible.
+        """
         same_family = (host for host in self.hosts if (":" in host) == (":" in address))
         return next(same_family, self.host)
 
     @property
     def multicast_port(self) -> int:
-        """Where participants announce themselves to the group."""
+        """The port for announcements to the multicast group."""
         return SPDP_MULTICAST + PORTS_PER_DOMAIN * self.number
 
     @property
     def unicast_port(self) -> int:
-        """Where the first participant of a machine is told of others."""
+        """The first well-known port, which the first participant of a machine binds."""
         return SPDP_UNICAST + PORTS_PER_DOMAIN * self.number
 
     @property
     def discovery_port(self) -> int:
-        """The port of the range, its first, at which outside announces itself to the proxy."""
+        """The first port of the range, at which outside announces itself to the proxy."""
         return self.ports.listen.first
 
     def to_outside(self, datagram: bytes) -> list[Outgoing]:
-        """A datagram for the LAN and all peers, at which participants inside are announced."""
+        """A datagram for the LAN relay and all peers."""
         sent = self.to_lan(datagram)
         for peer in self.peers:
             targets = [peer] if peer.port else self.well_known_of_peer(peer.host)
@@ -147,21 +158,21 @@ class DomainSettings:
         return sent
 
     def to_lan(self, datagram: bytes) -> list[Outgoing]:
-        """A datagram for the LAN; nothing without a LAN relay."""
+        """A datagram for the LAN relay, with a proof; empty without a LAN relay."""
         if self.relay is None:
             return []
         return [Outgoing(self.relay.address, self.relay.proof.sealed(Direction.TO_LAN, datagram))]
 
     def well_known(self, host: str, count: int = PARTICIPANTS_TRIED) -> list[HostPort]:
-        """Where the first participants of a host are told of others (9.6.2.3)."""
+        """The first ``count`` well-known ports of a host (9.6.2.3)."""
         ports = range(self.unicast_port, self.unicast_port + 2 * count, 2)
         return [HostPort(host, port) for port in ports]
 
     def well_known_of_peer(self, host: str) -> list[HostPort]:
-        """Where the participants of a peer are told of others."""
+        """The well-known ports of a peer to which announcements go."""
         count = min(2 * self.participants_at(host), MOST_TRIED)
         return self.well_known(host, max(PARTICIPANTS_TRIED, count))
 
     def is_peer(self, address: str) -> bool:
-        """Whether an address is a peer's."""
+        """Whether an address is that of a peer."""
         return any(peer.host == address for peer in self.peers)

@@ -1,7 +1,7 @@
-"""Reports once what keeps participants of ROS 2 apart: in the log, and as a problem.
+"""Reports the problems of ROS 2 domains once: in the log, and as problems of the proxy.
 
-What is wrong only for a moment is not reported: a participant that has just been heard, or one
-whose readers and writers are not all known. When it is mended, the problem goes.
+A problem has to last for two checks. So the proxy does not report participants that have just
+appeared, and readers and writers that are not all known yet. The problem disappears after the fix.
 """
 
 import logging
@@ -14,11 +14,11 @@ from rosproxy.telemetry.problems import Problems
 log = logging.getLogger(__name__)
 
 MOST_NOTED = 20
-"""Problems that are noted at a time, with fair shares by address."""
+"""Problems that are reported at a time, with fair shares by address."""
 
 
 class DomainWatch:
-    """Looks at the domains, and notes what it finds in ``problems``."""
+    """Checks the domains, and reports to ``problems``."""
 
     def __init__(self, state: Ros2State, problems: Problems) -> None:
         self._state = state
@@ -27,9 +27,12 @@ class DomainWatch:
         self._noted: dict[str, set[DomainProblem]] = {}
 
     async def look(self) -> None:
-        """Report what was found this time and the last, and forget what has gone."""
+        """Report the problems that this check and the last one found.
+
+        Withdraw the problems that are gone.
+        """
         problems = {p for domain in self._state.status() for p in domain_problems(domain)}
-        # The grave ones first, since no more than MOST_NOTED are noted.
+        # Grave problems first, because at most MOST_NOTED are reported.
         lasting = sorted(problems & self._previous, key=lambda p: (not p.grave, p.subject))
         self._previous = problems
         current: dict[str, set[DomainProblem]] = {}
@@ -41,7 +44,7 @@ class DomainWatch:
 
     def _note(self, subject: str, former: set[DomainProblem], current: set[DomainProblem]) -> None:
         if former - current:
-            # This forgets all of the subject, so that what lasts is added again below.
+            # This withdraws all problems of the subject. The lasting ones are added again below.
             self._problems.solved(subject)
         for problem in sorted(current, key=lambda p: p.text):
             if former - current or problem not in former:

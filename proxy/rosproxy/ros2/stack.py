@@ -1,4 +1,4 @@
-"""ROS 2 in a running proxy: one server for each domain, which share out the range."""
+"""ROS 2 in a running proxy: a server for each domain. The domains share the range."""
 
 import asyncio
 import logging
@@ -56,14 +56,15 @@ from rosproxy.telemetry.text import listed
 log = logging.getLogger(__name__)
 
 REFRESH_INTERVAL = 5.0
-"""Seconds between looks at the networks, at the addresses of peers, and at what is wrong."""
+"""Seconds between checks of the networks, the addresses of peers, and the domain problems."""
 POLICY_INTERVAL = 0.5
-"""Seconds between looks whether the policy has changed."""
+"""Seconds between checks of the policy for changes."""
 RATE_INTERVAL = 2.0
+"""Seconds between samples of the rates."""
 
 
 class Ros2:
-    """The part for ROS 2. `start` it in a running event loop, `stop` it in the same."""
+    """The part of the proxy for ROS 2. `start` and `stop` it in the same event loop."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
@@ -89,16 +90,16 @@ class Ros2:
         )
 
     async def start(self) -> None:
-        """Bind all ports and begin. Raises SettingError if one is taken that has to be had."""
+        """Bind all ports and begin. Raises SettingError if a necessary port is not available."""
         tasks = self._runtime.tasks
         self._hosts = await self._first_hosts()
-        # Before any port is opened: the table of a former process tells whose its ports were.
+        # Before opening any port: the table of a former process has the locator of each port.
         await self.plane.start()
         self._kernel_ports.note_former(self.plane.forwards)
         self._start_servers()
         self._runtime.metrics.registry.register(self.state)
         self._runtime.metrics.registry.register(self._domain_plane)
-        # Unlike in ROS 1 there is no registry to rebuild: the kernel ports have what was forwarded.
+        # Unlike in ROS 1 there is no registry to rebuild: `note_former` has noted all forwards.
         self.plane.recovered([])
         tasks.spawn(self._forget_former(), "waiting for participants from before the start")
         await self._refresh()
@@ -113,10 +114,10 @@ class Ros2:
         tasks.repeat(self._sample_rates, RATE_INTERVAL, "sampling rates")
 
     def _start_servers(self) -> None:
-        """Serve all domains. Raises SettingError."""
+        """Start a server for each domain. Raises SettingError."""
         settings = self._settings
         taken = list[int]()
-        # Each process of the proxy is given the same secret, and containers know neither.
+        # Each process of the proxy gets the same secret, which containers do not know.
         key = port_store_key(settings.token_hash or settings.ros2_lan_relay_secret)
         for number, ports in zip(settings.domains, self._domain_ports(), strict=True):
             domain_settings = DomainSettings(
@@ -138,13 +139,13 @@ class Ros2:
                 self._runtime.now,
                 self._is_inside,
                 self.plane.syncer.note_change,
-                # An operator selects addresses through the admin endpoint, which takes its token.
+                # With a token an operator is expected, which selects addresses.
                 UPDATE_TIMEOUT if settings.admin_token_hash else 0.0,
             )
             server.domain.ports.note_forwarded(self.plane.forwards)
             self.servers.append(server)
             self._kernel_ports.domains.append(server.domain.mappings)
-            # Any proxy for ROS 2: these ports follow from the domain, not from the range.
+            # Any proxy for ROS 2 may have these ports, which follow from the domain.
             other_proxies = proxy_signs.overlapping_proxies("2", 1, 65535)
             with setting_error_if_taken(
                 "--ros2-domain", f"a port of domain {number}", other_proxies
@@ -153,10 +154,10 @@ class Ros2:
         report_taken_ports("2", settings, taken, self._runtime.problems)
 
     async def settle(self) -> None:
-        """Its ports can be probed at once."""
+        """Return at once: ROS 2 needs no preparation before a probe."""
 
     async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
-        """Whether the discovery port of each domain is reached by UDP where outside finds it."""
+        """Whether UDP to the advertised host reaches the discovery port of each domain."""
         return tuple([await self._probe(server) for server in self.servers])
 
     async def _probe(self, server: DomainServer) -> PortProbe:
@@ -169,11 +170,14 @@ class Ros2:
         return PortProbe(settings.discovery_port, advertised, outcome, "unknown", "udp")
 
     async def try_ports(self) -> tuple[PortProbe, ...]:
-        """Instead of a start: take the range, try it, and let go. Raises SettingError."""
+        """Bind the range, probe the discovery port, and release the range. Raises SettingError.
+
+        A caller uses this instead of `start`.
+        """
         return await try_ports(self._runtime)
 
     async def stop(self) -> None:
-        """End everything."""
+        """Stop all tasks, the kernel plane and the servers."""
         await self._runtime.tasks.cancel()
         await self.plane.stop()
         for server in self.servers:
@@ -181,17 +185,18 @@ class Ros2:
 
     @property
     def actions(self) -> Mapping[str, Action]:
-        """What posts at the admin endpoint do, by their paths."""
+        """The handlers of POST requests at the admin endpoint, by path."""
         return {"/containers": self._handle_update, "/retire": self._retire}
 
     async def _handle_update(self, body: Any) -> dict[str, Any]:
-        """``POST /containers``: how many participants were ended.
+        """Handle ``POST /containers``. Return the number of participants that have ended.
 
-        One whose container has moved is ended as well: at its new address it is heard by itself.
+        The participants at the former address of a moved container end, too. At the new address
+        they announce themselves again.
         """
         update = read_body(body, ContainerUpdate)
-        self._look_at_networks()  # the proxy may have just joined that of new containers
-        # Before addresses are selected: participants that wait for that get their ports at once.
+        self._look_at_networks()  # the proxy may have just joined the network of new containers
+        # Before the selection, after which waiting participants get their ports at once.
         for server in self.servers:
             server.note_former(update.former_ports)
         if update.selected is not None:
@@ -204,11 +209,11 @@ class Ros2:
         return {"unregistered": sum(server.end(former_addresses) for server in self.servers)}
 
     async def _retire(self, body: Any) -> dict[str, Any]:
-        """``POST /retire``: how many participants were ended."""
+        """Handle ``POST /retire``. Return the number of participants that have ended."""
         read_body(body, EmptyBody)
         ended = 0
         for server in self.servers:
-            # Before they are ended, or their next announcement would let them in again.
+            # Before the end of the participants: their next announcement must not be accepted.
             server.select(())
             ended += server.retire()
             await server.finish()
@@ -216,7 +221,7 @@ class Ros2:
 
     @property
     def greeting(self) -> str:
-        """How nodes use it, for the log."""
+        """How nodes use the proxy, for the log."""
         domains = ", ".join(map(str, self._settings.domains))
         host = self._settings.advertise_host
         ports = self._settings.ports.advertise
@@ -225,13 +230,13 @@ class Ros2:
         )
 
     async def _forget_former(self) -> None:
-        """Stop the forwards of before the start that no participant has claimed since."""
+        """End former forwards of the kernel that no participant has claimed since the start."""
         await asyncio.sleep(REMEMBERED)
         self._kernel_ports.note_former({})
         self.plane.syncer.note_change()
 
     def _domain_ports(self) -> list[PortMap]:
-        """The range, shared out among the domains."""
+        """The part of the range for each domain."""
         ports = self._settings.ports
         count = len(self._settings.domains)
         size = len(ports.listen) // count
@@ -250,33 +255,35 @@ class Ros2:
         return not is_peer and addresses.is_inside(address, self.networks)
 
     def _is_allowed(self, kind: RuleKind, name: str, address: str) -> bool:
-        """Whether the policy allows something to a participant inside; nodes have no names here.
+        """Whether the policy allows a name to the participant inside at an address.
 
-        Nothing is, before an operator has sent the policy that is waited for.
+        Nothing is allowed while the proxy waits for the policy of an operator. The policy gets no
+        node names, because a participant is not a node.
         """
         return not self._awaiting and self._runtime.policy.ask(kind, name, (), address).allowed
 
     async def apply_policy(self) -> EnforcementCounts:
-        """Separate the participants inside of which the policy says something else than before."""
+        """Let participants inside with a changed verdict rediscover the participants outside."""
         version = self._runtime.policy.version
         for server in self.servers:
             server.apply_policy()
-        self._applied = version  # only now: what fails is tried again
+        self._applied = version  # after the calls, so that a failure is repeated
         for server in self.servers:
             await server.finish()
         return EnforcementCounts()
 
     retired = False
-    """Participants that it forgets are heard again."""
+    """Always False: after `/retire` the operator may select addresses again."""
 
     def unready(self) -> str | None:
-        """It needs no master, and is ready once it has begun."""
+        """Return None: ROS 2 needs no master, and is ready after `start`."""
         return None
 
     def add_to(self, status: ProxyStatus) -> ProxyStatus:
-        """The status of the proxy, with what there is to tell of ROS 2.
+        """Add the domains of ROS 2 to the status of the proxy.
 
-        Beside ROS 1, the networks, the ports and the data plane are those of ROS 1.
+        If the proxy also serves ROS 1, networks, ports and data plane in the status are those of
+        ROS 1.
         """
         domains = self.state.status()
         policy = with_hidden(status.policy, *self.state.hidden(self._runtime.policy))
@@ -316,7 +323,7 @@ class Ros2:
         return hosts
 
     async def _refresh(self) -> None:
-        """Take in the present networks, and where the advertised host and the peers are."""
+        """Check the networks, and the addresses of the advertised host and the peers."""
         self._look_at_networks()
         await self._find_hosts()
         await self._find_peers()
@@ -336,7 +343,7 @@ class Ros2:
     async def _find_peers(self) -> None:
         peers = self._peers
         found = await asyncio.gather(*(self._resolve_peer(peer) for peer in peers))
-        # A name server that is away takes no peer away.
+        # If the name server does not answer, the known addresses of a peer stay.
         known = {peer: self._addresses_of_peers.get(peer, ()) for peer in peers}
         self._addresses_of_peers = {
             peer: tuple(addresses) or known[peer]
@@ -344,7 +351,7 @@ class Ros2:
         }
         addresses_of_all = tuple(chain.from_iterable(self._addresses_of_peers.values()))
         hosts = (peer.host for peer in addresses_of_all)
-        # In a trial on one machine both sides may have one address.
+        # In a trial on a single machine, both sides may have the same loopback address.
         self._peer_addresses = frozenset(host for host in hosts if not addresses.is_loopback(host))
         for server in self.servers:
             server.ask_outside(addresses_of_all)
@@ -355,7 +362,7 @@ class Ros2:
         own_addresses = {address_into(network) for network in self.networks}
         gateways = default_gateways()
         for server in self.servers:
-            # The way into a network that the proxy is not in begins at an address outside of it.
+            # The route to a network without the proxy begins at an address outside the network.
             server.join(address for address in own_addresses if self._is_inside(address))
             server.note_gateways(gateways)
 
@@ -381,16 +388,17 @@ class Ros2:
 def advertised_hosts(
     resolved: Sequence[str], bind: str, present: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """The addresses of the advertised host to announce, one of each family: locators have no names.
+    """The addresses of the advertised host to announce: a single one, or one of each family.
 
-    ``resolved`` are the addresses that its name has now, ``present`` those that are announced. The
-    present ones stay while the name has them, or can't be resolved: a name server may give several
-    in any order. An address of a family that is not bound counts only where there is no other.
+    Locators have no host names. ``resolved`` are the addresses of the name now, and ``present`` the
+    announced addresses. The present addresses stay while the name has all of them, and if the name
+    can't be resolved: a name server may return several addresses in any order. An address of a
+    family that ``bind`` does not cover counts only if there is no other.
     """
     if not resolved or (present and all(address in resolved for address in present)):
         return present
     served = [a for a in resolved if bind == "::" or (":" in a) == (":" in bind)]
-    # Reversed: the last that is put in stays, which is then the first of its family.
+    # Reversed, so that the first address of each family is the last one written, and stays.
     by_family = {":" in a: a for a in reversed(served or resolved)}
     return tuple(sorted(by_family.values(), key=resolved.index))
 
@@ -398,17 +406,17 @@ def advertised_hosts(
 def networks_inside(
     own_networks: Mapping[Network, str], hosts: Collection[str]
 ) -> tuple[Network, ...]:
-    """The inside networks where no option names them: those of the proxy's interfaces.
+    """The inside networks without an option: the networks of the proxy's interfaces.
 
-    ``own_networks`` are these networks, each with the proxy's own address there. Where that is an
-    address of the advertised host, in ``hosts``, the network is outside, if there are others.
+    ``own_networks`` are these networks, each with the proxy's address there. If this is an address
+    of the advertised host (``hosts``), the network counts as outside, unless there are no others.
     """
     inside = tuple(network for network, own in own_networks.items() if own not in hosts)
     return inside or tuple(own_networks)
 
 
 def _relay(settings: Settings) -> LanRelayLink | None:
-    """The LAN relay of the settings, which have a secret where they have a relay."""
+    """The LAN relay in the settings; None without a relay or without a secret."""
     if settings.ros2_lan_relay is None or settings.ros2_lan_relay_secret is None:
         return None
     return LanRelayLink(

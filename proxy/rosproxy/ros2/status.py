@@ -33,10 +33,10 @@ from rosproxy.ros2.registry.participants import (
 from rosproxy.ros2.servers.domain_server import DomainServer
 
 MOST_ENDPOINTS = 8192
-"""Readers and writers on a side of a domain whose names are listed, with fair shares by address.
+"""Readers and writers of a side of a domain whose names are listed, with fair shares by address.
 
-A host with fifty nodes has some 1,000. To list 8,192 takes 30 ms, in which nothing else is done.
-"""
+A host with fifty nodes has some 1,000. Listing 8,192 takes 30 ms, and the event loop waits
+meanwhile."""
 MOST_MISMATCHES = 100
 """Mismatches of a domain that are listed, with fair shares by the address inside."""
 _NO_SHORTAGE = PortShortage()
@@ -47,7 +47,7 @@ _Participant = TypeVar("_Participant", bound=Participant)
 class Ros2State(Collector):
     """The state of ROS 2, read at each request.
 
-    Without ``with_names`` no topics and services are listed: that takes a tenth of the time.
+    Without ``with_names`` no topics and services are listed, which takes a tenth of the time.
     """
 
     _servers: Sequence[DomainServer]
@@ -55,11 +55,11 @@ class Ros2State(Collector):
     with_names: bool = True
 
     def status(self) -> tuple[document.DomainStatus, ...]:
-        """The domains."""
+        """The status of each domain."""
         return tuple(self._domain(server) for server in self._servers)
 
     def hidden(self, policy: AccessPolicy) -> tuple[list[document.HiddenStatus], int]:
-        """What the policy keeps from participants outside, and how much of that is left out."""
+        """The names that the policy hides from outside, and how many are left out."""
         hidden = [
             (participant, kind, name)
             for server in self._servers
@@ -82,7 +82,7 @@ class Ros2State(Collector):
         return rows, len(hidden) - len(rows)
 
     def collect(self) -> Iterable[Metric]:
-        """The state as metrics: gauges, and counters of datagrams."""
+        """The metrics of all domains: gauges, and counters of datagrams."""
         yield from self._participants()
         used = GaugeMetricFamily(
             "rosproxy_ros2_leases_used", "Ports of the range held by locators.", labels=["domain"]
@@ -170,7 +170,7 @@ class Ros2State(Collector):
         )
 
     def _shares(self, participants: Iterable[_Participant]) -> Iterator[tuple[_Participant, int]]:
-        """Each participant of a side, and how many of its readers and writers are listed."""
+        """Each participant of a side, and the number of its readers and writers to list."""
         every = list(participants)
         most = MOST_ENDPOINTS if self.with_names else 0
         wanted = [len(participant.endpoints) for participant in every]
@@ -220,7 +220,7 @@ class Ros2State(Collector):
 
 
 def _address_inside(pair: MismatchedPair) -> str:
-    """The address of the participant of a pair that is inside."""
+    """The address of the participant inside in a pair."""
     insider = pair.writer if isinstance(pair.writer, InsideParticipant) else pair.reader
     return insider.address
 

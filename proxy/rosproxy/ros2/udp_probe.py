@@ -1,7 +1,8 @@
-"""Does what is sent to the advertised host by UDP come in? Tried by the proxy itself.
+"""Does UDP to the advertised host reach the range? The proxy itself sends the probe.
 
-In ROS 2 nobody outside can be asked to try, and where NAT has no way back (no hairpin) the try
-fails although outside gets through. So a success proves much, and a failure little.
+In ROS 2 the proxy can't ask a participant outside to send a probe. The probe of the proxy fails
+behind NAT without hairpinning, although outside may reach the range. So a success proves much, and
+a failure little.
 """
 
 import asyncio
@@ -17,12 +18,16 @@ from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
 
 ATTEMPTS = 3
+"""Datagrams that the proxy sends, because UDP may lose some."""
 WITHIN = 1.0
-"""UDP may lose some: how many are sent, and the seconds in which each may come back."""
+"""Seconds in which each of these datagrams may arrive."""
 
 
 async def try_udp(target: HostPort, secret: bytes, heard: asyncio.Event) -> str:
-    """Send a secret to an IP address and port: ``ok`` if ``heard`` is set then, else why not."""
+    """Send a secret to an IP address and port until ``heard`` is set.
+
+    Return ``ok``, ``silent`` if the event was not set, or ``unreachable`` if sending failed.
+    """
     family = socket.AF_INET6 if ":" in target.host else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM) as sock:
         for _ in range(ATTEMPTS):
@@ -38,9 +43,10 @@ async def try_udp(target: HostPort, secret: bytes, heard: asyncio.Event) -> str:
 
 
 async def try_ports(runtime: Runtime) -> tuple[PortProbe, ...]:
-    """Take all ports of the range, and try the first, where outside finds the first domain.
+    """Bind all ports of the range, and probe the discovery port of the first domain.
 
-    Raises SettingError if none can be had.
+    This is the first port of the range. Empty if this port is not available, or if the advertised
+    host has no address. Raises SettingError if no port is available.
     """
     settings = runtime.settings
     addresses = await resolve(runtime.settings.advertise_host)
