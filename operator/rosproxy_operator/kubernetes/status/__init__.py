@@ -1,1 +1,1 @@
-"""What a RosProxy's owner is told: conditions, findings, status, Events. Pure."""
+"""What users read about a RosProxy: conditions, findings, status, Events. Pure."""

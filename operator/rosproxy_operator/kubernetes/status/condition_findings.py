@@ -1,4 +1,4 @@
-"""The findings of the doctor from the statuses of all RosProxies."""
+"""The doctor's findings from the statuses of all RosProxies."""
 
 from collections.abc import Collection, Iterator
 
@@ -21,13 +21,20 @@ _WRONG = {
     "Ready": "False",
     "Degraded": "True",
 }
-"""By condition, the status that means trouble; causes go before what follows from them."""
+"""The status of each condition that is an error.
+
+The order matters: a cause comes before its consequences. So a text that several conditions share is
+reported at the cause.
+"""
 
 
 def cluster_findings(
     rosproxies: Collection[Json], operators: Operators = UNKNOWN
 ) -> list[DoctorFinding]:
-    """All findings of a cluster, by its RosProxies; each text once, where it is a cause."""
+    """The findings of all RosProxies, each text once for a RosProxy.
+
+    Without any RosProxy, the only finding is a warning.
+    """
     findings = [f for rosproxy in rosproxies for f in _findings_of(rosproxy, operators)]
     if not rosproxies:
         fix = (
@@ -39,7 +46,7 @@ def cluster_findings(
 
 
 def is_unnoticed(rosproxy: Json) -> bool:
-    """Whether no operator has written a status since the last change."""
+    """Whether no operator has written the status since the last change of the spec."""
     generation = int_at(submap(rosproxy, "metadata"), "generation")
     return int_at(submap(rosproxy, "status"), "observedGeneration") < generation
 

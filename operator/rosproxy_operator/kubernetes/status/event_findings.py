@@ -1,7 +1,8 @@
-"""The last Warning Events of RosProxies and their pods, for the doctor: the newest first.
+"""The doctor's findings from the last Warning Events of RosProxies and pods, newest first.
 
-The conditions hold the present problems; an Event of the operator that no condition repeats is
-over. Events of the kubelet and the scheduler about a proxy's pod matter until that pod is ready.
+Conditions report the present problems. So if no condition repeats an Event of the operator, the
+problem of the Event is over. Events of the kubelet and the scheduler about a pod of the operator
+matter until the pod is ready.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -17,16 +18,17 @@ from rosproxy_operator.kubernetes.resources.names import KIND
 from rosproxy_operator.kubernetes.status.events import COMPONENT
 
 MOST = 10
-"""Events that are told."""
+"""Events that the doctor reports at most."""
 LONGEST = 400
-"""Characters of a message."""
+"""Characters of a reason or a message at most."""
 _CHECK = "events"
 
 
 class RecentEvent(msgspec.Struct, frozen=True):
-    """A Warning Event: about what, how many seconds ago, and how often.
+    """A Warning Event.
 
-    ``own``: the operator has made it; else it is about a pod of the operator's.
+    ``kind``, ``id`` and ``uid`` name the object of the Event. ``age`` is in seconds since the last
+    time, ``count`` is the number of times. ``own``: an operator has created the Event.
     """
 
     kind: str
@@ -42,11 +44,13 @@ class RecentEvent(msgspec.Struct, frozen=True):
 def recent_events(
     events: Iterable[Json], rosproxies: Collection[Json], pods: Iterable[Json], now: float
 ) -> list[RecentEvent]:
-    """The Events about these RosProxies, the operator's pods, and users' pods, the newest first.
+    """The Events about these RosProxies, about ``pods`` of the operator, and about users' pods.
 
-    Of users' pods those of the operator alone, and only beside a RosProxy: where there is none, the
-    doctor reports the pods that are there now. Of several that are alike it is the last one;
-    without those that a condition tells. ``now`` is in seconds of Unix time.
+    The newest Event comes first. About users' pods, only the Events of the operator count, and only
+    in a namespace with a RosProxy. In other namespaces the doctor reports the pods themselves. Of
+    several Events with the same object and reason, the newest counts; Events of the operator are
+    the same only with the same message. An Event of the operator is left out if a condition
+    contains the message. ``now`` is in seconds of Unix time.
     """
     uids = {text_at(submap(obj, "metadata"), "uid") for obj in rosproxies}
     namespaces = {text_at(submap(obj, "metadata"), "namespace") for obj in rosproxies}
@@ -58,6 +62,7 @@ def recent_events(
         is_users = event.kind == "Pod" and event.own and event.id.namespace in namespaces
         matters = event.uid in ours or is_users
         if matters and not (event.own and _is_told(event, told)):
+            # The scheduler repeats a reason with other texts, such as other counts of nodes.
             message = event.message if event.own else ""
             newest.setdefault((event.uid, event.reason, message), event)
     return [*newest.values()]
@@ -66,7 +71,7 @@ def recent_events(
 def event_findings(
     events: Iterable[RecentEvent], ready: Collection[str]
 ) -> Iterator[DoctorFinding]:
-    """Findings about the first few; ``ready`` are the uids of pods that are."""
+    """Findings about the first `MOST` Events; ``ready`` are the uids of the pods that are ready."""
     for event in [*events][:MOST]:
         subject = f"{event.kind.lower()} {event.id}"
         often = f", {event.count} times" if event.count > 1 else ""
@@ -76,7 +81,7 @@ def event_findings(
         elif event.uid in ready:
             yield note(_CHECK, subject, f"{text} (the pod is ready now)")
         else:
-            # The name in an Event is any text that the author of the Event has chosen.
+            # The author of an Event may write any text as the name.
             namespace = quoted(event.id.namespace)
             fix = f"read kubectl -n {namespace} describe pod {quoted(event.id.name)}"
             yield warning(_CHECK, subject, text, fix)
@@ -110,7 +115,10 @@ def _read(event: Json, now: float) -> RecentEvent:
 
 
 def _time(event: Json, series: Json) -> float:
-    """When it was seen last, in seconds of Unix time: the fields differ by who has made it."""
+    """The last time of an Event, in seconds of Unix time; 0 if no field is readable.
+
+    Clients of core/v1 write lastTimestamp, clients of events.k8s.io/v1 write eventTime and series.
+    """
     times = (
         text_at(series, "lastObservedTime"),
         *(text_at(event, key) for key in ("lastTimestamp", "eventTime", "firstTimestamp")),

@@ -1,4 +1,4 @@
-"""Which Kubernetes Events (core/v1) are made: each of them once, however often it is planned."""
+"""The Kubernetes Events (core/v1) of the operator: an Event for each problem, not for each plan."""
 
 import hashlib
 from collections import Counter
@@ -29,34 +29,38 @@ from rosproxy_operator.kubernetes.resources.names import (
 )
 
 QUIET = 60.0
-"""Seconds that a problem must have been away before it is told again."""
+"""Seconds without a problem after which the same problem gets an Event again."""
 MOST = 50
-"""Warnings that are made at once; the others have their turn at the next look."""
+"""Warning Events of a plan at most; the next plan has the rest."""
 MOST_TEXTS = 10
-"""Texts of one reason about one thing that came and went in `QUIET` seconds; others have to wait.
+"""Texts of the same reason about the same object that may come and go in `QUIET` seconds.
 
-A proxy in hostile hands chooses what its errors say, and so does a master.
+Further texts wait. A hostile proxy or master chooses the texts of its errors, and could cause any
+number of Events.
 """
 MOST_RESULTS = 20
-"""Events of one kind about what is done to a RosProxy's proxies at once; one more sums up."""
+"""Normal Events of a reason in a plan for a RosProxy; one more Event counts the rest."""
 LONGEST = 1024
-"""Bytes of an Event's message."""
+"""Bytes of the message of an Event at most."""
 COUNT_EVERY = 60.0
-"""Seconds in which the same Event is counted once at most."""
+"""Least seconds between two counts of the same Event."""
 COMPONENT = "rosproxy-operator"
-"""Who makes the Events, as they name it."""
+"""The source that the Events name."""
 _LONGEST_NAME = 200
 _ENDED: Mapping[type, tuple[str, str]] = {
     DeleteProxy: ("ProxyDeleted", "deleted"),
     EvictPod: ("PodEvicted", "evicted"),
 }
-"""Reason and verb of the Events about what goes."""
+"""Reason and verb of the Event about a removed pod, by the action."""
 _HELPERS = {LAN_RELAY: "LanRelay", IMAGE_CHECK: "ImageCheck"}
-"""What the reasons of Events about pods beside a proxy begin with."""
+"""The first part of the reasons of Events about pods beside a proxy."""
 
 
 class NewEvents(msgspec.Struct, frozen=True):
-    """Events to make, and when which problem was seen last, on a monotonic clock in seconds."""
+    """The Events to create, and when the operator last saw each problem.
+
+    The times in ``reported`` are in seconds of a monotonic clock.
+    """
 
     emits: tuple[Emit, ...] = ()
     reported: Mapping[ClusterFinding, float] = {}
@@ -65,14 +69,14 @@ class NewEvents(msgspec.Struct, frozen=True):
 def warnings(
     problems: Iterable[ClusterFinding], reported: Mapping[ClusterFinding, float], now: float
 ) -> NewEvents:
-    """Warning Events for problems that were not there before.
+    """Return Warning Events for new problems that name an object in ``about``.
 
-    One that comes and goes all the time is told once, and one whose text changes all the time
-    MOST_TEXTS times in QUIET seconds. After a restart of the operator all are
-    told again: who makes the Events counts those that are there already.
+    A problem that comes and goes gets a second Event only after `QUIET` seconds without the
+    problem. If the text of a problem keeps changing, further texts wait (`MOST_TEXTS`).
 
-    Only findings that are about an object become Events. ``reported`` is that of the last look, or
-    nothing; ``now`` is on its clock, in seconds.
+    After a restart of the operator all problems are new. The API server then has the Events, and
+    `count_patch` counts each Event once more. ``reported`` is from the plan before, and empty at
+    first; ``now`` is in seconds of the same clock.
     """
     findings = dict.fromkeys(f for f in problems if f.about)
     recent = {f: then for f, then in reported.items() if now - then < QUIET}
@@ -86,12 +90,12 @@ def warnings(
 
 
 def _kind(finding: ClusterFinding) -> tuple[object, ...]:
-    """What findings have in common that tell of the same thing in other words."""
+    """The key that findings with the same cause and different texts share."""
     return finding.of, finding.about, finding.subject, finding.reason
 
 
 def results(rosproxy: RosProxy, actions: Iterable[Action]) -> Iterator[Emit]:
-    """Normal Events for what is done to a RosProxy's proxies, to be made once it was done."""
+    """Normal Events for actions of a RosProxy, to create after the actions have succeeded."""
     reference = Reference(KIND, rosproxy.id, rosproxy.uid)
     texts: dict[str, list[str]] = {}
     for reason, text in map(_result, actions):
@@ -106,7 +110,7 @@ def results(rosproxy: RosProxy, actions: Iterable[Action]) -> Iterator[Emit]:
 
 
 def _result(action: Action) -> tuple[str, str]:
-    """The reason and the text of an Event about an action; empty if there is to be none."""
+    """The reason and the text of the Event about an action; empty for an action without Event."""
     match action:
         case CreateProxy(body={"metadata": {"name": name, "annotations": notes}}):
             place = f"on node {notes[NODE]} with ports {notes[PORT_RANGE]}"
@@ -127,14 +131,15 @@ def _result(action: Action) -> tuple[str, str]:
 
 
 def event_body(event: Emit, now: float) -> Json:
-    """An Event. The same thing that happens to the same object gets the same name.
+    """The Event as JSON. Equal Events about an object have the same name.
 
+    So the API server refuses the second Event, and the operator counts the first Event once more.
     ``now`` is in seconds of Unix time.
     """
     about = event.about
     identity = "\n".join([about.uid, event.type, event.reason, event.message])
     digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
-    # Before the dot a name must not end in a dot or a hyphen (RFC 1123, as Kubernetes wants names).
+    # The part before the dot must not end in a dot or a hyphen (RFC 1123 subdomain).
     name = f"{about.id.name[:_LONGEST_NAME].rstrip('.-')}.{digest}"
     return {
         "apiVersion": "v1",
@@ -160,7 +165,11 @@ def event_body(event: Emit, now: float) -> Json:
 
 
 def count_patch(event: Json, now: float) -> list[Json]:
-    """The JSON patch that counts an Event once more; empty if it was counted a moment ago."""
+    """The JSON patch that counts an Event once more.
+
+    Empty if the last count is less than `COUNT_EVERY` seconds old. ``now`` is in seconds of Unix
+    time.
+    """
     try:
         last = datetime.fromisoformat(text_at(event, "lastTimestamp")).timestamp()
     except (ValueError, OverflowError):
@@ -174,14 +183,14 @@ def count_patch(event: Json, now: float) -> list[Json]:
 
 
 def stamp(now: float) -> str:
-    """A time in seconds of Unix time in RFC 3339, in whole seconds as Kubernetes has it."""
+    """Format a Unix time by RFC 3339, in whole seconds as Kubernetes does."""
     return datetime.fromtimestamp(now, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def _warning(finding: ClusterFinding) -> Emit:
-    """A problem of the object itself needs no name there."""
+    """The Event of a finding. The text names the subject unless the Event is about the subject."""
     reference = finding.about
-    assert reference is not None  # noqa: S101 - `warnings` takes no others
+    assert reference is not None  # noqa: S101 - `warnings` skips findings without `about`
     itself = finding.subject == f"{reference.kind.lower()} {reference.id}"
     text = finding.text if itself else f"{finding.subject}: {finding.text}"
     return Emit(finding.of, reference, "Warning", finding.reason, _bounded(text))
@@ -190,5 +199,5 @@ def _warning(finding: ClusterFinding) -> Emit:
 def _bounded(text: str) -> str:
     if len(text.encode()) <= LONGEST:
         return text
-    # The ellipsis has three bytes; a character that is cut through is left out.
+    # The ellipsis has three bytes. `ignore` drops a character that the bound cuts.
     return text.encode()[: LONGEST - 3].decode(errors="ignore") + "…"

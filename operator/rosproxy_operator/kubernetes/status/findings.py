@@ -1,6 +1,6 @@
-"""What is wrong with a RosProxy's nodes and proxies, with reasons.
+"""Findings about the nodes and proxies of a RosProxy.
 
-The texts stay the same as long as the trouble does: an Event is made of each new one.
+The text of a finding must not change while the problem lasts: each new text is a new Event.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -42,16 +42,16 @@ WARNS = "ProxyWarns"
 REFUSES = "PolicyRefused"
 _LONGEST = 600
 _UNRESOLVED = "can't be resolved"
-"""Part of a proxy's error about a host name (rosproxy.net.http_client)."""
+"""Part of the error of a proxy about a host name (rosproxy.net.http_client)."""
 
 
 def findings(
     rosproxy: RosProxy, states: Iterable[RosProxyOnNode], failures: Mapping[Name, str]
 ) -> tuple[ClusterFinding, ...]:
-    """What is wrong with a RosProxy's nodes and proxies, and with what was to be carried out.
+    """The findings about failed actions, then about the nodes and proxies of a RosProxy.
 
-    Each has a reason; those that users are to be told by an Event have ``about``. ``failures`` is
-    what the API server said of actions that it refused, by the object.
+    A finding with ``about`` becomes an Event. ``failures`` are the errors of the API server, by the
+    object of the action.
     """
     problems = [_refused(rosproxy, id, text) for id, text in failures.items()]
     for state in sorted(states, key=lambda s: s.name):
@@ -60,7 +60,10 @@ def findings(
 
 
 def node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> Iterator[ClusterFinding]:
-    """What is wrong on one node. What keeps it from being served comes first, and is fatal."""
+    """The findings about a node and its pods. An obstacle comes first.
+
+    Findings that keep the node from being served are fatal.
+    """
     if state.obstacle is not None:
         yield _finding(rosproxy, f"node {state.name}", state.obstacle.text, state.obstacle.reason)
     if (
@@ -85,7 +88,7 @@ def node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> Iterator[Cluster
 def finding(
     of: RosProxy | InvalidRosProxy, reason: str, text: str, fatal: bool = False, subject: str = ""
 ) -> ClusterFinding:
-    """Something about a RosProxy, or about a ``subject`` that it has, with an Event."""
+    """A finding about a RosProxy or a ``subject`` of the RosProxy, with an Event."""
     subject = subject or f"rosproxy {of.id}"
     about = Reference(KIND, of.id, of.uid)
     return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=of.id, about=about)
@@ -94,7 +97,7 @@ def finding(
 def pod_finding(
     pod: Pod, rosproxy: RosProxy, reason: str, text: str, fatal: bool = True
 ) -> ClusterFinding:
-    """Something about a pod that a RosProxy selects, with an Event on the pod."""
+    """A finding about a pod that a RosProxy selects, with an Event on the pod."""
     subject = f"pod {pod.id}"
     about = Reference("Pod", pod.id, pod.uid)
     return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=rosproxy.id, about=about)
@@ -105,7 +108,7 @@ def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> Cluste
 
 
 def proxy_subject(proxy: ProxyPod) -> str:
-    """How a finding names a proxy."""
+    """The subject of a finding about a proxy."""
     return f"proxy {proxy.pod.id.name} on node {proxy.node}"
 
 
@@ -130,7 +133,7 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: PodFailure) -> ClusterFin
 
 
 def _unusable(rosproxy: RosProxy, check: HelperPod, proxy: ProxyPod) -> ClusterFinding:
-    """What keeps a proxy from its next image. The proxy runs on with the image that it has."""
+    """The finding that the next image is unusable. The proxy keeps the present image."""
     id = check.pod.id
     if check.stuck is PodFailure.IMAGE:
         text = f"the node can't get the image {check.image} ({check.message})"
@@ -162,7 +165,7 @@ def _deaf(rosproxy: RosProxy, lan_relay: HelperPod) -> ClusterFinding:
 def _answered(
     rosproxy: RosProxy, state: RosProxyOnNode, proxy: ProxyPod
 ) -> Iterator[ClusterFinding]:
-    """What follows from a proxy's answer. One that is not asked yet is not to blame."""
+    """The findings from the answer of a proxy; none before the operator has asked the proxy."""
     answer = state.answer
     subject = proxy_subject(proxy)
     if answer is None:
@@ -173,7 +176,7 @@ def _answered(
                 f"does not answer the operator ({answer.error}). Allow connections from the "
                 f"operator's pods to port {ADMIN_PORT} of this pod (NetworkPolicy)"
             )
-            # No Event: an operator that is cut off would make one for each proxy.
+            # No Event: an operator that reaches no proxy would create an Event for each proxy.
             yield ClusterFinding(subject, text, reason=SILENT, of=rosproxy.id)
         return
     if answer.refusal:
@@ -190,9 +193,9 @@ def _answered(
 
 
 def _own_problems(answer: ProxyReport) -> list[str]:
-    """The problems that a proxy tells, but those of its master and its range.
+    """The problems that a proxy reports, without problems that the operator finds as well.
 
-    The findings of the operator report these, too.
+    The operator reports the master and the range in findings and conditions of its own.
     """
     told = ["master: "] if not answer.master_up else []
     told += [f"{RANGE}: "] if answer.range_probe else []
@@ -200,7 +203,7 @@ def _own_problems(answer: ProxyReport) -> list[str]:
 
 
 def _master_remedy(rosproxy: RosProxy, error: str) -> str:
-    """What to do about a master that is not reached; ``error`` is in the words of the proxy."""
+    """The fix for a master that does not answer; ``error`` is the text of the proxy."""
     master = rosproxy.spec.master
     if master.service is not None:
         return f"Start roscore behind Service {master.service}, port {master.service_port}"

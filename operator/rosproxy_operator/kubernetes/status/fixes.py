@@ -1,6 +1,6 @@
-"""The fixes of the doctor for conditions of a RosProxy, by the reason of the condition.
+"""The doctor's fixes for conditions of a RosProxy, by the reason of the condition.
 
-The message of the condition names the object and has the same fix in full.
+The message of the condition names the object, and has the same fix in full.
 """
 
 from rosproxy_operator.kubernetes.resources.model import Name

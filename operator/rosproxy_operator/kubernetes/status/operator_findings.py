@@ -1,6 +1,6 @@
-"""Whether an operator runs, and whether it manages a RosProxy's namespace, for the doctor.
+"""The doctor's findings about operators: whether an operator runs, and manages a namespace.
 
-Without an operator everything else that the doctor finds is a consequence.
+Without an operator, all other findings are consequences.
 """
 
 from collections.abc import Iterator
@@ -13,16 +13,15 @@ from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 
 OPERATORS = "app.kubernetes.io/component=operator,app.kubernetes.io/part-of=rosproxy"
-"""Label selector of the operators' pods."""
+"""Label selector of the pods of operators."""
 _CHECK = "operator"
 _OPTION = "--namespace"
 
 
 class Operators(msgspec.Struct, frozen=True):
-    """What the cluster has of operators; ``pods`` None: the doctor could not read them.
+    """The operators in the cluster. ``pods`` is None if the doctor could not read the pods.
 
-    ``refused_namespaces`` are those in which the operator's role does not let it write the status
-    of a RosProxy.
+    In ``refused_namespaces`` the operator lacks the right to write the status of a RosProxy.
     """
 
     pods: tuple[Json, ...] | None = None
@@ -35,12 +34,15 @@ class Operators(msgspec.Struct, frozen=True):
 
     @property
     def ready_since(self) -> str:
-        """Since when one of them is ready, in RFC 3339; empty if none is."""
+        """Since when an operator is ready, in RFC 3339; empty if no operator is ready.
+
+        Of several ready pods, the time is the earliest.
+        """
         return min(filter(None, map(ready_since, self.pods or ())), default="")
 
     @property
     def namespaces(self) -> frozenset[str]:
-        """The namespaces that they manage; empty for all, or if that is not known."""
+        """The namespaces that operators manage; empty for all namespaces, or if unknown."""
         managed = [frozenset(_namespaces(pod)) for pod in self.pods or ()]
         return frozenset().union(*managed) if all(managed) else frozenset()
 
@@ -49,7 +51,7 @@ UNKNOWN = Operators()
 
 
 def operator_findings(operators: Operators) -> Iterator[DoctorFinding]:
-    """An error if no operator runs."""
+    """An error if no operator runs, or if no operator is ready."""
     if operators.missing:
         text = "no operator runs in the cluster, so no pod is wired and no proxy is created"
         fix = (
@@ -67,7 +69,7 @@ def operator_findings(operators: Operators) -> Iterator[DoctorFinding]:
 
 
 def unmanaged(rosproxy: Name, operators: Operators) -> DoctorFinding | None:
-    """The error about a RosProxy in a namespace that no operator manages."""
+    """The error about a RosProxy in a namespace that no operator manages, else None."""
     managed = operators.namespaces
     if not managed or rosproxy.namespace in managed:
         return None
@@ -83,7 +85,7 @@ def unmanaged(rosproxy: Name, operators: Operators) -> DoctorFinding | None:
 
 
 def unnoticed(rosproxy: Name, operators: Operators) -> DoctorFinding:
-    """The error about a RosProxy whose last change no operator has looked at."""
+    """The error about a RosProxy for whose last change no operator has written a status."""
     subject = f"rosproxy {rosproxy}"
     namespace = rosproxy.namespace
     if namespace in operators.refused_namespaces:
@@ -116,14 +118,14 @@ def describe_operators(namespace: str) -> str:
 
 
 def ready_since(pod: Json) -> str:
-    """Since when a pod is ready, in RFC 3339; empty if it is not."""
+    """Since when a pod is ready, in RFC 3339; empty if the pod is not ready."""
     conditions = submaps(submap(pod, "status"), "conditions")
     ready = (c for c in conditions if c.get("type") == "Ready" and c.get("status") == "True")
     return next((text_at(c, "lastTransitionTime") for c in ready), "")
 
 
 def service_account(operators: Operators) -> Name | None:
-    """The service account of the operator's pods; None if there are none."""
+    """The first service account that a pod of the operators names; None without such a pod."""
     pods = operators.pods or ()
     ids = (Name(_id(p).namespace, text_at(submap(p, "spec"), "serviceAccountName")) for p in pods)
     return next((id for id in ids if id.name), None)
@@ -135,7 +137,7 @@ def _id(pod: Json) -> Name:
 
 
 def _namespaces(pod: Json) -> Iterator[str]:
-    """The values of the option --namespace, in either of its forms."""
+    """The values of ``--namespace VALUE`` and of ``--namespace=VALUE``."""
     for container in submaps(submap(pod, "spec"), "containers"):
         words = [str(word) for word in container.get("args") or ()]
         for word, following in zip(words, [*words[1:], ""], strict=True):

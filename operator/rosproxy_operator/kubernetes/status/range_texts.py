@@ -1,8 +1,8 @@
 """Texts about whether outside reaches a proxy's ports: the result of the last test, and the fix.
 
-A network plug-in without support for hostPorts maps none and reports no error: the pods are ready,
-the proxies reach the master, and outside receives nothing. So the proxy tests its own range from
-outside (`range_probe`).
+A network plug-in without support for hostPorts maps no port and reports no error. Then the pods are
+ready, the proxies reach the master, and outside receives nothing. So the proxy tests its own range
+from outside (`range_probe`).
 """
 
 from rosproxy.admin.status_document import RangeProbeStatus
@@ -13,7 +13,7 @@ ADDRESS_FIX = FIXES["advertised host"].kubernetes
 _FIREWALL = "open the proxy's hostPorts in the node's firewall and in NetworkPolicies"
 _PLUGIN = "enable hostPorts in the nodes' network plug-in (CNI: the plug-in portmap)"
 PORTS_FIX = f"{FIXES['publish'].kubernetes}; or {ADDRESS_FIX}"
-"""The fix where the outcome of the test is not known."""
+"""The fix if the outcome of the test is unknown."""
 _NO_ANSWER = ("there is no answer", f"{_FIREWALL}; or {ADDRESS_FIX}")
 _STRANGER = (
     "another program answers there",
@@ -40,16 +40,16 @@ _BY_OUTCOME = {
 
 
 def no_way_in(state: RosProxyOnNode, probe: RangeProbeStatus) -> str:
-    """The text that outside does not reach a node's proxy, with the fix.
+    """The text that outside does not reach the proxy of a node, with the fix.
 
-    The text leaves out the tested ports: they differ from test to test, and each text is an Event.
+    The text leaves out the tested ports: each test takes other ports, and each text is an Event.
     """
     cause, fix = _BY_OUTCOME.get(probe.from_proxy, ("the test failed", PORTS_FIX))
     return f"outside does not reach {_target(state)} ({cause}). {fix[:1].upper()}{fix[1:]}"
 
 
 def not_proven(state: RosProxyOnNode, probe: RangeProbeStatus | None) -> str:
-    """Why it is not known whether outside reaches a node's proxy; to follow the proxy's name."""
+    """Why the test says nothing about outside. The name of the proxy precedes this text."""
     if probe is None:
         return (
             f"has not tested {_target(state)} yet. The test needs a master that answers and a free "

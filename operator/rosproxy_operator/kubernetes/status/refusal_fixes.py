@@ -1,7 +1,6 @@
-"""The fixes for what Kubernetes refuses, by the words of its admission, scheduler and kubelet.
+"""The fixes for errors of Kubernetes: of admission, the scheduler, the kubelet and registries.
 
-The words are those of Kubernetes 1.36. Each fix is one or several sentences without the last full
-stop.
+The patterns match the texts of Kubernetes 1.36. A fix has no full stop at the end.
 """
 
 import re
@@ -9,7 +8,7 @@ import re
 from rosproxy_operator.kubernetes.resources.model import RosProxy
 
 OF_ANOTHER = "the operator did not create"
-"""Part of the error about an object that has the name already and is not the operator's."""
+"""Part of the error about a foreign object that has the name already."""
 _ENFORCE = "pod-security.kubernetes.io/enforce"
 _LIMITS = "the LimitRange of the namespace"
 # k8s.io/apiserver, pkg/admission/plugin/resourcequota/controller.go; k8s.io/kubernetes,
@@ -43,7 +42,7 @@ _SCHEDULING = (
     (r"insufficient |outof", "Make room on the node, or lower spec.resources.requests"),
     (r"sysctlforbidden", "Allow the sysctl net.ipv4.ip_local_port_range in the kubelet"),
 )
-# The errors of registries as containerd gives them; k8s.io/kubernetes, pkg/kubelet/images.
+# The errors of registries in the words of containerd; k8s.io/kubernetes, pkg/kubelet/images.
 _IMAGE = (
     (r"pull policy of never|errimageneverpull",
      "Load the image on the node, or set spec.imagePullPolicy"),
@@ -69,7 +68,7 @@ def admission_fix(message: str, rosproxy: RosProxy) -> str:
 
 
 def scheduling_fix(message: str) -> str:
-    """The fix for a pod that the scheduler or the kubelet does not admit."""
+    """The fix for a pod that the scheduler or the kubelet refuses."""
     fallback = "Make room on the node, or set spec.tolerations or spec.resources"
     return _first(_SCHEDULING, message.lower(), fallback)
 
@@ -88,9 +87,9 @@ def _first(fixes: tuple[tuple[str, str], ...], low: str, fallback: str) -> str:
 
 
 def _unset_fix(low: str) -> str:
-    """The fix where a ResourceQuota wants values that the pod has not.
+    """The fix if a ResourceQuota requires values that the pod lacks.
 
-    A quota for ``cpu`` is one for ``requests.cpu``.
+    A quota for ``cpu`` counts ``requests.cpu``.
     """
     wanted = low.partition("must specify ")[2]
     names = re.findall(r"(?:limits\.|requests\.)?(?:cpu|memory|ephemeral-storage)\b", wanted)

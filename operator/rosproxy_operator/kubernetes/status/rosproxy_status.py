@@ -38,13 +38,16 @@ MASTER = "MasterReachable"
 DEGRADED = "Degraded"
 WAY_IN = "PortsReachable"
 LONGEST = 1024
-"""Characters of a message."""
+"""Characters of a message at most."""
 MOST_NODES = 200
-"""Nodes that are told one by one. The API server takes an object of about a megabyte."""
+"""Nodes in ``perNode`` at most.
+
+The API server refuses an object of more than 1.5 MB (etcd, --max-request-bytes).
+"""
 MOST_NAMES = 50
-"""Names of ROS nodes that are told of each."""
+"""Names of ROS nodes in a line of ``perNode`` at most."""
 MOST_NAMES_OF_ALL = 4000
-"""The same of all nodes: with `_NAME` characters each they take less than half of that object."""
+"""Names in all lines at most: 4,000 names of `_NAME` characters take 400 kB."""
 _NAME = 100
 _MESSAGE = 300
 _BY_NODE = 400
@@ -52,12 +55,12 @@ _BY_NODE = 400
 _REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
 _NO_PODS = "NoPods"
 _KEEPS_PODS_OUT = ("Ambiguous", "HostNetwork", "NodeLeftOut", "NotWired")
-"""Reasons of problems that leave pods without a proxy."""
+"""Reasons of findings about pods that get no proxy."""
 _NO_PROXY = "no proxy runs, so this is not known"
 
 
 class Condition(msgspec.Struct, frozen=True):
-    """A condition without its times. ``status`` is True, False or Unknown."""
+    """A condition without times. ``status`` is True, False or Unknown."""
 
     type: str
     status: str
@@ -73,15 +76,15 @@ def status_of(
     master: str,
     stamp: str,
 ) -> Json:
-    """The status of a RosProxy, as in the CRD.
+    """The status of a RosProxy, with the fields of the CRD.
 
-    What only proxies can tell stays as it was until they have been asked, so that an operator that
-    is started changes nothing.
+    While a proxy has not answered, the facts that only this proxy knows stay as in the former
+    status. So a start of the operator changes no status.
 
-    ``problems`` are all that is wrong with it: `findings`, those of its pods, and others.
-    ``cluster_ip`` is its Service's, empty if that is yet to be made. ``master`` is the URI of the
-    real master as the proxies use it, empty if it is not known; ``stamp`` the time for conditions
-    that change, in RFC 3339.
+    ``problems`` are all findings about the RosProxy, with the findings about pods. ``cluster_ip``
+    is the address of the Service, empty before the Service exists. ``master`` is the URI of the
+    real master for the proxies, empty if unknown. ``stamp`` is the time for conditions that change,
+    in RFC 3339.
     """
     former = rosproxy.status
     shown = _shown_nodes(states)
@@ -119,7 +122,7 @@ def status_of(
 
 
 def participants(observed: ClusterSnapshot) -> dict[int, int]:
-    """How many participants there are behind the proxies, by domain."""
+    """The number of participants behind the proxies, by domain."""
     domains = {r.uid: r.spec.ros2.number for r in observed.rosproxies if r.spec.ros2}
     counts = dict.fromkeys(domains.values(), 0)
     for proxy in observed.proxies:
@@ -130,9 +133,10 @@ def participants(observed: ClusterSnapshot) -> dict[int, int]:
 
 
 def _addressed(rosproxy: RosProxy, cluster_ip: str, master: str) -> dict[str, object]:
-    """Under which address pods find their proxy, and the master, if there is one.
+    """The addresses at which pods find the proxy of their node, and the URI of the real master.
 
-    It is the former one as long as there is no Service: it is to be had again.
+    Without a Service the former address stays in the status: the next Service asks for the same
+    address.
     """
     fields: dict[str, object] = {}
     if rosproxy.spec.ros1:
@@ -144,9 +148,9 @@ def _addressed(rosproxy: RosProxy, cluster_ip: str, master: str) -> dict[str, ob
 
 
 def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
-    """The status of a RosProxy that can't be used: as it was, but not Ready.
+    """The former status of a RosProxy that can't be used, with other conditions Ready and Degraded.
 
-    What it has goes on as it is, so that the other conditions stay.
+    All other conditions stay, because the operator leaves the existing proxies as they are.
     """
     former = rosproxy.status
     text = rosproxy.text
@@ -165,7 +169,10 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
 
 
 def _shown_nodes(states: Sequence[RosProxyOnNode]) -> list[RosProxyOnNode]:
-    """The nodes to be told, by name; those without pods are the first to be left out."""
+    """The nodes for ``perNode``, sorted by name, at most `MOST_NODES`.
+
+    Nodes without pods are left out first, and of these first the nodes without a proxy.
+    """
     ranked = sorted(states, key=lambda state: (not state.pods, state.proxy is None, state.name))
     return sorted(ranked[:MOST_NODES], key=lambda state: state.name)
 
@@ -187,7 +194,7 @@ def _line(rosproxy: RosProxy, state: RosProxyOnNode, names: int) -> dict[str, ob
 
 
 def _ros(state: RosProxyOnNode, limit: int, former: Json) -> dict[str, object]:
-    """What a proxy tells of its ROS nodes, now or when it was asked last."""
+    """The ROS nodes and topics behind a proxy, by the present answer or else the former status."""
     if _has_answered(state.answer):
         names = sorted({name for group in state.answer.nodes.values() for name in group})
         shown = [shorten(clean(name), _NAME) for name in names[:limit]]
@@ -216,7 +223,7 @@ def _topics(states: Sequence[RosProxyOnNode], former: Json) -> int:
 
 
 def _ports(states: Sequence[RosProxyOnNode]) -> str:
-    """The one range of all nodes that need one, or each node's."""
+    """The range of all nodes with pods or a proxy; if the ranges differ, the range of each node."""
     ranges = {s.name: str(s.range) for s in states if s.range and (s.pods or s.proxy)}
     if len(set(ranges.values())) <= 1:
         return next(iter(ranges.values()), "")
@@ -226,7 +233,7 @@ def _ports(states: Sequence[RosProxyOnNode]) -> str:
 
 
 def _addresses(wanted: Sequence[RosProxyOnNode]) -> str:
-    """Where outside reaches the proxy of each node, and which nodes have no proxy that works."""
+    """The advertised host of each node, with a mark at nodes whose proxy is not ready."""
     hosts = {state.name: state.advertise_host or "no address" for state in wanted}
     waiting = {state.name for state in wanted if not _serving(state)}
     lines = (
@@ -237,9 +244,9 @@ def _addresses(wanted: Sequence[RosProxyOnNode]) -> str:
 
 
 def _serving(state: RosProxyOnNode) -> bool:
-    """Whether a node's proxy has its ports and works.
+    """Whether the proxy of a node is ready, is not stuck, and has answered.
 
-    One that has not been asked since the operator started counts if the kubelet finds it ready.
+    Before the operator has asked the proxy, the condition Ready of the pod suffices.
     """
     proxy = state.proxy
     if proxy is None or proxy.pod.deleting or not proxy.ready or proxy.stuck is not None:
@@ -250,10 +257,10 @@ def _serving(state: RosProxyOnNode) -> bool:
 def _conditions(
     judged: Iterable[Condition], former: Json, generation: int, stamp: str
 ) -> list[dict[str, object]]:
-    """Conditions as the API server takes them.
+    """The conditions as JSON (``metav1.Condition``).
 
-    One whose status is the same as in the ``former`` status keeps its time; the time of the others
-    is ``stamp``, in RFC 3339.
+    A condition with the same status as in the ``former`` RosProxy status keeps the
+    lastTransitionTime. A changed condition gets ``stamp``, in RFC 3339.
     """
     since = {
         (text_at(condition, "type"), text_at(condition, "status")): text_at(
@@ -313,14 +320,14 @@ def _ready(
 
 
 def _message(ready: Condition, problems: Sequence[ClusterFinding]) -> str:
-    """Why the RosProxy is not ready, else the first problem, else what the proxies serve."""
+    """The text of Ready if the RosProxy is not ready or has no finding, else the first finding."""
     is_ready = ready.status == "True"
     text = _one_line(problems[0]) if is_ready and problems else ready.message
     return bounded(text, LONGEST)
 
 
 def _of_pod(problem: ClusterFinding) -> bool:
-    """Whether it concerns one of the users' pods, without which the others are served."""
+    """Whether a finding is about a user's pod. The proxies serve all other pods meanwhile."""
     return problem.about is not None and problem.about.kind == "Pod"
 
 
@@ -340,7 +347,7 @@ def _allocated(wanted: Sequence[RosProxyOnNode], problems: Sequence[ClusterFindi
 def _reached(
     states: Sequence[RosProxyOnNode], problems: Sequence[ClusterFinding], former: Json
 ) -> Condition:
-    """Proxies that are not asked yet say nothing: for them the former condition stays."""
+    """The condition MasterReachable; the former condition if a proxy has not answered yet."""
     proxies = [state for state in states if _may_answer(state)]
     answers = [s.answer for s in proxies if s.answer is not None and s.answer.answered]
     if not all(answer.master_up for answer in answers):
@@ -358,7 +365,7 @@ def _reached(
 def _way_in(
     states: Sequence[RosProxyOnNode], problems: Sequence[ClusterFinding], former: Json
 ) -> Condition:
-    """Whether outside reaches the ports. Proxies that are not asked yet say nothing, as above."""
+    """The condition PortsReachable; the former condition if a proxy has not answered yet."""
     proxies = [(s, s.proxy, s.answer) for s in states if s.proxy is not None and _may_answer(s)]
     probes = [(s, p, a.range_probe) for s, p, a in proxies if a is not None and a.answered]
     if any(probe is not None and probe.reached is False for _, _, probe in probes):
@@ -378,14 +385,14 @@ def _way_in(
 
 
 def _may_answer(state: RosProxyOnNode) -> bool:
-    """Whether a node has a proxy that runs, or is about to."""
+    """Whether a node has a proxy that is not stuck."""
     return state.proxy is not None and state.proxy.stuck is None
 
 
 def _previous(condition: str, former: Json) -> Condition:
-    """The condition as it was, where not every proxy that is there has been asked."""
+    """The former condition; Unknown if there is none."""
     previous = (c for c in submaps(former, "conditions") if c.get("type") == condition)
-    unknown = Condition(condition, "Unknown", "NotAsked", "no proxy has answered yet")
+    unknown = Condition(condition, "Unknown", "NotAsked", "not every proxy has answered yet")
     return next(map(_read, previous), unknown)
 
 

@@ -1,6 +1,7 @@
-"""Whether the webhook that wires pods can work, for the doctor: its configuration, CA and Service.
+"""The doctor's findings about the webhook that wires pods: about configuration, CA and Service.
 
-The webhook refuses no pod: if it fails, pods start unwired, and their nodes don't find the proxy.
+The webhook refuses no pod. If the webhook fails, pods start unwired, and the nodes in these pods
+don't find the proxy.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,19 +16,20 @@ from rosproxy_operator.kubernetes.resources.names import INJECT
 from rosproxy_operator.kubernetes.status.operator_findings import describe_operators
 
 NAME = "wire.rosproxy.io"
-"""What the webhook is called in its configuration."""
+"""The name of the webhook in the MutatingWebhookConfiguration."""
 _CHECK = "webhook"
 _ANEW = "then create unwired pods again: kubectl rollout restart"
 _INSTALL = "create the object again: helm upgrade, or kubectl apply -f manifests/install.yaml"
 
 
 class WebhookFacts(msgspec.Struct, frozen=True):
-    """What the cluster has of the webhook; None: the doctor could not read it.
+    """The objects of the webhook in the cluster. None means that the doctor could not read them.
 
-    ``configurations`` are the MutatingWebhookConfigurations with our webhook, ``operators`` the
-    operators' pods; ``ready`` is how many endpoints of a Service take calls, None where there is no
-    such Service; those that could not be looked at are left out. ``unreached`` are the pods that no
-    operator has wired, though an operator was ready.
+    - ``configurations``: the MutatingWebhookConfigurations with our webhook.
+    - ``operators``: the pods of operators, read only if there is no configuration.
+    - ``ready``: the number of ready endpoints of each Service, None for a missing Service. A
+      Service that the doctor could not read has no entry.
+    - ``unreached``: the unwired pods that were created while an operator was ready.
     """
 
     configurations: tuple[Json, ...] | None = None
@@ -37,22 +39,22 @@ class WebhookFacts(msgspec.Struct, frozen=True):
 
 
 def our_webhook(configuration: Json) -> Json:
-    """Our webhook in a configuration; empty if it is another one's."""
+    """Our webhook in a configuration; empty if the configuration has only other webhooks."""
     webhooks = submaps(configuration, "webhooks")
     return next((w for w in webhooks if w.get("name") == NAME), {})
 
 
 def service_of(configuration: Json) -> Name:
-    """The Service that the API server calls."""
+    """The Service that the API server calls for our webhook."""
     service = submap(our_webhook(configuration), "clientConfig", "service")
     return Name(text_at(service, "namespace"), text_at(service, "name"))
 
 
 def webhook_findings(facts: WebhookFacts) -> Iterator[DoctorFinding]:
-    """What is wrong with the webhook, as far as could be looked at."""
+    """The findings about the webhook; none if the doctor could not read the configurations."""
     if facts.configurations is None:
         return
-    if not facts.configurations and facts.operators != ():  # else there is no operator at all
+    if not facts.configurations and facts.operators != ():  # else `operator_findings` reports
         yield _missing(facts.operators)
     for configuration in facts.configurations:
         yield from _findings_of(configuration, facts)
