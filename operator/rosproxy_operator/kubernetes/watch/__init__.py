@@ -1,1 +1,1 @@
-"""The cluster as its watches tell it."""
+"""Watches the objects of the cluster and keeps the state."""

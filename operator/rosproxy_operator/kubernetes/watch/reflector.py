@@ -1,14 +1,13 @@
-"""Follows one kind of object, in a thread: lists it, then watches what happens to it.
+"""Follows objects of a kind in a thread: lists the objects, then watches changes.
 
-A watch that ends, after a while or because the API server is started anew, goes on from where it
-was; one that can't (410 Gone) begins with a new list. Now and then everything is listed anew in any
-case, to see whether something was missed. Lists come in pages. Whatever goes wrong, it is tried
-again, with pauses that grow and differ, so that not all watches come back at once.
+When a watch ends, the reflector starts the next watch at the last version. If the API server no
+longer has this version (410 Gone), the reflector lists all objects again. After `CHECKED` seconds
+the reflector lists again in any case, to find missed changes. Lists come in pages. After an error
+the reflector tries again. The pauses grow, and are random so that not all watches return at once.
 
-kopf's indices keep whole objects, in a task for each; the Kubernetes client's SharedInformer keeps
-them whole as well, lists them in one piece and can't be stopped while nothing happens. So these few
-lines are the operator's own. `records` reads the objects, and `store`, which is called in the event
-loop, keeps them.
+kopf's indices and the SharedInformer of the Kubernetes client keep whole objects, which takes too
+much memory. kopf also needs a task for each object. The SharedInformer lists without pages, and
+can't stop before the next event. `records` reduces each object, and `store` keeps the records.
 """
 
 import logging
@@ -34,34 +33,44 @@ from rosproxy_operator.kubernetes.resources.records import READERS, Change, Reco
 log = logging.getLogger(__name__)
 
 PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
-"""Seconds until the API server is asked again, the last one repeated."""
+"""Longest pauses in seconds after the first error, the second, and so on; the last repeats.
+
+Each pause is random, between half and all of this time.
+"""
 WELL = 10.0
-"""Seconds after which the loss of a watch counts as the first failure in a row."""
+"""Seconds. A watch that lasted longer resets the failure count."""
 CHECKED = 1800.0
-"""Seconds after which everything is listed anew though nothing seems to be missing."""
+"""Seconds after a list until the reflector lists again, once the present watch has ended."""
 DOUBTED = 60.0
-"""Least seconds between two lists that are made because the watched state was wrong."""
+"""Least seconds from a list to a further list because the watched state was wrong (`relist`)."""
 SHORT = 1.0
-"""Least seconds that a watch without events must last: it would be started in a loop otherwise."""
+"""A shorter watch without events is an error, in seconds. Else the reflector restarts in a loop."""
 STOPPING = 3.0
-"""Seconds that a thread has to end."""
+"""Seconds that the thread of a reflector has to end."""
 
 
 class Listener(Protocol):
-    """Gets lists and changes, in the event loop. ``place`` is a namespace, empty for all."""
+    """Gets lists and changes in the event loop. ``place`` is a namespace, empty for all."""
 
     def changed(self, kind: str, place: str, changes: Sequence[Change]) -> None:
-        """These objects have changed, in this order; None: gone."""
+        """Take changes of objects, in this order. A record None means that the object is gone.
+
+        A call without changes means that the watch works.
+        """
 
     def listed(self, kind: str, place: str, records: Mapping[str, Record]) -> None:
-        """These are all objects of the kind."""
+        """Take all objects of the kind."""
 
     def failed(self, kind: str, place: str, error: ApiError) -> None:
-        """The kind can't be listed or watched."""
+        """Take the error: the API server did not list or watch the kind."""
 
 
 class Reflector:
-    """Follows a kind in a namespace. ``call_soon`` lets a function run in the event loop."""
+    """Follows a kind in a namespace; ``collection`` names both.
+
+    ``call_soon`` runs a function in the event loop. The thread of the reflector calls ``lost`` at
+    each error.
+    """
 
     def __init__(
         self,
@@ -83,24 +92,27 @@ class Reflector:
         self._thread = threading.Thread(target=self._run, daemon=True, name=f"watch {self._kind}")
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Let it end. `join` waits for that."""
+        """Stop the watch and the thread. `join` waits for the end."""
         self._ending.set()
         if self._watch is not None:
             self._watch.stop()
 
     def relist(self) -> None:
-        """List everything anew soon: the watched state is wrong."""
+        """List all objects again soon, because the watched state is wrong.
+
+        Within `DOUBTED` seconds after a list, the call does nothing.
+        """
         if time.monotonic() - self._listed_at > DOUBTED:
-            self._listed_at = -CHECKED  # too long ago, however little the clock has counted
+            self._listed_at = -CHECKED  # old enough even if the monotonic clock is near 0
             if self._watch is not None:
                 self._watch.stop()
 
     def join(self) -> None:
-        """Wait until it has ended, but not long."""
+        """Wait until the thread has ended, for `STOPPING` seconds at most."""
         self._thread.join(STOPPING)
 
     def _run(self) -> None:
@@ -114,13 +126,13 @@ class Reflector:
                 failures = 0
             except ApiError as error:
                 failures = 1 if time.monotonic() - began > WELL else failures + 1
-                # A version that the API server does not know is one of before its store was lost.
+                # After a loss of etcd the API server refuses a former version as too large.
                 if isinstance(error, ApiExpired) or "resource version" in str(error).lower():
                     self._version = ""
                 self._complain(error)
                 if not isinstance(error, ApiLost) or failures > 1:
                     self._pause(failures)
-            except Exception as error:  # a mistake of ours must not blind the operator
+            except Exception as error:  # a bug of ours must not end the watch
                 text = "watch failed by an internal error, the operator tries again: %s"
                 log.exception(text, self._kind)
                 self._version = ""
@@ -139,7 +151,7 @@ class Reflector:
         self._ending.wait(longest * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
 
     def _list(self) -> str:
-        """List all objects. Returns the list's version."""
+        """List all objects. Returns the version of the list, at which the watch starts."""
         records: dict[str, Record] = {}
         token = ""
         while True:
@@ -156,17 +168,17 @@ class Reflector:
         return page.version
 
     def _follow(self) -> None:
-        """Pass on events until the watch ends, and keep the version that it has got to.
+        """Pass on events until the watch ends. Raises ApiError.
 
-        Also for a watch that is lost: else all its events would come again from the beginning, and
-        set objects back to what they were then.
+        Note the version after each group of events, for a lost watch, too. A watch from an older
+        version would repeat events, and set objects back to former states.
         """
         began = time.monotonic()
         heard = False
         self._watch = watch = self._api.watch(self._kind, self._place, self._version)
-        self._tell(self._listener.changed, ())  # it works again, if it did not
+        self._tell(self._listener.changed, ())  # the watch works
         if self._ending.is_set():
-            watch.stop()  # `stop` may have come before there was a watch to end
+            watch.stop()  # `stop` may have found no watch
         for events in watch:
             if self._ending.is_set():
                 break
@@ -178,7 +190,7 @@ class Reflector:
             raise ApiLost("the watch ended at once")
 
     def _changes(self, events: Iterable[Event]) -> list[Change]:
-        """The objects that have changed, by their keys. Raises ApiError for an ERROR event."""
+        """The changes in events. Raises ApiError for an ERROR event."""
         changes = list[Change]()
         for event in events:
             if event.type == "ERROR":
@@ -187,7 +199,7 @@ class Reflector:
                 continue
             key = key_of(event.object)
             changes.append((key, self._read(event.object)))
-            if event.type == "DELETED":  # the object is as it was at its end
+            if event.type == "DELETED":  # the event has the last state: pass on the state first
                 changes.append((key, None))
         return changes
 
@@ -200,17 +212,17 @@ class Reflector:
 
 
 def _version(events: Iterable[Event]) -> str:
-    """The last resourceVersion among events, empty if there is none."""
+    """The last resourceVersion in events; empty without events."""
     versions = (text_at(submap(event.object, "metadata"), "resourceVersion") for event in events)
     return ([version for version in versions if version] or [""])[-1]
 
 
 def _error(status: Json) -> ApiError:
-    """The error with which a watch has ended."""
+    """The error in an ERROR event (``metav1.Status``)."""
     text = text_at(status, "message") or "the watch ended"
     return ApiExpired(text) if status.get("code") == 410 else ApiLost(text)
 
 
 def watched_collections(api: Api) -> list[tuple[str, str]]:
-    """The kinds to be followed, each with a namespace (empty for all); RosProxies first."""
+    """The kinds to watch, each with a namespace (empty for all); RosProxies come first."""
     return [(kind, place) for kind in READERS for place in api.namespaces_of(kind)]

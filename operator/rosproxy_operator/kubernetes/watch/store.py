@@ -1,8 +1,9 @@
-"""The cluster as its watches tell it: what a look sees, and what has changed since the last one.
+"""Keeps the state of the cluster from watches, and notes what has changed since the last look.
 
-All of it lives in the event loop: reflectors write (`changed`, `listed`, `failed`), the controller
-reads (`snapshot`, `take_changes`). It may lag behind, and be wrong where a watch has lost
-something: a later look corrects the consequences, and nothing is deleted by it alone (`confirm`).
+The event loop makes all calls: reflectors write (`changed`, `listed`, `failed`), the controller
+reads (`snapshot`, `take_changes`). The state may lag behind the API server, or lack an event that a
+watch has lost. A later look corrects the consequences. Before the operator deletes an object, it
+reads the facts from the API server again (`confirm_deletion`).
 """
 
 import asyncio
@@ -49,21 +50,23 @@ R = TypeVar("R", bound=Record)
 Collection = tuple[str, str]
 """A kind, and a namespace, empty for all."""
 MOST_VANISHED = 4096
-"""Proxies whose pods have vanished that are remembered; of more, the first goes."""
+"""Places of vanished proxy pods at most; for a further place the store forgets the oldest."""
 
 
 @dataclass(slots=True)
 class StoreChanges:
-    """What has changed: something of these namespaces, or on these nodes."""
+    """The namespaces and the nodes of changed objects that matter to a RosProxy."""
 
     namespaces: set[str] = field(default_factory=set)
     nodes: set[str] = field(default_factory=set)
 
 
 class ClusterStore:
-    """The objects that are watched: of ``kinds``; ``places`` are the namespaces looked after.
+    """The records of the watched ``kinds``. The operator manages the namespaces in ``places``.
 
-    ``wake`` is called when a look is due, ``back`` when a watch that had failed works again.
+    The store calls ``wake`` when a look is due, and ``back`` when a failed watch works again.
+    ``corrected`` gets the number of objects in which a new list differs from the store. ``now``
+    gives seconds of a monotonic clock.
     """
 
     def __init__(
@@ -94,10 +97,10 @@ class ClusterStore:
         self._vanished: dict[ProxyPlace, float] = {}
         self._touched = StoreChanges()
 
-    # what reflectors call
+    # For reflectors:
 
     def changed(self, kind: str, place: str, changes: Sequence[Change]) -> None:
-        """Some objects have changed, in this order; None: gone. And the watch works."""
+        """Apply changes in this order; None means that the object is gone. The watch works."""
         collection = kind, place
         self._note_heard(collection)
         if self._errors.pop(collection, None):
@@ -106,7 +109,7 @@ class ClusterStore:
             self._put(collection, key, record)
 
     def listed(self, kind: str, place: str, records: Mapping[str, Record]) -> None:
-        """These are all objects of a kind; the watch is yet to begin."""
+        """Replace all records of a kind in a namespace. The watch starts later."""
         collection = (kind, place)
         former = dict(self._tables[kind, place])
         gone = dict.fromkeys(former.keys() - records.keys())
@@ -123,7 +126,7 @@ class ClusterStore:
         self._listed.add(collection)
 
     def failed(self, kind: str, place: str, error: ApiError) -> None:
-        """A kind can't be listed or watched for now."""
+        """Note an error of a list or watch; `check` raises the error while the watch fails."""
         if isinstance(error, ApiNotFound) and (text := crd_missing(kind)):
             error = ApiNotFound(text)
         fresh = (kind, place) not in self._errors
@@ -137,27 +140,28 @@ class ClusterStore:
         if not self._pending:
             self._all_heard.set()
 
-    # what the controller calls
+    # For the controller:
 
     async def check(self) -> None:
-        """Wait until all has been listed once; ApiError if a kind can't be listed or watched.
+        """Wait until each watch has started or failed once. Raises ApiError if a watch fails now.
 
-        NetworkPolicies may be missing, where the operator has no right to them.
+        NetworkPolicies are an exception: the operator may lack the right to read NetworkPolicies,
+        and works without. Only ApiUnavailable counts there.
         """
         await self._all_heard.wait()
-        # That of the RosProxies first: it says what to do where their definition is missing.
+        # RosProxies first: if the CRD is missing, this error has the fix.
         for (kind, _), error in sorted(self._errors.items(), key=lambda pair: pair[0][0] != PLURAL):
             if kind != POLICIES or isinstance(error, ApiUnavailable):
                 raise error
 
     def take_changes(self) -> StoreChanges:
-        """What has changed since the last call."""
+        """Return the changes since the last call, and start anew."""
         touched = self._touched
         self._touched = StoreChanges()
         return touched
 
     def snapshot(self, key: bytes = b"") -> ClusterSnapshot:
-        """The cluster as far as it is known."""
+        """The present state of the cluster. ``key`` is the key of the proxies' tokens."""
         rosproxies = tuple(self._records_of(PLURAL, RosProxy))
         masters = self._masters(rosproxies)
         services = self._records_of("services", ProxyService)
@@ -209,7 +213,10 @@ class ClusterStore:
     def _masters(
         self, rosproxies: Iterable[RosProxy]
     ) -> dict[Name, tuple[MasterService | None, set[int]]]:
-        """The Services that RosProxies name as their masters, and the ports that they name."""
+        """The Services that RosProxies name as the master, each with the named ports.
+
+        None stands for a Service that does not exist.
+        """
         ports: dict[Name, set[int]] = defaultdict(set)
         for rosproxy in rosproxies:
             if rosproxy.spec.master.service is not None:
@@ -234,7 +241,7 @@ class ClusterStore:
         rosproxies = self._rosproxies.get(pod.id.namespace)
         return rosproxies is not None and any(selects(r, pod) for r in rosproxies.values())
 
-    # what a change means
+    # Changes:
 
     def _put(self, collection: Collection, key: str, record: Record | None) -> None:
         table = self._tables[collection]
@@ -246,15 +253,15 @@ class ClusterStore:
             del table[key]
         else:
             table[key] = record
-        # A change concerns whom the former record mattered to, and whom the new one does: a pod
-        # whose label changes leaves one RosProxy for another.
+        # Touch the former record, then the new record: a pod with a changed label may leave one
+        # RosProxy for another. An update of a proxy's pod must end with add=True (`_note_place`).
         self._index(former, key, add=False)
         self._touch(former, record)
         self._index(record, key, add=True)
         self._touch(record, former)
 
     def _as_foreign(self, record: Record | None) -> Record | None:
-        """Turn pods of an operator that looks after other namespaces into ordinary pods."""
+        """Treat a pod of another operator, which manages other namespaces, as an ordinary pod."""
         if isinstance(record, OwnPod) and not self._is_looked_after(record.of.namespace):
             return record.pod
         return record
@@ -270,7 +277,10 @@ class ClusterStore:
             self._index_pod(record, key, record if add else None)
 
     def _note_place(self, proxy: ProxyPod, is_there: bool) -> None:
-        """Note when a proxy's pod is gone whose container was not seen to end."""
+        """Note the time when a proxy's pod vanishes and the store has not seen the container end.
+
+        Such a container may still run and hold ports. A new pod at the place clears the note.
+        """
         place = ProxyPlace(proxy.of, proxy.node)
         self._vanished.pop(place, None)
         if not is_there and proxy.runs:
@@ -289,13 +299,16 @@ class ClusterStore:
             _set(self._pods_with_ports, pod.node, key, kept)
 
     def _touch(self, record: Record | None, counterpart: Record | None) -> None:
-        """Note whom a change concerns that brings or takes a record in place of its counterpart."""
+        """Note the namespaces and nodes that a record concerns, and wake the controller.
+
+        ``counterpart`` is the record of the same object on the other side of the change.
+        """
         match record:
             case None:
                 return
             case RosProxy() | InvalidRosProxy():
                 if _requested(record) == _requested(counterpart):
-                    return  # its status alone, which the operator writes
+                    return  # only the status differs, which the operator writes
                 self._touched.namespaces.add(record.id.namespace)
             case ClusterNode():
                 self._touched.nodes.add(record.name)
@@ -308,11 +321,11 @@ class ClusterStore:
             case _:
                 self._touched.namespaces.add(record.of.namespace)
                 if counterpart is None and isinstance(record, OwnPod):
-                    self._touched.nodes.add(record.node)  # others may wait for its ports
+                    self._touched.nodes.add(record.node)  # another proxy may wait for these ports
         self._wake()
 
     def _touch_pod(self, pod: Pod) -> None:
-        """A pod of others matters if a RosProxy selects it or is meant to, or if it takes ports."""
+        """Note a pod that a RosProxy selects, or that asks for a proxy or takes ports of a node."""
         selected = self._is_selected(pod)
         is_meant = wants_proxy(pod) or bool(pod.misspelt)
         if selected or (is_meant and self._is_looked_after(pod.id.namespace)):
@@ -323,7 +336,7 @@ class ClusterStore:
             self._wake()
 
     def _touch_users(self, service: Name) -> None:
-        """A Service matters if a RosProxy names it as its master."""
+        """Note the namespaces of the RosProxies that name the Service as the master."""
         for namespace, rosproxies in self._rosproxies.items():
             if any(rosproxy.spec.master.service == service for rosproxy in rosproxies.values()):
                 self._touched.namespaces.add(namespace)
@@ -331,7 +344,7 @@ class ClusterStore:
 
 
 def _requested(record: Record | None) -> object:
-    """What a RosProxy asks for, without its status."""
+    """The part of a RosProxy that users write, without the status; None for other records."""
     if isinstance(record, RosProxy):
         asked = record.uid, record.generation, record.deleting, record.spec, record.remakes
         return *asked, record.misspelt
@@ -350,9 +363,9 @@ def _set(index: dict[str, dict[str, R]], name: str, key: str, record: R | None) 
 
 
 def read_master(service: MasterService | None, id: Name, ports: Iterable[int]) -> tuple[str, str]:
-    """The address of a master's Service, and what is wrong with it, one of them empty.
+    """Return the address of a master's Service, and the problem of the Service; either is empty.
 
-    ``ports`` are those that RosProxies name; one of them has to be there.
+    ``ports`` are the ports that RosProxies name. The Service needs at least one of these ports.
     """
     if service is None:
         return "", "does not exist. Create the Service, or correct spec.master.service"
