@@ -1,1 +1,1 @@
-"""The admission webhook: pods are wired to the proxy of their node as they are made."""
+"""The admission webhook, which wires new pods to the proxy of the node."""

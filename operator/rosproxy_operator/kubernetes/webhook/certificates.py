@@ -1,7 +1,7 @@
-"""The admission webhook's certificate, made here.
+"""Creates and checks the certificate of the admission webhook.
 
-The CA signs one certificate, and the operator then drops the key of the CA: no second certificate
-can be signed.
+The operator creates a CA for each certificate, signs the certificate, and drops the key of the CA.
+So no further certificate of this CA can exist.
 """
 
 import base64
@@ -18,22 +18,23 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 LIFE = timedelta(days=90)
+"""Lifetime of a certificate and of the CA."""
 RENEW_AFTER = 2 / 3
-"""The part of its life after which a certificate is made anew."""
+"""Share of the lifetime after which the operator replaces a certificate."""
 _BACKDATED = timedelta(hours=1)
-"""So that an API server whose clock is slow takes it as well."""
+"""The validity starts this time before now, because the clock of an API server may be slow."""
 CERTIFICATE = "tls.crt"
 KEY = "tls.key"
 CA = "ca.crt"
-"""Keys of the Secret; ``ca.crt`` also has the CAs before, as long as they are valid."""
+"""Keys of the Secret. ``ca.crt`` also has former CAs that are still valid."""
 
 
 class InvalidCertificate(Exception):
-    """What was found is no certificate with its key; the message says why."""
+    """The data is not a certificate with a matching key. The message gives the reason."""
 
 
 class KeyPair(msgspec.Struct, frozen=True):
-    """A certificate with its key, and the CAs by which it is trusted, all as PEM.
+    """A certificate, the key of the certificate, and the trusted CAs, all as PEM.
 
     ``ca`` is empty if another program manages the CA.
     """
@@ -44,17 +45,17 @@ class KeyPair(msgspec.Struct, frozen=True):
 
     @property
     def expires(self) -> datetime:
-        """When it is not valid any more."""
+        """The end of the certificate's lifetime."""
         return self._read().not_valid_after_utc
 
     def due(self, now: datetime) -> bool:
-        """Whether it is time for another one."""
+        """Whether the operator has to replace the certificate now (`RENEW_AFTER`)."""
         certificate = self._read()
         life = certificate.not_valid_after_utc - certificate.not_valid_before_utc
         return now >= certificate.not_valid_before_utc + life * RENEW_AFTER
 
     def names(self) -> set[str]:
-        """The DNS names that it is for."""
+        """The DNS names of the certificate; empty without the extension subjectAltName."""
         try:
             names = self._read().extensions.get_extension_for_class(x509.SubjectAlternativeName)
         except x509.ExtensionNotFound:
@@ -65,25 +66,25 @@ class KeyPair(msgspec.Struct, frozen=True):
         return x509.load_pem_x509_certificate(self.certificate)
 
     def secret(self) -> dict[str, str]:
-        """The ``data`` of a Secret that holds it."""
+        """The ``data`` of a Secret for the pair, in base64."""
         entries = {CERTIFICATE: self.certificate, KEY: self.key, CA: self.ca}
         return {name: base64.b64encode(text).decode() for name, text in entries.items()}
 
 
 def service_names(namespace: str, name: str) -> list[str]:
-    """The names under which an API server may call a Service."""
+    """The DNS names by which an API server may call a Service."""
     bare = f"{name}.{namespace}"
     return [f"{bare}.svc", bare, f"{bare}.svc.cluster.local"]
 
 
 def make(names: Iterable[str], now: datetime, before: bytes = b"") -> KeyPair:
-    """A new certificate for DNS names, with a new CA.
+    """Create a certificate for DNS names, and a new CA.
 
-    ``before`` are the former CAs: those that are valid stay trusted for the time in which the
-    former certificate is still served.
+    ``before`` are the former CAs as PEM. Valid former CAs stay trusted, because operators still
+    serve the former certificate for a while.
     """
     authority_key, key = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
-    # A name of its own: of two CAs that are called the same, some clients try only the first.
+    # A random name: of two CAs with the same name, some clients try only the first.
     authority = _name(f"rosproxy webhook {secrets.token_hex(8)}")
     ca = _builder(authority, authority, authority_key, now, signs=True)
     certificate = (
@@ -103,7 +104,7 @@ def make(names: Iterable[str], now: datetime, before: bytes = b"") -> KeyPair:
 
 
 def read(data: Mapping[str, str]) -> KeyPair:
-    """A pair from the ``data`` of a Secret. Raises InvalidCertificate."""
+    """Read a pair from the ``data`` of a Secret. Raises InvalidCertificate."""
     names = (CERTIFICATE, KEY, CA)
     try:
         decoded = [base64.b64decode(data[name], validate=True) for name in names]
@@ -115,7 +116,7 @@ def read(data: Mapping[str, str]) -> KeyPair:
 
 
 def checked(pair: KeyPair) -> KeyPair:
-    """The same pair, if it is one that can be served. Raises InvalidCertificate."""
+    """Return the pair unchanged if a server can serve the pair. Raises InvalidCertificate."""
     try:
         load(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), pair)
         x509.load_pem_x509_certificate(pair.certificate)
@@ -126,9 +127,9 @@ def checked(pair: KeyPair) -> KeyPair:
 
 
 def load(context: ssl.SSLContext, pair: KeyPair) -> None:
-    """Let a context serve a pair from its next connection on. Raises ssl.SSLError.
+    """Let a context serve a pair from the next connection on. Raises ssl.SSLError.
 
-    Python's ssl reads keys from files alone; this one is only in memory.
+    Python's ssl reads keys only from files. A memfd keeps the key off the disk.
     """
     file = os.memfd_create("rosproxy-webhook")
     try:
@@ -139,7 +140,7 @@ def load(context: ssl.SSLContext, pair: KeyPair) -> None:
 
 
 def _still_valid(authorities: bytes, now: datetime) -> bytes:
-    """The certificates among these that are still valid; empty if they can't be read."""
+    """The certificates that are still valid, as PEM; empty if the PEM text is unreadable."""
     try:
         certificates = x509.load_pem_x509_certificates(authorities)
     except ValueError:
@@ -148,7 +149,7 @@ def _still_valid(authorities: bytes, now: datetime) -> bytes:
 
 
 def now() -> datetime:
-    """The time of day, in whole seconds as certificates have it."""
+    """The time in UTC, in whole seconds as in certificates."""
     return datetime.now(UTC).replace(microsecond=0)
 
 
@@ -163,7 +164,7 @@ def _builder(
     now: datetime,
     signs: bool,
 ) -> x509.CertificateBuilder:
-    """A certificate to be signed; one that ``signs`` is a CA's."""
+    """An unsigned certificate; with ``signs`` the certificate of a CA."""
     usage = x509.KeyUsage(
         digital_signature=not signs,
         key_cert_sign=signs,

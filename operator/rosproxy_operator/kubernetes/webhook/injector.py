@@ -1,11 +1,13 @@
-"""Wires a pod, as the API server is about to create it, to the proxy of its node.
+"""Wires a new pod to the proxy of the node, before the API server creates the pod.
 
-A pod with the label rosproxy.io/inject comes here from kopf (`serving`). The RosProxies of its
-namespace and their Service are read as they are at this moment; the planner says which RosProxy
-takes the pod and what it needs. Nothing is written: the Service is the operator's alone to make,
-which knows its address, its owner and what to do when it is refused. Where it is not there yet,
-since pod and RosProxy were created together, the operator is woken and the pod waits. Whatever
-goes wrong, the pod is admitted; a warning gives the problem and the fix.
+kopf calls the injector for each pod with the label rosproxy.io/inject (`serving`). The injector
+reads the RosProxies of the namespace and the RosProxy's Service from the API server. The planner
+chooses the RosProxy and the variables. If a user creates the pod together with the RosProxy, the
+Service may be missing. Then the injector wakes the operator, and the pod waits.
+
+The injector writes nothing: only the operator creates the Service, because only the operator knows
+the former address, the owner and the retries. The injector admits the pod in every case. If the pod
+is not wired, a warning gives the problem and the fix.
 """
 
 import asyncio
@@ -36,30 +38,33 @@ from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
 log = logging.getLogger(__name__)
 
 LONGEST = 4.0
-"""Seconds until a pod is admitted as it is: less than the API server waits for the webhook."""
-AGAIN = 0.2
-"""Seconds until the API server is asked again that did not answer, or has no Service yet."""
-YOUNG = 3.0
-"""Seconds for which a Service may not be known on all nodes (kube-proxy gathers changes for 1 s).
+"""Seconds until the injector admits a pod unwired.
 
-Its creationTimestamp has whole seconds, so up to one of these has passed already.
-A pod that connects before loses its packets for two minutes, even if the Service is known a moment
-later: the connection was tracked as one that is not translated. So its admission is held up.
+The API server must wait longer for the webhook (timeoutSeconds, 5 s by default in the chart).
+"""
+AGAIN = 0.2
+"""Seconds between tries while the API server does not answer, or the Service is missing."""
+YOUNG = 3.0
+"""Seconds after the creation of a Service in which some nodes may not know the Service.
+
+kube-proxy gathers changes for 1 s, and a creationTimestamp has whole seconds. If a pod connects too
+early, conntrack notes a connection without translation. The packets of the connection are then lost
+for two minutes, even if kube-proxy knows the Service a moment later. So the injector holds the pod.
 """
 NOT_WIRED = "rosproxy: this pod was not wired to a proxy: "
-"""How each warning at admission begins."""
+"""The start of each warning at admission."""
 
 
 class NotWired(Exception):
-    """A pod can't be wired; the message has the reason and the fix."""
+    """The injector can't wire the pod. The message has the reason and the fix."""
 
 
 class NoService(NotWired):
-    """It can't be wired yet: its RosProxy has no Service, which the operator is about to make."""
+    """The injector can't wire the pod yet: the operator has not created the Service."""
 
 
 class Injector:
-    """Wires pods. ``wake`` lets the operator look at the cluster soon."""
+    """Wires pods. ``wake`` makes the operator look at the cluster soon."""
 
     def __init__(
         self,
@@ -74,7 +79,7 @@ class Injector:
         self._wake = wake
 
     async def wiring(self, body: Json, dry_run: bool) -> Wiring:
-        """What a pod needs. Never raises. A ``dry_run`` does not wait for a Service."""
+        """The wiring of a pod; on any error a warning only. A ``dry_run`` waits for no Service."""
         deadline = time.monotonic() + LONGEST
         try:
             wiring, hold = await self._wiring_by(body, dry_run, deadline)
@@ -91,9 +96,10 @@ class Injector:
         return Wiring(warnings=(NOT_WIRED + text,))
 
     async def _wiring_by(self, body: Json, dry_run: bool, deadline: float) -> tuple[Wiring, float]:
-        """What a pod needs, and for how many seconds to hold it up; tried until the deadline.
+        """The wiring of a pod, and the seconds to hold the pod.
 
-        For an API server may be just starting, or the Service not be there yet.
+        Tries until the deadline, because an API server may be starting, or the Service may be
+        missing. Raises ApiError, NotWired.
         """
         missing = f"the API server did not answer within {LONGEST:g} s. Create the pod again"
         while True:
@@ -114,9 +120,9 @@ class Injector:
     def _wiring(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
         pod = objects.pod(body)
         namespace = pod.id.namespace
-        # Without a namespace the API server would list the RosProxies of all. An API server names
-        # one for each pod (k8s.io/apiserver, EnsureObjectNamespaceMatchesRequestNamespace), but any
-        # pod can ask.
+        # Without a namespace, the API server would list the RosProxies of all namespaces. An API
+        # server fills in the namespace of each pod (k8s.io/apiserver,
+        # EnsureObjectNamespaceMatchesRequestNamespace), but any client may call the webhook.
         listed = self._api.rosproxies(namespace, SOON) if namespace else []
         readable, unusable = rosproxies(listed)
         usable = [r for r in readable.values() if not r.deleting]
@@ -131,9 +137,9 @@ class Injector:
         return Wiring(warnings=(". ".join([NOT_WIRED + text, *reasons]),) if text else ()), 0.0
 
     def _address(self, rosproxy: RosProxy, dry_run: bool) -> tuple[str, float]:
-        """The cluster IP of a RosProxy's Service, and in how many seconds it works everywhere.
+        """The cluster IP of a RosProxy's Service, and the seconds until all nodes know the Service.
 
-        Raises NotWired.
+        Raises ApiError, NotWired.
         """
         id = service_id(rosproxy.id)
         try:
@@ -150,14 +156,15 @@ class Injector:
             raise self._missing(rosproxy)
         if dry_run:
             return service.cluster_ip, 0.0
-        # Bounded, since the clocks of the API server and of this machine may differ.
+        # Bounded, because the clocks of the API server and of this machine may differ.
         created_at = datetime.fromisoformat(manifest["metadata"]["creationTimestamp"]).timestamp()
         return service.cluster_ip, min(max(created_at + YOUNG - time.time(), 0.0), YOUNG)
 
     def _missing(self, rosproxy: RosProxy) -> NotWired:
-        """Why a RosProxy has no Service: it asks for more than it may, or the Service is to come.
+        """The error for a RosProxy without a Service.
 
-        Pods wait for the latter alone (NoService).
+        NotWired if the RosProxy asks for more than the administrator allows. Else NoService: the
+        operator is about to create the Service, and the pod waits.
         """
         if refused := bounds_violation(rosproxy, self._consents(rosproxy), self._settings):
             return NotWired(f"RosProxy {rosproxy.id.name}: {refused}. Then create the pod again")
@@ -168,7 +175,7 @@ class Injector:
         )
 
     def _consents(self, rosproxy: RosProxy) -> Consents:
-        """The namespaces whose RosProxies may name the Service that is this one's master."""
+        """The namespaces whose RosProxies may name the Service of this RosProxy's master."""
         service = rosproxy.spec.master.service
         if service is None:
             return {}

@@ -1,4 +1,4 @@
-"""Keeping a valid certificate for the admission webhook: in a Secret, or from a directory."""
+"""Keeps a valid certificate for the admission webhook, in a Secret or from a directory."""
 
 import asyncio
 import base64
@@ -29,16 +29,19 @@ from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate
 log = logging.getLogger(__name__)
 
 EVERY = 20.0
-"""Seconds between two checks: a certificate that is due, a CA that somebody has overwritten."""
+"""Seconds between two checks for a certificate that is due, or a CA that was overwritten."""
 EVERY_DIRECTORY = 10.0
-"""The same for a certificate that somebody else puts into a directory."""
+"""Seconds between two checks of a directory into which another program writes certificates."""
 OVERLAP = 10.0
-"""Seconds from trusting a new CA to serving its certificate: API servers learn of it by a watch."""
+"""Least seconds from writing a new CA to serving the certificate of this CA.
+
+API servers learn of the CA by a watch.
+"""
 _SUBJECT = "webhook"
 
 
 class CertificateDirectory:
-    """A certificate that somebody else renews, cert-manager for one, as a mounted Secret."""
+    """A certificate that another program renews, such as cert-manager, in a mounted Secret."""
 
     every = EVERY_DIRECTORY
     problems: Sequence[Problem] = ()
@@ -47,7 +50,7 @@ class CertificateDirectory:
         self._directory = Path(directory)
 
     def refresh(self) -> KeyPair:
-        """The certificate that is there now. Raises InvalidCertificate."""
+        """Read the present certificate. Raises InvalidCertificate."""
         names = certificates.CERTIFICATE, certificates.KEY
         try:
             contents = [(self._directory / name).read_bytes() for name in names]
@@ -60,15 +63,15 @@ class CertificateDirectory:
 
 
 class NotMadeYet(Exception):
-    """There is no certificate yet, and only the operator that leads makes one."""
+    """There is no certificate yet. Only the leading operator creates certificates."""
 
 
 class SelfSigned:
-    """A certificate that is made here, kept in a Secret, its CA in the webhook's configuration.
+    """A certificate that the operator creates, with the CA in the webhook's configuration.
 
-    First a new CA is trusted, together with the one before, then its certificate is served; so
-    there is no moment at which an API server refuses what is served. Of several operators all serve
-    the one in the Secret; only one that ``leads`` writes.
+    The certificate is in a Secret. All operators serve this certificate, and only the operator that
+    ``leads`` writes. A renewal first writes the new CA beside the former CA, and the operators
+    serve the new certificate later. So API servers trust the served certificate during a renewal.
     """
 
     every = EVERY
@@ -95,20 +98,20 @@ class SelfSigned:
         self.problems: list[Problem] = []
 
     def refresh(self) -> KeyPair:
-        """Renew it if it is due, and see to it that its CA is trusted.
+        """Return the certificate to serve. Renew the certificate if due, and write the CA.
 
-        Raises ApiError, and NotMadeYet.
+        Raises ApiError, NotMadeYet.
         """
         self.problems = []
         now = self._now()
         self._pair = self._kept_pair()
         trusted = self._trust(self._pair.ca)
-        # There is nothing to wait for without a valid certificate to go on with, or without a
-        # configuration from which API servers have to learn of the CA first.
+        # Serve the new certificate at once if the former certificate has expired. Without a
+        # configuration there is no wait either: API servers get the CA by other means.
         if self._serving is None or self._serving.expires <= now or not self._configuration:
             self._serving = self._pair
         elif self._pair != self._serving and trusted:
-            # API servers are to have the time to learn of the new CA.
+            # API servers need time to learn of the new CA.
             self._trusted_at = self._trusted_at or now
             if (now - self._trusted_at).total_seconds() >= OVERLAP:
                 self._serving = self._pair
@@ -116,17 +119,18 @@ class SelfSigned:
         return self._serving
 
     def _kept_pair(self) -> KeyPair:
-        """The pair in the Secret, else this process's own; a new one if it isn't usable (any more).
+        """The pair in the Secret, or the own pair if the Secret is unreadable; else a new pair.
 
-        Raises ApiError, and NotMadeYet.
+        An operator that does not lead keeps a pair until the end of the lifetime. Raises ApiError,
+        NotMadeYet.
         """
         manifest: Json | None = None
         try:
             manifest = self._api.get("secrets", self._secret) if self._secret else None
         except ApiError as error:
             if self._pair is None and isinstance(error, ApiUnavailable):
-                raise  # the Secret may hold a good pair: no other one is made before it was read
-            if not isinstance(error, ApiUnavailable):  # which the operator's looks report
+                raise  # the Secret may hold a good pair, so read the Secret first
+            if not isinstance(error, ApiUnavailable):  # the operator's looks report ApiUnavailable
                 self._complain(error)
         kept = self._pair if manifest is None else self._read(manifest)
         if kept and self._is_usable(kept):
@@ -142,10 +146,10 @@ class SelfSigned:
         return pair
 
     def _new_pair(self, previous: KeyPair | None) -> KeyPair:
-        """A new pair in place of the previous one; the same again while it can't be written.
+        """A new pair in place of the previous pair. While writing fails, return the same new pair.
 
         With another pair at each try, API servers would have to learn of a new CA each time, and
-        the trusted CAs would grow in number.
+        the number of trusted CAs would grow.
         """
         if self._unsaved is None or not self._is_usable(self._unsaved):
             trusted = previous.ca if previous else b""
@@ -154,11 +158,14 @@ class SelfSigned:
         return self._unsaved
 
     def _is_usable(self, pair: KeyPair) -> bool:
-        """Whether a pair is for our names and has not lived too long."""
+        """Whether a pair has all our names and is not due."""
         return not pair.due(self._now()) and pair.names() >= set(self._names)
 
     def _put(self, secret: Name, pair: KeyPair, manifest: Json) -> None:
-        """Write a pair into the Secret. If another operator was faster, its pair counts."""
+        """Write a pair into the Secret. Raises ApiUnavailable if another program has written first.
+
+        The next refresh then reads the pair of that program.
+        """
         try:
             self._api.fill_secret(secret, manifest, pair.secret())
         except (ApiInvalid, ApiConflict) as error:
@@ -170,7 +177,7 @@ class SelfSigned:
             self._complain(error)
 
     def _complain(self, error: ApiError) -> None:
-        """Report that the Secret can't be used: the certificate is then in this process alone."""
+        """Report that the Secret is unusable, so only this process has the certificate."""
         text = f"Secret {self._secret}: {error}. The certificate is in memory only"
         if isinstance(error, ApiNotFound):
             text += ". Create an empty Secret of this name (the chart does so)"
@@ -191,7 +198,7 @@ class SelfSigned:
             return None
 
     def _trust(self, authorities: bytes) -> bool:
-        """Write the CAs into the webhook's configuration. Returns whether they are there."""
+        """Write the CAs into the webhook's configuration. Return whether the CAs are there."""
         if not self._configuration:
             return True
         try:
@@ -214,14 +221,14 @@ class SelfSigned:
 
 
 def _trust_patch(configuration: Json, authorities: bytes) -> list[Json]:
-    """The JSON patch that makes a configuration's webhooks trust these CAs; empty if they do."""
+    """The JSON patch that writes these CAs into a configuration; empty if the CAs are there."""
     bundle = base64.b64encode(authorities).decode()
     operations: list[Json] = []
     for index, webhook in enumerate(submaps(configuration, "webhooks")):
         if submap(webhook, "clientConfig").get("caBundle") != bundle:
             path = f"/webhooks/{index}"
             operations += [
-                # A JSON patch finds a webhook by its index alone, and others may be added.
+                # A JSON patch knows only the index, which changes if a webhook is added.
                 {"op": "test", "path": f"{path}/name", "value": webhook.get("name")},
                 {"op": "add", "path": f"{path}/clientConfig/caBundle", "value": bundle},
             ]
@@ -229,10 +236,10 @@ def _trust_patch(configuration: Json, authorities: bytes) -> list[Json]:
 
 
 class CertificateRotation:
-    """Holds the certificate that is to be served. `pair` may be read from any thread.
+    """Holds the certificate to serve. Any thread may read `pair`.
 
-    ``not_made_yet``: the operator that leads is yet to make it. If that one has no webhook, it
-    never will: this one is about to replace it.
+    ``not_made_yet``: the leading operator has not created the certificate yet. If the leading
+    operator runs without webhook, no certificate comes until this operator leads.
     """
 
     def __init__(self, source: CertificateDirectory | SelfSigned, metrics: ClusterMetrics) -> None:
@@ -243,13 +250,13 @@ class CertificateRotation:
         self._log = ProblemLog()
 
     async def run(self) -> None:
-        """Keep it valid until cancelled, whatever happens."""
+        """Keep the certificate valid until cancelled. Log all errors."""
         while True:
             await self.refresh()
             await asyncio.sleep(self._source.every if self.pair else 2.0)
 
     async def refresh(self) -> None:
-        """Check it once, and renew it if it is due."""
+        """Check the certificate once, and renew the certificate if due."""
         not_made_yet = False
         problems = list[Problem]()
         try:
@@ -260,7 +267,7 @@ class CertificateRotation:
             problems = [
                 Problem(_SUBJECT, f"the operator could not read or renew the certificate: {error}")
             ]
-        except Exception as error:  # a mistake of ours must not end the certificate
+        except Exception as error:  # a bug of ours must not end the checks
             text = "webhook certificate not checked by an internal error, the operator tries again"
             log.exception(text)
             problems = [Problem(_SUBJECT, f"the operator failed: {error!r}")]
@@ -277,7 +284,7 @@ class CertificateRotation:
 def certificate_source(
     api: Api, settings: WebhookSettings, leads: Callable[[], bool]
 ) -> CertificateDirectory | SelfSigned:
-    """Where the certificate comes from, by the settings."""
+    """The source of the certificate, by the settings."""
     if settings.directory or settings.service is None:
         return CertificateDirectory(settings.directory)
     names = certificates.service_names(settings.service.namespace, settings.service.name)

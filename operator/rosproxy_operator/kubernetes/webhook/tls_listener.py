@@ -1,8 +1,8 @@
 """Accepts TLS connections for an HTTP server: a bounded number of all, and of each address.
 
-A connection costs memory before the HTTP server hears of the connection: asyncio reserves 256 KiB
-for each handshake (`asyncio.sslproto.SSLProtocol.max_size`). Every pod of a cluster reaches the
-webhook. So connections are counted from the moment they are accepted.
+A connection takes memory before the HTTP server knows the connection: asyncio reserves 256 KiB for
+each handshake (`asyncio.sslproto.SSLProtocol.max_size`). Every pod of a cluster reaches the
+webhook. So the listener counts a connection as soon as the listener accepts the connection.
 """
 
 import asyncio
@@ -20,17 +20,20 @@ from rosproxy.net.tasks import Tasks
 MOST_CONNECTIONS = 512
 """Connections at most: 140 MB. The operator has 512 MiB by default (the chart's values)."""
 MOST_OF_SOURCE = 384
-"""The same of one address. An API server waits for some 200 pods at the same time.
+"""Connections of an address at most. An API server waits for some 200 pods at the same time.
 
 kube-apiserver: --max-mutating-requests-inflight is 200 by default.
 """
 HANDSHAKE_TIMEOUT_S = 10.0
-"""Seconds for a handshake. An API server waits 10 s for a webhook, and then admits the pod."""
+"""Seconds for a handshake.
+
+An API server waits 10 s for a webhook by default, and 5 s with the chart (timeoutSeconds).
+"""
 
 
 @dataclass(slots=True, eq=False)
 class _Connection:
-    """A connection: the task of its handshake, or its transport once the handshake is over."""
+    """A connection, with the task of the handshake, and then with the transport."""
 
     source: str
     handshake: asyncio.Task[None] | None
@@ -50,10 +53,11 @@ class _Connection:
 
 
 class TlsListener:
-    """Hands connections to ``server``, with TLS by ``context``; see `start`.
+    """Hands connections to ``server``, with TLS by ``context``; `start` begins to listen.
 
-    A connection over the bound of its address takes the place of the oldest one of that address. A
-    connection over the bound of all takes a place of the address with most connections.
+    If an address has too many connections, a new connection ends the oldest connection of this
+    address. If all addresses together have too many, a new connection ends the oldest connection
+    of the address with most connections.
     """
 
     def __init__(self, server: web.Server, context: ssl.SSLContext) -> None:
@@ -69,7 +73,7 @@ class TlsListener:
         self._acceptor = sockets.Acceptor(self._tasks, listener, self._serve)
 
     async def close(self) -> None:
-        """Stop listening, and end handshakes. Other connections are the server's to end."""
+        """Stop listening, and end handshakes. The server ends established connections."""
         if self._acceptor is not None:
             self._acceptor.close()
         await self._tasks.cancel()
@@ -84,12 +88,12 @@ class TlsListener:
                 self._server, sock, ssl=self._context, ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S
             )
         finally:
-            # Otherwise the task, its error and this frame keep the 256 KiB until the next garbage
+            # Break the cycle of task, error and frame. Else the 256 KiB stay until the next garbage
             # collection.
             connection.handshake = None
 
     def _make_room(self, source: str) -> None:
-        """End a connection if there are too many for one more of this source."""
+        """End a connection if a further connection of this source would exceed a bound."""
         self._connections = [c for c in self._connections if c.is_open]
         counts = Counter(c.source for c in self._connections)
         if counts[source] < MOST_OF_SOURCE:

@@ -1,7 +1,7 @@
-"""Serving the admission webhook for kopf, with a certificate that may change any time.
+"""Serves the admission webhook for kopf, with a certificate that may change at any time.
 
-`kopf.WebhookServer` does not do: even with an SSL context of ours it makes a certificate of its own
-unless it is given files, and it closes its port to exchange one.
+`kopf.WebhookServer` can't do this. Without certificate files, that class creates a certificate of
+its own, even with a given SSL context. To replace a certificate, that class closes the port.
 """
 
 import asyncio
@@ -26,29 +26,29 @@ from rosproxy_operator.kubernetes.webhook.tls_listener import TlsListener
 log = logging.getLogger(__name__)
 
 CHECK = 0.5
-"""Seconds between two looks whether there is another certificate to serve."""
+"""Seconds between two checks for another certificate to serve."""
 MOST = 4 * 2**20
-"""Bytes of a request: the API server takes objects of 3 MiB. The review of a new pod holds one.
+"""Bytes of a request at most. A review contains a pod, and the API server takes 3 MiB for a pod.
 
 k8s.io/apiserver, pkg/server/config.go: MaxRequestBodyBytes.
 """
 MOST_HELD = 96 * 2**20
-"""Bytes of all requests that are read and answered at the same time, with `VALUE_SIZE`."""
+"""Bytes of all requests in memory at the same time, with `VALUE_SIZE` for each value."""
 MOST_HELD_OF_SOURCE = 32 * 2**20
-"""The same of one address. A review of 20 KB counts as 80 KB."""
+"""Bytes of the requests of an address. A review of 20 KB counts as 80 KB."""
 VALUE_SIZE = 100
-"""Bytes that a value of a JSON document takes in memory, besides its text."""
+"""Bytes that a value of a JSON document takes in memory, besides the text."""
 BODY_TIMEOUT_S = 10.0
-"""Seconds in which a body must have arrived. An API server sends one at once."""
+"""Seconds until the whole body must be there. An API server sends the body at once."""
 ENDING = 2.0
-"""Seconds that requests have to be answered when serving ends."""
+"""Seconds to answer open requests when serving ends."""
 
 
 class WebhookServer:
-    """What kopf takes as ``settings.admission.server``.
+    """The server for kopf's ``settings.admission.server``.
 
-    The certificate is exchanged in the event loop that does the handshakes, and therefore never
-    in the midst of one. Connections that stand go on.
+    The event loop that does the handshakes also replaces the certificate, so never during a step of
+    a handshake. Established connections go on.
     """
 
     def __init__(self, bind: HostPort, rotation: CertificateRotation) -> None:
@@ -58,20 +58,22 @@ class WebhookServer:
         self._draining = False
 
     def unready(self) -> str | None:
-        """Why pods are not wired here; None if they are. May be asked from any thread.
+        """Why this operator is not ready to wire pods; None if ready. Any thread may ask.
 
-        While there is no certificate no operator wires pods, and the leader may have to end first.
+        The answer is None as well while the leading operator has not created the certificate. In a
+        rollout the leading operator may run without webhook, and ends only when this operator is
+        ready.
         """
         if self._serving or self._rotation.not_made_yet:
             return None
         return "the operator does not serve the webhook yet"
 
     def drain(self) -> None:
-        """Close each connection after its next response: serving ends soon."""
+        """Close each connection after the next response, because serving ends soon."""
         self._draining = True
 
     async def __call__(self, fn: kopf.WebhookFn) -> AsyncIterator[kopf.WebhookClientConfig]:
-        """Serve until cancelled."""
+        """Serve the handler ``fn`` of kopf until cancelled."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         while (pair := self._rotation.pair) is None:  # noqa: ASYNC110 - set in another thread
@@ -84,7 +86,7 @@ class WebhookServer:
             access_log=None,
             shutdown_timeout=ENDING,
             keepalive_timeout=IDLE_TIMEOUT,
-            # Nothing is inflated: a small body may become a very large one.
+            # A small compressed body may become a very large body.
             auto_decompress=False,
         )
         await runner.setup()
@@ -95,7 +97,7 @@ class WebhookServer:
             listener.start(bind)
             log.info("webhook started: https://%s", bind)
             self._serving = True
-            # For kopf's own webhook configuration, of which there is none (`admission.managed`).
+            # kopf needs the URL only for a configuration of its own (`admission.managed`).
             yield kopf.WebhookClientConfig(url=f"https://{bind}")
             await self._exchange(context, pair)
         finally:
@@ -108,7 +110,7 @@ class WebhookServer:
             response.force_close()
 
     async def _exchange(self, context: ssl.SSLContext, served: KeyPair) -> None:
-        """Serve another certificate as soon as there is one."""
+        """Serve another certificate within `CHECK` seconds."""
         while True:
             await asyncio.sleep(CHECK)
             pair = self._rotation.pair
@@ -119,7 +121,7 @@ class WebhookServer:
                     log.exception(
                         "webhook certificate not replaced: the new certificate is unusable"
                     )
-                served = pair  # also if it can't be: it would fail, and be logged, at each look
+                served = pair  # an unusable pair, too: else each check would log the error
 
 
 def _application(fn: kopf.WebhookFn) -> web.Application:
@@ -144,7 +146,7 @@ def _application(fn: kopf.WebhookFn) -> web.Application:
 
 
 async def _read_body(request: web.Request, charge: Charge) -> bytes:
-    """The body of a request, charged. Raises OverBudget, TooLong, TimeoutError."""
+    """Read and charge the body of a request. Raises OverBudget, TooLong, TimeoutError."""
     async with asyncio.timeout(BODY_TIMEOUT_S):
         body = await read_bounded(request.content, MOST, charge.add)
     charge.add(VALUE_SIZE * sum(map(body.count, (b"{", b"[", b","))))
@@ -159,7 +161,7 @@ async def _answer(fn: kopf.WebhookFn, body: bytes, webhook: str) -> web.Response
         return web.Response(status=400, text="the request is not an AdmissionReview\n")
     try:
         return web.json_response(await fn(review, webhook=webhook))
-    except Exception as error:  # the pod passes as it is
+    except Exception as error:  # admit the pod unwired
         log.warning("pod not wired: the operator failed: %r", error)
         warning = f"{NOT_WIRED}the operator failed: {error!r}"[:200]
         response = {"uid": uid, "allowed": True, "warnings": [warning]}
