@@ -1,1 +1,1 @@
-"""What a proxy is told and may be asked for: the same on each engine."""
+"""The options of a proxy and the settings that an operator gives a proxy, on each engine."""

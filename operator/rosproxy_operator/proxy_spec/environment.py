@@ -11,16 +11,17 @@ _SETTINGS = {setting.field: setting for setting in declared(Settings)}
 
 
 def variable(field: str) -> str:
-    """The variable of a field of the proxy's `Settings`."""
-    # Another variable of the same setting would make the proxies of former operators anew.
+    """The variable for a field of the proxy's `Settings`."""
+    # With another variable of the setting, the fingerprint would change, and the operator would
+    # recreate the proxies of former operators.
     return "ROS_MASTER_URI" if field == "master_uri" else _SETTINGS[field].variables[0]
 
 
 def environment(operator: str, told: Mapping[str, Any], always: Collection[str]) -> dict[str, str]:
-    """The variables of a proxy with these values of fields of its `Settings`, in their order.
+    """The variables of a proxy for values of fields of the proxy's `Settings`, in the given order.
 
-    Empty values and the proxy's own defaults have no variable, except defaults of the fields in
-    ``always``. With other variables, or in another order, an operator makes its proxies anew.
+    Empty values and the proxy's defaults have no variable, except defaults of the fields in
+    ``always``. A change of variables or order changes the fingerprint, and recreates proxies.
     """
     variables = {fixes.VARIABLE: operator}
     for field, value in told.items():
@@ -31,7 +32,7 @@ def environment(operator: str, told: Mapping[str, Any], always: Collection[str])
 
 
 def _text(value: Any) -> str:
-    """A value as a variable; empty if there is nothing to be told."""
+    """A value as the text of a variable; empty for False, None and empty values."""
     if isinstance(value, tuple):
         return " ".join(map(str, value))
     if isinstance(value, bool | None):

@@ -1,4 +1,4 @@
-"""What says that something has to be made anew: another fingerprint of what it is made of."""
+"""Fingerprints. If the fingerprint differs, the operator recreates the container or pod."""
 
 import hashlib
 import json
@@ -9,10 +9,13 @@ from rosproxy import fixes
 from rosproxy_operator.proxy_spec.environment import variable
 
 LIVE_VARIABLES = frozenset({fixes.VARIABLE, *map(variable, ("await_policy", "policy_layers"))})
-"""Variables in no fingerprint: a running proxy is told a new policy, and the operator's name only
-words the fixes of the proxy."""
+"""Variables in no fingerprint.
+
+The operator sends a running proxy a new policy. The operator's name only selects the words of fixes
+(`rosproxy.fixes`).
+"""
 
 
 def digest(body: Mapping[str, Any]) -> str:
-    """The fingerprint of an object as the engine takes it, 16 hex digits."""
+    """The fingerprint of a JSON object for the engine: 16 hex digits of SHA-256."""
     return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()[:16]

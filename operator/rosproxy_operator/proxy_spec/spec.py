@@ -1,7 +1,7 @@
-"""What users may ask of a proxy: each option once.
+"""The options of a proxy that users may set, for all engines.
 
-A container asks by labels, a RosProxy by the fields of its spec. The meaning of an option is that
-of the proxy's own setting of the same name (`rosproxy.settings.Settings`).
+A container sets an option by a label, a RosProxy by a field of the spec. An option means the same
+as the proxy's setting of this name (`rosproxy.settings.Settings`).
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,17 +13,19 @@ import msgspec
 from rosproxy.setting_kinds import DataPlane, Direction, SlaveControl
 
 Wishes = Mapping[str, Any]
-"""What a container asks for, by the fields of `ProxySpec`."""
+"""The values that a container asks for, by the fields of `ProxySpec`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """How users ask for an option.
+    """The label and the field of an option, and the rules for the value.
 
-    ``field`` is below a RosProxy's ``spec``. If the containers of a proxy ask for several values,
-    the first in ``precedence`` counts. ``yields``: a container that does not ask takes any value.
-    ``ros``: the only version of ROS that has the option. ``fix`` is what to write into the label.
-    ``free`` are the values that no option of the administrator has to allow; empty: all values.
+    - ``field``: the field below a RosProxy's ``spec``.
+    - ``precedence``: of several values that the containers ask for, the first one here counts.
+    - ``yields``: a container without the label takes any value. Else the default counts as asked.
+    - ``ros``: the only version of ROS with this option; empty for both versions.
+    - ``fix``: the text after ``label=`` in a fix.
+    - ``free``: the values that need no permission of the administrator; empty for all values.
     """
 
     label: str
@@ -35,7 +37,7 @@ class Wish:
     free: tuple[Any, ...] = ()
 
     def first(self, values: Iterable[Any]) -> Any:
-        """The one of several values that counts."""
+        """The value that counts, by `precedence`."""
         return min(values, key=self.precedence.index)
 
 
@@ -47,11 +49,11 @@ class ProxySpec(msgspec.Struct, frozen=True):
         Wish(
             "rosproxy.data-plane",
             "dataPlane",
-            # First what the proxy can't do by itself.
+            # kernel first: only this value needs a capability from the operator.
             ("kernel", "splice", "copy", "auto"),
             yields=True,
             fix="kernel to let the kernel forward topics, or remove the label",
-            free=("auto", "splice", "copy"),  # the kernel's takes the capability NET_ADMIN
+            free=("auto", "splice", "copy"),  # kernel needs the capability NET_ADMIN
         ),
     ] = "auto"
     direction: Annotated[
@@ -59,7 +61,7 @@ class ProxySpec(msgspec.Struct, frozen=True):
         Wish(
             "rosproxy.direction",
             "direction",
-            # A container with a route outwards loses nothing by going through the proxy.
+            # A container with a route outwards also works through the proxy.
             ("both", "out"),
             fix="both if the nodes reach outside only through the proxy, or remove the label",
         ),
@@ -70,7 +72,7 @@ class ProxySpec(msgspec.Struct, frozen=True):
         Wish(
             "rosproxy.slave-control",
             "policy.slaveControl",
-            # A node must not be open to all hosts because of a neighbour.
+            # The label of another container must not open a node to all hosts.
             ("master", "any"),
             ros="1",
             fix="master to let only the master's host call shutdown, publisherUpdate and "
@@ -86,14 +88,14 @@ WISHES: Mapping[str, Wish] = {name: hint.__metadata__[0] for name, hint in _HINT
 
 
 def words(name: str) -> tuple[str, ...]:
-    """The words that an option can be; none for a flag."""
+    """The words that are values of an option; empty for a flag."""
     return get_args(get_args(_HINTS[name])[0])
 
 
 def merged(wishes: Iterable[Wishes], defaults: ProxySpec) -> ProxySpec:
-    """The options of a proxy whose containers have these wishes.
+    """The options of a proxy for the wishes of the containers.
 
-    Datagrams from outside need both directions, so ``udp`` counts only there.
+    ``udp`` counts only with direction both: UDPROS from outside needs both directions.
     """
     every = [*wishes]
     spec: dict[str, Any] = {}
