@@ -21,9 +21,9 @@ _WRONG = {
     "Ready": "False",
     "Degraded": "True",
 }
-"""The status of each condition that is an error.
+"""By condition, the status that the doctor reports as an error.
 
-The order matters: a cause comes before its consequences. So a text that several conditions share is
+The order matters: causes come before consequences. So a text that several conditions share is
 reported at the cause.
 """
 

@@ -244,7 +244,7 @@ def _addresses(wanted: Sequence[RosProxyOnNode]) -> str:
 
 
 def _serving(state: RosProxyOnNode) -> bool:
-    """Whether the proxy of a node is ready, is not stuck, and has answered.
+    """Whether the proxy of a node is ready, is not stuck, and answers.
 
     Before the operator has asked the proxy, the condition Ready of the pod suffices.
     """

@@ -26,7 +26,7 @@ class WebhookFacts(msgspec.Struct, frozen=True):
     """The objects of the webhook in the cluster. None means that the doctor could not read them.
 
     - ``configurations``: the MutatingWebhookConfigurations with our webhook.
-    - ``operators``: the pods of operators, read only if there is no configuration.
+    - ``operators``: the pods of operators, given only if there is no configuration.
     - ``ready``: the number of ready endpoints of each Service, None for a missing Service. A
       Service that the doctor could not read has no entry.
     - ``unreached``: the unwired pods that were created while an operator was ready.

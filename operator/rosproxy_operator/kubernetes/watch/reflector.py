@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Longest pauses in seconds after the first error, the second, and so on; the last repeats.
 
-Each pause is random, between half and all of this time.
+Each pause is random, between half and all of this time. A first lost watch has no pause.
 """
 WELL = 10.0
 """Seconds. A watch that lasted longer resets the failure count."""
@@ -44,7 +44,7 @@ CHECKED = 1800.0
 DOUBTED = 60.0
 """Least seconds from a list to a further list because the watched state was wrong (`relist`)."""
 SHORT = 1.0
-"""A shorter watch without events is an error, in seconds. Else the reflector restarts in a loop."""
+"""Seconds. A shorter watch without events is an error: else the reflector would loop fast."""
 STOPPING = 3.0
 """Seconds that the thread of a reflector has to end."""
 
@@ -170,15 +170,15 @@ class Reflector:
     def _follow(self) -> None:
         """Pass on events until the watch ends. Raises ApiError.
 
-        Note the version after each group of events, for a lost watch, too. A watch from an older
-        version would repeat events, and set objects back to former states.
+        Note the version after each group of events, so that the next watch goes on there. A watch
+        from an older version would repeat events, and set objects back to former states.
         """
         began = time.monotonic()
         heard = False
         self._watch = watch = self._api.watch(self._kind, self._place, self._version)
         self._tell(self._listener.changed, ())  # the watch works
         if self._ending.is_set():
-            watch.stop()  # `stop` may have found no watch
+            watch.stop()  # an earlier `stop` had no watch to stop
         for events in watch:
             if self._ending.is_set():
                 break
