@@ -1,1 +1,1 @@
-"""What the operator and its proxies tell each other, and what Events say of their pods."""
+"""Exchange between the operator and the proxies, and Events about the pods of proxies."""

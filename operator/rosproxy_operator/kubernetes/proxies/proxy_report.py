@@ -1,4 +1,4 @@
-"""The part of a proxy's status that matters to the operator."""
+"""Reports on proxies: the part of a proxy's ``/status`` that the operator uses."""
 
 from msgspec.structs import replace
 
@@ -15,16 +15,18 @@ from rosproxy_operator.common.proxy_status import (
 from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
 
 RECENT = 300.0
-"""Seconds for which a problem counts that the proxy does not take back: it lists the last ones."""
+"""Seconds for which a problem counts after the event. The proxy keeps listing its last problems."""
 _BY_POLICY = {problem_subject(reason) for reason in (DENIED, WOULD_BE_DENIED)}
+"""Subjects of problems by which a proxy reports denials. A denial is no fault of the proxy."""
 _LONGEST = 300
-"""Characters kept of a problem or an error, which may be of any size in the status."""
+"""Characters that are kept of a problem or an error. The proxy may send texts of any size."""
 
 
 def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
-    """The report on a proxy, by its status; ``refusal`` is why it does not take its policy.
+    """Return the report on a proxy that has answered with a status.
 
-    Nodes that it has given up already are not among its nodes.
+    ``refusal`` is the reason why the proxy refuses its policy. ``nodes`` of the report leaves out
+    nodes that the proxy has given up.
     """
     master = status.master
     nodes = nodes_by_address(status)
@@ -55,20 +57,20 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
 
 
 def _counts(problem: ProblemStatus) -> bool:
-    """Whether a problem of a proxy is one now. A policy that denies does what it is there for."""
+    """Whether a problem still holds or is recent, and is not a denial by the policy."""
     return problem.subject not in _BY_POLICY and (problem.holds or problem.age <= RECENT)
 
 
 def no_answer(error: str) -> ProxyReport:
-    """The report on a proxy that does not answer."""
+    """Return the report on a proxy that does not answer."""
     return ProxyReport(answered=False, error=short(error))
 
 
 def unreadable(last: ProxyReport, error: str) -> ProxyReport:
-    """The report on a proxy that answers with more than is read: what it said last, and that."""
+    """Return the last report, with ``error`` as the only problem: the new answer is too long."""
     return replace(last, problems=(short(error),))
 
 
 def short(text: str) -> str:
-    """A proxy's text, cleaned and cut so that it may be shown."""
+    """Return a text from a proxy, cleaned and cut so that the operator may show the text."""
     return bounded(clean(text), _LONGEST)

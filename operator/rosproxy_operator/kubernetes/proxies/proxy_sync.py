@@ -1,12 +1,13 @@
 """Keeps proxies and operator in step, over the proxies' admin endpoints.
 
-Each proxy's pod that has an address has a `ProxyPoller` of its own. It waits until the proxy
-reports a change (``/status/changes``), which costs nothing as long as none happens; a proxy that is
-just starting, does not answer or is of a former release is polled. The poller also sends the proxy
-its policy (``/policy``), which pods may use it as their master and which are gone
-(``/containers``), until the proxy confirms. Reports land in `ClusterProxySync.reports`, from where
-each look takes them; one that has changed wakes the operator. An operator that does not lead
-listens as well, and sends nothing.
+Each proxy's pod with an address has a `ProxyPoller`. The poller waits until the proxy reports a
+change (``/status/changes``), so an idle proxy causes no traffic. The poller polls a proxy that is
+starting, does not answer, or is of a former release. Each look reads the reports
+(`ClusterProxySync.reports`), and a changed report wakes the operator.
+
+The poller also sends the proxy's policy (``/policy``), the addresses of pods that may use the
+proxy, and the addresses of gone pods (``/containers``). The poller repeats each call until the
+proxy confirms. An operator that does not lead receives reports, and sends nothing.
 """
 
 import asyncio
@@ -31,34 +32,37 @@ from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, token_of
 log = logging.getLogger(__name__)
 
 EVERY = 3.0
-"""Seconds between two polls of a proxy."""
+"""Seconds between two polls of a proxy that has something to confirm, or is silent for long."""
 EVERY_STARTING = 0.5
-"""The same until it has answered for the first time."""
+"""Seconds between two polls in the poller's first minute, while the proxy does not answer."""
 LEAST_INTERVAL = 0.5
-"""Seconds between two changes that are taken: a hostile proxy may report them for ever."""
+"""Seconds between two reports of changes. A hostile proxy may report changes for ever."""
 EVERY_FORMER = 15.0
-"""The same for one that does not report changes (``/status/changes``)."""
+"""Seconds between two polls of a proxy that does not report changes (``/status/changes``)."""
 WAIT = 1800.0
-"""Longest wait for a change, in seconds, until a proxy answers in any case.
+"""Longest wait for a change, in seconds. Then the proxy answers without a change.
 
-Keep-alive probes of TCP find a proxy that is cut off (`common.proxy_client`).
+TCP keep-alive finds a proxy that is cut off (`common.proxy_client`).
 """
 STARTING = 10.0
-"""Seconds for which a proxy may be silent after its pod has an address: it is just starting."""
+"""Seconds for which the operator does not report a new proxy that is silent: the proxy starts."""
 SILENT = 2
-"""Unanswered polls in a row before a proxy counts as silent."""
+"""Unanswered polls in a row after which a proxy counts as silent."""
 AT_ONCE = 32
-"""Proxies that are polled at the same time."""
+"""Short calls to all proxies at the same time."""
 SLOW_AT_ONCE = 256
-"""The same for calls that may wait for a proxy's master: so they hold up no other calls."""
+"""Calls at the same time that may wait for a master. So these calls hold up no short calls."""
 REPEATED = 30.0
-"""Seconds after which a proxy that does not report changes is sent anew which pods may use it."""
+"""Seconds after which the poller repeats the allowed callers to a proxy that reports no changes.
+
+The operator does not notice a restart of such a proxy by its status.
+"""
 _KNOWS_NO_CHANGES = (403, 404, 405, 503)
-"""HTTP answers of a proxy of a former release, or of one at which too many wait already."""
+"""HTTP answers to ``/status/changes`` from a proxy of a former release, or without a free slot."""
 
 
 class CallLimits:
-    """Limits of calls at the same time: short questions, and calls that may wait for a master."""
+    """Limits of calls at the same time: short calls, and calls that may wait for a master."""
 
     def __init__(self) -> None:
         self.questions = asyncio.Semaphore(AT_ONCE)
@@ -66,9 +70,10 @@ class CallLimits:
 
 
 class ProxyPoller:
-    """Polls one proxy, and sends it what it is to know until it confirms that.
+    """Polls a single proxy, and repeats policy, callers and gone pods until the proxy confirms.
 
-    ``changed`` is called when its report has changed.
+    The poller calls ``changed`` when the report has changed. ``key`` is the key of the proxies'
+    tokens. While ``leads`` returns False, the poller sends nothing.
     """
 
     def __init__(
@@ -101,7 +106,7 @@ class ProxyPoller:
         self._since = time.monotonic()
 
     def brief(self, briefing: Briefing) -> None:
-        """Have the proxy told what is new of this."""
+        """Send the proxy the parts of a briefing that the proxy has not confirmed."""
         self._gone |= {*briefing.gone}
         if briefing.policy is not None:
             self._policy = briefing.policy
@@ -111,14 +116,14 @@ class ProxyPoller:
             self._pending.set()
 
     def restarted(self, restarts: int) -> None:
-        """Note how often its container was started again: a proxy knows nothing after that."""
+        """Note the restarts of the container: a restarted proxy has no policy and no callers."""
         if restarts != self._restarts:
             self._restarts = restarts
             self._forget()
             self._pending.set()
 
     async def run(self) -> None:
-        """Poll the proxy and send to it until cancelled."""
+        """Poll the proxy, and send policy, callers and gone pods, until cancelled."""
         long_poll: asyncio.Task[None] | None = None
         try:
             while True:
@@ -127,10 +132,11 @@ class ProxyPoller:
                     long_poll = long_poll or asyncio.create_task(self._ask(_random_wait()))
                     await self._wait_for_either(long_poll)
                     if long_poll.done():
-                        long_poll = long_poll.result()  # None, or raises what it died of
+                        long_poll = long_poll.result()  # None; raises the error of a failed task
                         await self._wait_for_update(LEAST_INTERVAL)
                     continue
-                # Acting on that may take the proxy a moment: the next poll rechecks, not this one.
+                # The proxy may need a moment to act on gone pods. So the next poll, not this poll,
+                # passes on the report even without a change.
                 self._recheck = self._recheck and not told_gone
                 async with self._limits.questions:
                     await self._ask()
@@ -149,7 +155,7 @@ class ProxyPoller:
 
     @property
     def _is_busy(self) -> bool:
-        """Whether the proxy is yet to answer, or to confirm what it was sent."""
+        """Whether the proxy still has to answer, or to confirm policy, callers or gone pods."""
         return bool(self._failures or self._recheck or self._gone) or not self._is_confirmed
 
     @property
@@ -162,7 +168,7 @@ class ProxyPoller:
         )
 
     async def _wait_for_either(self, long_poll: asyncio.Task[None]) -> None:
-        """Wait for a change, or until there is something to send."""
+        """Wait for a change, or until the poller has something to send."""
         pending = asyncio.create_task(self._pending.wait())
         try:
             await asyncio.wait({long_poll, pending}, return_when=asyncio.FIRST_COMPLETED)
@@ -170,7 +176,7 @@ class ProxyPoller:
             pending.cancel()
 
     async def _pause(self) -> None:
-        """Wait until the next poll is due, or until there is something to send."""
+        """Wait until the next poll is due, or until the poller has something to send."""
         answers = self.report is not None and self.report.answered
         pause = EVERY if answers or self._has_waited(EVERY * 20) else EVERY_STARTING
         if answers and not self._is_busy:
@@ -178,20 +184,20 @@ class ProxyPoller:
         await self._wait_for_update(pause)
 
     async def _wait_for_update(self, seconds: float) -> None:
-        """Wait for so long, or until there is something to send."""
+        """Wait for some seconds, or until the poller has something to send."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self._pending.wait()
 
     async def _tell(self) -> bool:
-        """Send all that is not confirmed yet. Returns whether gone pods were confirmed now."""
+        """Send all unconfirmed parts. Return whether the proxy has now confirmed gone pods."""
         self._pending.clear()
-        if await self._tell_policy():  # nobody is let in before the policy is known
+        if await self._tell_policy():  # no pod gets in before the policy is in force
             await self._tell_callers()
         return await self._tell_gone()
 
     async def _ask(self, within: float = 0.0) -> None:
-        """Request its status, or wait for a change of it for ``within`` seconds."""
+        """Request the status, or wait up to ``within`` seconds for a changed status."""
         try:
             status = await self._fetch_status(within)
             new_report = report(status, self._refusal)
@@ -201,14 +207,15 @@ class ProxyPoller:
             if error.is_unreadable and self.report:
                 new_report = unreadable(self.report, str(error))
             else:
-                self._forget()  # the process that answers next may be a new one
+                self._forget()  # the next answer may come from a new process
                 if self._failures < SILENT or not (self.report or self._has_waited(STARTING)):
                     return
                 new_report = no_answer(str(error))
         starting = self.report is None and not self._has_waited(STARTING)
         if starting and new_report.answered and not new_report.master_up:
-            return  # it may not have asked its master yet
-        # A process may outlive its pod for a moment: then the next look tells it again.
+            return  # the proxy may not have asked its master yet
+        # A gone pod's process may run on for a moment and register again: then the next look sends
+        # the gone address again.
         recheck = self._recheck
         self._recheck = False
         if new_report != self.report or recheck:
@@ -231,19 +238,19 @@ class ProxyPoller:
         return await self.session.status()
 
     def _note_instance(self, instance: str) -> None:
-        """Note which process answers: one that was started again knows nothing."""
+        """Note which process answers: a new process has no policy and no callers."""
         if self._instance and instance != self._instance:
             self._forget()
             self._pending.set()
         self._instance = instance
 
     def _forget(self) -> None:
-        """Assume that the proxy knows nothing."""
+        """Assume that the proxy has confirmed nothing, and may report changes."""
         self.session.forget()
         self._tells_changes = True
 
     async def _tell_policy(self) -> bool:
-        """Send its policy, if it does not have that. Returns whether it has it now."""
+        """Send the policy, unless confirmed. Return whether the proxy has the policy."""
         policy = self._policy
         if policy is None or self.session.has_policy(policy):
             return True
@@ -258,14 +265,15 @@ class ProxyPoller:
         except ProxyError as error:
             log.debug("policy not sent: proxy %s: %s", self.session.admin, error)
             return False
-        self._recheck = self._recheck or bool(self._refusal)  # it has another report now
+        self._recheck = self._recheck or bool(self._refusal)  # the report has no refusal now
         self._refusal = ""
         return True
 
     async def _tell_callers(self) -> None:
-        """Send which pods may use it, if it does not know.
+        """Send the addresses of pods that may use the proxy, unless confirmed.
 
-        In a call of its own, before the others: those may wait for the master, and pods for this.
+        This call is separate from the call about gone pods, and comes first: the call about gone
+        pods may wait for the master, and new pods wait for this call.
         """
         callers = self._callers
         recent = self._tells_changes or time.monotonic() - self._callers_told_at < REPEATED
@@ -273,7 +281,7 @@ class ProxyPoller:
             return
         try:
             async with self._limits.questions:
-                if not self._leads():  # the call before may have taken long
+                if not self._leads():  # sending the policy may have taken long
                     return
                 await self.session.tell_callers(callers)
         except ProxyError as error:
@@ -283,7 +291,7 @@ class ProxyPoller:
         self._callers_told_at = time.monotonic()
 
     async def _tell_gone(self) -> bool:
-        """Send which pods are gone, if any are. Returns whether the proxy has confirmed that."""
+        """Send the addresses of gone pods, if any. Return whether the proxy has confirmed."""
         gone = sorted(self._gone)
         if not gone:
             return False
@@ -293,7 +301,7 @@ class ProxyPoller:
                     return False
                 answer = await self.session.tell_containers({"gone": gone})
         except ProxyError as error:
-            # It may just be without its master; it is sent again with the next poll.
+            # The proxy may have no master at the moment. The next poll sends the addresses again.
             log.debug("gone addresses not sent: proxy %s, %s: %s", self.session.admin, gone, error)
             return False
         self._gone -= set(gone)
@@ -305,9 +313,9 @@ class ProxyPoller:
 
 
 class ClusterProxySync:
-    """All pollers, one for each proxy's pod that has an address.
+    """The pollers of all proxies whose pods have an address.
 
-    ``changed`` is called with the namespaces of proxies whose reports have changed.
+    A poller calls ``changed`` with the proxy's namespace when the report has changed.
     """
 
     def __init__(
@@ -326,17 +334,20 @@ class ClusterProxySync:
 
     @property
     def reports(self) -> dict[str, ProxyReport]:
-        """The reports by the uids of the proxies' pods; none of a proxy that is just starting."""
+        """The reports by the uids of the proxies' pods, without proxies that are starting."""
         return {uid: p.report for uid, (p, _) in self._pollers.items() if p.report is not None}
 
     @property
     def admin_endpoints(self) -> dict[str, tuple[HostPort, str]]:
-        """Each proxy's admin endpoint and the token for it, by the names of their pods."""
+        """The admin endpoint and the token of each proxy, by the name of the proxy's pod."""
         sessions = {poller.name: poller.session for poller, _ in self._pollers.values()}
         return {name: (session.admin, session.token) for name, session in sessions.items()}
 
     def follow(self, proxies: Iterable[ProxyPod], key: bytes = b"") -> None:
-        """Poll these and no others, with tokens made from this key."""
+        """Poll exactly these proxies, with tokens computed from ``key``.
+
+        A changed address or token gets a new poller.
+        """
         wanted = {p.pod.uid: p for p in proxies if p.pod.ip and not p.pod.ended}
         for uid in [*self._pollers]:
             poller, task = self._pollers[uid]
@@ -356,7 +367,10 @@ class ClusterProxySync:
                 self._pollers[uid] = added, task
 
     async def forget(self) -> None:
-        """Assume that no proxy knows anything: another operator has sent to them meanwhile."""
+        """End all pollers, and forget what the proxies have confirmed.
+
+        Another operator may send to the proxies until this operator leads again.
+        """
         tasks = [task for _, task in self._pollers.values()]
         self._pollers.clear()
         for task in tasks:
@@ -364,24 +378,27 @@ class ClusterProxySync:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def brief(self, briefings: Mapping[str, Briefing]) -> None:
-        """Have proxies told what is new, by the uid of their pods."""
+        """Send briefings to proxies, by the uid of the proxy's pod."""
         for uid, briefing in briefings.items():
             if uid in self._pollers:
                 self._pollers[uid][0].brief(briefing)
 
 
 def _random_wait() -> float:
-    """Seconds to wait for a change: not the same for all pollers, which begin together."""
+    """Return the seconds to wait for a change, random because all pollers begin together."""
     return WAIT * random.random()  # noqa: S311 - no secret
 
 
 def address_of(proxy: ProxyPod) -> HostPort:
-    """A proxy's admin endpoint."""
+    """Return the address and port of a proxy's admin endpoint."""
     return HostPort(proxy.pod.ip, ADMIN_PORT)
 
 
 def token_for(proxy: ProxyPod, key: bytes) -> str:
-    """The token of a proxy's admin endpoint: by the key, or in the pod of a former operator's."""
+    """Return the token of a proxy's admin endpoint.
+
+    A former operator wrote the token into the pod; otherwise the token is computed from ``key``.
+    """
     return proxy.token or token_of(key, proxy.pod.id, proxy.node)
 
 

@@ -1,7 +1,7 @@
-"""Why the kubelet can't set up a proxy's pod, a taken port for one: only an Event tells that.
+"""Events that say why the kubelet can't set up a proxy's pod, for example for a taken hostPort.
 
-While proxies have been waiting for some time, the Events with that reason are requested, at once
-for a whole namespace and never often.
+The pod's status does not say so. The operator requests these Events while proxies wait for more
+than `PATIENCE` seconds: a single request for a namespace, at most every `EVERY` seconds.
 """
 
 import asyncio
@@ -21,17 +21,19 @@ from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
 
 FAILED = "FailedCreatePodSandBox"
-"""The reason of the kubelet's Event, which alone says that a hostPort could not be had."""
+"""Reason of the kubelet's Event. Only this Event says that a hostPort was not free."""
 PATIENCE = 2.0
-"""Seconds for which a proxy's pod may wait on its node before its Events are requested."""
+"""Seconds for which a proxy's pod waits on its node before the operator requests Events."""
 EVERY = 3.0
 """Seconds between two requests for a namespace's Events."""
 _IDS = re.compile(r"\b[0-9a-f]{32,64}\b")
+"""Ids of sandboxes, as container runtimes write them."""
 _LONGEST = 300
+"""Characters that are kept of a message."""
 
 
 class SandboxFailures:
-    """What the Events say of proxies that wait. Every method belongs to the event loop."""
+    """The messages of Events about waiting proxies. Use all methods from the event loop only."""
 
     def __init__(self, api: Api) -> None:
         self._api = api
@@ -40,7 +42,7 @@ class SandboxFailures:
         self._messages: dict[str, str] = {}
 
     async def read(self, observed: ClusterSnapshot) -> set[str]:
-        """Request the Events that are due. Returns the namespaces with new messages."""
+        """Request the Events that are due. Return the namespaces with new messages."""
         now = time.monotonic()
         waiting = [proxy for proxy in observed.proxies if _waits(proxy)]
         uids = {p.pod.uid for p in waiting}
@@ -63,33 +65,33 @@ class SandboxFailures:
         return self._api.list_fresh("events", namespace, f"reason={FAILED}")
 
     def with_messages(self, observed: ClusterSnapshot) -> ClusterSnapshot:
-        """The snapshot, with the Events' messages at its proxies."""
+        """Return the snapshot, with ``stuck`` and ``message`` of waiting proxies from Events."""
         if not self._messages:
             return observed
         return replace(observed, proxies=tuple(map(self._shown, observed.proxies)))
 
     def again_in(self) -> float | None:
-        """In how many seconds to request Events again; None: no proxy waits."""
+        """Return the seconds until the next request for Events, None if no proxy waits."""
         return EVERY if self._waiting_since else None
 
     def _shown(self, proxy: ProxyPod) -> ProxyPod:
         message = self._messages.get(proxy.pod.uid, "")
         if not message or not _waits(proxy):
             return proxy
-        # Without the sandbox's id, which is another one with each try.
+        # Each try has a new sandbox id. Without the id, the message stays the same.
         steady = clean(_IDS.sub("…", " ".join(message.split())))[:_LONGEST]
         return replace(proxy, stuck=stuck_by_event(message), message=steady)
 
 
 def _waits(proxy: ProxyPod) -> bool:
-    """Whether a proxy's pod is on its node, without an address or a known failure yet."""
+    """Whether a proxy's pod is pending on its node, without an address and a known failure."""
     pod = proxy.pod
     is_pending = pod.phase == "Pending" and bool(pod.node) and not pod.deleting
     return is_pending and not (proxy.stuck or pod.ip)
 
 
 def _latest(events: Sequence[Json]) -> dict[str, str]:
-    """What the last Event about each pod says, by the pod's uid."""
+    """Return the message of the last Event about each pod, by the pod's uid."""
     latest: dict[str, Json] = {}
     for event in sorted(events, key=_timestamp):
         latest[text_at(submap(event, "involvedObject"), "uid")] = event

@@ -1,11 +1,13 @@
-"""The key from which the tokens of the proxies' admin endpoints are made: in a Secret, made once.
+"""The key of the proxies' tokens. The operator creates the key once, and keeps the key in a Secret.
 
-A proxy's pod holds only the hash of its token, so that whoever may read pods can't change what the
-proxy knows. The operator has no disk, and computes each token anew from this key and the proxy's
-name (`names.token_of`), as operators that stand by do. The chart makes the Secret without data, so
-that the right to write is for one name; upgrades leave it alone. If the key is removed from it,
-another one is made, and the proxies are made anew, one of a RosProxy after the other, on the same
-ports.
+A proxy's pod has only the hash of the token. So a user that may read pods can't change anything at
+the admin endpoint. The operator has no disk, and computes each token from the key, the proxy's name
+and the node (`names.token_of`). Operators that stand by compute the same tokens.
+
+The chart creates the Secret without data. So the operator needs the right to write only for this
+name. An upgrade of the chart does not change the Secret. If a user removes the key from the Secret,
+the operator creates a new key. Then the operator recreates the proxies of a RosProxy in turn, on
+the same ports.
 """
 
 import base64
@@ -29,13 +31,13 @@ from rosproxy_operator.kubernetes.resources.model import Json, Name
 log = logging.getLogger(__name__)
 
 ENTRY = "key"
-"""The key's name in the Secret's data."""
+"""Name of the key's entry in the Secret's data."""
 LENGTH = 32
-"""Bytes of the key: as many as those of the hash that it is used with (RFC 2104, section 3)."""
+"""Bytes of the key: the length of a SHA-256 hash (RFC 2104, section 3)."""
 
 
 class TokenKey:
-    """Reads the key, and makes one where there is none. Without a Secret it is this process's."""
+    """Reads the key from the Secret, or creates a key: without a Secret, in memory only."""
 
     def __init__(self, api: Api, secret: Name | None) -> None:
         self._api = api
@@ -44,7 +46,10 @@ class TokenKey:
         self.problems: Sequence[Problem] = ()
 
     def read(self) -> bytes:
-        """The key as it is now. Raises ApiUnavailable."""
+        """Return the key. Raises ApiUnavailable.
+
+        Other errors of the API server become ``problems``, and the key is in memory only.
+        """
         self.problems = ()
         if self._secret is None:
             return self._kept_key()
@@ -63,7 +68,10 @@ class TokenKey:
         return key
 
     def _put(self, secret: Name, key: bytes, manifest: Json) -> None:
-        """Write a key to the Secret; a key of a faster operator counts. Raises ApiError."""
+        """Write a new key to the Secret. Raises ApiError.
+
+        Raises ApiUnavailable if another program was faster: the next look reads the Secret again.
+        """
         entries = {ENTRY: base64.b64encode(key).decode()}
         try:
             self._api.fill_secret(secret, manifest, entries)
@@ -72,7 +80,7 @@ class TokenKey:
         log.info("key of the proxies' tokens created: Secret %s", secret)
 
     def _kept_key(self) -> bytes:
-        """The key that was known last, else one that lasts as long as this process."""
+        """Return the last known key, or else a key that only this process has."""
         self._cached_key = self._cached_key or secrets.token_bytes(LENGTH)
         return self._cached_key
 
@@ -87,7 +95,7 @@ class TokenKey:
 
 
 def _read(secret: Json) -> bytes:
-    """The key in a Secret; empty if there is none that is long enough."""
+    """Return the key in a Secret, empty if the key is missing, too short, or not base64."""
     try:
         key = base64.b64decode(text_at(submap(secret, "data"), ENTRY), validate=True)
     except binascii.Error:

@@ -1,10 +1,12 @@
-"""Having unwired pods made anew, where their RosProxy asks for that.
+"""Eviction of unwired pods, for each RosProxy with the annotation `REMAKE`.
 
-A pod that was created while no operator answered the API server is never wired any more; it has to
-be created again. With the annotation `REMAKE` on the RosProxy such a pod is evicted, if its
-controller makes it anew; PodDisruptionBudgets hold. One at a time: the next one goes once none of
-the pods is about to go or to start; after the first ones there are growing pauses, so that a
-webhook that does not work costs a pod a minute and no more.
+The webhook wires a pod only when the pod is created. If no operator answered the API server at that
+moment, only a new pod can be wired. So the operator evicts an unwired pod whose controller creates
+a new pod. PodDisruptionBudgets hold.
+
+The operator evicts a single pod at a time, and waits while a selected pod starts or is being
+deleted. After the first evictions the pauses grow (`planner.retries`). So a webhook that does not
+work costs at most a pod a minute.
 """
 
 from collections.abc import Iterator
@@ -17,15 +19,15 @@ from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext
 from rosproxy_operator.kubernetes.resources.model import Pod, RosProxy
 
 RECREATING_CONTROLLERS = ("ReplicaSet", "ReplicationController", "StatefulSet", "DaemonSet")
-"""Kinds of controllers that make a pod anew. A Job would count its pod as failed."""
+"""Kinds of controllers that replace an evicted pod. A Job counts an evicted pod as failed."""
 
 
 def remake_unwired(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
-    """Evict one pod that is not wired, if it is time for that."""
+    """Yield the eviction of a single unwired pod, if an eviction is due."""
     if not rosproxy.remakes:
         return
     task = Task(rosproxy.id, "remake", rosproxy.id)
-    context.retries.note_effect(task)  # the count is kept as long as this is asked for
+    context.retries.note_effect(task)  # keeps the count of evictions, and so the pauses
     address = context.cluster_ip(rosproxy)
     pods = context.view.selected_pods.get(rosproxy.id, ())
     candidates = [pod for pod in pods if address and is_to_be_remade(pod, rosproxy, address)]
@@ -38,7 +40,7 @@ def remake_unwired(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Acti
 
 
 def is_to_be_remade(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
-    """Whether a pod is not wired, would be if it were made anew, and is made anew if it goes.
+    """Whether a pod is unwired, and its controller creates a new pod that the webhook would wire.
 
     ``cluster_ip`` is the address of the RosProxy's Service.
     """
