@@ -1,7 +1,7 @@
 """Keeps proxies and operator in step, over the proxies' admin endpoints.
 
 Each proxy's pod with an address has a `ProxyPoller`. The poller waits until the proxy reports a
-change (``/status/changes``), so an idle proxy causes no traffic. The poller polls a proxy that is
+change (``/status/changes``), so an idle proxy causes no calls. The poller polls a proxy that is
 starting, does not answer, or is of a former release. Each look reads the reports
 (`ClusterProxySync.reports`), and a changed report wakes the operator.
 

@@ -1,1 +1,1 @@
-"""The cluster's objects as the operator knows them: what the API server holds, read. Pure."""
+"""The objects of the cluster: the operator's model, and readers of the API server's JSON. Pure."""

@@ -1,4 +1,4 @@
-"""Checks of names, labels and hosts by Kubernetes' rules; and typed reads from any JSON."""
+"""Checks of names, labels and hosts by Kubernetes' rules, and typed reads from JSON."""
 
 import re
 
@@ -13,12 +13,12 @@ _QUALIFIED = re.compile(r"[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?")
 
 
 def quoted(value: object) -> str:
-    """A value as it may be shown: not too long, and harmless."""
+    """Return the repr of a value, at most 80 characters long."""
     return shorten(repr(value), 80)
 
 
 def host_problem(host: str) -> str:
-    """Why outside can't reach a node at this host name or address; empty if outside can."""
+    """Return why outside can't reach a node at this host name or address, empty if outside can."""
     try:
         parse_host("host", host)
     except SettingError:
@@ -29,12 +29,12 @@ def host_problem(host: str) -> str:
 
 
 def is_subdomain(text: str) -> bool:
-    """Whether a text is a lower-case DNS name (RFC 1123), as Kubernetes wants names."""
+    """Whether a text is a lower-case DNS name (RFC 1123), the form of Kubernetes' object names."""
     return len(text) <= 253 and _SUBDOMAIN.fullmatch(text) is not None
 
 
 def is_label(text: str) -> bool:
-    """Whether a text is one label of such a DNS name."""
+    """Whether a text is a single label of a lower-case DNS name (RFC 1123)."""
     return len(text) <= 63 and "." not in text and is_subdomain(text)
 
 
@@ -50,7 +50,7 @@ def is_label_value(text: str) -> bool:
 
 
 def submap(obj: Json, *keys: str) -> Json:
-    """The map that is found down some keys, empty if there is none."""
+    """Return the map at a path of keys, empty if there is no map."""
     for key in keys:
         child = obj.get(key)
         obj = child if isinstance(child, dict) else {}
@@ -58,25 +58,25 @@ def submap(obj: Json, *keys: str) -> Json:
 
 
 def submaps(obj: Json, key: str) -> list[Json]:
-    """The maps in the list under a key, none if there is no list."""
+    """Return the maps in the list under a key, empty if there is no list."""
     array = obj.get(key)
     return [child for child in array if isinstance(child, dict)] if isinstance(array, list) else []
 
 
 def text_at(obj: Json, key: str) -> str:
-    """The text under a key, empty if there is none."""
+    """Return the text under a key, empty if there is no text."""
     text = obj.get(key)
     return text if isinstance(text, str) else ""
 
 
 def int_at(obj: Json, key: str) -> int:
-    """The integer under a key, 0 if there is none."""
+    """Return the integer under a key, 0 if there is no integer."""
     value = obj.get(key)
     return value if type(value) is int else 0
 
 
 def port_range(obj: Json, key: str) -> PortRange | None:
-    """The range of ports that is written under a key, None if there is none."""
+    """Return the port range in the text under a key, None if the text is no range."""
     try:
         return parse_range(key, text_at(obj, key))
     except SettingError:
@@ -84,5 +84,5 @@ def port_range(obj: Json, key: str) -> PortRange | None:
 
 
 def texts_at(obj: Json, *keys: str) -> dict[str, str]:
-    """The texts of a map, by their keys."""
+    """Return the texts in the map at a path of keys, by their keys."""
     return {key: value for key, value in submap(obj, *keys).items() if isinstance(value, str)}

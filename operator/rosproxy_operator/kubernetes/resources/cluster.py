@@ -1,4 +1,4 @@
-"""The operator's own objects, what proxies say, and the cluster as a whole at one moment."""
+"""The operator's own objects, the proxies' reports, and a snapshot of the cluster."""
 
 from collections.abc import Mapping
 from enum import Enum
@@ -21,20 +21,20 @@ from rosproxy_operator.kubernetes.resources.model import (
 class PodFailure(Enum):
     """Why a proxy's pod does not run."""
 
-    PORTS = "ports"  # one of its hostPorts is taken
-    SCHEDULING = "scheduling"  # the scheduler or the kubelet does not admit it for another reason
+    PORTS = "ports"  # a hostPort is taken
+    SCHEDULING = "scheduling"  # the scheduler or the kubelet refuses the pod for another reason
     IMAGE = "image"
     CRASHING = "crashing"
-    SANDBOX = "sandbox"  # the kubelet can't set it up
+    SANDBOX = "sandbox"  # the kubelet can't set up the pod or its container
 
 
 class OwnPod(msgspec.Struct, frozen=True):
-    """A pod of the operator.
+    """A pod that the operator has created.
 
-    ``of`` and ``owner`` are the name and uid of its RosProxy, ``node`` where it is meant to run
-    (``pod.node`` may still be empty). ``image`` is what its spec names. ``stuck`` and ``message``
-    say why it does not run, in the words of the scheduler or the kubelet; ``ready`` is its
-    condition Ready.
+    ``of`` and ``owner`` are the name and the uid of the pod's RosProxy. ``node`` is the node that
+    the operator has chosen; ``pod.node`` is empty until the scheduler has bound the pod. ``image``
+    is the image in the pod's spec. ``ready`` is the pod's condition Ready. ``stuck`` is the reason
+    why the pod does not run; ``message`` has the words of the scheduler or the kubelet.
     """
 
     pod: Pod
@@ -49,11 +49,11 @@ class OwnPod(msgspec.Struct, frozen=True):
 
 
 class ProxyPod(OwnPod, frozen=True, kw_only=True):
-    """A pod in which a proxy runs, or is to run.
+    """The pod of a proxy.
 
-    ``restarts`` counts those of its container. ``token`` is that of its admin endpoint where it
-    stands in the pod, as former operators wrote it. ``runs``: its container was started, and was
-    not seen to end.
+    ``restarts`` is the restart count of the container. ``runs``: the container's last known state
+    is running. ``token`` is the token of the admin endpoint if a former operator wrote the token
+    into the pod, otherwise empty.
     """
 
     range: PortRange
@@ -63,13 +63,13 @@ class ProxyPod(OwnPod, frozen=True, kw_only=True):
 
 
 class HelperPod(OwnPod, frozen=True, kw_only=True):
-    """A pod beside a proxy: LAN_RELAY or IMAGE_CHECK, by its ``component`` (`names`)."""
+    """A LAN relay or an image check: ``component`` is LAN_RELAY or IMAGE_CHECK (`names`)."""
 
     component: str
 
 
 class ProxyService(msgspec.Struct, frozen=True):
-    """A Service of the operator: under its address pods find the proxy on their node."""
+    """The Service of a RosProxy. At its address, each pod reaches the proxy on its own node."""
 
     of: Name
     owner: str
@@ -80,10 +80,11 @@ class ProxyService(msgspec.Struct, frozen=True):
 
 
 class MasterService(msgspec.Struct, frozen=True):
-    """Any other Service, which may be that of a master.
+    """A Service that the operator has not created. A RosProxy may name the Service as its master.
 
-    ``address`` is its cluster IP as it stands there, ``type`` its type; ``allowed`` are the
-    namespaces whose RosProxies may name it, besides its own; ``misspelt`` is as that of a pod.
+    ``address`` is ``spec.clusterIP`` as written (also ``None``), ``type`` is ``spec.type``.
+    ``allowed`` are other namespaces whose RosProxies may name the Service. ``misspelt`` has the
+    texts of `misspelt_names`.
     """
 
     id: Name
@@ -95,7 +96,7 @@ class MasterService(msgspec.Struct, frozen=True):
 
 
 class ProxyPolicy(msgspec.Struct, frozen=True):
-    """A NetworkPolicy of the operator, for the proxies of a RosProxy or for its pods."""
+    """A NetworkPolicy of the operator, for the proxies or the selected pods of a RosProxy."""
 
     id: Name
     of: Name
@@ -106,14 +107,21 @@ class ProxyPolicy(msgspec.Struct, frozen=True):
 
 
 class ProxyReport(msgspec.Struct, frozen=True):
-    """What a proxy says of itself (``/status``), as far as it matters here.
+    """The part of a proxy's ``/status`` that the operator uses.
 
-    ``nodes`` are the names of the ROS nodes behind it, by their pod's IP; ``problems`` what it
-    warns of; ``error`` is why its master is not reached, or why the proxy itself does not answer;
-    ``refusal`` why it does not take its policy. ``participants`` are the GUID prefixes of those of
-    ROS 2, ``leases`` their ports. One without ROS 1 has no master, which counts as reached.
-    ``range_probe`` is, without its age, whether outside reaches its ports; None: not tried yet.
-    ``unregistered_addresses`` are those of nodes that were silent for long, and may come back.
+    - ``answered``: whether the proxy answers.
+    - ``master_up``: whether the proxy reaches its master, always true for a proxy without ROS 1.
+    - ``error``: why the proxy does not answer, or does not reach its master.
+    - ``nodes``: names of ROS 1 nodes, by the IP address of their pod.
+    - ``topics``: names of all topics inside.
+    - ``problems``: texts of the proxy's current problems.
+    - ``refusal``: why the proxy refuses its policy.
+    - ``participants``: GUID prefixes of ROS 2 participants, by the IP address of their pod.
+    - ``leases``: ports of participants, by GUID prefix.
+    - ``range_probe``: whether outside reaches the range. None: not tried yet. ``age`` is always 0,
+      so that an unchanged result gives an equal report.
+    - ``unregistered_addresses``: addresses of nodes that the proxy has given up after a long
+      silence. Such a node may come back.
     """
 
     answered: bool
@@ -130,14 +138,14 @@ class ProxyReport(msgspec.Struct, frozen=True):
 
     @property
     def addresses(self) -> frozenset[str]:
-        """Where it has ROS nodes or participants."""
+        """The addresses of all nodes and participants, also of nodes that may come back."""
         return self.unregistered_addresses | {*self.nodes, *self.participants}
 
 
 class Obstacle(msgspec.Struct, frozen=True):
-    """What keeps a proxy from being made or changed, told with the node's name before it.
+    """Why the operator can't create or change a proxy on a node.
 
-    ``reason`` is the same in one CamelCase word.
+    The status shows ``text`` after the node's name. ``reason`` is a CamelCase word.
     """
 
     reason: str
@@ -145,12 +153,13 @@ class Obstacle(msgspec.Struct, frozen=True):
 
 
 class RosProxyOnNode(msgspec.Struct, frozen=True):
-    """What one RosProxy has on one node, and what it gets there: a line of its status.
+    """The state of a RosProxy on a node: an entry of ``status.perNode``.
 
-    ``pods`` are the selected ones that are neither ended nor being deleted; a node without any is
-    told for its ``range``, so that it gets the same again. ``range`` is None if there is none to be
-    had. ``proxy`` is the pod that serves the node, None where there is none yet or any more;
-    ``lan_relay`` its LAN relay, ``image_check`` the check of its next image.
+    ``pods`` are the selected pods that are neither ended nor being deleted. The status also lists a
+    node without pods, so that the node gets the same ``range`` again. ``range`` is None if no range
+    is free. ``proxy`` is the pod that serves the node, None if there is no such pod. ``lan_relay``
+    is the proxy's LAN relay, ``image_check`` the check of the proxy's next image. ``answer`` is the
+    proxy's report.
     """
 
     name: str
@@ -165,30 +174,42 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
 
 
 class WebhookState(msgspec.Struct, frozen=True):
-    """Whether the operator serves the webhook, and since when, in RFC 3339; empty: not known."""
+    """Whether the operator serves the webhook, and since when (RFC 3339; empty: unknown)."""
 
     served: bool = True
     since: str = ""
 
 
 class ClusterSnapshot(msgspec.Struct, frozen=True):
-    """A cluster at one moment, as far as it matters.
+    """The part of a cluster's state that the operator uses, at a single moment.
 
-    ``pods`` are those that a RosProxy selects; and on the nodes where those, proxies or LAN relays
-    run all others of the namespaces that have such, and any that take ports there. ``masters``
-    gives, for each Service that a RosProxy names as its master, its address and what is wrong; one
-    of them is empty. ``consents`` gives, for the same, the namespaces whose RosProxies may name it,
-    besides its own. ``selected`` are the uids of the pods that a RosProxy selects,
-    ``unselected_pods`` those that ask for a proxy by their label and that no RosProxy selects;
-    ``misspelt_pods`` are those with a misspelt label or annotation, ``misspelt_services`` says what
-    is wrong with those of ``masters``. ``policies`` are the operator's own NetworkPolicies by their
-    names; ``policies_error`` is why they can't be listed. ``key`` is that from which the proxies'
-    tokens are made. ``unusable`` are the RosProxies that can't be read at all: what they have is
-    left as it is. ``reports`` are what the proxies say of themselves, by the uid of the pod;
-    ``failures`` are, by RosProxy and object, what the API server said of the actions that failed at
-    the last try; ``vanished`` are the places whose proxy's pod is gone though its container was not
-    seen to end, and when, by the operator's monotonic clock; ``webhook`` is that of this operator:
-    the reports, the failures and the webhook are not listed, the operator puts them here.
+    From the API server:
+
+    - ``pods``: all pods that a RosProxy selects, and all pods of the operator. In addition, on the
+      nodes of these pods: all pods of namespaces with a RosProxy or with a pod of the operator, and
+      all pods with hostPorts.
+    - ``services``: the Services of RosProxies, by RosProxy.
+    - ``masters``: for each Service that a RosProxy names as its master, the address and the
+      problem. Either the address or the problem is empty.
+    - ``consents``: for each such Service, other namespaces whose RosProxies may name the Service.
+    - ``misspelt_services``: for each such Service, the texts of `misspelt_names`.
+    - ``selected``: uids of the pods that a RosProxy selects and that have not ended.
+    - ``unselected_pods``: pods that ask for a proxy by their label, but that no RosProxy selects.
+    - ``misspelt_pods``: pods with a misspelt label or annotation.
+    - ``policies``: the operator's NetworkPolicies by name. ``policies_error`` is why the operator
+      can't list or watch NetworkPolicies.
+    - ``unusable``: RosProxies that the operator can't read. `planner.bounds` adds RosProxies that
+      ask for more than allowed. The operator leaves the objects of these RosProxies unchanged.
+    - ``vanished``: the places whose proxy's pod is gone although the operator did not see the
+      container end. The value is the time, in seconds of the operator's monotonic clock.
+
+    From the operator itself:
+
+    - ``key``: the key of the proxies' tokens.
+    - ``reports``: the proxies' reports, by the uid of the pod.
+    - ``failures``: the API server's errors about actions that failed at the last try, by RosProxy
+      and object.
+    - ``webhook``: the state of the operator's webhook.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()
@@ -215,5 +236,5 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
 
     @property
     def own_pods(self) -> tuple[OwnPod, ...]:
-        """The operator's pods of all kinds."""
+        """All pods that the operator has created."""
         return (*self.proxies, *self.lan_relays, *self.image_checks)

@@ -1,7 +1,7 @@
-"""What a user writes, read strictly: the first field that does not fit is refused by its name.
+"""A strict reader of users' objects: the first invalid field raises `InvalidField`.
 
-Not by msgspec, which reads the proxy's documents: its messages neither name a field as Kubernetes
-does nor give a fix.
+msgspec reads the proxy's documents, but its errors neither name a field as Kubernetes does nor give
+a fix.
 """
 
 from collections.abc import Mapping
@@ -17,35 +17,36 @@ _NOTHING: Mapping[str, Any] = {}
 
 
 class InvalidField(Exception):
-    """Why an object can't be used: which field, what is wrong, and what to do."""
+    """An object is unusable. The message has the field, the problem and the fix."""
 
 
 class Field(msgspec.Struct, frozen=True):
-    """A part of an object, None if it is not given; ``path`` names it as Kubernetes does.
+    """A field of an object. ``value`` is None if the field is missing.
 
-    All methods but `error` raise InvalidField if it is not what they are to give.
+    ``path`` names the field as Kubernetes does, for example ``spec.peers[0]``. All methods except
+    `error` raise InvalidField if the value has another type, or is out of bounds.
     """
 
     path: str
     value: Any
 
     def error(self, problem: str, fix: str) -> InvalidField:
-        """The error to raise for it: what is wrong, and what to do."""
+        """Return the error to raise for this field."""
         return InvalidField(f"{self.path}: {quoted(self.value)} {problem}. {fix}")
 
     def __getitem__(self, key: str) -> "Field":
         return Field(f"{self.path}.{key}", self.map().get(key))
 
     def map(self, default: Mapping[str, Any] = _NOTHING) -> Mapping[str, Any]:
-        """A map of anything."""
+        """Return the value as a map, without a check of its entries."""
         return self._checked(dict, default, "a map of fields")
 
     def texts(self) -> dict[str, str]:
-        """A map of texts."""
+        """Return the value as a map of texts."""
         return {key: self[key].text() for key in self.map()}
 
     def items(self) -> list["Field"]:
-        """The fields of a list."""
+        """Return the entries of a list as fields. A null entry is invalid."""
         fields = [
             Field(f"{self.path}[{i}]", v) for i, v in enumerate(self._checked(list, [], "a list"))
         ]
@@ -55,18 +56,19 @@ class Field(msgspec.Struct, frozen=True):
         return fields
 
     def text(self, default: str = "") -> str:
-        """A text."""
+        """Return the value as a text."""
         return self._checked(str, default, "a text, in quotes")
 
     def boolean(self) -> bool:
-        """True or false, which is the default."""
+        """Return the value as a boolean. The default is False."""
         return self._checked(bool, False, "true or false")
 
     def number(self, default: N, least: int, most: int) -> N:
-        """A number of the type that the default has, within bounds."""
+        """Return the value as a number from ``least`` to ``most``, of the type of ``default``."""
         if self.value is None:
             return default
-        kind = type(default)  # bool is excluded below, since it is a kind of int in Python
+        kind = type(default)
+        # In Python, bool is a subclass of int.
         fits = isinstance(self.value, int | kind) and not isinstance(self.value, bool)
         if not fits or not least <= self.value <= most:
             expected = {int: "an integer", float: "a number"}[kind]
@@ -74,7 +76,7 @@ class Field(msgspec.Struct, frozen=True):
         return kind(self.value)
 
     def one_of(self, allowed: Mapping[str, V], default: str) -> V:
-        """What the text stands for, which must be one of those that are allowed."""
+        """Return the value that ``allowed`` has for the text. Another text is invalid."""
         text = self.text(default)
         if text not in allowed:
             fix = f"Write one of {', '.join(sorted(filter(None, allowed)))}"
@@ -90,7 +92,7 @@ class Field(msgspec.Struct, frozen=True):
 
 
 def stripped(obj: Any) -> Any:
-    """The same without blanks around its texts; null in a map is as if it were not given."""
+    """Return a copy of JSON without blanks around texts, and without null entries of maps."""
     if isinstance(obj, str):
         return obj.strip()
     if isinstance(obj, Mapping):

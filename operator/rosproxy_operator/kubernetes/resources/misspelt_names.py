@@ -1,7 +1,7 @@
-"""Labels and annotations that are meant for the operator, and that the operator does not know.
+"""Warnings about misspelt labels and annotations that are meant for the operator.
 
-A pod with a misspelt label belongs to no RosProxy: no webhook sees the pod and no RosProxy selects
-it, so no other message mentions the pod. The text gives the name that was meant.
+A pod with a misspelt label belongs to no RosProxy: no webhook sees the pod, no RosProxy selects the
+pod, and so no other message mentions the pod. The warning suggests the correct name.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ Kind = Literal["pods", "nodes", "Services of masters", "RosProxies"]
 
 
 class _Named(NamedTuple):
-    """A name that users set: a label or an annotation, and of what."""
+    """A name that users set: a label or an annotation (``place``), and the ``kind`` of object."""
 
     name: str
     place: str
@@ -37,23 +37,24 @@ _USERS = (
 _BY_NAME = {named.name: named for named in _USERS}
 _BY_END = {named.name.partition("/")[2]: named for named in _USERS}
 _NEAR_END = 0.6
+"""Least similarity (`spelling.nearest`) of the part after the prefix, for a suggestion."""
 _OPERATORS = frozenset(
     {
         *(names.PROXY_OF, names.NODE, names.PORT_RANGE, names.FINGERPRINT),
         *(names.MASTER_URI, names.REPLACED_URI, names.STATIC_PEERS),
     }
 )
-"""Those that the operator sets itself, some of them in users' pods: they may be copied."""
+"""Names that the operator sets. Users may copy such names, since some are in users' pods."""
 _PREFIXES = (f"{names.GROUP}/", "rosproxy.", "rosproxy/")
 _PLACES = {"label": "labels", "annotation": "annotations"}
 MOST = 3
-"""Names of one object that are reported."""
+"""Misspelt names that are reported for an object."""
 MOST_CHECKED = 256
-"""Labels, and annotations, of one object whose spelling is checked. That takes 30 us for each."""
+"""Labels of an object that are checked, and as many annotations. Each check takes 30 us."""
 
 
 def misspelt_names(metadata: Json, kind: Kind) -> tuple[str, ...]:
-    """What is wrong with the names of labels and annotations of an object, in short texts."""
+    """Return a warning for each misspelt label and annotation of an object, at most `MOST`."""
     if names.is_own(texts_at(metadata, "labels")):
         return ()
     return tuple(islice(_texts(metadata, kind), MOST))
@@ -74,12 +75,12 @@ def _texts(metadata: Json, kind: Kind) -> Iterator[str]:
 
 
 def _is_ours(name: str) -> bool:
-    """Whether a name begins like those of the operator."""
+    """Whether a name begins like the names of the operator."""
     return name.lower().startswith(_PREFIXES)
 
 
 def _meant(name: str, kind: Kind) -> str:
-    # All begin alike, so that what follows is compared.
+    # Only the part after the prefix is compared, because all names have the same prefix.
     _, slash, last = name.rpartition("/")
     near = nearest(last if slash else name.partition(".")[2], tuple(_BY_END), _NEAR_END)
     if near:
