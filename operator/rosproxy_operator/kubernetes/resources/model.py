@@ -1,7 +1,4 @@
-"""What users and the cluster have: RosProxies, nodes and pods, in Kubernetes' words.
-
-What the operator has made of it is in `cluster`.
-"""
+"""RosProxies, nodes of the cluster and pods. `cluster` has the operator's own objects."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,11 +13,11 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec
 
 Json = Mapping[str, Any]
-"""An object as the API server gives it, or a part of one."""
+"""An object as the API server sends it, or a part of the object."""
 
 
 class Name(msgspec.Struct, frozen=True, order=True):
-    """What tells namespaced objects of one kind apart."""
+    """Namespace and name of an object. Within a kind, no two objects have the same."""
 
     namespace: str
     name: str
@@ -30,14 +27,14 @@ class Name(msgspec.Struct, frozen=True, order=True):
 
 
 class ProxyPlace(msgspec.Struct, frozen=True, order=True):
-    """A node, as one RosProxy (``of``) sees it."""
+    """A place for a proxy: a RosProxy (``of``) and a node of the cluster."""
 
     of: Name
     node: str
 
 
 class Selector(msgspec.Struct, frozen=True):
-    """A label selector (``metav1.LabelSelector``): all parts must fit.
+    """A label selector (``metav1.LabelSelector``). A pod must match all parts.
 
     ``expressions`` are (key, operator, values) with the operators In, NotIn, Exists, DoesNotExist.
     """
@@ -47,15 +44,15 @@ class Selector(msgspec.Struct, frozen=True):
 
 
 PodEgress = Literal["any", "proxy"]
-"""What selected pods may connect to: anything, or the proxies, one another and the DNS alone."""
+"""Where selected pods may connect to. ``proxy``: only to proxies, to each other, and to DNS."""
 
 
 class MasterSpec(msgspec.Struct, frozen=True):
-    """Where the real ROS master is: outside at ``uri``, or a Service of the cluster.
+    """The real ROS 1 master: outside at ``uri``, or a Service in the cluster.
 
-    ``address`` is the IP address of the host in ``uri``, for names that the cluster's DNS does not
-    know. ``publish`` is the hostPort under which outside finds a master that runs in the cluster,
-    0 for none.
+    ``address`` is the IP address of the host in ``uri``, for a name that the cluster's DNS does not
+    resolve. ``publish`` is the hostPort at which outside reaches a master in the cluster, 0 for
+    none.
     """
 
     uri: str = ""
@@ -66,7 +63,10 @@ class MasterSpec(msgspec.Struct, frozen=True):
 
 
 class Ros2Spec(msgspec.Struct, frozen=True):
-    """What it asks for of ROS 2. ``domain`` None is 0, pods are not told it; ``peers``: hosts."""
+    """The ROS 2 fields of a RosProxy. ``peers`` are hosts outside.
+
+    With ``domain`` None, the domain is 0, and the webhook sets no ROS_DOMAIN_ID in pods.
+    """
 
     domain: int | None = None
     peers: tuple[str, ...] = ()
@@ -74,12 +74,12 @@ class Ros2Spec(msgspec.Struct, frozen=True):
 
     @property
     def number(self) -> int:
-        """The domain."""
+        """The number of the domain."""
         return self.domain or 0
 
 
 class Advertise(Enum):
-    """Which of a node's addresses outside is told (``status.addresses[].type``)."""
+    """Type of the node's address that is the advertised host (``status.addresses[].type``)."""
 
     INTERNAL_IP = "InternalIP"
     EXTERNAL_IP = "ExternalIP"
@@ -87,26 +87,29 @@ class Advertise(Enum):
 
 
 class MaxUnavailable(msgspec.Struct, frozen=True):
-    """How many proxies of a RosProxy a rollout may have away: a count, or a percentage."""
+    """Number of proxies that a rollout may replace at the same time: a count, or a percentage."""
 
     number: int = 1
     is_percent: bool = False
 
     def of(self, count: int) -> int:
-        """How many of ``count`` proxies these are: at least one; a percentage is rounded up."""
+        """Return the number for ``count`` proxies, at least 1. A percentage is rounded up."""
         return max(1, -(-count * self.number // 100) if self.is_percent else self.number)
 
 
 class RosProxySpec(msgspec.Struct, frozen=True):
-    """What a RosProxy asks for; the fields are those of the CRD.
+    """The spec of a RosProxy, with the fields of the custom resource definition.
 
-    ``pod_selector`` None means: the pods whose label rosproxy.io/inject is "true" or the
-    RosProxy's name. ``cleanup_after`` and ``grace`` are in seconds. ``image`` empty means the
-    operator's default. ``policy`` is one layer or none. ``resources``, ``tolerations``,
-    ``host_aliases`` and ``image_pull_secrets`` go into the pods as they are. ``node_selector``,
-    ``tolerations``, ``image_pull_secrets`` and ``resources`` None mean the administrator's
-    defaults (`pod_defaults`). It is for ROS 1 if ``ros1`` is set (``master`` says nothing
-    otherwise), for ROS 2 if ``ros2`` is there.
+    With ``pod_selector`` None, the RosProxy selects pods whose label rosproxy.io/inject is "true"
+    or the RosProxy's name. ``cleanup_after`` and ``grace`` are in seconds. An empty ``image`` means
+    the operator's default. ``policy`` has at most a single layer.
+
+    ``resources``, ``tolerations``, ``host_aliases`` and ``image_pull_secrets`` go into the pods
+    unchanged. None in ``node_selector``, ``tolerations``, ``image_pull_secrets`` or ``resources``
+    means the administrator's default (`pod_defaults`).
+
+    ``ros1``: the proxies are for ROS 1. Without ``ros1``, ``master`` has no meaning. ``ros2`` None:
+    the proxies are not for ROS 2.
     """
 
     master: MasterSpec
@@ -132,23 +135,22 @@ class RosProxySpec(msgspec.Struct, frozen=True):
 
     @property
     def multicast(self) -> bool:
-        """Whether each proxy has a LAN relay, at the last port of its range."""
+        """Whether each proxy has a LAN relay. The relay uses the last port of the proxy's range."""
         return self.ros2 is not None and self.ros2.multicast
 
     @property
     def takes_udp(self) -> bool:
-        """Whether its proxies take UDP ports of their nodes: for DDS, or for UDPROS."""
+        """Whether the proxies use UDP ports of the nodes: for DDS, or for UDPROS."""
         return self.ros2 is not None or self.proxy.udp
 
 
 class RosProxy(msgspec.Struct, frozen=True):
     """A RosProxy, the custom resource.
 
-    ``former_ranges`` are the ranges by node name that its status holds; ``cluster_ip`` is the
-    address that its Service has, or had; ``status`` is its status as it is now. ``remakes``:
-    whether pods that came by unwired are to be made anew. ``misspelt``: what is wrong with the
-    names of its annotations and labels, as for nodes and pods (`misspelt_names`). ``created`` is
-    the time of the creation, as the API server writes it.
+    ``former_ranges`` are the ranges in the status, by node name. ``cluster_ip`` is the address of
+    the RosProxy's Service in the status, also of a deleted Service. ``remakes``: the operator
+    evicts unwired pods. ``created`` is the creation time, as the API server writes the time.
+    ``misspelt`` has the texts of `misspelt_names`.
     """
 
     id: Name
@@ -165,10 +167,10 @@ class RosProxy(msgspec.Struct, frozen=True):
 
 
 class ClusterNode(msgspec.Struct, frozen=True):
-    """A node of the cluster. ``addresses`` are by their type, the first of each.
+    """A node of the cluster. ``addresses`` has the first address of each type.
 
-    ``advertise_host`` is its annotation rosproxy.io/advertise-host. ``pod_networks`` are its
-    ``spec.podCIDRs``.
+    ``advertise_host`` is the annotation rosproxy.io/advertise-host. ``pod_networks`` are
+    ``spec.podCIDRs``. ``misspelt`` has the texts of `misspelt_names`.
     """
 
     name: str
@@ -182,27 +184,32 @@ class ClusterNode(msgspec.Struct, frozen=True):
 
 
 VALUE_AT_RUNTIME = "$()"
-"""Stands for a value that is only known once the container runs."""
+"""Stands for a value that is unknown until the container runs."""
 
 
 class PodContainer(msgspec.Struct, frozen=True):
-    """A container of a pod: its image, and those of its variables that matter to ROS 2."""
+    """A container of a pod: the image, and the variables that ROS 2 reads."""
 
     image: str = ""
     variables: Mapping[str, str] = {}
 
 
 class Pod(msgspec.Struct, frozen=True):
-    """A pod. ``node`` and ``ip`` are empty until it has them; ``ips`` are all of its addresses.
+    """A pod.
 
-    ``host_ports`` are the TCP ports that its containers take on the node. ``own_masters`` are the
-    ROS_MASTER_URIs that its template sets itself, so that the webhook left them alone; one that is
-    not a plain text (from a ConfigMap, for one) is `VALUE_AT_RUNTIME`. ``wired_master_uri`` is the
-    one that the webhook has set, empty if it has not; ``static_peers`` the same of
-    ROS_STATIC_PEERS. ``udp_ports`` are the UDP ports that it takes, ``controller`` is the kind of
-    the object that creates the pod again, ``workload`` names the object whose pods `kubectl rollout
-    restart` creates anew, as "deployment/talker". ``created`` is the time of the creation, as the
-    API server writes it.
+    ``node`` and ``ip`` are empty until the pod has a node and an address. ``ips`` are all addresses
+    of the pod. ``host_ports`` are the TCP hostPorts of the containers, ``udp_ports`` the UDP
+    hostPorts.
+
+    ``wired_master_uri`` is the ROS_MASTER_URI that the webhook has set, empty for none.
+    ``own_masters`` are the other values of ROS_MASTER_URI, which the pod's template sets. A value
+    that is no plain text, for example from a ConfigMap, is `VALUE_AT_RUNTIME`. ``static_peers`` is
+    the ROS_STATIC_PEERS that the webhook has set, empty for none.
+
+    ``controller`` is the kind of the pod's controller, for example ReplicaSet. ``workload`` is the
+    object for `kubectl rollout restart`, for example "deployment/talker". ``created`` is the
+    creation time, as the API server writes the time. ``misspelt`` has the texts of
+    `misspelt_names`.
     """
 
     id: Name
@@ -227,22 +234,22 @@ class Pod(msgspec.Struct, frozen=True):
 
     @property
     def every_port(self) -> frozenset[int]:
-        """The ports that it takes, by either protocol."""
+        """All hostPorts of the pod, for TCP and UDP."""
         return self.host_ports | self.udp_ports
 
     def ports_of(self, spec: RosProxySpec) -> frozenset[int]:
-        """Its ports that a RosProxy can't have, by the protocols that its proxies use."""
+        """Return the pod's hostPorts for protocols that the RosProxy's proxies use."""
         tcp = self.host_ports if spec.ros1 else frozenset[int]()
         return tcp | self.udp_ports if spec.takes_udp else tcp
 
     @property
     def ended(self) -> bool:
-        """Whether it has run to its end: it holds no ports any more."""
+        """Whether the pod has ended. An ended pod holds no ports."""
         return self.phase in ("Succeeded", "Failed")
 
 
 class Reference(msgspec.Struct, frozen=True):
-    """What a Kubernetes Event is about (``involvedObject``)."""
+    """The object of a Kubernetes Event (``involvedObject``)."""
 
     kind: str
     id: Name
@@ -251,10 +258,10 @@ class Reference(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClusterFinding(Problem):
-    """A problem as conditions and Kubernetes Events tell it.
+    """A problem that conditions and Kubernetes Events report.
 
-    ``reason`` is one word in CamelCase; ``of`` the RosProxy that it belongs to. ``about`` is the
-    object that the Event is about; None means that the problem gets no Event.
+    ``of`` is the RosProxy. ``reason`` is a CamelCase word. ``about`` is the object of the Event;
+    None: no Event.
     """
 
     reason: str
@@ -263,9 +270,9 @@ class ClusterFinding(Problem):
 
 
 class InvalidRosProxy(msgspec.Struct, frozen=True):
-    """A RosProxy that can't be read, or asks for more than it may.
+    """A RosProxy that the operator can't read, or that asks for more than allowed.
 
-    ``text`` says why, ``reason`` the same in one CamelCase word; the rest is as it is there.
+    ``text`` is the reason for users, ``reason`` a CamelCase word.
     """
 
     id: Name

@@ -1,7 +1,7 @@
-"""Objects of the API server, read: what the planner wants to know of nodes, pods and Services.
+"""Readers of nodes, pods, Services and NetworkPolicies, from the JSON of the API server.
 
-Their fields are those of k8s.io/api, core/v1/types.go. The API server has checked their types; what
-is missing is as if it were empty.
+The field names are from k8s.io/api, core/v1/types.go. The API server has checked the types. A
+missing field counts as empty.
 """
 
 from collections.abc import Iterator
@@ -48,28 +48,30 @@ ROS2_VARIABLES = frozenset(
         "RMW_IMPLEMENTATION",
     }
 )
-"""Those by which it is told what a pod can't have of ROS 2."""
+"""Variables from which the operator tells what does not work with ROS 2 in a pod."""
 MOST_LABELS = 128
-"""Labels that are kept of a pod, those of rosproxy.io first. All pods of the cluster are kept in
-memory, and the API server takes pods with a megabyte of labels."""
+"""Labels that are kept of a pod, first the labels of rosproxy.io.
+
+The operator keeps all pods of the cluster in memory, and a pod may have a megabyte of labels.
+"""
 _TEMPLATE_HASH = "pod-template-hash"
 _RESTARTED = ("StatefulSet", "DaemonSet")
-"""Controllers of pods that `kubectl rollout restart` takes themselves."""
+"""Kinds of pods' controllers that `kubectl rollout restart` takes directly."""
 MOST_CONTAINERS = 64
-"""Containers that are kept of a pod, and values of ROS_MASTER_URI, for the same reason."""
+"""Containers that are kept of a pod, and as many values of ROS_MASTER_URI, to bound the memory."""
 LONGEST_TEXT = 2048
-"""Characters that are kept of a variable, an annotation or an image: a URI has no more."""
+"""Characters that are kept of a variable, an annotation or an image. No usable URI is longer."""
 _LONGEST_LIST = 16 * 1024
-"""Characters that are read of the list of namespaces that a master's Service agrees to."""
+"""Characters that are read of the annotation `names.ALLOW_FROM`."""
 
 
 def node(obj: Json) -> ClusterNode:
-    """A node."""
+    """Return a node of the cluster."""
     meta = submap(obj, "metadata")
     spec = submap(obj, "spec")
     status = submap(obj, "status")
     networks = spec.get("podCIDRs") or (text_at(spec, "podCIDR"),)
-    # Reversed, so that of several addresses of a type the first one stays.
+    # In reverse, so that the first address of each type stays in the map.
     addresses = reversed(submaps(status, "addresses"))
     return ClusterNode(
         name=text_at(meta, "name"),
@@ -84,7 +86,7 @@ def node(obj: Json) -> ClusterNode:
 
 
 def pod(obj: Json) -> Pod:
-    """A pod. At admission it may have no name, uid, node and address."""
+    """Return a pod. At admission, a pod may lack name, uid, node and address."""
     meta = submap(obj, "metadata")
     spec = submap(obj, "spec")
     status = submap(obj, "status")
@@ -114,7 +116,7 @@ def pod(obj: Json) -> Pod:
 
 
 def proxy_pod(obj: Json) -> ProxyPod | None:
-    """A proxy's pod; None if the object is not one that this operator made, or not whole."""
+    """Return a proxy's pod. None: the pod is not a proxy's, or lacks a required part."""
     containers = submaps(submap(obj, "spec"), "containers")
     container = next((c for c in containers if c.get("name") == names.CONTAINER), None)
     ports = port_range(texts_at(obj, "metadata", "annotations"), names.PORT_RANGE)
@@ -132,7 +134,7 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
 
 
 def helper_pod(obj: Json) -> HelperPod | None:
-    """A pod beside a proxy; None if the object is not one that this operator made, or not whole."""
+    """Return a LAN relay or an image check. None: another pod, or a required part is missing."""
     container = next(iter(submaps(submap(obj, "spec"), "containers")), {})
     component = _component(obj)
     if component in ("", names.PROXY):
@@ -141,14 +143,17 @@ def helper_pod(obj: Json) -> HelperPod | None:
 
 
 def _component(obj: Json) -> str:
-    """What a pod of the operator is (`names`); empty if it is not the operator's, or not whole."""
+    """Return the component of a pod (`names.component`).
+
+    Empty: the pod is not the operator's, or lacks the annotation `names.NODE` or the owner.
+    """
     meta = submap(obj, "metadata")
     is_whole = texts_at(meta, "annotations").get(names.NODE) and _owner(meta)
     return names.component(texts_at(meta, "labels")) if is_whole else ""
 
 
 def _own_pod(obj: Json, container: Json) -> dict[str, Any]:
-    """The fields of `OwnPod`, for a pod of the operator with this container."""
+    """Return the fields of `OwnPod`."""
     meta = submap(obj, "metadata")
     status = submap(obj, "status")
     notes = texts_at(meta, "annotations")
@@ -167,7 +172,7 @@ def _own_pod(obj: Json, container: Json) -> dict[str, Any]:
 
 
 def service(obj: Json) -> ProxyService | None:
-    """A Service; None if the object is not one that this operator made."""
+    """Return a Service of the operator, None for another Service."""
     meta = submap(obj, "metadata")
     address = text_at(submap(obj, "spec"), "clusterIP")
     labels = texts_at(meta, "labels")
@@ -186,7 +191,7 @@ def service(obj: Json) -> ProxyService | None:
 
 
 def master_service(obj: Json) -> MasterService:
-    """A Service, as far as a master's matters."""
+    """Return a Service that may be the Service of a master."""
     spec = submap(obj, "spec")
     ports = submaps(submap(obj, "spec"), "ports")
     return MasterService(
@@ -200,7 +205,7 @@ def master_service(obj: Json) -> MasterService:
 
 
 def policy(obj: Json) -> ProxyPolicy | None:
-    """A NetworkPolicy; None if the object is not one that this operator made."""
+    """Return a NetworkPolicy of the operator, None for another NetworkPolicy."""
     meta = submap(obj, "metadata")
     labels = texts_at(meta, "labels")
     owner = _owner(meta)
@@ -216,19 +221,19 @@ def policy(obj: Json) -> ProxyPolicy | None:
 
 
 def allowed_from(service: Json) -> frozenset[str]:
-    """The namespaces whose RosProxies may name a Service as their master; ``*`` for all."""
+    """Return the other namespaces whose RosProxies may name a Service as master; ``*`` for all."""
     text = text_at(submap(service, "metadata", "annotations"), names.ALLOW_FROM)[:_LONGEST_LIST]
     namespaces = (namespace.strip() for namespace in text.split(","))
     return frozenset(n for n in namespaces if n == "*" or is_label(n))
 
 
 def name_of(metadata: Json) -> Name:
-    """An object's namespace and name."""
+    """Return an object's namespace and name."""
     return Name(text_at(metadata, "namespace"), text_at(metadata, "name"))
 
 
 def is_deleted(metadata: Json) -> bool:
-    """Whether an object is about to go."""
+    """Whether an object is being deleted."""
     return metadata.get("deletionTimestamp") is not None
 
 
@@ -238,7 +243,7 @@ def _is_ready(status: Json) -> bool:
 
 
 def _container(obj: Json) -> PodContainer:
-    """What a container's own variables and its image say of ROS 2."""
+    """Return a container: the image, and the ROS 2 variables that the container itself sets."""
     variables = {
         name: VALUE_AT_RUNTIME
         if variable.get("valueFrom") is not None
@@ -262,9 +267,9 @@ def _short(text: str) -> str:
 
 
 def _host_ports(spec: Json, protocol: str) -> Iterator[int]:
-    """Those of containers that run all the time, as the scheduler counts them.
+    """Yield the hostPorts of containers and sidecars, as the scheduler counts hostPorts.
 
-    That is ``GetHostPorts`` in k8s.io/kubernetes, pkg/scheduler/util/utils.go.
+    Source: ``GetHostPorts`` in k8s.io/kubernetes, pkg/scheduler/util/utils.go.
     """
     inits = submaps(spec, "initContainers")
     sidecars = (c for c in inits if c.get("restartPolicy") == "Always")
@@ -284,16 +289,15 @@ def _masters(spec: Json) -> Iterator[str]:
 
 
 def _controller(meta: Json) -> Json:
-    """The reference to the controller of an object; empty if there is none."""
+    """Return the owner reference of an object's controller, empty without a controller."""
     owners = submaps(meta, "ownerReferences")
     return next((owner for owner in owners if owner.get("controller") is True), {})
 
 
 def _workload(meta: Json) -> str:
-    """What `kubectl rollout restart` takes to create a pod anew; empty if there is no such object.
+    """Return the object for `kubectl rollout restart` that replaces a pod, empty for none.
 
-    A Deployment names its ReplicaSets after itself and the hash of the template, which all their
-    pods have as a label.
+    A Deployment names each ReplicaSet NAME-HASH. The pods of the ReplicaSet have the hash as label.
     """
     controller = _controller(meta)
     kind = text_at(controller, "kind")
@@ -306,7 +310,7 @@ def _workload(meta: Json) -> str:
 
 
 def _owner(meta: Json) -> str:
-    """The uid of the RosProxy that owns an object, empty if none does."""
+    """Return the uid of the RosProxy that owns an object, empty without such an owner."""
     for owner in submaps(meta, "ownerReferences"):
         group = text_at(owner, "apiVersion").partition("/")[0]
         if group == names.GROUP and owner.get("kind") == names.KIND and owner.get("controller"):

@@ -1,7 +1,7 @@
-"""What is kept of an object that is watched: its key, and no more than a look wants to know.
+"""Records: the parts of watched objects that the operator keeps in memory.
 
-There may be tens of thousands of pods, most of them others': of those some hundred bytes are kept
-each. What many have in common, as labels and nodes, is kept once.
+A cluster may have tens of thousands of pods, and most pods do not use rosproxy. Such a pod takes a
+few hundred bytes. Texts that many pods share, such as labels and node names, are kept once.
 """
 
 import sys
@@ -40,17 +40,17 @@ Record = (
     | ProxyPolicy
 )
 Change = tuple[str, Record | None]
-"""An object's key and what it is now; None: gone."""
+"""An object's key, and the object's new record. None: the object is gone."""
 POLICIES = "networkpolicies"
 
 
 def key_of(obj: Json) -> str:
-    """What an object is known by: its uid, which no other has, before or after it."""
+    """Return the key of an object: the uid, which Kubernetes never uses again."""
     return text_at(submap(obj, "metadata"), "uid")
 
 
 def pod_record(obj: Json) -> PodRecord:
-    """A pod, as one of the operator's if it is one."""
+    """Return the record of a pod, an `OwnPod` for a pod of the operator."""
     if names.is_own(texts_at(submap(obj, "metadata"), "labels")):
         own_pod = objects.proxy_pod(obj) or objects.helper_pod(obj)
         if own_pod is not None:
@@ -59,7 +59,7 @@ def pod_record(obj: Json) -> PodRecord:
 
 
 def rosproxy_record(obj: Json) -> RosProxy | InvalidRosProxy:
-    """A RosProxy, or what is left of one that can't be read."""
+    """Return the record of a RosProxy, an `InvalidRosProxy` if a field is invalid."""
     try:
         return rosproxy(obj)
     except InvalidField as error:
@@ -67,7 +67,7 @@ def rosproxy_record(obj: Json) -> RosProxy | InvalidRosProxy:
 
 
 def service_record(obj: Json) -> ProxyService | MasterService:
-    """A Service, as one of the operator's if it is one."""
+    """Return the record of a Service, a `ProxyService` for a Service of the operator."""
     return objects.service(obj) or objects.master_service(obj)
 
 
@@ -78,11 +78,11 @@ READERS: Mapping[str, Callable[[Json], Record | None]] = {
     "services": service_record,
     POLICIES: objects.policy,
 }
-"""By watched kind, how an object is read; None if the operator does not need the object."""
+"""The reader for each watched kind. A reader returns None for an object without use here."""
 
 
 def _shared(pod: Pod) -> Pod:
-    """The same pod, with texts interned that many pods have in common."""
+    """Return the same pod, with interned texts: a text that many pods share is in memory once."""
     intern = sys.intern
     return replace(
         pod,
@@ -91,7 +91,7 @@ def _shared(pod: Pod) -> Pod:
         phase=intern(pod.phase),
         controller=intern(pod.controller),
         labels={intern(key): intern(value) for key, value in pod.labels.items()},
-        # One address is most often all.
+        # Most pods have a single address: then `ips` is shared with no copy.
         ips=(pod.ip,) if pod.ips == (pod.ip,) else pod.ips,
         containers=tuple(replace(c, image=intern(c.image)) for c in pod.containers),
         misspelt=tuple(map(intern, pod.misspelt)),
