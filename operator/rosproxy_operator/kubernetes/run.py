@@ -1,7 +1,8 @@
-"""Running the Kubernetes operator.
+"""Start and end of the Kubernetes operator.
 
-When it is told to end, it first stops acting and gives the lead away, then serves the webhook until
-kube-proxy sends no more requests here.
+After a signal, an operator with a Lease object first stops acting and releases the Lease object.
+Then the operator serves the webhook for `DRAINING` seconds, until kube-proxy sends no more requests
+to this pod.
 """
 
 import asyncio
@@ -29,28 +30,31 @@ from rosproxy_operator.kubernetes.webhook.webhook_server import WebhookServer
 log = logging.getLogger(__name__)
 
 UNDER_WAY = 5.0
-"""Seconds that requests have to end before the lead is given away; else its Lease runs out."""
+"""Seconds for requests to end before the operator releases the Lease object.
+
+If a request takes longer, the operator does not release the Lease object, which then expires.
+"""
 DRAINING = 6.0
-"""Seconds for which the webhook is served after that: kube-proxy on each node is to hear of it."""
+"""Seconds for which the webhook is served after that, so that each kube-proxy notices the end."""
 
 
 def run(settings: KubernetesSettings) -> None:
-    """Run the operator until a signal ends it; its proxies go on.
+    """Run the operator until a signal ends the operator. The proxies keep running.
 
-    Raises SettingError if it can't listen where it is told to, ApiError if no cluster is known.
+    Raises SettingError if ``settings.admin`` can't be bound, ApiError if no cluster is configured.
     """
     _raise_limit()
     asyncio.run(_run(settings, Api(settings.namespaces)))
 
 
 def logs_command(proxy: str) -> str:
-    """The command that shows the log of a proxy, by the namespace and name of its pod."""
+    """Return the command that shows the log of a proxy, given NAMESPACE/NAME of the proxy's pod."""
     namespace, _, pod = proxy.partition("/")
     return f"kubectl -n {namespace} logs {pod}"
 
 
 def _raise_limit() -> None:
-    """Allow as many open files as possible: each proxy takes a connection that waits."""
+    """Allow as many open files as possible, because each proxy takes a connection that waits."""
     _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard_limit, hard_limit))
 
@@ -89,7 +93,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     tasks = [asyncio.ensure_future(work) for work in running]
     serving.start()
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    # Without a Lease there is no other operator to hand over to.
+    # Without a Lease object, there is no other operator that could lead.
     if settings.lease and stopped.is_set():
         await hand_over(api, controller, election)
         if webhook:
@@ -99,11 +103,11 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     await asyncio.gather(*tasks, health.stop(), return_exceptions=True)
     serving.stop()
     for task in done:
-        task.result()  # raises what it died of
+        task.result()  # raises the error of a failed task
 
 
 async def hand_over(api: Api, controller: KubernetesController, election: LeaderElection) -> None:
-    """Stop to act, and let another operator lead only when nothing is under way any more."""
+    """Stop acting, and release the Lease object once no request is under way."""
     election.resign()
     await controller.stop_acting()
     if await in_thread(api.gate.close, UNDER_WAY):
@@ -111,7 +115,7 @@ async def hand_over(api: Api, controller: KubernetesController, election: Leader
 
 
 async def _drain(server: WebhookServer, stopped: asyncio.Event) -> None:
-    """Serve the requests that still come here. A second signal ends the wait."""
+    """Serve the webhook for `DRAINING` seconds. A second signal ends the wait."""
     stopped.clear()
     server.drain()
     with contextlib.suppress(TimeoutError):
@@ -119,5 +123,5 @@ async def _drain(server: WebhookServer, stopped: asyncio.Event) -> None:
 
 
 def _first_reason(*checks: Callable[[], str | None]) -> Callable[[], str | None]:
-    """The first reason that one of these gives."""
+    """Return a check that gives the first reason of several checks."""
     return lambda: next(filter(None, (check() for check in checks)), None)

@@ -1,8 +1,10 @@
-"""Running kopf in a thread of its own, again whenever it ends: it serves webhook and liveness.
+"""A thread that serves the webhook (by kopf) and the liveness check.
 
-kopf watches nothing here: it would keep a task and the whole object for each, and ends as a whole
-when one of its watches does (`reflector` watches instead). Only the admission of pods depends on
-kopf.
+When kopf ends, the thread starts kopf and the liveness server again. Only the admission of pods and
+the liveness check depend on this thread.
+
+kopf watches nothing here; `watch.reflector` watches instead. kopf would keep a task and the whole
+object in memory for each object, and all of kopf ends when a single watch ends.
 """
 
 import asyncio
@@ -29,28 +31,29 @@ from rosproxy_operator.kubernetes.webhook.webhook_server import WebhookServer
 log = logging.getLogger(__name__)
 
 WIRE = "wire"
-"""The id of the handler that wires pods, and so the path of the webhook."""
+"""Id of the handler that wires pods. kopf uses the id as the path of the webhook."""
 BACK_OFF = (1.0, 2.0, 5.0, 10.0)
-"""Seconds until kopf is started again; the last is repeated."""
+"""Seconds until the thread starts kopf again, after each failure in a row. The last repeats."""
 WELL = 60.0
-"""Seconds after which a run counts as a good one."""
+"""Seconds after which a run of kopf resets the count of failures."""
 STOPPING = 3.0
-"""Seconds that kopf has to end."""
+"""Seconds for kopf to end."""
 _BETWEEN_TRIES = (1.0, 1.0, 2.0, 3.0, 5.0)
+"""Seconds between tries of a request. The last repeats."""
 
 
 class EndlessBackoff:
-    """Seconds between the tries of a request, without end: kopf would give up and end otherwise."""
+    """Seconds between tries of a request, without an end. After a last value, kopf would end."""
 
     def __iter__(self) -> Iterator[float]:
-        """Give them one after the other, the last for ever."""
+        """Yield the seconds in order, and then the last value for ever."""
         yield from _BETWEEN_TRIES
         while True:
             yield _BETWEEN_TRIES[-1]
 
 
 def quiet_library_logs() -> None:
-    """Keep kopf and its libraries from logging each request; looks report what is wrong."""
+    """Keep kopf and its libraries from logging each request. Looks report problems."""
     debug = logging.getLogger().isEnabledFor(logging.DEBUG)
     for name in ("kopf", "kubernetes", "urllib3"):
         logging.getLogger(name).setLevel(logging.INFO if debug else logging.CRITICAL)
@@ -59,7 +62,7 @@ def quiet_library_logs() -> None:
 
 
 class ClusterServing:
-    """Serves liveness and, if it is given, the webhook, in a thread."""
+    """Serves the liveness check in a thread, and the webhook unless ``webhook`` is None."""
 
     def __init__(
         self,
@@ -75,34 +78,36 @@ class ClusterServing:
         self._thread = threading.Thread(target=self._run, daemon=True, name="kopf")
 
     def start(self) -> None:
-        """Begin to serve."""
+        """Start the thread."""
         self._thread.start()
 
     def restart(self) -> None:
-        """Let kopf begin anew."""
+        """End the current run of kopf. The thread then starts the next run."""
         if self._running is not None:
             loop, task = self._running
-            with contextlib.suppress(RuntimeError):  # it has just ended by itself
+            with contextlib.suppress(RuntimeError):  # the run has just ended
                 loop.call_soon_threadsafe(task.cancel)
 
     def stop(self) -> None:
-        """End serving; waits for it, but not long."""
+        """Stop serving, and wait up to `STOPPING` seconds for the thread."""
         self._ending.set()
         self.restart()
         self._thread.join(STOPPING)
 
     async def configure(self, settings: kopf.OperatorSettings, **_: Any) -> None:
-        """Set kopf up."""
-        settings.posting.enabled = False  # the operator makes its own Events
-        # To watch namespaces and definitions takes rights that the operator has not.
+        """Configure kopf (startup handler)."""
+        settings.posting.enabled = False  # the operator creates its own Events
+        # kopf would watch namespaces and definitions, but the operator has no right to do so.
         settings.scanning.disabled = True
-        settings.peering.standalone = True  # `leader` says who acts
-        # It would kill this thread some minutes after kopf was only started again.
+        settings.peering.standalone = True  # `leader_election` decides which operator acts
+        # With a timeout, each cancelled run schedules SIGKILL for this thread, and SIGKILL ends the
+        # whole process (ultimate_termination in kopf, _core/reactor/running.py).
         settings.process.ultimate_exiting_timeout = None
         settings.networking.error_backoffs = EndlessBackoff()
         settings.networking.request_timeout = 30.0
         settings.networking.connect_timeout = 5.0
-        # The chart makes the webhook's configuration; kopf would write it anew, and take it away.
+        # The chart creates the webhook's configuration. kopf would overwrite and later delete this
+        # configuration.
         settings.admission.managed = None
         settings.admission.server = self._webhook[1] if self._webhook else None
 
@@ -119,7 +124,7 @@ class ClusterServing:
             with warnings.catch_warnings(action="ignore"):
                 asyncio.run(self._operate())
         except asyncio.CancelledError:
-            pass  # by `restart`
+            pass  # `restart` has cancelled the run
         except Exception as error:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
             log.warning("webhook server ended, the operator starts it again: %s", reason)
@@ -140,11 +145,11 @@ class ClusterServing:
         try:
             bind = self._settings.liveness
             await web.TCPSite(liveness, bind.host, bind.port, backlog=BACKLOG).start()
-            # kopf's own stop flag would hold it up for seconds when it ends for another reason.
+            # No stop flag: with a flag, kopf takes seconds longer to end for another reason.
             await kopf.operator(
                 registry=self._handlers(),
                 standalone=True,
-                # kopf would ask for the user's name otherwise, and an image's user has none.
+                # By default kopf asks for the Unix user's name. The user of the image has no name.
                 identity=cast(Any, "rosproxy-operator"),
                 clusterwide=not namespaces,
                 namespaces=namespaces,
@@ -153,14 +158,14 @@ class ClusterServing:
             await liveness.cleanup()
 
     async def _tell_liveness(self, _request: web.BaseRequest) -> web.Response:
-        """Answer the kubelet. kopf's own liveness endpoint has no bound of connections."""
+        """Answer the kubelet. kopf's own liveness endpoint does not limit connections."""
         reason = self._controller.dead()
         return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
 
     def _handlers(self) -> kopf.OperatorRegistry:
         handlers = kopf.OperatorRegistry()
         kopf.on.startup(registry=handlers, id="startup")(self.configure)
-        # As long as there are no credentials, kopf is not to end for it.
+        # Without credentials kopf would end. With a back-off, kopf tries again.
         kopf.on.login(registry=handlers, backoff=5.0)(kopf.login_via_client)
 
         if self._webhook:
@@ -182,7 +187,7 @@ def _register_webhook(handlers: kopf.OperatorRegistry, injector: Injector) -> No
     async def wire(
         body: kopf.Body, patch: kopf.Patch, warnings: list[str], dryrun: bool, **_: Any
     ) -> None:
-        # As it was sent: kopf's own is a view whose parts are no dictionaries.
+        # kopf's body is a view, and its parts are no dictionaries. So the pod is copied.
         wiring = await injector.wiring(dict(body), dryrun)
         warnings.extend(wiring.warnings)
         if wiring.spec is not None:
@@ -192,5 +197,5 @@ def _register_webhook(handlers: kopf.OperatorRegistry, injector: Injector) -> No
 
 
 def _log_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log errors of tasks that kopf leaves behind when it ends; why it ends `_run_once` logs."""
+    """Log errors of tasks that kopf leaves behind. `_run_once` logs why kopf ends."""
     log.debug("kopf: %s: %r", context.get("message"), context.get("exception"))

@@ -1,7 +1,7 @@
 """The settings of ``rosproxy-operator kubernetes``: plain data, each setting written once.
 
-See `rosproxy.settings`. One option is in `rosproxy_operator.cli`: ``--webhook-bind``, without which
-there is no webhook.
+See `rosproxy.settings`. The option ``--webhook-bind`` is in `rosproxy_operator.cli`. Without this
+option, the operator serves no webhook.
 """
 
 from collections.abc import Mapping
@@ -34,9 +34,9 @@ DEFAULT_ADMIN = HostPort("0.0.0.0", 11313)
 DEFAULT_LIVENESS = HostPort("0.0.0.0", 8080)
 DEFAULT_WEBHOOK = HostPort("0.0.0.0", 9443)
 NODE_PORTS = PortRange(30000, 32767)
-"""The API server's own default of --service-node-port-range."""
+"""The API server's default of --service-node-port-range."""
 EPHEMERAL = PortRange(32768, 60999)
-"""Linux's own default of net.ipv4.ip_local_port_range."""
+"""Linux's default of net.ipv4.ip_local_port_range."""
 EVERY_PORT = PortRange(1024, 65535)
 """Ports that the custom resource definition allows for hostPorts."""
 
@@ -127,7 +127,8 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     """The options of the operator that decide the plan.
 
     With an empty ``image_pull_policy``, Kubernetes decides. ``proxy_bounds`` are the bounds of each
-    proxy. ``policy`` is the administrator's policy for all proxies: one layer or none.
+    proxy. ``policy`` is the administrator's policy for all proxies, with at most a single
+    layer.
     """
 
     image: Annotated[
@@ -249,8 +250,8 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
     """All settings of ``rosproxy-operator kubernetes``.
 
     ``resync`` is in seconds. Without ``webhook`` the operator wires no pods. Without ``key_secret``
-    the operator makes a new key of the proxies' tokens at each start. Without ``lease`` it is the
-    only operator.
+    the operator makes a new key of the proxies' tokens at each start. Without ``lease`` there
+    must be no second operator.
     """
 
     plan: ClusterSettings = ClusterSettings()
@@ -309,7 +310,7 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
 
 
 def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
-    """Settings from the values of the command line's options, by name.
+    """Return the settings, from the values of the command line's options by name.
 
     Raises SettingError if two values exclude each other.
     """

@@ -1,6 +1,7 @@
-"""The chart value ``proxy.pod``: what the pods of all proxies have, read strictly.
+"""The chart's value ``proxy.pod``: defaults for the pods of all proxies, and a strict reader.
 
-The API server would refuse each pod with a wrong value, long after the value was written.
+Without the reader, the API server would refuse each new pod, long after the user wrote a wrong
+value.
 """
 
 import re
@@ -24,17 +25,17 @@ USER = 10001
 _RESERVED = (GROUP, NAME_LABEL.partition("/")[0])
 """Prefixes of the labels and annotations that the operator writes itself."""
 _REPLACED = ("image_pull_secrets", "node_selector", "tolerations", "resources")
-"""The fields of RosProxies that replace defaults."""
+"""Fields of a RosProxy's spec that replace defaults."""
 _QUANTITY = re.compile(r"[0-9]+(\.[0-9]*)?([KMGTPE]i|[numkMGTPE]|[eE][+-]?[0-9]+)?", re.ASCII)
 _OPERATORS = {operator: operator for operator in ("Equal", "Exists")}
 _EFFECTS = {effect: effect for effect in ("", "NoSchedule", "PreferNoSchedule", "NoExecute")}
 
 
 class PodDefaults(msgspec.Struct, frozen=True):
-    """What the pods of proxies have.
+    """Defaults for the pods of proxies.
 
     A RosProxy's field of the same name replaces ``image_pull_secrets``, ``node_selector``,
-    ``tolerations`` or ``resources``. LAN relays and image checks have resources of their own.
+    ``tolerations`` or ``resources``. LAN relays and image checks do not use ``resources``.
     With ``run_as_user`` None, the cluster or else the image chooses the user.
     """
 
@@ -49,7 +50,7 @@ class PodDefaults(msgspec.Struct, frozen=True):
 
 
 def pod_defaults(value: Any) -> PodDefaults:
-    """The defaults as the chart's values have them. Raises InvalidField."""
+    """Return the defaults in the chart's value ``proxy.pod``. Raises InvalidField."""
     field = Field("proxy.pod", stripped(value))
     _check_names(
         field,
@@ -71,9 +72,9 @@ def pod_defaults(value: Any) -> PodDefaults:
 
 
 def with_pod_defaults(observed: ClusterSnapshot, defaults: PodDefaults) -> ClusterSnapshot:
-    """What is seen, with RosProxies whose specs have the defaults.
+    """Return the snapshot, with the defaults in all RosProxies' specs.
 
-    An empty list or map in a spec is no missing field: the RosProxy wants nothing there.
+    An empty list or map in a spec counts as given: no default replaces the empty value.
     """
     rosproxies = tuple(_completed(rosproxy, defaults) for rosproxy in observed.rosproxies)
     return msgspec.structs.replace(observed, rosproxies=rosproxies)
@@ -115,7 +116,7 @@ def _object_name(field: Field) -> str:
 
 
 def _keyed(field: Field) -> dict[str, str]:
-    """A map of texts whose keys may be those of labels and annotations."""
+    """Return a map of texts. Each key must be a valid key of a label or annotation."""
     for key in field.map():
         if not is_label_key(key):
             fix = "Write NAME or PREFIX/NAME of letters, digits, -, _ and dots"
@@ -133,7 +134,7 @@ def _labels(field: Field) -> dict[str, str]:
 
 
 def _toleration(field: Field) -> Json:
-    """A toleration by the rules of the RosProxy's ``spec.tolerations``."""
+    """Return a toleration that satisfies the rules of a RosProxy's ``spec.tolerations``."""
     _check_names(field, "key", "operator", "value", "effect", "tolerationSeconds")
     key = field["key"].text()
     exists = field["operator"].one_of(_OPERATORS, "Equal") == "Exists"

@@ -1,6 +1,6 @@
-"""Why a proxy's pod does not run, from what the scheduler and the kubelet say of it.
+"""Why a proxy's pod does not run, read from the pod's status and Events.
 
-The texts are those of Kubernetes 1.36; the files named are in k8s.io/kubernetes.
+Reasons and texts are from Kubernetes 1.36. Paths without a repository are in k8s.io/kubernetes.
 """
 
 import re
@@ -14,8 +14,9 @@ from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, IMAGE_CHECK, LAN_RELAY
 
 PORTS_TAKEN = "didn't have free ports for the requested pod ports"
-"""``ErrReason`` in pkg/scheduler/framework/plugins/nodeports/node_ports.go; the kubelet gives the
-same text with the reason ``NodePorts`` (pkg/kubelet/lifecycle/predicate.go).
+"""``ErrReason`` in pkg/scheduler/framework/plugins/nodeports/node_ports.go.
+
+The kubelet uses the same text with the reason ``NodePorts`` (pkg/kubelet/lifecycle/predicate.go).
 """
 _IMAGE = frozenset(
     {
@@ -28,7 +29,7 @@ _IMAGE = frozenset(
         "SignatureValidationFailed",
     }
 )
-"""pkg/kubelet/images/types.go, and k8s.io/cri-api, pkg/errors/errors.go."""
+"""Source: pkg/kubelet/images/types.go, and k8s.io/cri-api, pkg/errors/errors.go."""
 _SANDBOX = frozenset(
     {
         "CreateContainerConfigError",
@@ -41,29 +42,35 @@ _SANDBOX = frozenset(
         "ConfigPodSandboxError",
     }
 )
-"""pkg/kubelet/kuberuntime/kuberuntime_container.go, pkg/kubelet/container/sync_result.go."""
+"""Source in pkg/kubelet: kuberuntime/kuberuntime_container.go, container/sync_result.go."""
 _NOT_STARTED = ("StartError", "ContainerCannotRun")
-"""What containerd and cri-dockerd say of a container whose program could not be started."""
+"""Reasons of containerd and cri-dockerd if the container's program could not be started."""
 _BACK_OFF = re.compile(r'Back-off pulling image "[^"]*"(: )?')
-"""The kubelet puts this before the error of the try before and takes it off again at the next
-(pkg/kubelet/images/image_manager.go): the same trouble in other words.
+"""Prefix that the kubelet puts before the last error while the kubelet waits for the next try.
+
+Without the prefix, the message stays the same between tries (pkg/kubelet/images/image_manager.go).
 """
 _REASON = re.compile(r"(ErrImagePull|RegistryUnavailable|SignatureValidationFailed): ")
 _STAMP = re.compile(r"\d{4}-\d\d-\d\d[T ][\d:.,]+Z? *")
 _TAKEN = ("address already in use", "port is already allocated", "cannot open hostport")
-"""What container runtimes say that look for listeners on a hostPort: CRI-O and cri-dockerd. With
-the CNI plugin portmap the port is silently taken over: its DNAT rules come before the listener.
+"""Texts of the runtimes that check a hostPort for listeners: CRI-O and cri-dockerd.
+
+The CNI plugin portmap reports nothing: its DNAT rules take the port over from the listener.
 """
 _LONGEST = 300
+"""Characters that are kept of a message."""
 _STABLE_AFTER_S = 60.0
-"""A container that ran this long and then ended does not end again and again: the liveness probe
-fails for the third time after half of it."""
+"""Seconds after which the end of a container counts as no crash.
+
+A liveness probe that never succeeds ends the container after half of this time (third failure).
+"""
 
 
 def pod_failure(status: Json) -> tuple[PodFailure | None, str]:
-    """Why a pod does not run, and the same in the words of Kubernetes; None if it does, or may yet.
+    """Return why a pod does not run, and the message of Kubernetes.
 
-    ``status`` is the pod's. The words don't change while the trouble is the same.
+    None: the pod runs, or may still start. ``status`` is the pod's status. The message does not
+    change while the cause is the same.
     """
     if text_at(status, "phase") == "Failed":
         return _failed(text_at(status, "reason"), text_at(status, "message"))
@@ -77,22 +84,23 @@ def pod_failure(status: Json) -> tuple[PodFailure | None, str]:
 
 
 def stuck_by_event(message: str) -> PodFailure:
-    """What the message of a FailedCreatePodSandBox event means: PORTS or SANDBOX."""
+    """Return the cause in the message of a FailedCreatePodSandBox Event: PORTS or SANDBOX."""
     low = message.lower()
     return PodFailure.PORTS if any(text in low for text in _TAKEN) else PodFailure.SANDBOX
 
 
 def _failed(reason: str, message: str) -> tuple[PodFailure, str]:
-    """The kubelet did not admit the pod, or ended it (``rejectPod`` in pkg/kubelet/kubelet.go)."""
+    """Return why the kubelet refused or ended a pod (``rejectPod`` in pkg/kubelet/kubelet.go)."""
     ports = reason == "NodePorts" or PORTS_TAKEN in message
     return PodFailure.PORTS if ports else PodFailure.SCHEDULING, _text(reason, message)
 
 
 def _unscheduled(reason: str, message: str) -> tuple[PodFailure | None, str]:
-    """The scheduler found no place: reason Unschedulable or SchedulingGated.
+    """Return why the scheduler bound a pod to no node: reason Unschedulable or SchedulingGated.
 
-    After a SchedulerError, as when a pod of the same name has just been deleted, it tries again by
-    itself (``handleSchedulingFailure`` in pkg/scheduler/schedule_one.go).
+    A SchedulerError is no failure, because the scheduler tries again by itself
+    (``handleSchedulingFailure`` in pkg/scheduler/schedule_one.go). Such an error occurs, for
+    example, if a pod of the same name has just been deleted.
     """
     if reason in ("", "SchedulerError"):
         return None, ""
@@ -102,10 +110,10 @@ def _unscheduled(reason: str, message: str) -> tuple[PodFailure | None, str]:
 
 
 def _waiting(container: Json) -> tuple[PodFailure | None, str]:
-    """What a container waits for. One that has ended for the second time waits as well.
+    """Return why a container does not run, also for a container that has ended twice.
 
-    The kubelet calls that CrashLoopBackOff only when it looks at the pod again. A proxy ends with
-    exit code 0 only if the kubelet stops it, as for another image.
+    The kubelet reports CrashLoopBackOff only later, when the kubelet syncs the pod again. A proxy
+    ends with exit code 0 only if the kubelet stops the container, for example for another image.
     """
     ended = submap(container, "state", "terminated")
     waiting = submap(container, "state", "waiting")
@@ -126,7 +134,7 @@ def _waiting(container: Json) -> tuple[PodFailure | None, str]:
 
 
 def _was_stable(ended: Json) -> bool:
-    """Whether a container ran for a while before it ended."""
+    """Whether a container ran for at least `_STABLE_AFTER_S` before the end."""
     try:
         started, finished = (
             datetime.fromisoformat(text_at(ended, key)) for key in ("startedAt", "finishedAt")
@@ -137,9 +145,10 @@ def _was_stable(ended: Json) -> bool:
 
 
 def _crashing(ended: Json) -> tuple[PodFailure, str]:
-    """How the container ended; the kubelet's own words count the seconds until it is started.
+    """Return how a container ended.
 
-    Between two tries to start a container that never ran, the kubelet calls that a crash too.
+    The kubelet's own message is unusable: the message has the back-off time, which changes. The
+    kubelet also reports CrashLoopBackOff for a container that never ran: the cause is then SANDBOX.
     """
     reason = text_at(ended, "reason")
     message = text_at(ended, "message")

@@ -1,8 +1,9 @@
-"""The custom resource RosProxy, read.
+"""A reader of the custom resource RosProxy.
 
-The API server checks objects against the CRD, but not those that were there before the CRD became
-stricter; all that would harm others (a label selector that is refused, a host alias with which no
-pod is admitted) is checked here again. Names, types, bounds and defaults are those of the CRD.
+Names, types, bounds and defaults are the same as in the custom resource definition (CRD). The API
+server checks objects against the CRD, but not again when the CRD becomes stricter. So the reader
+repeats each check without which an object would harm other RosProxies. Examples: a label selector
+that the API server refuses, or a host alias with which no pod is admitted.
 """
 
 import re
@@ -50,10 +51,11 @@ from rosproxy_operator.kubernetes.resources.objects import is_deleted, name_of
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, words
 
 MOST_PORTS = 500
+"""Most ports that ``spec.ports`` may ask for."""
 MOST_NAME = 46
-"""Characters of a RosProxy's name, so that a proxy's still fits into a pod's host name."""
+"""Characters of a RosProxy's name. With more, a proxy's name would not fit in a host name."""
 _OF_ROS = {"1": ("master", WISHES["udp"].field), "2": ("domain", "peers", "multicast")}
-"""The fields that only one version of ROS has."""
+"""The fields that belong to a single ROS version."""
 _POLICY_MODE = {"Enforce": PolicyMode.ENFORCE, "Audit": PolicyMode.AUDIT}
 _ACTION = {"Allow": RuleAction.ALLOW, "Deny": RuleAction.DENY}
 RULE_KINDS = {
@@ -75,13 +77,14 @@ _EXAMPLE = "http://robot.example:11311"
 _HIGH = (1024, 65535)
 """Ports that a proxy may listen on."""
 _DAY = 86400
+"""Seconds of a day."""
 _Value = TypeVar("_Value")
 
 
 def rosproxies(
     objs: Iterable[Json],
 ) -> tuple[dict[Name, RosProxy], dict[Name, InvalidRosProxy]]:
-    """RosProxies, and those that can't be read."""
+    """Return the RosProxies, and the RosProxies with an invalid field."""
     usable: dict[Name, RosProxy] = {}
     unusable: dict[Name, InvalidRosProxy] = {}
     for obj in objs:
@@ -94,7 +97,7 @@ def rosproxies(
 
 
 def rosproxy(obj: Json) -> RosProxy:
-    """A RosProxy. Raises InvalidField."""
+    """Return a RosProxy. Raises InvalidField."""
     meta = submap(obj, "metadata")
     status = submap(obj, "status")
     id = name_of(meta)
@@ -119,7 +122,7 @@ def rosproxy(obj: Json) -> RosProxy:
 
 
 def invalid(obj: Json, error: InvalidField) -> InvalidRosProxy:
-    """What is left of a RosProxy that can't be read. Never raises."""
+    """Return the record of a RosProxy with an invalid field. Never raises."""
     meta = submap(obj, "metadata")
     status = submap(obj, "status")
     uid = text_at(meta, "uid")
@@ -165,7 +168,7 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
 
 
 def _versions(field: Field) -> tuple[str, ...]:
-    """The versions of ROS: 1 (as without the field), 2, or "1,2"."""
+    """Return the ROS versions in ``spec.ros``: 1 (the default), 2, or both for "1,2"."""
     value = "1" if field.value is None else field.value
     text = str(value).replace(" ", "") if type(value) in (int, str) else ""
     if text not in ("1", "2", "1,2"):
@@ -194,7 +197,7 @@ def _peer(field: Field) -> str:
 
 
 def _given(field: Field, read: Callable[[Field], _Value]) -> _Value | None:
-    """What a field says; None without the field, which then has the administrator's default."""
+    """Return the value of a field, or None if the administrator's default holds."""
     return None if field.value is None else read(field)
 
 
@@ -203,7 +206,7 @@ def _maps(field: Field) -> tuple[Json, ...]:
 
 
 def _max_unavailable(field: Field) -> MaxUnavailable:
-    """A count, or a percentage from 1% to 100% as text."""
+    """Return ``spec.maxUnavailable``: a count from 1 on, or a text from 1% to 100%."""
     if isinstance(field.value, str):
         percent = field.value.removesuffix("%")
         if field.value == percent or not percent.isdecimal() or not 1 <= int(percent) <= 100:
@@ -229,7 +232,7 @@ def _proxy_spec(field: Field) -> ProxySpec:
 
 
 def _wish(field: Field, name: str) -> Any:
-    """What a field asks for: words begin with a capital there."""
+    """Return the value for a field of `ProxySpec`. In the CRD, words begin with a capital."""
     for key in WISHES[name].field.split("."):
         field = field[key]
     allowed = {word.capitalize(): word for word in words(name)}
@@ -238,7 +241,7 @@ def _wish(field: Field, name: str) -> Any:
 
 
 def _policy(field: Field, of: Name) -> tuple[PolicyLayer, ...]:
-    """The layer of its policy; none if it has no rules."""
+    """Return the layer of the RosProxy's policy, empty without rules."""
     mode = field["mode"].one_of(_POLICY_MODE, "Enforce")
     rules = tuple(rule for r in field["rules"].items() for rule in _rules(r))
     layers = (PolicyLayer(f"RosProxy {of}", rules, mode),) if rules else ()
@@ -248,7 +251,7 @@ def _policy(field: Field, of: Name) -> tuple[PolicyLayer, ...]:
 
 
 def _rules(field: Field) -> Iterator[Rule]:
-    """A rule for each listed name with each listed node."""
+    """Yield a rule for each listed name with each listed node."""
     action = field["action"].one_of(_ACTION, "")
     kind = field["kind"].one_of(RULE_KINDS, "")
     names = [_glob(name, kind is not RuleKind.SLAVE) for name in field["names"].items()]
@@ -260,7 +263,7 @@ def _rules(field: Field) -> Iterator[Rule]:
 
 
 def _glob(field: Field, ros_name: bool) -> str:
-    """A glob, for a ROS name or for a method of the slave API."""
+    """Return a glob for ROS names, or else for methods of the slave API."""
     glob = field.text()
     if not _GLOB.fullmatch(glob) or (ros_name and glob[0] not in "/*?"):
         begins = ", with / or * at the beginning" if ros_name else ""
@@ -270,7 +273,8 @@ def _glob(field: Field, ros_name: bool) -> str:
 
 
 def _window(field: Field, ports: int) -> PortRange:
-    # From above roscore's port (11311) and rosserial's (11411) up to below the NodePorts (30000).
+    # The default lies above the ports of roscore (11311) and rosserial (11411), and below the
+    # NodePorts (from 30000).
     window = PortRange(field["first"].number(11412, *_HIGH), field["last"].number(29999, *_HIGH))
     if window.last - window.first + 1 < ports:
         raise InvalidField(
@@ -281,9 +285,9 @@ def _window(field: Field, ports: int) -> PortRange:
 
 
 def _host_alias(field: Field) -> Json:
-    """A host alias that the API server takes: with any other no pod would be admitted.
+    """Return a host alias. With an invalid host alias, the API server would refuse each pod.
 
-    That is ``ValidateHostAliases`` in k8s.io/kubernetes, pkg/apis/core/validation/validation.go.
+    Source: ``ValidateHostAliases`` in k8s.io/kubernetes, pkg/apis/core/validation/validation.go.
     """
     ip = field["ip"].text()
     names = []
@@ -298,9 +302,10 @@ def _host_alias(field: Field) -> Json:
 
 
 def _selector(field: Field) -> Selector | None:
-    """As strict as the API server, which is asked for pods with it and refuses what is malformed.
+    """Return a label selector, checked by the rules of the API server.
 
-    That is k8s.io/apimachinery, pkg/labels/selector.go and pkg/util/validation/validation.go.
+    The API server would refuse a NetworkPolicy with a malformed selector. Source:
+    k8s.io/apimachinery, pkg/labels/selector.go and pkg/util/validation/validation.go.
     """
     if field.value is None:
         return None
@@ -357,7 +362,7 @@ def _master(field: Field, of: Name) -> MasterSpec:
 
 
 def _uri(field: Field, of: Name) -> str:
-    """A master's URI in its one form: host in lower case, with a port, no slash at the end."""
+    """Return a master's URI in canonical form: lower-case host, a port, no slash at the end."""
     text = field.text()
     master = parse_slave_uri(text) or parse_slave_uri(_with_port(text))
     path = urlsplit(text).path.rstrip("/") if master else ""
@@ -379,7 +384,7 @@ _OWN_SERVICE = "is this RosProxy's own Service"
 
 
 def _with_port(text: str) -> str:
-    """The same URI with the master's usual port."""
+    """Return a URI with the master's default port, empty if the URI has a port or is invalid."""
     try:
         uri = urlsplit(text)
         lacks_port = uri.port is None and bool(uri.netloc) and not uri.netloc.endswith(":")
@@ -389,7 +394,7 @@ def _with_port(text: str) -> str:
 
 
 def _is_service(host: str, service: Name) -> bool:
-    """Whether a host's name is that of a Service in the cluster's DNS, seen from its namespace."""
+    """Whether a host name means a Service, for a pod in the Service's namespace."""
     full = f"{service.name}.{service.namespace}.svc"
     return host == service.name or f"{full}.".startswith(f"{host}.") or host.startswith(f"{full}.")
 
@@ -416,7 +421,7 @@ def _address(field: Field) -> str:
 
 
 def _former(status: Json) -> dict[str, PortRange]:
-    """The ranges in a status. What can't be read there is no range that was ever given."""
+    """Return the ranges in a status, by node name. An unreadable range counts as missing."""
     ranges = {
         text_at(line, "name"): port_range(line, "ports") for line in submaps(status, "perNode")
     }
