@@ -127,8 +127,7 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     """The options of the operator that decide the plan.
 
     With an empty ``image_pull_policy``, Kubernetes decides. ``proxy_bounds`` are the bounds of each
-    proxy. ``policy`` is the administrator's policy for all proxies, with at most a single
-    layer.
+    proxy. ``policy`` is the administrator's policy for all proxies: a single layer, or none.
     """
 
     image: Annotated[

@@ -32,7 +32,7 @@ from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, token_of
 log = logging.getLogger(__name__)
 
 EVERY = 3.0
-"""Seconds between two polls of a proxy that has something to confirm, or is silent for long."""
+"""Seconds between two polls while a call is unconfirmed, or no answer comes after a minute."""
 EVERY_STARTING = 0.5
 """Seconds between two polls in the poller's first minute, while the proxy does not answer."""
 LEAST_INTERVAL = 0.5
@@ -45,7 +45,7 @@ WAIT = 1800.0
 TCP keep-alive finds a proxy that is cut off (`common.proxy_client`).
 """
 STARTING = 10.0
-"""Seconds for which the operator does not report a new proxy that is silent: the proxy starts."""
+"""Seconds for which a new proxy counts as starting. Its silence is then no fault yet."""
 SILENT = 2
 """Unanswered polls in a row after which a proxy counts as silent."""
 AT_ONCE = 32
@@ -272,8 +272,8 @@ class ProxyPoller:
     async def _tell_callers(self) -> None:
         """Send the addresses of pods that may use the proxy, unless confirmed.
 
-        This call is separate from the call about gone pods, and comes first: the call about gone
-        pods may wait for the master, and new pods wait for this call.
+        New pods wait for this call, and the call about gone pods may wait for the master. So the
+        two calls are separate, and this call comes first.
         """
         callers = self._callers
         recent = self._tells_changes or time.monotonic() - self._callers_told_at < REPEATED

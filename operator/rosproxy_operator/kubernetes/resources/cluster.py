@@ -110,7 +110,7 @@ class ProxyReport(msgspec.Struct, frozen=True):
     """The part of a proxy's ``/status`` that the operator uses.
 
     - ``answered``: whether the proxy answers.
-    - ``master_up``: whether the proxy reaches its master, always true for a proxy without ROS 1.
+    - ``master_up``: whether the proxy reaches its master; for an answer without ROS 1, always true.
     - ``error``: why the proxy does not answer, or does not reach its master.
     - ``nodes``: names of ROS 1 nodes, by the IP address of their pod.
     - ``topics``: names of all topics inside.
@@ -185,9 +185,9 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
 
     From the API server:
 
-    - ``pods``: all pods that a RosProxy selects, and all pods of the operator. In addition, on the
-      nodes of these pods: all pods of namespaces with a RosProxy or with a pod of the operator, and
-      all pods with hostPorts.
+    - ``pods``: all pods that a RosProxy selects, and all pods of the operator. On the nodes of
+      these pods, also all pods with hostPorts, and all pods of some namespaces: the namespaces with
+      a RosProxy or with a pod of the operator.
     - ``services``: the Services of RosProxies, by RosProxy.
     - ``masters``: for each Service that a RosProxy names as its master, the address and the
       problem. Either the address or the problem is empty.

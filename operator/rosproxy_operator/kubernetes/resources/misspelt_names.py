@@ -1,7 +1,7 @@
 """Warnings about misspelt labels and annotations that are meant for the operator.
 
-A pod with a misspelt label belongs to no RosProxy: no webhook sees the pod, no RosProxy selects the
-pod, and so no other message mentions the pod. The warning suggests the correct name.
+The webhook does not see a pod with a misspelt label, and no RosProxy selects the pod. So no other
+message mentions the pod. The warning suggests the correct name.
 """
 
 from collections.abc import Iterator

@@ -17,7 +17,7 @@ Json = Mapping[str, Any]
 
 
 class Name(msgspec.Struct, frozen=True, order=True):
-    """Namespace and name of an object. Within a kind, no two objects have the same."""
+    """Namespace and name of an object, unique within the object's kind."""
 
     namespace: str
     name: str

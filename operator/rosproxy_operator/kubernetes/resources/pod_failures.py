@@ -62,7 +62,8 @@ _LONGEST = 300
 _STABLE_AFTER_S = 60.0
 """Seconds after which the end of a container counts as no crash.
 
-A liveness probe that never succeeds ends the container after half of this time (third failure).
+Exception: the kubelet reports CrashLoopBackOff, and the exit code is not 0. A liveness probe that
+never succeeds ends the container after half of this time (third failure).
 """
 
 
@@ -110,7 +111,7 @@ def _unscheduled(reason: str, message: str) -> tuple[PodFailure | None, str]:
 
 
 def _waiting(container: Json) -> tuple[PodFailure | None, str]:
-    """Return why a container does not run, also for a container that has ended twice.
+    """Return why a container does not run, also for a container that has ended at least twice.
 
     The kubelet reports CrashLoopBackOff only later, when the kubelet syncs the pod again. A proxy
     ends with exit code 0 only if the kubelet stops the container, for example for another image.

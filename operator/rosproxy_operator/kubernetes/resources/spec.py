@@ -51,7 +51,6 @@ from rosproxy_operator.kubernetes.resources.objects import is_deleted, name_of
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, words
 
 MOST_PORTS = 500
-"""Most ports that ``spec.ports`` may ask for."""
 MOST_NAME = 46
 """Characters of a RosProxy's name. With more, a proxy's name would not fit in a host name."""
 _OF_ROS = {"1": ("master", WISHES["udp"].field), "2": ("domain", "peers", "multicast")}
@@ -77,7 +76,6 @@ _EXAMPLE = "http://robot.example:11311"
 _HIGH = (1024, 65535)
 """Ports that a proxy may listen on."""
 _DAY = 86400
-"""Seconds of a day."""
 _Value = TypeVar("_Value")
 
 

@@ -6,7 +6,7 @@ a new pod. PodDisruptionBudgets hold.
 
 The operator evicts a single pod at a time, and waits while a selected pod starts or is being
 deleted. After the first evictions the pauses grow (`planner.retries`). So a webhook that does not
-work costs at most a pod a minute.
+work leads to at most one eviction a minute.
 """
 
 from collections.abc import Iterator
