@@ -1,9 +1,10 @@
-"""What is to be done for the LAN relay of a proxy for ROS 2.
+"""Plan the steps for the LAN relay of a proxy for ROS 2.
 
-The LAN relay is in the host's network: it hears the LAN's multicast there, and the proxy at the
-uplink's gateway, at the last of the ports that are held for the proxy, which is not published. It
-has to know the proxy's address, so it is made once the sandbox has one, and anew when that is
-another.
+The LAN relay runs in the host's network, and receives the multicast of the LAN there. For the
+proxy, the LAN relay listens at the gateway of the uplink, at the last port of the proxy's range.
+The sandbox does not publish this port. The LAN relay has to know the proxy's address. So the
+operator creates the LAN relay after the sandbox has an address, and recreates the LAN relay when
+this address changes.
 """
 
 from collections.abc import Collection, Iterator
@@ -34,9 +35,10 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 
 def with_lan_relay(context: PlanContext, steps: list[Action]) -> list[Action]:
-    """The steps for a proxy, and if it is for ROS 2 those for its LAN relay.
+    """Return the steps for a proxy, for ROS 2 with the steps for the LAN relay.
 
-    Before a sandbox is started the LAN relay goes: its port may become one that is published.
+    If the steps start, create or remove a sandbox, the operator removes the LAN relay first: the
+    new sandbox may publish the LAN relay's port. The next looks then create the LAN relay.
     """
     key = context.desired.key
     if not key.is_ros2:
@@ -48,7 +50,7 @@ def with_lan_relay(context: PlanContext, steps: list[Action]) -> list[Action]:
 
 
 def missing_lan_relay(key: Key, observed: HostState, settings: PlanSettings) -> Problem | None:
-    """Why a proxy for ROS 2 has no LAN relay though it ought to."""
+    """The warning that a proxy for ROS 2 lacks the LAN relay; None if nothing is missing."""
     if settings.ros2_lan == NOWHERE or _lan(key, observed, settings) or observed.lan_relays_of(key):
         return None
     text = (
@@ -59,20 +61,24 @@ def missing_lan_relay(key: Key, observed: HostState, settings: PlanSettings) -> 
 
 
 def _starts(step: Action, sandboxes: Collection[str]) -> bool:
-    """Whether a sandbox, one of these or a new one, begins or ends by a step."""
+    """Whether a step creates a sandbox, or starts or removes one of ``sandboxes``."""
     begins = isinstance(step, Start | Remove) and step.name in sandboxes
     return begins or isinstance(step, CreateSandbox)
 
 
 def _lan(key: Key, observed: HostState, settings: PlanSettings) -> str:
-    """This host's address on the LAN; empty if there is none, or it is not known."""
+    """This host's address on the LAN; empty if unknown, or if ``--ros2-lan`` is ``none``."""
     if settings.ros2_lan:
         return "" if settings.ros2_lan == NOWHERE else settings.ros2_lan
     return key.advertise_host if is_address(key.advertise_host) else observed.far
 
 
 def _wanted(context: PlanContext) -> CreateLanRelay | None:
-    """The LAN relay that is wanted; None if none is wanted, or the proxy is not found."""
+    """The action that creates the LAN relay.
+
+    None without a LAN relay, and while an address is unknown: of the LAN, of the proxy on the
+    uplink, or of the uplink's gateway.
+    """
     key = context.desired.key
     observed = context.observed
     settings = context.settings
@@ -97,13 +103,13 @@ def _lan_relay_steps(context: PlanContext) -> Iterator[Action]:
     lan_relay = _wanted(context)
     if context.settings.ros2_lan == NOWHERE:
         yield from _without(context, f"--ros2-lan is {NOWHERE}")
-    # Where an address is not known now, the LAN relay that is there stays as it is.
+    # While an address is unknown, an existing LAN relay stays unchanged.
     elif lan_relay is not None:
         yield from _ensure_lan_relay(context, lan_relay)
 
 
 def _ensure_lan_relay(context: PlanContext, lan_relay: CreateLanRelay) -> Iterator[Action]:
-    """The steps to have this LAN relay and no other."""
+    """The steps after which the proxy has this LAN relay and no other."""
     lan_relays = context.observed.lan_relays_of(lan_relay.key)
     observed = context.observed
     expected = lan_relay_fingerprint(

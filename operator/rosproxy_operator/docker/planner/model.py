@@ -1,4 +1,4 @@
-"""What is seen on a Docker host, and what is wanted there."""
+"""The state of a Docker host, and the proxies that the operator wants there."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,24 +11,25 @@ from rosproxy.net.addresses import HostPort
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec, Wishes
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
-"""States of a container, in the engine's words, in which its nodes run, or may soon."""
+"""States of a container, in the engine's words, in which the nodes run, or may run soon."""
 STARTED = frozenset({"running", "paused"})
+"""States of a container that has processes and a network namespace."""
 SERVING = STARTED | {"restarting"}
-"""States of a container that runs, or does again in a moment."""
+"""States of a container that runs, or that the engine is about to restart."""
 THIS_HOST = "host.docker.internal"
-"""How containers call the host that they run on."""
+"""The host name by which containers reach their own host."""
 STARTED_LABEL = "io.rosproxy.started"
-"""On a redirect's container: when the one was started whose network it is in."""
+"""Label of a redirect's container: the start time of the container that owns the network."""
 
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A container on a network.
+    """The connection of a container to a network.
 
-    ``address`` is its IPv4 address there, empty while it does not run. ``names`` are those by
-    which the engine's name server knows it on that network: aliases, name, short id.
-    ``network_id`` and ``endpoint``, the engine's id of the connection, are empty where it does not
-    tell (a container never started). The endpoint changes with each start.
+    ``address`` is the container's IPv4 address on the network, empty while the container does not
+    run. ``names`` are the names that the engine's name server resolves to the container on the
+    network: aliases, name, short id. ``endpoint`` is the engine's id of the connection, and
+    changes with each start. ``network_id`` and ``endpoint`` are empty before the first start.
     """
 
     network: str
@@ -42,13 +43,20 @@ class Attachment:
 class Container:
     """A container, in the engine's words.
 
-    ``network_mode`` is ``bridge``, ``host``, ``none``, ``container:ID`` or a network's name,
-    ``master_uri`` ROS_MASTER_URI of its environment or empty, ``variables`` those that say what it
-    is of ROS 2, and how its nodes call their host. ``host_ports`` are the TCP ports that it
-    publishes on the host, or will once it is started, ``udp_ports`` the UDP ports. ``started_at``
-    is empty if it never was, or if nobody asked; ``exit_code`` is how it ended last.
-    ``is_zenoh_router``: its command runs a router of zenoh. ``forged`` says of one that has the
-    labels of this operator's own what shows that it is none; it is empty for all others.
+    Fields from the inspection are empty while the engine has not answered the inspection.
+
+    Attributes:
+        network_mode: ``bridge``, ``host``, ``none``, ``container:ID`` or the name of a network.
+        master_uri: The variable ROS_MASTER_URI; empty without.
+        host_ports: TCP ports of the host that the container publishes now, or after a start.
+        variables: The variables that the operator needs: the ROS version, settings of ROS 2,
+            ROS_IP and ROS_HOSTNAME.
+        udp_ports: As ``host_ports``, for UDP.
+        started_at: Time of the last start, as the engine writes times; empty before the first.
+        forged: Why a container with the labels of the operator's own containers is not the
+            operator's; empty for all other containers.
+        exit_code: Exit code of the last run.
+        is_zenoh_router: Whether the command runs a router of zenoh.
     """
 
     id: str
@@ -69,26 +77,29 @@ class Container:
 
     @property
     def alive(self) -> bool:
-        """Whether it runs or is about to."""
+        """Whether the container runs, or may run soon."""
         return self.state in ALIVE
 
     @property
     def network_container(self) -> str | None:
-        """The container whose network namespace it is in, by id or name; None if in its own."""
+        """The id or name of the container whose network namespace this container shares.
+
+        None if the container does not share a namespace.
+        """
         _, separator, container = self.network_mode.partition("container:")
         return container if separator else None
 
     @property
     def networks(self) -> frozenset[str]:
-        """The names of its networks."""
+        """The names of the container's networks."""
         return frozenset(attachment.network for attachment in self.attachments)
 
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """A network of the engine. ``gateway`` is its IPv4 gateway, empty if it has none.
+    """A network of the engine. ``gateway`` is the IPv4 gateway; empty without.
 
-    ``made_by_operator``: its label says so.
+    ``made_by_operator``: the network has the operator's label.
     """
 
     id: str
@@ -102,34 +113,35 @@ class Network:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Key:
-    """What tells proxies of one host apart: master's URI or domain, and the advertised host.
+    """The identity of a proxy on a host: the master's URI or the domain, and the advertised host.
 
-    ROS 1 has a master. ROS 2 has a domain, and its ``master_uri`` is empty: a container with both
-    has two proxies, since the containers of a master are not those of a domain. All containers of
-    rmw_zenoh share one proxy (`ZENOH`), which publishes no port: zenoh keeps domains apart itself.
+    A key of ROS 1 has a master. A key of ROS 2 has a domain, and an empty ``master_uri``. A
+    container with both versions has two proxies, since a master and a domain may have different
+    containers. All containers with rmw_zenoh share a single proxy (`ZENOH`), since zenoh itself
+    keeps domains apart. This proxy publishes no port.
     """
 
-    # Ordering never compares a domain with None: keys of ROS 1 have a master_uri, those of ROS 2
-    # an advertised host, and the one of rmw_zenoh neither.
+    # The order of keys never compares a domain with None: only a key of ROS 1 has a master_uri, and
+    # of all other keys only ZENOH has no advertised host.
     master_uri: str
     advertise_host: str
     domain: int | None = None
 
     @property
     def ros(self) -> Literal["1", "2", "zenoh"]:
-        """What the proxy serves, in the words of its option ``--ros``."""
+        """The ROS version that the proxy serves, as a value of the proxy's option ``--ros``."""
         if self.is_ros2:
             return "2"
         return "1" if self.master_uri else "zenoh"
 
     @property
     def is_ros2(self) -> bool:
-        """Whether it is of a proxy for ROS 2, which publishes UDP ports instead of TCP ports."""
+        """Whether the proxy is for ROS 2 by DDS, and publishes UDP ports instead of TCP ports."""
         return self.domain is not None
 
     @property
     def graph(self) -> str:
-        """What its nodes have in common, as users are told of it."""
+        """The master, domain or zenoh network of the nodes, in the words of messages."""
         graphs = {"1": f"master {self.master_uri}", "2": f"ROS 2 domain {self.domain}"}
         return graphs.get(self.ros, "zenoh network")
 
@@ -140,9 +152,9 @@ ZENOH = Key("", "")
 
 @dataclass(frozen=True, slots=True)
 class OwnContainer:
-    """A container of this operator, as found on the host, and what its labels say.
+    """A container of this operator on the host, and the content of its labels.
 
-    ``range`` are the proxy's ports, ``fingerprint`` is that of the settings it was created with.
+    ``range`` are the proxy's ports. ``fingerprint`` is the hash of how the container was made.
     """
 
     key: Key
@@ -152,67 +164,77 @@ class OwnContainer:
 
 
 class Sandbox(OwnContainer):
-    """It holds a proxy's network namespace: published ports, networks and the names on them.
+    """The container that holds a proxy's network namespace: published ports, networks and names.
 
-    The proxy itself runs in another container in the same namespace. So it can be replaced in no
-    time, while taking published ports down and up again costs an engine seconds.
+    The proxy itself runs in another container in the same namespace. So the operator replaces a
+    proxy within half a second. To free and publish the ports again, the engine needs seconds.
     """
 
 
 class Proxy(OwnContainer):
-    """A proxy runs in it, in the namespace of its sandbox, the `network_container`."""
+    """The container in which a proxy runs. `network_container` is the proxy's sandbox."""
 
 
 class LanRelayContainer(OwnContainer):
-    """The LAN relay of a proxy for ROS 2 runs in it, in the host's network."""
+    """The container in which the LAN relay of a proxy for ROS 2 runs, in the host's network."""
 
 
 class RedirectContainer(OwnContainer):
-    """It has set, or taken away, rules in another container's network namespace, and has ended.
+    """A container that sets or deletes rules in the network namespace of another container.
 
-    It is kept as the record of them. `network_container` is that container's id, ``started`` when
-    it was started: each start of it makes another namespace.
+    The ended container stays as the record of the rules. `network_container` is the id of the other
+    container.
     """
 
     @property
     def started(self) -> str:
-        """When the container was started whose network it has been in."""
+        """The start time of the other container, in whose namespace the rules were set.
+
+        Each start of that container makes a new namespace, without rules.
+        """
         return self.container.labels.get(STARTED_LABEL, "")
 
     @property
     def done(self) -> bool:
-        """Whether its rules are as it was to make them."""
+        """Whether the container has ended without error, so that the rules are set."""
         return self.container.state == "exited" and self.container.exit_code == 0
 
 
 class FlushContainer(OwnContainer):
-    """It has deleted the host's conntrack entries for a sandbox's UDP ports, and has ended.
+    """A container that deletes the host's conntrack entries for the UDP ports of a sandbox.
 
-    It is kept as the record of that: ``started_at`` is when it ran last.
+    The ended container stays as the record of the last run, at the time ``started_at``.
     """
 
     @property
     def done(self) -> bool:
-        """Whether its last run did what it is for."""
+        """Whether the last run has ended without error."""
         return self.container.state == "exited" and self.container.exit_code == 0
 
 
 @dataclass(frozen=True, slots=True)
 class HostState:
-    """A Docker host at one moment.
+    """The state of a Docker host at one moment.
 
-    ``containers`` are all but the operator's own: the proxies and their sandboxes. ``ephemeral``
-    is the range from which the kernel takes ports for connections, ``listening`` are TCP ports on
-    which something listens in the operator's own network namespace, ``listening_udp`` UDP ports.
-    ``image_id`` is the id of the proxy's image, empty if the host does not have it. ``advertise``
-    gives, for a master's host name, this host's address towards it; without an entry it is not
-    known. ``far`` is its address towards hosts far away, empty where unknown. ``masters`` are the
-    addresses of the masters' hosts, by name, empty where unknown. ``busy`` are the names of own
-    containers of which not everything is known yet, so that nothing can be done to them, and
-    ``addresses`` those of all containers. ``secret`` is what the tokens of proxies are made of.
-    ``redirects`` are the records of rules in containers' networks, ``flushes`` those of deleted
-    conntrack entries; neither is among its ``own``, as no proxy is made of them.
-    ``deletes_udp_entries``: the engine itself deletes the entries that a flush would.
+    Attributes:
+        containers: All containers except the operator's own.
+        ephemeral: The range from which the kernel takes ports for outgoing connections.
+        listening: TCP ports of the host on which a program listens, except ports of busy
+            sandboxes. Empty if the operator is not in the host's network, as are
+            ``listening_udp``, ``advertise`` and ``far``.
+        listening_udp: Bound UDP ports of the host, except ports of busy sandboxes and LAN relays.
+        image_id: The id of the proxy's image; empty if the host does not have the image.
+        advertise: This host's address towards a master, by the master's host name. A host name
+            without entry has no known address.
+        far: This host's address on the default route; empty if unknown.
+        redirects: The records of rules in the networks of containers.
+        flushes: The records of deleted conntrack entries.
+        masters: The addresses of the masters' hosts, by host name; empty if unknown.
+        busy: The names of own containers without a current inspection. The operator leaves these
+            containers alone in this look.
+        addresses: The addresses of all containers, the operator's own included.
+        secret: The secret from which the operator makes the tokens of the proxies.
+        deletes_udp_entries: Whether the engine itself deletes outdated conntrack entries for UDP.
     """
 
     containers: tuple[Container, ...]
@@ -236,12 +258,12 @@ class HostState:
 
     @property
     def own(self) -> tuple[OwnContainer, ...]:
-        """All that is the operator's own."""
+        """The sandboxes, proxies and LAN relays; the records of redirects and flushes are not."""
         return (*self.sandboxes, *self.proxies, *self.lan_relays)
 
     @property
     def keys(self) -> frozenset[Key]:
-        """The keys of all that is the operator's own."""
+        """The keys that have a sandbox, a proxy or a LAN relay."""
         return frozenset(own.key for own in self.own)
 
     def sandboxes_of(self, key: Key) -> tuple[Sandbox, ...]:
@@ -253,7 +275,7 @@ class HostState:
         return tuple(p for p in self.proxies if p.key == key)
 
     def gateway(self, name: str) -> str:
-        """The gateway of a network; empty if it has none or is not there."""
+        """The gateway of a network; empty without a gateway, or without the network."""
         return next((n.gateway for n in self.networks if n.name == name), "")
 
     def lan_relays_of(self, key: Key) -> tuple[LanRelayContainer, ...]:
@@ -261,24 +283,30 @@ class HostState:
         return tuple(e for e in self.lan_relays if e.key == key)
 
     def sandbox_of(self, proxy: Proxy) -> Sandbox | None:
-        """The sandbox in whose network namespace a proxy is; None if it is there no more."""
+        """The sandbox in whose network namespace a proxy runs; None if the sandbox is gone."""
         sandbox_id = proxy.container.network_container
         return next((s for s in self.sandboxes if s.container.id == sandbox_id), None)
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A labelled container, and what it wants of its proxy: labels and settings put together.
+    """A container with a proxy, and what the container asks of this proxy.
 
-    ``ports`` is 0 without a label, ``wishes`` are what its other labels ask for. ``networks`` are
-    the names of those on which it wants to meet its proxy. ``wanted_alias`` is the host in its
-    ROS_MASTER_URI: the name by which it looks for the proxy, ``rosproxy`` if it has no such
-    variable, empty where no alias can help it. ``policy`` are rules for its own nodes alone.
-    ``peers`` are hosts outside, for a member of a ROS 2 domain, and routers for rmw_zenoh.
-    ``redirect`` is what its label says, None without one; ``redirected`` are the addresses and
-    ports that are to lead to its proxy, in its network: its master's, or those of the routers that
-    its nodes of rmw_zenoh look for. A container that is not alive only
-    keeps networks joined, and what else its labels made its proxy, for a while.
+    A member whose container has exited creates no proxy. For the operator's grace, the existing
+    proxy keeps the networks and options of this member.
+
+    Attributes:
+        ports: Least number of ports of the proxy; 0 without the label.
+        networks: The names of the networks on which container and proxy meet.
+        wanted_alias: The name by which ROS 1 nodes look for the proxy: the host in ROS_MASTER_URI,
+            or ``rosproxy`` without this variable. Empty if no alias can help.
+        wishes: The options that further labels ask for.
+        policy: Rules for the nodes of this container alone.
+        peers: ROS 2: the hosts outside to which the proxy announces participants. rmw_zenoh: the
+            routers to which the proxy connects.
+        redirect: The value of the label ``rosproxy.redirect``; None without the label.
+        redirected: The addresses and ports that the operator redirects to the proxy, in the
+            container's network: of the master, or of the routers that nodes of rmw_zenoh look for.
     """
 
     container: Container
@@ -295,11 +323,12 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class Desired:
-    """What one proxy is to be.
+    """The proxy that the operator wants for a key.
 
-    Without ``live`` no running container wants it any more: it is left as it is, but for the
-    networks that it leaves, until its grace ends. ``ports`` is the least number of ports. ``peers``
-    are whom a proxy for ROS 2 tells of its participants, and routers that one for rmw_zenoh dials.
+    If ``live`` is false, no live container needs the proxy. Until the grace ends, the operator then
+    only disconnects the sandbox from networks. ``ports`` is the least number of ports. ``members``
+    are the live containers. ``peers`` are the hosts or routers of all members (`Member`) and, for
+    DDS, of the operator's option.
     """
 
     key: Key

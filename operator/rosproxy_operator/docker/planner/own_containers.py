@@ -1,19 +1,20 @@
-"""Which containers are this operator's own: their labels say so, and nothing gives them away.
+"""Decide which containers are the operator's own, by labels, name and HostConfig.
 
-The operator has no disk, so it knows its containers by their labels; but an image may carry labels
-as well, together with variables, a command and a user. What an image has no say in is the
-container's name and its HostConfig: these belong to whoever creates the container. So one is own
-only if both are as this operator makes them, and nothing is read of one that is not: neither its
-range nor its key.
+The operator has no disk, and recognises its containers by their labels. But an image may carry such
+labels too, and variables, a command and a user. An image can't choose the name and the HostConfig
+of a container; the client that creates the container chooses both. So a container counts as own
+only if name and HostConfig are as the operator makes them. Of all other containers, the operator
+ignores the labels for range and key.
 
-There is no mark besides that only the operator could compute (an HMAC in a label). Who can create
-containers with a name and a HostConfig of his choice speaks to the engine, and is root on its host:
-he can read any secret of the operator's, and needs no forged container. And an operator that has
-lost its secret still has to know its containers, to make them anew on the same ports.
+The labels have no signature, such as an HMAC. A client that chooses name and HostConfig has access
+to the engine, and is root on the host. Such a client can read every secret of the operator, and
+needs no forged container. And an operator without its former secret still has to recognise its
+containers, to recreate them on the same ports.
 
-What ``docker update`` may change on a running container (memory, threads, restart policy) is not
-looked at, nor what options of the operator decide, as the uplink or the published addresses: these
-make a container anew, and must not make a stranger of it.
+Two kinds of fields are not checked. ``docker update`` changes the first kind on a running
+container: memory, threads, restart policy. Options of the operator decide the second kind, such as
+the uplink and the published addresses. If such an option changes, the operator recreates the
+container, and so has to recognise the container.
 """
 
 import re
@@ -48,14 +49,15 @@ from rosproxy_operator.docker.planner.specs import (
 from rosproxy_operator.docker.planner.zenoh_redirect import zenoh_sysctls
 
 _TEMPORARY = r"(-\d+)?(-old(-\d+)?)?"
-"""What follows a name while another container takes over or has it (`duplicates.free_name`)."""
+"""Endings of a container's name: a number if the name is taken (`duplicates.free_name`), or
+``-old`` if another container takes over (`container_steps.former_name`)."""
 _NEVER = (
     *("Privileged", "Binds", "Mounts", "VolumesFrom", "Devices", "DeviceRequests", "GroupAdd"),
     *("PidMode", "UTSMode", "UsernsMode"),
 )
 """Fields of the HostConfig that the operator never sets."""
 _OWN_IPC = (None, "", "private", "shareable")
-"""What engines set as IpcMode by default."""
+"""Values that engines set as IpcMode by default."""
 _COMMANDS = {
     ROLE_SANDBOX: SANDBOX_COMMAND,
     ROLE_PROXY: PROXY_COMMAND,
@@ -71,8 +73,8 @@ _SYSCTLS = {"net.ipv4.ip_local_port_range", "net.ipv4.ip_forward"}
 class CreationFacts:
     """How a container was made, in the engine's words.
 
-    ``image`` is the id of its image, ``host`` its HostConfig. ``command`` are entry point and
-    command, whether given or the image's.
+    ``image`` is the id of the image, ``host`` the HostConfig. ``command`` is the entry point and
+    the command, from the image or from the client that created the container.
     """
 
     image: str = ""
@@ -82,7 +84,7 @@ class CreationFacts:
 
 
 def has_own_name(own: OwnLabels, name: str) -> bool:
-    """Whether a name is one that a container with these labels can have."""
+    """Whether the operator gives this name to a container with these labels."""
     names = [_name(own)]
     if own.role == ROLE_LAN_RELAY:
         names.append(f"{proxy_name(own.key)}-{FORMER_LAN_RELAY}")
@@ -90,10 +92,11 @@ def has_own_name(own: OwnLabels, name: str) -> bool:
 
 
 def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: str) -> str:
-    """What shows that a container is none of this operator's, though its labels say so.
+    """Return why a container with the operator's labels is not the operator's own.
 
-    Empty if nothing does. ``image_id`` is that of the proxies' image now. A container of a former
-    image must at least have the user and the command of one.
+    Empty if nothing speaks against the labels. ``image_id`` is the present image of the proxies. A
+    proxy of this image may have any command, since the operator leaves the command to the image.
+    All other containers must have the command of their role.
     """
     if not has_own_name(own, name):
         return f"the name is not {_name(own)}"
@@ -104,7 +107,8 @@ def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: s
         return "the command is not the operator's"
     command = _COMMANDS.get(own.role, making.command)
     of_image = own.role == ROLE_PROXY and making.image == image_id
-    # What a redirect runs ends with its rules: they are in its fingerprint, and so in its name.
+    # The rules are the last argument of a redirect's command. The check of the name covers the
+    # rules, too: the name has the fingerprint of the rules.
     actual = making.command[:1] if own.role == ROLE_REDIRECT else making.command
     is_former = own.role == ROLE_LAN_RELAY and actual == _FORMER_COMMAND
     if actual != command and not of_image and not is_former:
@@ -127,7 +131,7 @@ def _name(own: OwnLabels) -> str:
 
 
 def _odd(host: Mapping[str, Any]) -> Iterator[str]:
-    """The fields of a HostConfig that differ from what all containers of the operator have."""
+    """The fields of a HostConfig that differ from all containers of the operator."""
     if host.get("ReadonlyRootfs") is not True:
         yield "ReadonlyRootfs"
     if host.get("CapDrop") != ["ALL"]:
@@ -147,7 +151,7 @@ def _odd_sandbox(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
     if mode in ("host", "none") or mode.startswith("container:"):
         yield "NetworkMode"
     bindings = host.get("PortBindings") or {}
-    # No label says whether its ports are published for UDP as well, so both will do.
+    # No label says whether the ports are published for UDP as well, so both are valid.
     expected = [
         {name: {str(port)} for name, port in published_ports(own.key, own.range, udp)}
         for udp in (False, True)
@@ -164,7 +168,7 @@ def _odd_sandbox(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _odd_lan_relay(host: Mapping[str, Any]) -> Iterator[str]:
-    """A LAN relay is in the host's network, and has no other right."""
+    """A LAN relay is in the host's network, and has no other privilege."""
     yield from _odd(host)
     if host.get("CapAdd"):
         yield "CapAdd"
@@ -176,7 +180,7 @@ def _odd_lan_relay(host: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _odd_redirect(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
-    """It has NET_ADMIN in another container's network; for rmw_zenoh, it has a sysctl there."""
+    """A redirect has NET_ADMIN in another container's network; for rmw_zenoh also a sysctl."""
     sysctls = frozenset(zenoh_sysctls(True)) if own.key == ZENOH else frozenset()
     yield from _odd_helper(host, sysctls)
     if not str(host.get("NetworkMode")).startswith("container:"):
@@ -184,7 +188,7 @@ def _odd_redirect(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _odd_flush(host: Mapping[str, Any]) -> Iterator[str]:
-    """It has NET_ADMIN in the host's network, and nothing else."""
+    """A flush has NET_ADMIN in the host's network, and no other privilege."""
     yield from _odd_helper(host)
     if host.get("NetworkMode") != "host":
         yield "NetworkMode"

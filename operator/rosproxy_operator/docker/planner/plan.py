@@ -1,4 +1,4 @@
-"""From what is seen on a Docker host to what is to be done there."""
+"""Make the plan for a Docker host from the state of the host."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -34,18 +34,20 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 UNWANTED = "no running container needs the proxy"
 SOON = 1.0
-"""Seconds until a look at something that is about to end: a removal, a port that is let go."""
+"""Seconds until the next look while the engine removes a container, or still holds a port."""
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Actions to be carried out one after the other, for one key (or for the uplink: no key).
+    """Actions for a key, in order. If ``key`` is None, the actions are for the uplink.
 
-    One ``subject`` a container alone, for a redirect, and the key's other groups do not wait for
-    each other. When an action fails, the rest of its group is left out, so that a proxy is only
-    removed when its successor was created; but a failed Connect or Disconnect stops nothing else.
-    ``fix`` is what users can do where one fails again and again, in words; empty for nothing.
-    ``fatal``: a failure keeps an object from what its user wants (`Problem`).
+    Every group waits for the uplink's group. Groups with the same key and ``subject`` run in order.
+    Redirects and flushes have a ``subject``, so other work for the proxy does not wait for these.
+
+    If an action fails, the executor skips the rest of the group. So the operator removes a proxy
+    only after the operator has created the successor. A failed Connect or Disconnect is an
+    exception: the group goes on. ``fix`` says what users can do if an action keeps failing; empty
+    if users can do nothing. ``fatal`` is that of the `Problem` that a failure makes.
     """
 
     key: Key | None
@@ -57,12 +59,14 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class DockerPlan:
-    """What to do, group after group, and what to remember.
+    """The groups of actions that the operator carries out, and the memory for the next look.
 
-    ``deferred`` are groups that have to wait until the address of their master is known: without
-    it a proxy would find itself by its master's name; or until the uplink is there, where a LAN
-    relay listens. ``again_in`` is in how many seconds to look again even if nothing happens; None:
-    no need.
+    ``deferred`` are groups that wait for an address. A proxy for ROS 1 waits for the address of
+    the master: on the proxy's networks, the master's host name leads to the proxy itself. All
+    other proxies wait for the uplink network, since LAN relays, and routers of this host, are at
+    the gateway of the uplink.
+
+    ``again_in`` are the seconds until the next look if no event comes; None if nothing is pending.
     """
 
     groups: tuple[Group, ...]
@@ -75,7 +79,7 @@ class DockerPlan:
 
     @property
     def actions(self) -> tuple[Action, ...]:
-        """All actions that can be carried out now, in order."""
+        """All actions that the operator can carry out now, in order."""
         return tuple(action for group in self.groups for action in group.actions)
 
 
@@ -86,11 +90,11 @@ def plan(
     memory: DockerMemory,
     now: float,
 ) -> DockerPlan:
-    """The next actions, from everything that is seen; none if all is as it ought to be.
+    """Return the plan for a host. The plan has no actions if nothing is left to do.
 
-    For a key of which a container is busy nothing is done. ``labels`` are those that were read from
-    ``observed``. ``memory`` is that of the plan before, or an empty one. ``now`` is in seconds of a
-    monotonic clock that goes on as long as the memory does.
+    A key with a busy container gets no actions for its proxy. ``labels`` are the labels in
+    ``observed``. ``memory`` is the memory of the plan before, empty for the first plan. ``now`` is
+    in seconds of a monotonic clock, the same clock as for the plan before.
     """
     members, unplaced = find_members(labels, observed, settings)
     members, crowded = _within_bounds(members, settings)
@@ -108,7 +112,7 @@ def plan(
         key: [*removal_steps(observed, key, UNWANTED)] for key in expired
     }
     for wanted in desired:
-        if ports := memory.planned.get(wanted.key):  # else its problem is reported already
+        if ports := memory.planned.get(wanted.key):  # without ports, ``tight`` has the problem
             context = PlanContext(observed, settings, wanted, ports, naming, creatable)
             steps = wanted_steps(context)
             planned[wanted.key] = steps if steps is None else with_lan_relay(context, steps)
@@ -134,7 +138,7 @@ def plan(
 def _within_bounds(
     members: Collection[Member], settings: PlanSettings
 ) -> tuple[tuple[Member, ...], list[Problem]]:
-    """The members as far as their proxies can hold what all of their labels ask for together."""
+    """Return the members that their proxies can serve together, and problems of all others."""
     members, crowded = with_bounded_rules(members, settings)
     members, peerless = with_bounded_peers(members, settings)
     members, left_out = with_bounded_containers(members)
@@ -142,7 +146,7 @@ def _within_bounds(
 
 
 def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
-    """What keeps proxies from being created."""
+    """The problem that keeps the operator from creating proxies; None without such a problem."""
     if not observed.image_id:
         return Problem(
             f"proxy image {settings.proxy_image}",
@@ -168,7 +172,7 @@ def _possible_groups(
     naming: Naming,
     memory: DockerMemory,
 ) -> Iterator[Group]:
-    """All groups but those of keys of which a container is busy, and those of helpers."""
+    """The groups of keys without busy containers, and all groups of redirects and flushes."""
     busy = {own.key for own in observed.own if own.container.name in observed.busy}
     groups = _groups(observed, settings.uplink, desired, planned, naming)
     yield from (group for group in groups if group.key not in busy)
@@ -183,7 +187,7 @@ def flush_groups(
     desired: Collection[Desired],
     outdated: Mapping[str, str],
 ) -> Iterator[Group]:
-    """The groups that delete conntrack entries; each key's other work does not wait for them."""
+    """The groups that delete conntrack entries. No other group waits for these groups."""
     for flush in flush_steps(observed, settings, desired, outdated):
         if flush.actions:
             subject = f"conntrack entries for {proxy_name(flush.key)}"
@@ -197,7 +201,11 @@ def _groups(
     planned: Mapping[Key, list[Action] | None],
     naming: Naming,
 ) -> Iterator[Group]:
-    """First what makes names free, then the uplink, then one key after the other."""
+    """The groups of proxies and the uplink, in order.
+
+    The groups that leave networks come first, since these groups free names for other proxies. The
+    uplink comes next, and then key after key.
+    """
     for wanted in desired:
         others = planned.get(wanted.key)
         for action in disconnect_steps(observed, wanted, others, uplink, naming):
@@ -213,7 +221,7 @@ def _groups(
 
 
 def _waits(group: Group, observed: HostState, uplink: str) -> bool:
-    """Whether a group makes a proxy that lacks an address: its master's, or that of its uplink."""
+    """Whether a group creates a proxy without a known address of the master, or of the uplink."""
     return any(
         isinstance(action, Create) and _lacks_address(action.key, observed, uplink)
         for action in group.actions
@@ -221,19 +229,19 @@ def _waits(group: Group, observed: HostState, uplink: str) -> bool:
 
 
 def _lacks_address(key: Key, observed: HostState, uplink: str) -> bool:
-    if key.ros != "1":  # a LAN relay, and a router of this host, are at the uplink's gateway
+    if key.ros != "1":  # LAN relays, and routers of this host, are at the uplink's gateway
         return uplink not in {network.name for network in observed.networks}
     return observed.masters.get(master(key).host) == ""
 
 
 def _deaf(observed: HostState, settings: PlanSettings, live: Collection[Key]) -> Iterator[Problem]:
-    """Proxies for ROS 2 that lack a LAN relay."""
+    """Warnings for proxies for ROS 2 without a LAN relay."""
     problems = (missing_lan_relay(key, observed, settings) for key in sorted(live) if key.is_ros2)
     yield from filter(None, problems)
 
 
 def _unwell(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
-    """Proxies that end again and again, and masters that are not found."""
+    """Problems of containers that the engine restarts, and of masters without a known address."""
     for own in observed.own:
         name = own.container.name
         if own.key in live and own.container.state == "restarting":
@@ -247,7 +255,10 @@ def _unwell(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
 def _delays(
     observed: HostState, settings: PlanSettings, docker_plan: DockerPlan, now: float
 ) -> Iterator[float]:
-    """In how many seconds something ends without an event."""
+    """The seconds until the plan may change without an event.
+
+    These are the ends of graces, and `SOON` during a removal or after a refused port.
+    """
     memory = docker_plan.memory
     for wanted in docker_plan.desired:
         present = [own.container for own in observed.own if own.key == wanted.key]

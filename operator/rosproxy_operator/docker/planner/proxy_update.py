@@ -1,8 +1,9 @@
-"""What a proxy is to be told of the containers on its networks.
+"""Decide what the operator tells a proxy about the containers on the proxy's networks.
 
-`network_facts` is what one look says to one proxy. `ProxyUpdate` compares it with what the proxy
-was told before and with the nodes that it has, and says what is new and when something is due
-again. Nothing is forgotten until the proxy has heard it. Times are seconds of a monotonic clock.
+`network_facts` takes from a look what a single proxy needs. `ProxyUpdate` compares the facts with
+earlier facts and with the nodes of the proxy, and decides what to tell next, and when. If the proxy
+does not answer, arrivals stay due until the proxy answers, and moves for `MOVING` seconds. Times
+are seconds of a monotonic clock.
 """
 
 import re
@@ -30,45 +31,53 @@ from rosproxy_operator.docker.planner.redirect import redirect_record_name
 from rosproxy_operator.docker.planner.specs import master
 
 AGAIN = (0.0, 1.0, 3.0, 10.0)
-"""Seconds after a container's arrival at which its proxy is told: nodes take time to register."""
+"""Seconds after a container's arrival at which the operator tells the proxy of the arrival. The
+operator repeats the message, because nodes need time to register."""
 AGAIN_MOVED = 1.0
-"""Seconds until a move is told again: the new address may not be reachable at once."""
+"""Seconds between two messages about a move: the new address may not be reachable at once."""
 AWAY = 2.0
-"""Seconds for which a running container may be off a network before its address counts as gone."""
+"""Seconds for which a running container may be off a network before the address counts as gone."""
 MOVING = 5.0
-"""Seconds for which a proxy is told of a move, until it has found the nodes at the new address."""
+"""Seconds for which the operator tells a proxy of a move, unless the proxy has found the nodes."""
 ContainerNetwork = tuple[str, str]
-"""A container's id and a network."""
+"""The id of a container, and the name of a network."""
 _HOST_NAME = re.compile(r"[\w.-]{1,253}", re.ASCII)
-"""What a node can call its host in a URI; aliases may be anything."""
+"""The host names that a URI of a node can have. The engine allows any text as an alias."""
 
 
 @dataclass(frozen=True, slots=True)
 class ContainerArrival:
-    """A labelled container on a network of its proxy, since one start of it (``endpoint``).
+    """A labelled container on a network of the proxy.
 
-    ``redirect`` is what leads its nodes to the proxy, if anything does: those that were quicker
-    are looked for again once it is there.
+    ``endpoint`` changes with each start, so each start is a new arrival. ``redirect`` is the name
+    of the redirect's record, or empty. A new redirect also is a new arrival: nodes may have
+    registered at the real master before, so the proxy has to look for these nodes again.
     """
 
     container: str
     network: str
     address: str
     endpoint: str
-    # Not compared: aliases are known from a later inspection on, and make no other arrival of it.
+    # Not compared: a later inspection may add aliases, and the arrival stays the same.
     names: frozenset[str] = field(compare=False)
     redirect: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkFacts:
-    """What one look says to one proxy.
+    """The part of a look that concerns a single proxy.
 
-    ``addresses`` are those of running containers on its networks, by container id and network;
-    ``taken`` those of all containers and gateways. ``subnets`` are those of its networks,
-    ``running`` the ids of all containers that run. ``master_address`` is empty if there is nothing
-    to be told. ``selected`` are the addresses, on its networks, of all containers whose labels mean
-    this proxy: those that may use it as their master. ``policy`` are all layers of its policy.
+    Attributes:
+        master_address: The address of the master; empty if unknown, or if the URI of the master
+            has an address already.
+        addresses: The addresses of running containers on the proxy's networks.
+        taken: The addresses of all containers and gateways.
+        subnets: The subnets of the proxy's networks.
+        arrivals: The running containers of the proxy; none for ROS 2 and rmw_zenoh.
+        running: The ids of all running containers.
+        selected: The addresses of the proxy's containers on the proxy's networks. These addresses
+            may use the proxy as their master.
+        policy: All layers of the proxy's policy.
     """
 
     master_address: str = ""
@@ -82,10 +91,10 @@ class NetworkFacts:
 
 
 class AddressHistory:
-    """Where containers are, as far as their proxy knows, and where they were just now.
+    """The addresses of containers, and the addresses that containers had a moment ago.
 
-    A container that is disconnected and connected again under another address has moved, and its
-    nodes live on.
+    If a running container leaves a network and joins again with another address, the container has
+    moved. The nodes in the container keep running, and the proxy has to find them there.
     """
 
     def __init__(self) -> None:
@@ -94,7 +103,7 @@ class AddressHistory:
         self._moves: dict[str, tuple[str, float]] = {}
 
     def look(self, latest: NetworkFacts, now: float) -> None:
-        """Compare with what the last look has found."""
+        """Compare the latest facts with the facts of the last call, and note moves."""
         missing = [place for place in self._at if place not in latest.addresses]
         self._absent = {place: self._absent.get(place, now) for place in missing}
         for place, since in list(self._absent.items()):
@@ -113,10 +122,10 @@ class AddressHistory:
         }
 
     def _follow(self, latest: NetworkFacts, now: float) -> None:
-        """Let nodes of a network that their container has left be found on one that it is on."""
+        """Note a move if a container has left a network and is still on another network."""
         for container, network in list(self._absent):
-            # The first is a network that it was not on before (False sorts first): its nodes have
-            # moved there. Else it is one that it was on all the time.
+            # A network that the container has just joined comes first (False sorts before True):
+            # the container has probably moved there. Otherwise any network of the container counts.
             elsewhere = [
                 ((container, other_network) in self._at, address)
                 for (owner, other_network), address in latest.addresses.items()
@@ -129,23 +138,26 @@ class AddressHistory:
 
     @property
     def reserved_addresses(self) -> frozenset[str]:
-        """The addresses that no container has, but whose containers may come back or have moved."""
+        """The former addresses of containers that may come back, or that have moved."""
         return frozenset(self._at[place] for place in self._absent) | self._moves.keys()
 
     @property
     def next_expiry(self) -> float | None:
-        """When the first of them is given up; None if there is none."""
+        """The time at which the first absence or move expires; None without absence and move."""
         times = [since + AWAY for since in self._absent.values()]
         times += [since + MOVING for _, since in self._moves.values()]
         return min(times, default=None)
 
     def moved(self, nodes: Collection[str]) -> dict[str, str]:
-        """Old address to new one, of those where the proxy still believes its ``nodes`` to be."""
+        """The new address for each old address at which the proxy still has ``nodes``."""
         return {old: new for old, (new, _) in self._moves.items() if old in nodes}
 
 
 class ProxyUpdate:
-    """What one run of a proxy has yet to be told. ``policy`` is all of its policy."""
+    """The updates that the operator owes a proxy, from the proxy's start to its end.
+
+    ``policy`` is the whole policy of the proxy.
+    """
 
     def __init__(self) -> None:
         self.facts = NetworkFacts()
@@ -157,7 +169,7 @@ class ProxyUpdate:
         self._moving = False
 
     def look(self, latest: NetworkFacts, now: float) -> None:
-        """Take note of what a look has found."""
+        """Record the facts of a look."""
         self.facts = latest
         common = tuple(layer for layer in latest.policy if layer.addresses is None)
         own = (layer for layer in latest.policy if layer.addresses is not None)
@@ -169,9 +181,10 @@ class ProxyUpdate:
         }
 
     def body(self, nodes: Collection[str], now: float) -> dict[str, Any]:
-        """The body of ``POST /containers`` for a proxy with nodes at these addresses; or nothing.
+        """Return the body of ``POST /containers`` for a proxy with nodes at these addresses.
 
-        Addresses that are ``gone``, have ``moved`` or where containers have ``arrived``.
+        The body has the addresses that are ``gone``, that have ``moved``, and at which containers
+        have ``arrived``. The body is empty if nothing is due.
         """
         self._places.look(self.facts, now)
         body = {
@@ -187,21 +200,22 @@ class ProxyUpdate:
         return {key: value for key, value in body.items() if value}
 
     def _gone(self, node: str) -> bool:
-        """Whether no container has a node's address any more.
+        """Whether the container of a node is gone: no container has the node's address.
 
-        Only the engine can tell, so it must be in a network that the proxy is on or was on.
+        Only addresses on networks of the proxy, present or former, count: the engine knows all
+        containers there.
         """
         is_known = node in self.facts.taken or node in self._places.reserved_addresses
         return not is_known and is_inside(node, tuple(self._subnets))
 
     def mark_delivered(self, now: float) -> None:
-        """Take note that the proxy has been told what was due until then."""
+        """Record that the proxy has received all updates that were due at the time ``now``."""
         self._due = {
             arrival: [when for when in times if when > now] for arrival, times in self._due.items()
         }
 
     def next_due(self, now: float) -> float | None:
-        """Seconds until there is something to be told again; None if there is nothing."""
+        """Return the seconds until the next update is due; None if no update is due."""
         times = [when for due in self._due.values() for when in due[:1]]
         times += [self._places.next_expiry] if self._places.next_expiry else []
         times += [now + AGAIN_MOVED] if self._moving else []
@@ -214,9 +228,10 @@ def network_facts(
     members: Collection[Member],
     policy: tuple[PolicyLayer, ...] = (),
 ) -> NetworkFacts:
-    """What a look says to a proxy. ``members`` are those of all, ``policy`` the administrator's.
+    """Return the part of a look that concerns a proxy.
 
-    One for ROS 2 has no master, and hears by itself of containers that come.
+    ``members`` are the members of all proxies, ``policy`` are the administrator's layers. A proxy
+    for ROS 2 has no master, and gets no arrivals: the proxy discovers new participants itself.
     """
     host = master(proxy.key).host.lower() if proxy.key.ros == "1" else ""
     sandbox = observed.sandbox_of(proxy)
@@ -262,14 +277,14 @@ def _attachments(container: Container, networks: Collection[str]) -> list[Attach
 def _arrivals(
     member: Member, observed: HostState, by_id: Mapping[str, Container], joined: set[str]
 ) -> list[ContainerArrival]:
-    """A container's arrivals: where it, or the container whose network it shares, is attached."""
+    """The arrivals of a running container, one for each network that the proxy has joined, too."""
     container = member.container
     host = network_owner(container, by_id)
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}
-    # Until the redirect is there, nodes reach the real master by its address, and register around
-    # the proxy with the host that these variables name.
+    # Before the redirect, nodes reach the real master by address, and register there directly. The
+    # registered URI then has the host that these variables name.
     if member.redirected:
         own |= {container.variables.get(name, "") for name in ("ROS_IP", "ROS_HOSTNAME")}
         own = {name for name in own if not is_loopback(name)}

@@ -1,9 +1,14 @@
-"""Which ROS a container is of, and what it wants of a proxy for ROS 2 by DDS.
+"""Read the ROS versions of a container, and what the container asks of a proxy for DDS.
 
-A label says it, else the container's own variables, which most images with ROS have: ROS_VERSION,
-ROS_DISTRO. Else a label or a variable that one version alone has says it: ROS_MASTER_URI for ROS 1,
-ROS_DOMAIN_ID for ROS 2. Where nothing says it, the container counts as one of ROS 1. A container of
-ROS 2 has rmw_zenoh instead of DDS if a label or RMW_IMPLEMENTATION says so.
+The first source that states the version counts:
+
+1. The label ``rosproxy.ros``.
+2. The variables ROS_VERSION and ROS_DISTRO, which most images with ROS have.
+3. Labels and variables of a single version, such as ROS_MASTER_URI (ROS 1) or ROS_DOMAIN_ID (ROS
+   2). ROS 1 wins over ROS 2.
+
+Without such a source, the operator assumes ROS 1. A label or RMW_IMPLEMENTATION states that the
+ROS 2 nodes use rmw_zenoh instead of DDS.
 """
 
 import re
@@ -47,9 +52,9 @@ UNKNOWN = "no label and no variable states the ROS version"
 
 
 def versions(container: Container) -> frozenset[str]:
-    """The versions of ROS that a container is of: 1, 2 or zenoh, or 1 and another one.
+    """Return the ROS versions of a container: ``1``, ``2`` or ``zenoh``, or ``1`` and another.
 
-    Raises UnusableLabel.
+    ``zenoh`` stands for ROS 2 with rmw_zenoh. Raises UnusableLabel.
     """
     of_ros = _ros_versions(container)
     if "2" in of_ros and _has_zenoh(container):
@@ -58,7 +63,7 @@ def versions(container: Container) -> frozenset[str]:
 
 
 def _has_zenoh(container: Container) -> bool:
-    """Whether nodes of ROS 2 in a container use rmw_zenoh. Raises UnusableLabel."""
+    """Whether the ROS 2 nodes in a container use rmw_zenoh. Raises UnusableLabel."""
     labels = container.labels
     if RMW in labels and labels[RMW].strip().lower() != "zenoh":
         fix = f"Write {RMW}=zenoh, or remove the label: the proxy then serves DDS"
@@ -85,7 +90,7 @@ def _ros_versions(container: Container) -> frozenset[str]:
 
 
 def _is_marked_ros2(container: Container) -> bool:
-    """Whether a container has marks of ROS 2, and none of ROS 1."""
+    """Whether a container has labels or variables of ROS 2 alone, and no ROS 1 master."""
     if MASTER_URI in container.labels or container.master_uri:
         return False
     return any(name in container.labels for name in _OF_ROS2) or bool(
@@ -94,7 +99,10 @@ def _is_marked_ros2(container: Container) -> bool:
 
 
 def domain(container: Container) -> int:
-    """The domain of its participants: from the label, else its variable, else 0."""
+    """The domain of a container: from the label, else from ROS_DOMAIN_ID, else 0.
+
+    Raises UnusableLabel.
+    """
     if DOMAIN in container.labels:
         source = named(DOMAIN, container.labels)
         text = container.labels[DOMAIN]
@@ -109,7 +117,10 @@ def domain(container: Container) -> int:
 
 
 def peers(labels: Labels) -> frozenset[str]:
-    """The hosts outside that are told of a container's participants; none without the label."""
+    """The hosts outside to which the proxy announces participants; none without the label.
+
+    Raises UnusableLabel.
+    """
     names = [name for name in re.split(r"[,\s]+", labels.get(PEERS, "")) if name]
     if len(names) > MOST_PEERS:
         raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts. Name fewer hosts")
@@ -120,7 +131,10 @@ def peers(labels: Labels) -> frozenset[str]:
 
 
 def refuse_unserved(host: str) -> None:
-    """Raise UnusableLabel for what a proxy for ROS 2 can't do. ``host``: the advertised one."""
+    """Raise UnusableLabel if the advertised host is an IPv6 address.
+
+    The operator starts proxies for ROS 2 with IPv4 alone.
+    """
     if ":" in host:
         text = f"advertised host {host} is an IPv6 address, and for ROS 2 a proxy uses IPv4 only"
         raise UnusableLabel(f"{text}. Give an IPv4 address")
@@ -129,11 +143,12 @@ def refuse_unserved(host: str) -> None:
 def past_the_proxy(
     container: Container, networks: Collection[str], observed: HostState
 ) -> Iterator[str]:
-    """Warnings for hosts outside that a container's own ROS_STATIC_PEERS names.
+    """Warnings for hosts outside that the variable ROS_STATIC_PEERS of a container names.
 
-    ``networks`` are those of the container, by name. Its nodes announce themselves to such a host
-    with addresses that the host can't reach. A participant keeps the locators that it learns first
-    (Fast DDS: PDPListener.cpp), so the announcement by the proxy comes too late.
+    ``networks`` are the names of the container's networks. The nodes announce inside addresses
+    directly to such a host, and the host can't reach these addresses. A participant keeps the first
+    locators of another participant (Fast DDS: PDPListener.cpp), so the announcement of the proxy
+    comes too late.
     """
     attachments = (a for c in observed.containers for a in c.attachments if a.network in networks)
     inside = {ALIAS, "localhost", *(name for a in attachments for name in a.names)}
@@ -149,14 +164,14 @@ def past_the_proxy(
 
 
 def is_guessed(container: Container) -> bool:
-    """Whether nothing says which version of ROS a container is of."""
+    """Whether no label and no variable states the ROS version of a container."""
     explicit = {ROS, MASTER_URI} & container.labels.keys() or container.master_uri
     is_told = explicit or {"ROS_VERSION", "ROS_DISTRO"} & container.variables.keys()
     return not is_told and not _is_marked_ros2(container)
 
 
 def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[str]:
-    """Warnings for a container of these versions, which has a proxy nevertheless."""
+    """Warnings for a container of these versions. The container gets a proxy nevertheless."""
     labels = container.labels
     if is_guessed(container):
         yield f"{UNKNOWN}, so the operator assumes ROS 1. Add the label {ROS}=1 or {ROS}=2"

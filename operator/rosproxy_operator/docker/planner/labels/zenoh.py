@@ -1,8 +1,8 @@
-"""What a container of rmw_zenoh wants: the routers that its proxy dials, and its redirect.
+"""Read what a container with rmw_zenoh asks for: routers for the proxy, and the redirect.
 
-The routers outside are those of the label ``rosproxy.peers``, and those to which the container's
-own ZENOH_CONFIG_OVERRIDE connects. A container that runs a router keeps serving its neighbours, and
-the proxy dials that router.
+The label ``rosproxy.peers`` and the variable ZENOH_CONFIG_OVERRIDE of the container name routers.
+The proxy connects to these routers. If the container itself runs a router, the router goes on
+serving the containers around it, and the proxy connects to the router, too.
 """
 
 import re
@@ -35,7 +35,11 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 @dataclass(frozen=True, slots=True)
 class _Router:
-    """A router that a container names; ``neighbour`` is the container in which it runs, if any."""
+    """A router that a container names.
+
+    ``source`` is the label or variable with the name, for messages. ``neighbour`` is the container
+    in which the router runs; None for a router outside.
+    """
 
     address: HostPort
     source: str
@@ -43,7 +47,11 @@ class _Router:
 
     @property
     def peer(self) -> str:
-        """How the proxy dials it: a container's name leads to its present address."""
+        """The router as ``host:port``, for an option of the proxy.
+
+        For a router in a container, the host is the container's name: each start may change the
+        address.
+        """
         host = self.neighbour.name if self.neighbour else self.address.host
         return str(HostPort(host, self.address.port))
 
@@ -51,7 +59,7 @@ class _Router:
 def zenoh_member(
     container: Container, observed: HostState, settings: PlanSettings
 ) -> tuple[Member, list[str]]:
-    """What a container of rmw_zenoh wants, and the warnings about it. Raises UnusableLabel."""
+    """Return what a container with rmw_zenoh asks for, and warnings. Raises UnusableLabel."""
     labels = container.labels
     _refuse_rules(labels, settings)
     member = Member(
@@ -88,7 +96,10 @@ def _may_be_dialed(router: _Router, settings: PlanSettings) -> bool:
 def with_bounded_containers(
     members: Iterable[Member],
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
-    """The members for which their proxy has a router, and the problems of the others."""
+    """Return the members for which the proxy has a router, and problems of all other members.
+
+    Only members of the proxy for rmw_zenoh count; all members of other proxies stay.
+    """
     every = tuple(members)
     crowd = [member for member in every if member.key == ZENOH][MOST_ZENOH_PORTS:]
     text = (
@@ -100,9 +111,9 @@ def with_bounded_containers(
 
 
 def _refuse_rules(labels: Labels, settings: PlanSettings) -> None:
-    """Raise UnusableLabel for rules, which have no effect: hidden names would be seen."""
+    """Raise UnusableLabel if a policy applies: on rmw_zenoh, the proxy could hide no name."""
     if labels.get(POLICY, "").strip():
-        text = "has no effect on rmw_zenoh, so outside would see what it hides. Remove the label"
+        text = "has no effect on rmw_zenoh, so outside would see denied names. Remove the label"
         raise UnusableLabel(f"label {POLICY} {text}")
     if settings.policy:
         raise UnusableLabel(
@@ -112,7 +123,7 @@ def _refuse_rules(labels: Labels, settings: PlanSettings) -> None:
 
 
 def _labelled(labels: Labels) -> Iterator[_Router]:
-    """The routers outside that the label names."""
+    """The routers that the label ``rosproxy.peers`` names. Raises UnusableLabel."""
     names = [name for name in re.split(r"[,\s]+", labels.get(PEERS, "")) if name]
     if len(names) > MOST_PEERS:
         raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts. Name fewer hosts")
@@ -125,7 +136,10 @@ def _labelled(labels: Labels) -> Iterator[_Router]:
 
 
 def _connected(member: Member, observed: HostState) -> Iterator[_Router]:
-    """The routers to which a container's variable connects its nodes; none for a router itself."""
+    """The routers to which ZENOH_CONFIG_OVERRIDE connects the nodes of a container.
+
+    None for a container that runs a router: the variable then configures this router.
+    """
     container = member.container
     if container.is_zenoh_router:
         return
@@ -136,7 +150,7 @@ def _connected(member: Member, observed: HostState) -> Iterator[_Router]:
 
 
 def _neighbour(host: str, member: Member, observed: HostState) -> Container | None:
-    """The container on a network of this one that has a name or an address."""
+    """The container with this name or address on a network of the member; None if none has it."""
     for container in observed.containers:
         for attachment in container.attachments:
             names = {attachment.address, *map(str.lower, attachment.names)}
@@ -146,15 +160,20 @@ def _neighbour(host: str, member: Member, observed: HostState) -> Container | No
 
 
 def _has_router(owner: Container, observed: HostState) -> bool:
-    """Whether a router runs in the network of a container."""
+    """Whether a router runs in the network namespace of a container."""
     by_id = {container.id: container for container in observed.containers}
     routers = (c for c in observed.containers if c.is_zenoh_router and c.alive)
     return any(network_owner(router, by_id).id == owner.id for router in routers)
 
 
 def _is_redirectable(router: _Router, owner: Container, observed: HostState) -> bool:
-    """Whether a rule of nftables can lead to the proxy what nodes send to a router outside."""
-    # Without a route connect(2) fails before a rule could take effect.
+    """Whether nftables can redirect the connections for a router outside to the proxy.
+
+    The rules are for IPv4 alone. A container that is only on internal networks has no route to the
+    router.
+    """
+    # Without a route, connect(2) fails before a rule could take effect: the kernel looks for a
+    # route before there is a packet (net/ipv4/tcp_ipv4.c, tcp_v4_connect).
     internal = {network.name for network in observed.networks if network.internal}
     host = router.address.host
     return is_address(host) and ":" not in host and not owner.networks <= internal
@@ -164,13 +183,13 @@ def _refusals(refused: Iterable[_Router]) -> Iterator[str]:
     for router in refused:
         yield (
             f"{router.source} names {quoted(router.peer)}, which the operator does not allow in "
-            "labels. The proxy does not connect there. To allow it, start the operator with "
-            f"--allow-peer {router.peer}"
+            "labels. The proxy does not connect there. To allow this router, start the operator "
+            f"with --allow-peer {router.peer}"
         )
 
 
 def _past_the_proxy(routers: Iterable[_Router]) -> Iterator[str]:
-    """Warnings for routers to which the nodes connect by themselves."""
+    """Warnings for routers to which the nodes connect directly, not through the proxy."""
     for router in routers:
         yield (
             f"{router.source} connects the nodes to {quoted(router.peer)}, and the operator can "
@@ -192,6 +211,6 @@ def _by_other_protocols(container: Container) -> Iterator[str]:
 def _not_redirected() -> str:
     return (
         "is not redirected to the proxy, as --no-redirect of the operator or the label "
-        f"{REDIRECT} says. So the nodes do not find the proxy. Remove that, or set "
+        f"{REDIRECT} says. So the nodes do not find the proxy. Remove the option or label, or set "
         f"{as_client(proxy_name(ZENOH))}"
     )
