@@ -1,20 +1,22 @@
-"""A master that is given by address: its address leads to the proxy, in the container's network.
+"""Plan redirects: rules in a container's network that lead the address of a master to the proxy.
 
-No name can stand in for an address. So a rule of nftables in the network namespace of the labelled
-container sends what its nodes open to that one address and port to the proxy instead, as service
-meshes do. It is set by a container of the proxy's image that joins this namespace, has NET_ADMIN
-there, runs ``nft`` once and ends: it parses nothing, and nobody can talk to it.
+If ROS_MASTER_URI has an address, no alias of the proxy helps. So the operator sets a rule of
+nftables in the network namespace of the labelled container, as service meshes do. The rule sends
+connections to the master's address and port to the proxy instead.
 
-What has ended is kept as the record of the rules, since the operator has no disk: its labels say in
-which start of the container they were made, and what they are made of. Every start has a namespace
-of its own, without rules. Where a record says something else than is wanted, the rules are set
-anew, in one transaction; where nothing is wanted any more, they are taken away and the record goes
-last. Connections that were there before stay as they are.
+A container of the proxy's image sets the rule. The container joins the namespace, has NET_ADMIN
+there, runs ``nft`` once and ends. The container opens no port and reads nothing but its command.
 
-The routers that nodes of rmw_zenoh look for lead to the proxy in the same way (`zenoh_redirect`).
+The ended container stays as the record of the rules, since the operator has no disk. The labels of
+the record have a hash of the rules, and the start time of the labelled container: each start makes
+a new namespace, without rules. If a record differs from the plan, the operator sets the rules again
+in a single transaction. If the plan has no redirect any more, the operator deletes the rules, and
+then the record. For a master, the rules do not change connections that are open already.
 
-A redirect is only set towards a proxy that runs. Once set, it stays while the proxy is away for a
-moment: its nodes then reach nothing, as they would by a name.
+For rmw_zenoh, the operator redirects the addresses of routers in the same way (`zenoh_redirect`).
+
+The operator sets a redirect only to a running proxy. Afterwards, the redirect stays while the proxy
+is away. The nodes then reach no master, just as nodes that use the proxy's name.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -57,8 +59,9 @@ from rosproxy_operator.docker.planner.zenoh_redirect import (
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.fingerprint import digest
 
-# The priorities are those of destination and source NAT (nf_ip_hook_priorities in the kernel). In
-# the hook output, nat chains see what this network namespace itself opens, which is enough here.
+# The priorities are the kernel's for destination and source NAT (nf_ip_hook_priorities). In the
+# hook output, nat chains see only connections that this network namespace itself opens. No other
+# connections need the redirect.
 _SET = Template("""\
 table ip $table {
   chain output {
@@ -71,16 +74,17 @@ table ip $table {
   }
 }
 """)
-"""The source address is chosen before dnat, which may lead to another network: so masquerade."""
+"""The rules for a master. The masquerade is needed, because the kernel chooses the source address
+before dnat, and dnat may lead to another network."""
 RedirectSite = tuple[Key, str]
-"""A proxy's key, and the id of the container whose network a redirect is in."""
+"""The key of a proxy, and the id of the container that owns the network of a redirect."""
 
 
 @dataclass(frozen=True, slots=True)
 class RedirectSteps:
-    """What is to be done for one redirect; ``container`` names the one whose network it is in.
+    """The steps for a redirect. ``container`` is the name of the network's owner.
 
-    ``fix`` is what its user can do where that fails; empty where a redirect is taken away.
+    ``fix`` says what users can do if a step fails; empty for the removal of a redirect.
     """
 
     key: Key
@@ -90,7 +94,7 @@ class RedirectSteps:
 
 
 def redirect_config(action: CreateRedirect, settings: PlanSettings) -> dict[str, Any]:
-    """The body of the engine's ``POST /containers/create`` for what sets a redirect's rules."""
+    """The body of the engine's ``POST /containers/create`` for a redirect's container."""
     helper = helper_config(settings, f"container:{action.target}")
     if action.key == ZENOH:
         helper["HostConfig"]["Sysctls"] = zenoh_sysctls(bool(action.addresses))
@@ -103,9 +107,12 @@ def redirect_config(action: CreateRedirect, settings: PlanSettings) -> dict[str,
 
 
 def _rules(action: CreateRedirect) -> str:
-    """One transaction of nft(8): whatever a redirect has had there goes, and comes as it is now."""
+    """A transaction of nft(8) that deletes the redirect's table and creates the table anew.
+
+    Without ``proxy``, the transaction only deletes the table.
+    """
     table = f"rosproxy-redirect-{proxy_name(action.key).rpartition('-')[2]}"
-    # To delete a table that is not there is an error, and would undo the transaction: so add first.
+    # Add the table first: to delete a missing table is an error, and undoes the whole transaction.
     text = f"add table ip {table}\ndelete table ip {table}\n"
     if action.proxy is None:
         return text
@@ -120,7 +127,7 @@ def _rules(action: CreateRedirect) -> str:
 def redirect_steps(
     observed: HostState, settings: PlanSettings, desired: Iterable[Desired]
 ) -> Iterator[RedirectSteps]:
-    """What is to be done so that each redirect that is wanted is there, and no other."""
+    """The steps after which the host has exactly the planned redirects."""
     wanted = _wanted(observed, settings, desired)
     records: dict[RedirectSite, list[RedirectContainer]] = {}
     for record in observed.redirects:
@@ -142,7 +149,7 @@ def redirect_steps(
 
 
 def _by_name(key: Key) -> str:
-    """How nodes use their proxy where no redirect can be set."""
+    """What users can do if the operator can't set a redirect."""
     if key == ZENOH:
         return (
             "Until the redirect is in place, the nodes do not find the proxy. The operator tries "
@@ -156,9 +163,9 @@ def _by_name(key: Key) -> str:
 
 
 def redirect_record_name(observed: HostState, key: Key, owner: Container) -> str:
-    """The name of the record of a redirect to a proxy, in a container's own network; or empty.
+    """The name of the record of a redirect to a proxy in a container's network; or empty.
 
-    It may lead to where the proxy was a moment ago.
+    The redirect may still lead to a former address of the proxy.
     """
     return next(
         (
@@ -173,9 +180,9 @@ def redirect_record_name(observed: HostState, key: Key, owner: Container) -> str
 def _wanted(
     observed: HostState, settings: PlanSettings, desired: Iterable[Desired]
 ) -> dict[RedirectSite, CreateRedirect | None]:
-    """The redirects that there ought to be; None for one that is to be left as it is.
+    """The planned redirects; None for a redirect that stays unchanged.
 
-    Of several proxies for one address, in one network, the first one gets it.
+    If several proxies claim an address in a network, the first proxy gets the address.
     """
     wanted: dict[RedirectSite, CreateRedirect | None] = {}
     owners: dict[tuple[str, HostPort], Key] = {}
@@ -198,7 +205,7 @@ def _wanted(
 
 
 def _started(proxy: Desired, observed: HostState) -> Iterator[tuple[Member, Container]]:
-    """The containers of a proxy that are to be redirected now, and whose network each is in."""
+    """The members of a proxy that need a redirect now, each with the owner of the network."""
     by_id = {container.id: container for container in observed.containers}
     for member in proxy.members if proxy.live else ():
         owner = network_owner(member.container, by_id)
@@ -209,13 +216,13 @@ def _started(proxy: Desired, observed: HostState) -> Iterator[tuple[Member, Cont
 def _redirect_to(
     member: Member, owner: Container, port: int, observed: HostState, settings: PlanSettings
 ) -> CreateRedirect | None:
-    """The redirect of a container; None while its proxy does not run, or is not met."""
+    """The redirect of a container; None while the container can't reach the proxy."""
     meeting = _meeting(member, owner, observed)
     if meeting is None:
         return None
     proxy, ports = meeting
     if member.key == ZENOH:
-        if port not in ports:  # the proxy is about to get more ports
+        if port not in ports:  # the sandbox is about to get more ports
             return None
         ports = PortRange(port, port)
     action = CreateRedirect(
@@ -231,7 +238,10 @@ def _redirect_to(
 
 
 def _meeting(member: Member, owner: Container, observed: HostState) -> tuple[str, PortRange] | None:
-    """Where a container meets its proxy, on the first network that both are on."""
+    """The address and range of the proxy, on the first network that container and proxy share.
+
+    None if the proxy or the sandbox does not run, or without a common network.
+    """
     shared = {a.network for a in owner.attachments if a.address} & member.networks
     running = [p for p in observed.proxies_of(member.key) if p.container.state == "running"]
     for proxy in running:
@@ -246,8 +256,9 @@ def _meeting(member: Member, owner: Container, observed: HostState) -> tuple[str
 def _with_fingerprint(
     action: CreateRedirect, observed: HostState, settings: PlanSettings
 ) -> CreateRedirect:
-    """The same with what it is made of, and its name by that."""
-    # The proxy's range is a label alone, and no part of the rules: a longer range changes nothing.
+    """The action with a fingerprint, and with the name by this fingerprint."""
+    # The fingerprint leaves out the proxy's range, which is only a label: a longer range changes no
+    # rule.
     body = redirect_config(replace(action, range=PortRange(1, 1)), settings)
     fingerprint = digest({**body, "Image": observed.image_id})
     return replace(action, fingerprint=fingerprint, name=redirect_name(action.key, fingerprint))
@@ -256,7 +267,10 @@ def _with_fingerprint(
 def _set_steps(
     action: CreateRedirect, records: Collection[RedirectContainer], observed: HostState
 ) -> list[Action]:
-    """Have these rules, and their record, and then no other record."""
+    """The steps that set these rules, keep a record of the rules, and remove all other records.
+
+    No steps if the record is missing and the host does not have the proxy's image.
+    """
     matching = [r for r in records if r.fingerprint == action.fingerprint]
     record = next((r for r in matching if r.container.state != "dead"), None)
     steps: list[Action] = []
@@ -267,7 +281,8 @@ def _set_steps(
         steps.append(action)
     outdated = [r for r in records if r.fingerprint != action.fingerprint]
     if record is None or not record.done or outdated:
-        steps.append(Run(action.name))  # others may have been started by hand since, and set theirs
+        # With outdated records, run again: a user may have started an outdated record.
+        steps.append(Run(action.name))
     return [*steps, *(Remove(r.container.name, "outdated") for r in outdated)]
 
 
@@ -277,31 +292,33 @@ def _removal_steps(
     observed: HostState,
     settings: PlanSettings,
 ) -> list[Action]:
-    """Take rules away that nobody wants any more, and then their record.
+    """The steps that delete the rules of a redirect, and then the records.
 
-    With a namespace its rules have gone.
+    If the container has ended, only the records are left: the kernel deletes the rules with the
+    namespace.
     """
     owner = next((c for c in observed.containers if c.id == target), None)
     if owner is None or owner.state not in STARTED:
         return [Remove(r.container.name, "the network namespace is gone") for r in records]
-    # Also those of a former start: whoever has started the record since has set its rules anew.
+    # Delete rules even if all records are of a former start: a user may have started a record by
+    # hand since, and so set the rules again.
     record = next(iter(records))
     action = CreateRedirect("", record.key, record.range, target, owner.started_at)
     action = _with_fingerprint(action, observed, settings)
     steps = _set_steps(action, records, observed)
     if not steps and not any(r.fingerprint == action.fingerprint for r in records):
-        return []  # without an image they stay
+        return []  # without the image, the operator can't delete the rules
     return [*steps, Remove(action.name, "done")]
 
 
 def _is_busy(records: Iterable[RedirectContainer], observed: HostState) -> bool:
-    """Whether the engine is busy with one of them, so that nothing can be done."""
+    """Whether the engine removes a record, or a record has no current inspection."""
     return any(
         r.container.state == "removing" or r.container.name in observed.busy for r in records
     )
 
 
 def _is_of(record: RedirectContainer, owner: Container) -> bool:
-    """Whether it is about the network that a container has now."""
+    """Whether a record is of the present network namespace of a container."""
     is_same = owner.id == record.container.network_container and owner.started_at == record.started
     return is_same and owner.state in STARTED

@@ -1,6 +1,7 @@
-"""The status of a Docker host as text for people.
+"""Render the status of a Docker host as text for people.
 
-Names of containers, networks and nodes are whatever their users say, so all are made harmless.
+Users choose the names of containers, networks and nodes freely. So `clean` makes all names safe for
+a terminal.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,13 +16,18 @@ Status = Mapping[str, Any]
 PROXIES = ("PROXY", "STATE", "MASTER OR DOMAIN", "OUTSIDE", "PORTS")
 CONTAINERS = ("CONTAINER", "STATE", "PROXY", "PORTS", "NODES")
 LEAST_NAME = 20
-"""Columns that a name gets at least, even where the line is then too long."""
+"""Least columns of a name, even if the line is then too long."""
 MOST_LINES = 3
+"""Most lines for the nodes of a container, and for the topics of a participant or node."""
 INDENT = "    "
 
 
 def render(status: Status, columns: int, lines: int | None = None) -> str:
-    """The whole status in ``columns``; in ``lines`` what matters most if there is a bound."""
+    """Return the status, wrapped at ``columns`` characters.
+
+    If the text has more than ``lines`` lines, the table of proxies and the details of containers
+    are left out. If the text still is too long, the end is left out.
+    """
     proxies = len(status["proxies"])
     containers = len({container["name"] for container in status["containers"]})
     head = wrap(
@@ -79,7 +85,7 @@ def _proxy_row(proxy: Status) -> tuple[str, ...]:
 
 
 def _outside(proxy: Status) -> str:
-    """At which host outside reaches a proxy; which routers one for rmw_zenoh is linked with."""
+    """The host at which outside reaches a proxy; for rmw_zenoh the routers outside."""
     if proxy["ros"] != "zenoh":
         return clean(proxy["advertise_host"])
     links = (clean(peer) + ("" if up else " DOWN") for peer, up in proxy["links"].items())
@@ -87,7 +93,7 @@ def _outside(proxy: Status) -> str:
 
 
 def _graph(proxy: Status) -> str:
-    """What a proxy's nodes have in common."""
+    """The master or domain of a proxy, or rmw_zenoh."""
     if proxy["ros"] == "zenoh":
         return "rmw_zenoh"
     if proxy["ros"] == "2":
@@ -124,7 +130,7 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
             for node in container["zenoh_nodes"]:
                 yield from wrap(_topics(node["name"], node), columns, INDENT, most=MOST_LINES)
         yield from _wrong(filter(None, (p["problem"] for p in container["participants"])), columns)
-        # A container of both versions of ROS has two rows; what is wrong with it is told once.
+        # A container with both versions of ROS has two rows, and the report shows problems once.
         subject = f"container {container['name']}"
         if subject not in reported:
             yield from _wrong(
@@ -134,7 +140,7 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
 
 
 def _topics(name: str, row: Status) -> str:
-    """The topics and services of a participant or a node, in one line."""
+    """The topics and services of a participant or a node, as a line."""
     verbs = (("publishes", "publishes"), ("subscribes to", "subscribes"), ("serves", "services"))
     texts = [f"{verb} {'  '.join(map(clean, row[key]))}" for verb, key in verbs if row[key]]
     return f"{clean(name)}: {'; '.join(texts) or 'nothing announced yet'}"

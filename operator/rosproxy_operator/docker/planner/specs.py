@@ -1,4 +1,4 @@
-"""The containers of a proxy: what they are made of, and what is read back from their labels."""
+"""The specifications of a proxy's containers: names, labels, and bodies for the engine."""
 
 import hashlib
 import hmac
@@ -41,22 +41,22 @@ ROLE_SANDBOX = "ports"
 ROLE_PROXY = "proxy"
 ROLE_LAN_RELAY = "lan-relay"
 FORMER_LAN_RELAY = "ear"
-"""The role, command and end of the name of LAN relays that operators before 0.1.0 made. They are
-made anew."""
+"""The role, the command and the end of the name of LAN relays by operators before 0.1.0. The
+operator recreates these LAN relays."""
 ROLE_REDIRECT = "redirect"
 ROLE_FLUSH = "flush"
 MASTER_URI = "io.rosproxy.master-uri"
 DOMAIN = "io.rosproxy.domain"
 ROUTERS = "io.rosproxy.zenoh"
-"""``true`` on what is for the proxy for rmw_zenoh."""
+"""Label: ``true`` on the containers of the proxy for rmw_zenoh."""
 ADVERTISE_HOST = "io.rosproxy.advertise-host"
 RANGE = "io.rosproxy.range"
 FINGERPRINT = "io.rosproxy.fingerprint"
 SECRET = "io.rosproxy.secret"  # noqa: S105 - the label's name
-"""On the uplink network: what the proxies' tokens are made of."""
+"""Label of the uplink network: the secret from which the operator makes the tokens of proxies."""
 
 FORMER_TOKEN = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
-"""Where proxies had their token before they got the hash alone."""
+"""The variable with the token of former proxies. Present proxies have only the token's hash."""
 ADMIN_PORT = 11312
 DEFAULT_MASTER_PORT = 11311
 COMMON: Mapping[str, Any] = {
@@ -65,15 +65,16 @@ COMMON: Mapping[str, Any] = {
     "SecurityOpt": ["no-new-privileges:true"],
     "RestartPolicy": {"Name": "always"},
 }
-"""The ``HostConfig`` of all containers of a proxy.
+"""The common part of ``HostConfig`` for all containers of a proxy.
 
-An engine that was killed stops what runs when it is back, and then takes it for stopped on purpose:
-of that, it starts again what is to run ``always``, not what is so ``unless-stopped``.
+The restart policy is ``always``. After a crash of the engine, the new engine stops all containers,
+and then takes them for stopped by a user. So the engine starts containers with ``always`` again,
+but not containers with ``unless-stopped``.
 """
 _KERNEL = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:false"]}
-"""What a proxy needs besides so that the kernel forwards for it: see the proxy's Dockerfile.
+"""The further ``HostConfig`` of a proxy with the kernel plane: see the proxy's Dockerfile.
 
-Given explicitly, as an engine may have no-new-privileges for its default.
+no-new-privileges is set to false explicitly, because an engine may have true as the default.
 """
 _ROLES = {
     CreateSandbox: ROLE_SANDBOX,
@@ -83,12 +84,13 @@ _ROLES = {
     CreateFlush: ROLE_FLUSH,
 }
 LAN_RELAY_MEMORY = 128 * 1024**2
+"""Bytes of memory that a LAN relay may have. A LAN relay takes 30 MiB."""
 LAN_RELAY_PIDS = 64
-"""Bytes and threads of a LAN relay, which has 30 MiB and one."""
+"""Threads that a LAN relay may have. A LAN relay has a single thread."""
 USER = "10001:10001"
 SANDBOX_COMMAND = ("sleep", "infinity")
 PROXY_COMMAND = ("rosproxy", "run")
-"""What the proxy's image does by itself (its Dockerfile): the operator gives no other command."""
+"""The default command of the proxy's image (Dockerfile). The operator gives proxies no command."""
 NFT = "/usr/sbin/nft"
 FLUSH = r"""
 /usr/sbin/conntrack -L -p udp --orig-port-dst "$1" >/dev/null
@@ -101,22 +103,24 @@ FLUSH = r"""
     fi
   done
 """
-"""Deletes the conntrack entries, of IPv4 and IPv6, for the UDP ports from ``$1`` to ``$2``.
+"""A script that deletes the conntrack entries, of IPv4 and IPv6, for UDP ports ``$1`` to ``$2``.
 
-The first line fails where this may not be done. Each ``conntrack -D`` reads the whole table, which
-takes 10 ms, so it is run only for ports that have entries.
+The first line fails if the kernel denies access to the entries, and ``sh -e`` then ends the script.
+Each ``conntrack -D`` reads the whole table, which takes 10 ms. So the script runs ``conntrack -D``
+only for ports with entries.
 """
 HELPER_USER = "0:0"
-"""Root: its capabilities need no file capabilities, which no-new-privileges would defeat."""
+"""Root. The capability of another user would need a program with file capabilities, and
+no-new-privileges makes file capabilities ineffective."""
 HELPER_MEMORY = 64 * 1024**2
-"""Bytes of memory that a helper may have: nft and conntrack take 5 MiB."""
+"""Bytes of memory that a helper may have. nft and conntrack take 5 MiB."""
 HELPER_PIDS = 16
 """Threads that a helper may have."""
 
 
 @dataclass(frozen=True, slots=True)
 class OwnLabels:
-    """What a container's labels say that this operator made. ``role`` is one of ``ROLE_…``."""
+    """The content of the labels of an own container. ``role`` is one of ``ROLE_…``."""
 
     role: str
     key: Key
@@ -125,7 +129,7 @@ class OwnLabels:
 
 
 def proxy_name(key: Key) -> str:
-    """The name of a key's proxy container: master's host or domain, six digits of a hash."""
+    """The name of a proxy's container: master's host or domain, and six hex digits of a hash."""
     digest = hashlib.sha256(_identity(key).encode()).hexdigest()
     labels = {"2": f"domain-{key.domain}", "zenoh": "zenoh"}
     label = labels.get(key.ros) or master(key).host.lower()
@@ -144,7 +148,7 @@ def lan_relay_name(key: Key) -> str:
 
 
 def redirect_name(key: Key, fingerprint: str) -> str:
-    """The name of a container that sets a redirect to a key's proxy, by what it is made of."""
+    """The name of a container that sets a redirect to a key's proxy, with the fingerprint."""
     return f"{proxy_name(key)}-redirect-{fingerprint[:12]}"
 
 
@@ -154,19 +158,20 @@ def flush_name(key: Key) -> str:
 
 
 def is_proxy_name(name: str) -> bool:
-    """Whether a name is one that a proxy's container has, also if it is not there now."""
+    """Whether a name has the form of a proxy's, sandbox's or LAN relay's name."""
     return re.fullmatch(r"rosproxy-[a-z0-9-]+-[0-9a-f]{6}(-ports|-lan-relay)?", name) is not None
 
 
 def _identity(key: Key) -> str:
-    """What a key's proxy is known by."""
+    """The text that identifies a key, for hashes and secrets."""
     return f"{key.master_uri or key.graph} {key.advertise_host}"
 
 
 def unresolved_master(host: str) -> str:
-    """What to do about a master whose host's name leads nowhere.
+    """Say what users can do if the operator can't resolve the host name of a master.
 
-    An address in its place is no fix: nodes that have one in ROS_MASTER_URI go around the proxy.
+    An address in place of the name is no fix: nodes with an address in ROS_MASTER_URI bypass the
+    proxy.
     """
     return (
         f"the operator can't resolve the host name {host}. Add the line 'ADDRESS {host}' to "
@@ -177,7 +182,7 @@ def unresolved_master(host: str) -> str:
 
 
 def master(key: Key) -> HostPort:
-    """The host and port of a key's master; a key of ROS 2 has none. Raises ValueError."""
+    """The host and port of a key's master. Raises ValueError for a key without a master."""
     host_port = parse_slave_uri(key.master_uri)
     if host_port is None:
         raise ValueError(f"{key.master_uri!r} is no master's URI")
@@ -185,7 +190,7 @@ def master(key: Key) -> HostPort:
 
 
 def admin_port(key: Key) -> int:
-    """The port of a proxy's admin endpoint: 11312, or 11313 where nodes find their master there."""
+    """The port of a proxy's admin endpoint: 11312, or 11313 if 11312 is the master port."""
     taken = key.ros == "1" and master(key).port == ADMIN_PORT
     return ADMIN_PORT + 1 if taken else ADMIN_PORT
 
@@ -193,29 +198,34 @@ def admin_port(key: Key) -> int:
 def proxy_token(key: Key, secret: str) -> str:
     """The token of a key's proxy, 64 hex digits: HMAC-SHA256 (RFC 2104) of the key.
 
-    It is made anew whenever it is needed, so that it is kept nowhere: the proxy has its hash, and
-    the operator has no disk.
+    The operator has no disk, and computes the token for each use. The proxy has only the hash of
+    the token.
     """
     return hmac.new(secret.encode(), _identity(key).encode(), hashlib.sha256).hexdigest()
 
 
 def reserved_ports(key: Key) -> frozenset[int]:
-    """The ports on which a key's proxy listens besides its range, so never to be in it."""
+    """The ports that can't be in the range of a key's proxy.
+
+    These are the further ports on which the proxy listens. For ROS 2, the default master port is
+    reserved as well: each proxy refuses a range that contains the setting ``master_port``.
+    """
     if key.domain is not None:
         return frozenset({DEFAULT_MASTER_PORT, ADMIN_PORT, *well_known_ports(key.domain)})
     return frozenset({admin_port(key), *((master(key).port,) if key.ros == "1" else ())})
 
 
 def own_range(key: Key, ports: PortRange) -> PortRange:
-    """The proxy's own ports of a range: for ROS 2 the last port of the range is the LAN relay's."""
+    """The ports that the proxy itself may use. For ROS 2, the LAN relay has the last port."""
     return PortRange(ports.first, ports.last - 1) if key.is_ros2 else ports
 
 
 def published_ports(key: Key, ports: PortRange, udp: bool) -> list[tuple[str, int]]:
-    """What a key's sandbox publishes, in the engine's words, each with the port of the host.
+    """The ports that a key's sandbox publishes, as the engine writes ports, with the host's port.
 
-    ``udp``: that of a proxy for ROS 1 publishes them for UDP as well, for UDPROS. The one for
-    rmw_zenoh publishes nothing, as it connects to outside by itself.
+    If ``udp`` is true, the sandbox of a proxy for ROS 1 publishes the ports for UDP as well, for
+    UDPROS. The sandbox for rmw_zenoh publishes no port, since that proxy opens all connections to
+    outside.
     """
     protocols = {"1": ["tcp", *(["udp"] if udp else [])], "2": ["udp"], "zenoh": []}[key.ros]
     own = own_range(key, ports).ports()
@@ -223,9 +233,10 @@ def published_ports(key: Key, ports: PortRange, udp: bool) -> list[tuple[str, in
 
 
 def read_own(labels: Mapping[str, str]) -> OwnLabels | None:
-    """What the labels of a container of this operator say.
+    """Read the labels of an own container.
 
-    None if they are not those of one, or not whole.
+    None if the labels are not the operator's, or not complete. An image can carry such labels, too:
+    see `own_containers`.
     """
     role = labels.get(ROLE, "")
     if role == FORMER_LAN_RELAY:
@@ -261,13 +272,13 @@ Creation = CreateSandbox | Create | CreateLanRelay | CreateRedirect | CreateFlus
 
 
 def flush_command(key: Key, ports: PortRange) -> tuple[str, ...]:
-    """What deletes the conntrack entries for the UDP ports that a key's sandbox publishes."""
+    """The command that deletes the conntrack entries for the UDP ports of a key's sandbox."""
     published = own_range(key, ports)
     return ("/bin/sh", "-ec", FLUSH, "flush", str(published.first), str(published.last))
 
 
 def own_labels(action: Creation) -> dict[str, str]:
-    """The labels of a container, from which `read_own` reads it back."""
+    """The labels of a container that the action creates. `read_own` reads these labels."""
     key = action.key
     graph = {"1": {MASTER_URI: key.master_uri}, "2": {DOMAIN: str(key.domain)}}
     return {
@@ -282,18 +293,19 @@ def own_labels(action: Creation) -> dict[str, str]:
 
 
 def sandbox_fingerprint(action: CreateSandbox, settings: PlanSettings) -> str:
-    """What a sandbox is made of, in 16 hex digits. Its name and the image are not in it."""
+    """The fingerprint of a sandbox, 16 hex digits, without name and image."""
     body = sandbox_config(replace(action, fingerprint=""), settings)
-    # It only sleeps, so a new image is no reason to take its ports down.
+    # A sandbox only sleeps, so a new image is no reason to recreate the sandbox and free the ports.
     return digest({**body, "Image": ""})
 
 
 def proxy_fingerprint(action: Create, settings: PlanSettings, image_id: str, secret: str) -> str:
-    """What a proxy's own container is made of, in 16 hex digits.
+    """The fingerprint of a proxy's container, 16 hex digits.
 
-    Neither its name, its sandbox nor the master's address are in it. The hash of its token is: a
-    proxy that knows another one would not listen to the operator. So is what it shares with its
-    LAN relay.
+    The fingerprint leaves out the container's name, the sandbox, the master's address and the
+    policy: the operator tells a running proxy a new address or policy. The fingerprint includes the
+    hash of the token and the secret of the LAN relay: with another token, the proxy would refuse
+    the operator.
     """
     body = container_config(replace(action, sandbox="", fingerprint=""), settings, secret, "")
     env = [v for v in body["Env"] if v.partition("=")[0] not in LIVE_VARIABLES]
@@ -303,8 +315,9 @@ def proxy_fingerprint(action: Create, settings: PlanSettings, image_id: str, sec
 def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for a sandbox.
 
-    It does nothing until it is stopped. Outgoing connections, which are the proxy's, start
-    below the ports that a proxy is to listen on, and above those of its routers for rmw_zenoh.
+    The sandbox only sleeps. In the sandbox's namespace, outgoing connections of the proxy get ports
+    from 1024 to 11000: below the usual ports for master, admin endpoint and range. For rmw_zenoh,
+    these ports begin after the ports of the routers.
     """
     first = FIRST_PORT + MOST_ZENOH_PORTS if action.key == ZENOH else 1024
     sysctls = {"net.ipv4.ip_local_port_range": f"{first} 11000"}
@@ -318,15 +331,15 @@ def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, A
         "Image": settings.proxy_image,
         "User": USER,
         "Entrypoint": [*SANDBOX_COMMAND[:1]],
-        # The image's health check asks a proxy's admin endpoint (Dockerfile), which is not here.
         "Cmd": [*SANDBOX_COMMAND[1:]],
+        # The image's health check asks a proxy's admin endpoint (Dockerfile). A sandbox has none.
         "Healthcheck": {"Test": ["NONE"]},
         "Labels": own_labels(action),
         "ExposedPorts": {port: {} for port in bindings},
         "HostConfig": {
-            # As process 1, sleep would ignore SIGTERM (pid_namespaces(7)), and be killed only after
-            # the engine's time-out.
             **COMMON,
+            # As process 1, sleep would ignore SIGTERM (pid_namespaces(7)), so that the engine would
+            # have to kill sleep after a time-out.
             "Init": True,
             "NetworkMode": settings.uplink,
             "PortBindings": bindings,
@@ -337,9 +350,9 @@ def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, A
 
 
 def helper_config(settings: PlanSettings, network_mode: str) -> dict[str, Any]:
-    """What all helpers have of the body of the engine's ``POST /containers/create``.
+    """The common body of the engine's ``POST /containers/create`` for all helpers.
 
-    A helper does one thing in a network namespace with NET_ADMIN, and ends.
+    A helper has NET_ADMIN in a network namespace, does a single task there, and ends.
     """
     return {
         "Image": settings.proxy_image,
@@ -362,8 +375,8 @@ def container_config(
 ) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for a proxy.
 
-    ``secret`` is what its token is made of. ``master_address`` may be empty: then the proxy
-    resolves its master's host itself.
+    The operator makes the token from ``secret``. If ``master_address`` is empty, the proxy itself
+    resolves the host name of the master.
     """
     told = _told(action, settings, secret, master_address)
     variables = environment("docker", told, always=("port_range", "master_port"))
@@ -386,7 +399,10 @@ def container_config(
 def _told(
     action: Create, settings: PlanSettings, secret: str, master_address: str
 ) -> dict[str, Any]:
-    """The settings of a proxy, by their fields, in the order of `environment`."""
+    """The settings of a proxy, by field of the proxy's `Settings`.
+
+    Keep the order: another order of variables changes the fingerprint, and recreates all proxies.
+    """
     key = action.key
     if key == ZENOH:
         return {
@@ -417,14 +433,15 @@ def _told(
 
 
 def _relay_secret(key: Key, secret: str) -> str:
-    """What a key's proxy and its LAN relay prove to each other that they know."""
+    """The secret with which a proxy and the LAN relay prove their datagrams to each other."""
     return relay_secret(secret.encode(), _identity(key))
 
 
 def lan_relay_config(action: CreateLanRelay, settings: PlanSettings, secret: str) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for a LAN relay.
 
-    It has the host's network and nothing else of the host's. ``secret`` is what its own is made of.
+    The LAN relay shares only the network with the host. The operator makes the LAN relay's own
+    secret from ``secret``.
     """
     own = _relay_secret(action.key, secret)
     variables = lan_relay_variables(
@@ -451,15 +468,15 @@ def lan_relay_config(action: CreateLanRelay, settings: PlanSettings, secret: str
 def lan_relay_fingerprint(
     action: CreateLanRelay, settings: PlanSettings, image_id: str, secret: str
 ) -> str:
-    """What a LAN relay is made of, in 16 hex digits; its name is not in it."""
+    """The fingerprint of a LAN relay, 16 hex digits, without the name."""
     body = lan_relay_config(replace(action, fingerprint=""), settings, secret)
     return digest({**body, "Image": image_id})
 
 
 def is_kernel_host(host: Mapping[str, Any]) -> bool:
-    """Whether a proxy's HostConfig, as the engine tells it, has the rights of the kernel plane.
+    """Whether a proxy's HostConfig has the privileges for the kernel plane.
 
-    Engines lead capabilities by ``CAP_`` or not.
+    Some engines write capabilities with the prefix ``CAP_``.
     """
     added = [str(name).removeprefix("CAP_") for name in host.get("CapAdd") or ()]
     return added == _KERNEL["CapAdd"] and host.get("SecurityOpt") == _KERNEL["SecurityOpt"]

@@ -1,4 +1,4 @@
-"""What the operator remembers from look to look. Losing it costs time, never correctness."""
+"""The memory of the operator from look to look. A loss of the memory costs only time."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -12,15 +12,16 @@ from rosproxy_operator.docker.planner.taken_names import (
     remember_names,
 )
 
-# One that is only created has published no port yet: its range may still turn out to be taken.
+# A container in the state created has published no port yet: the range may still be taken.
 _HAS_SERVED = SERVING | {"exited", "dead", "removing"}
 
 
 @dataclass(frozen=True, slots=True)
 class PortRefusal:
-    """The engine didn't start a sandbox because of its ports.
+    """The engine has refused to start a sandbox because a port is taken.
 
-    ``since`` is when it first said so. ``port`` is the one that it named; None if it named none.
+    ``since`` is the time of the first refusal. ``port`` is the port in the engine's last error;
+    None if the error names no port.
     """
 
     since: float
@@ -29,15 +30,21 @@ class PortRefusal:
 
 @dataclass(frozen=True, slots=True)
 class DockerMemory:
-    """Times are in seconds of the operator's monotonic clock.
+    """The memory of the operator. Times are in seconds of the operator's monotonic clock.
 
-    ``exited`` are containers, by id, since when they are seen not to run; ``absent`` proxies since
-    when nobody wants them. ``served`` is the range on which a proxy was last seen to serve,
-    ``planned`` the one with which one is being created. ``refusals`` are by the name of the
-    sandbox. ``taken`` are ports that the engine has refused, and when. ``names`` are those that
-    containers have or had (`remember_names`). ``engine_returned``: the engine was not there, or not
-    listened to, before the look. ``outdated_flushes`` are flushes that ran before that, by id, with
-    the time of their last run.
+    Attributes:
+        exited: Since when a member's container does not run, by the id of the container.
+        absent: Since when no running container needs a proxy.
+        served: The last range on which a proxy has served.
+        planned: The range that the operator has chosen for a wanted proxy.
+        refusals: The refusals of the engine, by the name of the sandbox.
+        taken: Since when the operator avoids a port that the engine has refused.
+        moved: The range that a proxy had to leave, and when.
+        names: The names that containers have or had (`remember_names`).
+        engine_returned: Whether the operator has connected to the engine since the last look, and
+            so may have missed events.
+        outdated_flushes: The flushes from before that connection, by id, each with the time of the
+            last run as the engine writes times.
     """
 
     exited: Mapping[str, float] = field(default_factory=dict)
@@ -52,14 +59,17 @@ class DockerMemory:
     outdated_flushes: Mapping[str, str] = field(default_factory=dict)
 
     def port_taken(self, name: str, port: int | None, now: float) -> "DockerMemory":
-        """Note that the engine could not start the sandbox ``name``: a port of it is taken."""
+        """Return the memory after the engine could not start the sandbox ``name``.
+
+        ``port`` is the taken port; None if unknown.
+        """
         previous = self.refusals.get(name)
         refusal = PortRefusal(previous.since if previous else now, port)
         return replace(self, refusals={**self.refusals, name: refusal})
 
 
 def with_exited(memory: DockerMemory, members: Iterable[Member], now: float) -> DockerMemory:
-    """The memory with the containers that have exited, and since when."""
+    """Return the memory with the members that do not run, and since when."""
     gone = (member.container.id for member in members if not member.container.alive)
     return replace(memory, exited={c: memory.exited.get(c, now) for c in gone})
 
@@ -67,7 +77,10 @@ def with_exited(memory: DockerMemory, members: Iterable[Member], now: float) -> 
 def after_look(
     memory: DockerMemory, observed: HostState, desired: Iterable[Desired], grace: float, now: float
 ) -> DockerMemory:
-    """What is remembered after a look at the host, before anything is decided."""
+    """Return the memory after a look at the host, before the operator chooses names and ranges.
+
+    ``grace`` is in seconds.
+    """
     live = {d.key for d in desired if d.live}
     idle = {s.container.name for s in observed.sandboxes if s.container.state not in SERVING}
     keys = (observed.keys | set(memory.served)) - live
@@ -88,9 +101,11 @@ def after_look(
 
 
 def _served(memory: DockerMemory, observed: HostState) -> dict[Key, PortRange]:
-    """Where each proxy has served: a sandbox that runs knows best.
+    """Return the range on which each proxy has served.
 
-    What has stopped may be older than what is remembered, unless it has more ports.
+    The range of a running sandbox counts first, then the remembered range. A stopped container may
+    be older than the memory. So the container's range counts only if the range has all remembered
+    ports, or without a remembered range.
     """
     served = dict(memory.served)
     for own in (*observed.sandboxes, *observed.proxies):

@@ -1,4 +1,4 @@
-"""Which names containers have or had on a network, so that no proxy may be given them by a label.
+"""Find the names that containers have or had on a network. No label gives a proxy such a name.
 
 The caller that creates a container chooses its name and aliases; an image does not. The label
 ``com.docker.compose.service`` is not read. An image can carry this label, and Compose gives each
@@ -15,12 +15,12 @@ from rosproxy_operator.docker.planner.labels.readers import BUILT_IN
 from rosproxy_operator.docker.planner.model import Container, HostState
 
 MOST_REMEMBERED = 10_000
-"""Names of containers that are remembered; beyond that the ones unseen for longest are forgotten.
+"""Most names that the operator remembers. The names unseen for the longest time are dropped first.
 
-A container has two names on a network as a rule, and some 150 bytes are kept of each.
+A container usually has two names on a network, and each name takes about 150 bytes.
 """
 GONE = frozenset({"dead", "removing"})
-"""States of a container that answers to its names never again."""
+"""States of a container that never answers to its names again."""
 
 NamesByNetwork = Mapping[str, Mapping[str, frozenset[str]]]
 """By network and name (in lower case): the containers of that name, as texts show them."""
@@ -38,7 +38,7 @@ def present_names(observed: HostState) -> NamesByNetwork:
         for attachment in container.attachments:
             for name in attachment.names:
                 own[attachment.network][name.lower()].add(container.name)
-            # No names resolve on built-in networks: a container there finds no names of others.
+            # No names resolve on built-in networks, so names there are not taken on other networks.
             neighbours[attachment.network] |= container.networks - BUILT_IN
     taken: dict[str, dict[str, frozenset[str]]] = {}
     for network, others in neighbours.items():
@@ -52,10 +52,11 @@ def present_names(observed: HostState) -> NamesByNetwork:
 
 
 def places_of(name: str, network: str, networks: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Where the engine looks for a name that a container of a network asks for: network, name.
+    """The pairs of network and name where the engine looks up a name for a container of a network.
 
-    The engine also answers to ``NAME.NETWORK`` (moby: libnetwork/sandbox.go, ResolveName), and
-    looks for the whole name first: a proxy of that alias would stand before the container.
+    The engine resolves ``NAME.NETWORK`` as well (moby: libnetwork/sandbox.go, ResolveName), but
+    looks up the whole text first. So a proxy with the alias ``NAME.NETWORK`` would replace the
+    container ``NAME``.
     """
     wanted = name.lower()
     yield network, wanted
@@ -67,8 +68,8 @@ def places_of(name: str, network: str, networks: Iterable[str]) -> Iterator[tupl
 def remember_names(
     former: FormerNames, present: NamesByNetwork, containers: Iterable[Container]
 ) -> FormerNames:
-    """The names that containers had or have, for the next look."""
-    # No later container gets the short id of another one as its name.
+    """Return the names that containers have or had, for the next look."""
+    # A short id is left out: no later container gets the short id of another container.
     short_ids = {container.id[:12] for container in containers}
     current = {
         (network, name): min(holders)

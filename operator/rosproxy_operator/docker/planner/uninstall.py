@@ -1,12 +1,14 @@
-"""What is to be done so that nothing of the operator's is left on a Docker host.
+"""Plan the removal of everything that the operator has made on a Docker host.
 
-It goes in the opposite order of how it came: redirects out of the networks of containers that stay,
-while their records tell of them; each key's proxy, which first tells outside that its nodes have
-ended, then the proxy's LAN relay and sandbox; and once no container is left, the networks that the
-operator has made.
+The order is the reverse of the creation:
 
-Nothing may come back meanwhile. Who sees a container of the operator's that was not there before
-has found another operator at work, and stops.
+1. The redirects in the networks of users' containers, and then the records of these redirects.
+2. The proxy of each key. The proxy first tells outside that the nodes have ended.
+3. The LAN relay and the sandbox of the proxy.
+4. The networks that the operator has made, after all of the operator's containers are gone.
+
+If a new container of the operator appears during the removal, another operator is running. The
+removal then stops with a problem.
 """
 
 from collections.abc import Iterator
@@ -26,7 +28,7 @@ REASON = "rosproxy is uninstalled"
 
 
 class Uninstall:
-    """Decides as `plan` does, look after look; it remembers what there was at the first."""
+    """Decides in place of `plan`, look after look. Remembers the containers of the first look."""
 
     def __init__(self) -> None:
         self._first: frozenset[str] | None = None
@@ -39,7 +41,7 @@ class Uninstall:
         memory: DockerMemory,
         _now: float,
     ) -> DockerPlan:
-        """The next actions; none if nothing is left, or nothing can be done about what is."""
+        """Return the next plan. Without actions, the removal is complete, or can't go on."""
         ids = frozenset(own.container.id for own in observed.own)
         if self._first is None:
             self._first = ids
@@ -50,26 +52,27 @@ class Uninstall:
 
 
 def _other_operator(observed: HostState, first: frozenset[str]) -> Problem | None:
-    """The problem that another operator creates containers again; None without such containers."""
+    """The problem that another operator creates containers; None without new containers."""
     anew = [own.container.name for own in observed.own if own.container.id not in first]
     if not anew:
         return None
     return Problem(
         "operator",
-        f"another operator is running on this host: it has created {listed(anew)} meanwhile. Stop "
+        f"another operator is running on this host, and has created {listed(anew)} meanwhile. Stop "
         "that operator (docker rm -f rosproxy-operator, or docker compose stop operator), then run "
         "uninstall again",
     )
 
 
 def _groups(observed: HostState, settings: PlanSettings) -> Iterator[Group]:
-    """All that can be removed now."""
+    """The groups of everything that the operator can remove now."""
     busy = {own.key for own in observed.own if own.container.name in observed.busy}
     for steps in redirect_steps(observed, settings, ()):
         yield Group(steps.key, steps.actions, f"container {steps.container}")
     yield from flush_groups(observed, settings, (), {})
     for key in sorted(observed.keys - busy):
-        # One that is already being removed is asked for again: the network has to wait for its end.
+        # With ``again``, the plan has also the containers that the engine removes already. So the
+        # command does not end before these containers are gone and the networks can go.
         if actions := tuple(removal_steps(observed, key, REASON, again=True)):
             yield Group(key, actions)
     if not observed.own:
@@ -79,7 +82,7 @@ def _groups(observed: HostState, settings: PlanSettings) -> Iterator[Group]:
 
 
 def _remaining(observed: HostState, settings: PlanSettings) -> Iterator[Problem]:
-    """What can't be removed, and what to do."""
+    """The problems that keep the operator from removing networks and redirects."""
     for network in observed.networks:
         if guests := _guests(observed, network.name) if network.made_by_operator else []:
             yield Problem(
@@ -99,7 +102,10 @@ def _remaining(observed: HostState, settings: PlanSettings) -> Iterator[Problem]
 
 
 def _guests(observed: HostState, network: str) -> list[str]:
-    """Other containers that are on a network; without it one that restarts could not start."""
+    """The names of users' containers that run on a network, or that the engine restarts.
+
+    A container in the state restarting counts, since without the network it could not start.
+    """
     return sorted(
         container.name
         for container in observed.containers
