@@ -1,4 +1,4 @@
-"""Decide which containers are the operator's own, by labels, name and HostConfig.
+"""Decide which containers are the operator's own, by labels, name, user, command and HostConfig.
 
 The operator has no disk, and recognises its containers by their labels. But an image may carry such
 labels too, and variables, a command and a user. An image can't choose the name and the HostConfig

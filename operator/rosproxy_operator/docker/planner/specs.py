@@ -68,8 +68,8 @@ COMMON: Mapping[str, Any] = {
 """The common part of ``HostConfig`` for all containers of a proxy.
 
 The restart policy is ``always``. After a crash of the engine, the new engine stops all containers,
-and then takes them for stopped by a user. So the engine starts containers with ``always`` again,
-but not containers with ``unless-stopped``.
+and counts these as stopped by a user. So the engine starts containers with ``always`` again, but
+not containers with ``unless-stopped``.
 """
 _KERNEL = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:false"]}
 """The further ``HostConfig`` of a proxy with the kernel plane: see the proxy's Dockerfile.
@@ -208,7 +208,7 @@ def reserved_ports(key: Key) -> frozenset[int]:
     """The ports that can't be in the range of a key's proxy.
 
     These are the further ports on which the proxy listens. For ROS 2, the default master port is
-    reserved as well: each proxy refuses a range that contains the setting ``master_port``.
+    reserved as well: each proxy refuses a range that contains the port of ``--master-port``.
     """
     if key.domain is not None:
         return frozenset({DEFAULT_MASTER_PORT, ADMIN_PORT, *well_known_ports(key.domain)})

@@ -4,8 +4,8 @@ The first source that states the version counts:
 
 1. The label ``rosproxy.ros``.
 2. The variables ROS_VERSION and ROS_DISTRO, which most images with ROS have.
-3. Labels and variables of a single version, such as ROS_MASTER_URI (ROS 1) or ROS_DOMAIN_ID (ROS
-   2). ROS 1 wins over ROS 2.
+3. The label ``rosproxy.master-uri`` or the variable ROS_MASTER_URI: ROS 1.
+4. A label or variable that only ROS 2 has, such as ROS_DOMAIN_ID: ROS 2.
 
 Without such a source, the operator assumes ROS 1. A label or RMW_IMPLEMENTATION states that the
 ROS 2 nodes use rmw_zenoh instead of DDS.

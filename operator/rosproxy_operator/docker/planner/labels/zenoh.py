@@ -150,7 +150,7 @@ def _connected(member: Member, observed: HostState) -> Iterator[_Router]:
 
 
 def _neighbour(host: str, member: Member, observed: HostState) -> Container | None:
-    """The container with this name or address on a network of the member; None if none has it."""
+    """The container with this name or address on a network of the member; None without."""
     for container in observed.containers:
         for attachment in container.attachments:
             names = {attachment.address, *map(str.lower, attachment.names)}
