@@ -1,11 +1,17 @@
-"""Keeping each proxy up to date about the containers on its networks, independently of others.
+"""Keeps each proxy up to date about the containers on its networks.
 
-Which addresses may use a proxy as their master is told first and alone: the call of a new container
-waits for that, while all other updates may take a proxy long (it asks nodes and its master). Before
-both it is told its policy, if that has changed: no container is let in before its policy is known.
+Each proxy has separate tasks, so a slow proxy delays no other proxy. The operator sends three kinds
+of updates, in this order:
 
-A proxy for ROS 2 that had to leave its ports is told which participants had some of them, so that
-these are discovered anew: outside ignores other locators of a participant that it knows.
+1. The policy, if changed. The proxy must know the policy before any container may use the proxy.
+2. The addresses that may use the proxy as their master. A call of a new container waits for this
+   update.
+3. All other updates, in a separate task. The proxy may ask nodes and the master first, which can
+   take long.
+
+If a ROS 2 proxy had to leave its ports, the operator also sends the former ports of participants.
+With these ports, the proxy knows which participants outside has to discover again: outside ignores
+new locators of a participant that is already known.
 """
 
 import asyncio
@@ -30,17 +36,20 @@ from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 log = logging.getLogger(__name__)
 
 PAUSES = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
-"""Seconds until a proxy is asked again that did not answer; the last is repeated."""
+"""Seconds until the operator asks a silent proxy again. The last pause is repeated."""
 
 
 class ProxyUpdater:
-    """Keeps one run of one proxy up to date. ``answered`` is called when it begins to answer.
+    """Keeps one run of one proxy up to date. Calls ``answered`` when the proxy begins to answer.
 
-    After each look the proxy is told its policy if that has changed, and who may use it as its
-    master, whether or not that has, asked for its nodes, and told what is new (`ProxyUpdate`).
-    ``silent_since`` is when it ceased to answer (monotonic), or was started; None while it answers.
-    ``leases`` are what its participants of ROS 2 have; it is told the ``former_leases`` until it
-    has some. ``has_callers``: it is told who may use it.
+    After each look, the updater sends the policy if the policy has changed, and always sends the
+    allowed callers. Then the updater reads the status and sends what is new (`ProxyUpdate`).
+    ``has_callers`` is False for a proxy without a list of allowed callers.
+
+    ``silent_since`` is the monotonic time in seconds at which the proxy was started or began to
+    fail. A refusal of the policy counts as a failure. None: the proxy answers. ``leases`` are
+    the ports of the proxy's ROS 2 participants. The updater sends ``former_leases`` until a status
+    has leases.
     """
 
     def __init__(
@@ -67,20 +76,20 @@ class ProxyUpdater:
         self._selecting = asyncio.Event()
 
     def update(self, network_facts: NetworkFacts) -> None:
-        """Take note of what a look has found."""
+        """Store the facts of a look, and wake both tasks."""
         self._update.look(network_facts, time.monotonic())
         self._looked.set()
         self._selecting.set()
 
     async def run(self) -> None:
-        """Tell what there is to be told, for good."""
+        """Send updates until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             if self._has_callers:
                 tasks.create_task(self._keep_selected())
             tasks.create_task(self._keep_told())
 
     async def _keep_selected(self) -> None:
-        """Tell after each look which addresses may use the proxy as their master."""
+        """Send a changed policy and then the allowed addresses, after each look."""
         failures = 0
         logged = ""
         while True:
@@ -95,7 +104,7 @@ class ProxyUpdater:
                 failures = 0
                 logged = ""
             except ProxyError as error:
-                # Not logged before all pauses are used up, which takes 19 s, and then once.
+                # Log each error once, and only after all pauses (19 s): the proxy may be starting.
                 if not error.is_unreachable and failures >= len(PAUSES) and str(error) != logged:
                     logged = str(error)
                     text = "proxy not updated: %s, does not know which addresses may use it: %s"
@@ -105,7 +114,7 @@ class ProxyUpdater:
                 failures += 1
 
     async def _keep_told(self) -> None:
-        """Tell what else is new."""
+        """Read the status and send all other updates, after each look and when an update is due."""
         failures = 0
         while True:
             pause = self._update.next_due(time.monotonic())
@@ -119,7 +128,7 @@ class ProxyUpdater:
                 failures = 0
             except ProxyError as error:
                 failures += 1
-                # It has answered, and only its master can't be asked: that is no silence.
+                # HTTP 503: the proxy answers, but can't reach the master. This is no silence.
                 self._heard(None if error.lacks_master else error)
 
     async def _tell(self) -> None:
@@ -130,10 +139,10 @@ class ProxyUpdater:
         except ProxyError as error:
             if not error.is_unreadable:
                 raise
-            refusal = refusal or error  # the proxy is told what is new, by its last status
+            refusal = refusal or error  # go on with the last status that was readable
         status = self._status
         self.leases = leases(status)
-        # The facts are not older than need be: its nodes may have come since the last look.
+        # Read the facts only now: a look may have ended while the calls above waited.
         address = self._update.facts.master_address
         if address and status.master.address != address:
             await self._session.tell_master_address(address)
@@ -142,7 +151,7 @@ class ProxyUpdater:
         now = time.monotonic()
         body = self._update.body(inside_addresses(status), now)
         if isinstance(refusal, PolicyRefused):
-            body.pop("arrived", None)  # adopted nodes would not be kept to the policy
+            body.pop("arrived", None)  # the proxy would adopt nodes without checking the policy
         if body:
             log.debug("updating proxy: %s, %s", self._name, body)
             answer = await self._session.tell_containers(body)
@@ -153,7 +162,7 @@ class ProxyUpdater:
         self._heard(refusal)
 
     async def _policy_refusal(self) -> PolicyRefused | None:
-        """Tell the policy; why the proxy does not take it, if it does not. Raises ProxyError."""
+        """Send the policy. Return the refusal, or None if the proxy accepts. Raises ProxyError."""
         try:
             await self._session.tell_policy(self._update.policy)
         except PolicyRefused as error:
@@ -161,7 +170,7 @@ class ProxyUpdater:
         return None
 
     def _heard(self, error: ProxyError | None) -> None:
-        """Take note that the proxy has answered, or why not."""
+        """Note that the proxy has answered (None), or why the call failed."""
         self.error = error
         if error is not None:
             self.silent_since = self.silent_since or time.monotonic()
@@ -171,7 +180,7 @@ class ProxyUpdater:
 
 
 class DockerProxySync:
-    """Keeps all running proxies up to date. ``answered``: one answers that did not before."""
+    """Keeps all running proxies up to date. Calls ``answered`` when a silent proxy answers."""
 
     def __init__(
         self,
@@ -188,9 +197,12 @@ class DockerProxySync:
         self._leases: dict[str, Leases] = {}
 
     def update(self, snapshot: DockerSnapshot, members: Collection[Member]) -> None:
-        """Begin to tell every running proxy what a look has found."""
+        """Begin to send each running proxy the facts of a look.
+
+        A proxy that was started again gets a new updater.
+        """
         for name, (updater, task) in list(self._running.items()):
-            # A task that has ended by an error of ours is begun anew, as the log says why.
+            # A task that is done has failed by a bug, which `Tasks` has logged. Start another task.
             if snapshot.access.get(name) != updater.access or task.done():
                 task.cancel()
                 del self._running[name]
@@ -207,24 +219,24 @@ class DockerProxySync:
                     self._proxies,
                     self._answered,
                     self._former_leases(name, proxy.range),
-                    has_callers=proxy.key != ZENOH,  # routers of zenoh ask nobody
+                    has_callers=proxy.key != ZENOH,  # routers of zenoh have no list of callers
                 )
                 self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
             facts = network_facts(snapshot.state, proxy, members, self._settings.policy)
             self._running[name][0].update(facts)
 
     def _former_leases(self, name: str, ports: PortRange) -> Leases:
-        """What its participants had, unless the proxy has all of these ports now."""
+        """Return the ports of the former run; empty if ``ports`` contains all of these ports."""
         previous = self._leases.get(name, {})
         is_kept = all(port in ports for leased in previous.values() for port in leased)
         return {} if is_kept else previous
 
     def answers(self, name: str) -> bool:
-        """Whether a proxy answers and knows everything."""
+        """Whether the last exchange of updates with a proxy succeeded."""
         return name in self._running and self._running[name][0].silent_since is None
 
     def problems(self, snapshot: DockerSnapshot) -> list[Problem]:
-        """The proxies that do not answer, and what to do about it."""
+        """Return a problem for each proxy that has failed for at least `STARTING` seconds."""
         lately = time.monotonic() - STARTING
         return [
             silence(name, updater.error, snapshot, self._settings.uplink)
@@ -236,7 +248,7 @@ class DockerProxySync:
 async def ask_proxies(
     proxies: ProxyClient, snapshot: DockerSnapshot, uplink: str
 ) -> dict[str, ProxyStatus | Problem]:
-    """The status of each proxy that runs, by name, or the problem that it does not answer."""
+    """Return the status of each running proxy, by name; of a silent proxy, the problem."""
 
     async def ask(name: str, access: ProxyAccess) -> ProxyStatus | Problem:
         try:
@@ -249,7 +261,7 @@ async def ask_proxies(
 
 
 def silence(name: str, error: ProxyError, snapshot: DockerSnapshot, uplink: str) -> Problem:
-    """The problem of a proxy that does not answer, or not as it should."""
+    """Return the problem and the fix for a proxy that does not answer, or answers an error."""
     if isinstance(error, PolicyRefused):
         return Problem(f"proxy {name}", str(error))
     if error.is_unreachable and not snapshot.at_host:

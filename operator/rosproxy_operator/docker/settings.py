@@ -28,7 +28,7 @@ from rosproxy_operator.docker import option_values
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
 GIBIBYTE = 1024 * 1024 * 1024
 WINDOW = PortRange(11412, 65535)
-"""Ports for ranges: above those of the master, the admin endpoint and rosserial (11411)."""
+"""The default window: above the ports of the master, the admin endpoint and rosserial (11411)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,13 +36,15 @@ class PlanSettings:
     """The options of the operator that decide the plan.
 
     ``master_uri``, ``advertise_host``, ``data_plane``, ``direction`` and ``udp`` are for containers
-    without such a label. ``grace`` is in seconds. ``proxy_memory`` (bytes) and ``proxy_pids`` are
-    by default several times the need of a thousand connections at full rate (docs/performance.md).
-    The process has 32 MiB, and 50 KiB and two threads for each connection. Pipes take 64 MiB. Where
-    the kernel counts socket buffers, these take 0.7 MiB for each connection. ``proxy_bounds`` are
-    further bounds of each proxy. ``policy`` is the administrator's policy for all proxies: one
-    layer or none. The operator makes the proxies' tokens from ``secret``; if ``secret`` is empty,
-    from the secret of the uplink network.
+    without the label of the same name. ``grace`` is in seconds. ``policy`` is the administrator's
+    policy for all proxies: a single layer, or none. The operator makes the proxies' tokens from
+    ``secret``, or from the secret of the uplink network if ``secret`` is empty.
+
+    ``proxy_memory`` (bytes) and ``proxy_pids`` bound each proxy, as do ``proxy_bounds``. The
+    defaults are several times the need of a thousand connections at full rate
+    (docs/performance.md). The process takes 32 MiB, and 50 KiB and two threads for each connection.
+    Pipes take 64 MiB. Where the kernel counts socket buffers, each connection takes another
+    0.7 MiB.
     """
 
     master_uri: Annotated[
@@ -259,9 +261,9 @@ class PlanSettings:
 
 
 def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
-    """Settings from the values of the command line's options, by name.
+    """Return the settings from the values of the command line's options, by name.
 
-    Raises SettingError if two values exclude each other.
+    Raises SettingError if two values contradict each other.
     """
     settings = make_settings(
         PlanSettings,

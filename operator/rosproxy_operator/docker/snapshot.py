@@ -1,8 +1,8 @@
-"""A look at a Docker host: the engine, the labels of its containers, and where their masters are.
+"""Looks at a Docker host: containers, networks, labels, and the addresses of the masters.
 
-What is seen is data for the planner (`HostState`), and what the planner need not know: how
-proxies are reached, and by which tokens. Labels are read here, once per look, since what
-they say decides which masters' names are resolved.
+A look returns the planner's data (`HostState`), and what the planner does not need: the admin
+endpoints and tokens of the proxies. A look also reads the labels, once, because the labels decide
+which names of masters the operator resolves.
 """
 
 import asyncio
@@ -53,11 +53,11 @@ from rosproxy_operator.docker.settings import PlanSettings
 log = logging.getLogger(__name__)
 
 PATIENCE = 0.1
-"""Seconds that a look waits for inspections; later ones count from the next look on."""
+"""Seconds that a look waits for inspections. A later look uses the results that come too late."""
 FIRST_PATIENCE = 1.0
-"""Seconds that an observer's first look waits, when nothing is inspected yet.
+"""Seconds that the first look of an observer waits for inspections.
 
-A proxy gets no name that a container has, and only inspections tell the aliases of containers.
+A proxy must not get a name that a container has. Only inspections have the aliases of containers.
 """
 _KINDS: Mapping[str, type[OwnContainer]] = {
     ROLE_SANDBOX: Sandbox,
@@ -67,18 +67,18 @@ _KINDS: Mapping[str, type[OwnContainer]] = {
     ROLE_FLUSH: FlushContainer,
 }
 DOUBT = 1.0
-"""Seconds for which a container is inspected with each look after something has happened to it."""
+"""Seconds after an event for which each look inspects the container of the event again."""
 CHECK = 30.0
-"""Seconds after which the operator's own containers are inspected, even without an event."""
+"""Seconds between two inspections of the operator's own containers when no event arrives."""
 MOST_INSPECTIONS = 16
-"""Inspections that are under way at once."""
+"""Inspections at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProxyAccess:
-    """How a running proxy is reached: its admin endpoint, its token, and which run of it this is.
+    """The admin endpoint and the token of a running proxy.
 
-    ``run`` differs after each start of the container.
+    ``run`` identifies this run: each start of the container has another value.
     """
 
     admin: HostPort
@@ -90,8 +90,8 @@ class ProxyAccess:
 class DockerSnapshot:
     """A Docker host at one moment.
 
-    ``access`` to those proxies that run is by name. ``at_host``: the operator is in the host's
-    network namespace. ``new_secret`` is the secret for an uplink network that is made now.
+    ``access`` has the running proxies, by name. ``at_host``: the operator is in the host's network
+    namespace. ``new_secret`` is the secret for an uplink network that the operator has yet to make.
     """
 
     state: HostState
@@ -102,19 +102,22 @@ class DockerSnapshot:
 
 
 class Inspector:
-    """Inspections of containers, by id, each asked for once and kept.
+    """The inspections of containers, by container id. Inspects a container only after a change.
 
-    The engine's list answers in milliseconds whatever happens. An inspection waits until the
-    container's start is over, which takes 26 s with 1000 ports to publish. Nothing that is read
-    from it changes but the aliases, and those only with the endpoints, whose ids are in the list.
+    The engine always lists containers within milliseconds. But the engine answers an inspection
+    only when the start of the container is over: with 1000 published ports, this takes 26 s. Of an
+    inspection, only the aliases change during a run. The aliases change only together with the
+    endpoints, and the list has the ids of the endpoints.
 
-    The operator's own containers can be started anew without a trace in the list: a proxy's has no
-    network of its own, and the list is late to tell that one has ended. The engine's events tell it
-    (`mark_doubtful`), and those are inspected with each look for a moment; all of them once in a
-    while, beside the look, in case an event was missed.
+    The list does not show each restart of an own container. A proxy's container has no network
+    endpoint, and the list shows the end of a container late. The engine's events report the restart
+    (`mark_doubtful`). Then each look inspects this container for `DOUBT` seconds. In case an event
+    was missed, the inspector also inspects all own containers every `CHECK` seconds, beside the
+    looks. Redirects are an exception: a redirect's container has ended.
 
-    One that can't be read is logged once, and treated as missing: it affects no other container.
-    ``late`` is called when something new comes after a look.
+    The inspector logs an unreadable inspection once, and treats the inspection as missing. Other
+    containers are not affected. Calls ``late`` when an inspection ends after the look that wanted
+    the inspection, or when a check finds a change.
     """
 
     def __init__(self, engine: DockerClient, late: Callable[[], None]) -> None:
@@ -139,27 +142,27 @@ class Inspector:
         return bool(self._asking.keys() - self._checking)
 
     def get(self, container: str) -> Json | None:
-        """The last known inspection of a container; None if there is none yet."""
+        """Return the last known inspection of a container, or None."""
         return self._cached.get(container, (None, None))[1]
 
     def is_current(self, row: Json) -> bool:
-        """Whether the list and the inspection of a container, which is newer, say the same."""
+        """Whether the inspection belongs to this row of the list, and both have the same state."""
         mark, inspected = self._cached.get(row["Id"], (None, None))
         fresh = mark == self._marks[row["Id"]]
         return fresh and engine_json.dig(inspected, "State", "Status") == row["State"]
 
     def mark_doubtful(self, container: str | None) -> None:
-        """Something has happened to a container; None: perhaps to any, with events missed."""
+        """Note an event about a container. None: events may be missing, so doubt all containers."""
         if container is None:
             self._all_doubted = time.monotonic()
         else:
             self._doubted[container] = time.monotonic()
 
     async def update(self, rows: Iterable[Json], own: Mapping[str, str], patience: float) -> None:
-        """Inspect what is new or has changed in the list; wait for it for so many seconds.
+        """Inspect new and changed containers. Wait for the results for ``patience`` seconds.
 
-        ``own`` are those that may have been started anew without a trace in the list, by id, with
-        what they are for. A doubt is good for one look at least, however late that is.
+        ``own`` gives the roles of the operator's own containers, by container id. A doubt lasts
+        until the next look at least, however late this look comes.
         """
         now = time.monotonic()
         since = min(now - DOUBT, self._updated)
@@ -187,7 +190,7 @@ class Inspector:
             self._check(key for key, role in own.items() if role != ROLE_REDIRECT)
 
     def _mark(self, row: Json, own: Collection[str], doubtful: Collection[str]) -> object:
-        """The state that an inspection is of; if that changes, the container is inspected anew."""
+        """Return a mark of the state. If the mark changes, the next look inspects the container."""
         key = row["Id"]
         signature = engine_json.signature(row)
         if key not in own:
@@ -197,7 +200,7 @@ class Inspector:
         return row["State"], signature, self._doubtful_look.get(key)
 
     def _check(self, ids: Iterable[str]) -> None:
-        """Inspect all of these beside the looks, and tell if something is new."""
+        """Inspect containers beside the looks. Call ``late`` if an inspection has changed."""
         for key in ids:
             if key in self._marks and key not in self._asking:
                 self._checking.add(key)
@@ -213,7 +216,7 @@ class Inspector:
         return task
 
     async def _inspect(self, container: str, mark: object) -> bool:
-        """Inspect a container; whether the inspection differs from the last one."""
+        """Inspect a container. Return whether the inspection differs from the last inspection."""
         previous = self.get(container)
         try:
             async with self._turns:
@@ -234,7 +237,7 @@ class Inspector:
 
 
 class DockerObserver:
-    """Looks at an engine. ``late`` is called when an inspection ends after the look it was for."""
+    """Looks at an engine. Calls ``late`` when an inspection ends after the look that wanted it."""
 
     def __init__(
         self,
@@ -256,16 +259,16 @@ class DockerObserver:
         return self._inspector.waiting
 
     def mark_doubtful(self, container: str | None) -> None:
-        """The engine tells that something has happened to a container, by id; None: to any."""
+        """Note an event of the engine about a container id. None: events may be missing."""
         self._inspector.mark_doubtful(container)
 
     async def look(self, patience: float = PATIENCE) -> DockerSnapshot:
-        """What there is now. Raises EngineError.
+        """Return the state of the host now. Raises EngineError.
 
-        Containers whose inspection takes longer than ``patience`` seconds are left out until it is
-        there, unless an older one is known.
+        The result has no foreign container that the operator has not inspected yet. The look waits
+        ``patience`` seconds for inspections, and the first look `FIRST_PATIENCE` at least.
         """
-        # First: ports that the engine opens meanwhile are not foreign.
+        # Read the ports before the list: a port that the engine opens in between is not foreign.
         listening = host.listening_ports()
         bound = host.bound_udp_ports()
         rows, net_rows, image = await asyncio.gather(
@@ -280,8 +283,8 @@ class DockerObserver:
         self._has_looked = True
         networks = tuple(map(engine_json.read_network, net_rows))
         bridges = [n.gateway for n in networks if n.driver == "bridge" and n.gateway]
-        # A bridge's gateway is an address of the host's own network namespace. In another one, the
-        # ports on which something listens here say nothing of those of the host.
+        # The gateway of a bridge is an address in the host's network namespace. In any other
+        # namespace, the ports that listen here are not the ports of the host.
         at_host = any(map(host.has, bridges))
         state = self._read(rows, networks, image)
         if at_host:
@@ -311,9 +314,9 @@ class DockerObserver:
         )
 
     def _read_own(self, row: Json) -> OwnLabels | None:
-        """What the labels of a container say that may be the operator's own, by its name."""
+        """Return the operator's labels; None if the labels or the name are not the operator's."""
         own = read_own(row.get("Labels") or {})
-        nameless = not row.get("Names")  # it is just being removed
+        nameless = not row.get("Names")  # the engine is removing the container
         return own if own and (nameless or has_own_name(own, engine_json.name_of(row))) else None
 
     def _read(
@@ -322,10 +325,11 @@ class DockerObserver:
         networks: tuple[Network, ...],
         image: str,
     ) -> HostState:
-        """The containers, the operator's own apart from others.
+        """Return the state of the host, with the operator's own containers apart.
 
-        One that only claims to be its own is like any other. One that is not inspected yet counts
-        as own if its name is right: until it is known, nothing is done to it.
+        A container with forged labels of the operator counts as a foreign container. Without an
+        inspection, a container with the right name counts as the operator's own. The operator does
+        nothing to this container until the inspection is there (``busy``).
         """
         containers: list[Container] = []
         own_by_role: dict[str, list[Any]] = {role: [] for role in _KINDS}
@@ -349,7 +353,7 @@ class DockerObserver:
                 own_by_role[own.role].append(own_container)
             if own and not self._inspector.is_current(row):
                 busy.add(container.name)
-        # Who shares the network of one that is not inspected yet is left out as long as that is.
+        # Also leave out each container that shares the network of a container without inspection.
         unread = {row["Id"] for row in rows if self._inspector.get(row["Id"]) is None}
         return HostState(
             containers=tuple(c for c in containers if c.network_container not in unread),
@@ -366,7 +370,7 @@ class DockerObserver:
         )
 
     async def _resolve(self, state: HostState, names: Collection[str]) -> dict[str, str]:
-        """The addresses of masters' hosts, empty where unknown."""
+        """Return the address of each master's host, by name; empty if unknown."""
         uplink = self._settings.uplink
         local = {name: address for name in names if (address := address_in(state, name, uplink))}
         excluded = [a.address for sandbox in state.sandboxes for a in sandbox.container.attachments]
@@ -387,7 +391,7 @@ class DockerObserver:
 
 
 def _addresses(rows: Iterable[Json]) -> frozenset[str]:
-    """The addresses of all containers in the engine's list."""
+    """Return the addresses of all containers in the engine's list."""
     endpoints = (endpoint for row in rows for endpoint in engine_json.endpoints(row).values())
     return frozenset(endpoint.get("IPAddress") or "" for endpoint in endpoints)
 
@@ -395,17 +399,20 @@ def _addresses(rows: Iterable[Json]) -> frozenset[str]:
 def foreign_ports(
     starting: Iterable[Sandbox], lan_relays: Iterable[LanRelayContainer], listening: frozenset[int]
 ) -> frozenset[int]:
-    """Which of the host's ports on which something listens may belong to other programs.
+    """Return the listening ports of the host that may belong to other programs.
 
-    Not those of a sandbox that is just being started: the engine takes them one by one before it
-    says that it runs. Nor those of the LAN relays.
+    The ports of ``starting`` sandboxes and of LAN relays are left out. The engine opens a sandbox's
+    ports one after the other before it reports the sandbox as running.
     """
     own = {port for sandbox in starting for port in sandbox.range.ports()}
     return listening - own - {lan_relay.range.last for lan_relay in lan_relays}
 
 
 def address_in(state: HostState, name: str, uplink: str) -> str:
-    """The address of a host's name that no name server has: this host, or a container."""
+    """Return the address of this host or of a container, by a name that name servers do not know.
+
+    Empty if the name is unknown here, too.
+    """
     if name == THIS_HOST:
         return next((n.gateway for n in state.networks if n.name == uplink), "")
     for container in state.containers:

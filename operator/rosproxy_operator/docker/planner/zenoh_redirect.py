@@ -1,14 +1,16 @@
-"""The redirect of a container of rmw_zenoh: the routers that its nodes look for lead to the proxy.
+"""The redirect for containers of rmw_zenoh: connections to a router go to the proxy instead.
 
-Nodes of rmw_zenoh look for a router at localhost:7447. A router passes no data between two of its
-own peers, so each network namespace has a router of its own at the proxy, at a port of its own. The
-record of a redirect has this port as its range, since the operator has no disk.
+Nodes of rmw_zenoh look for a router at localhost:7447. A router passes no data between two peers
+of the same router. So the proxy runs a separate router, at a separate port, for each network
+namespace. The operator has no disk: the range of the redirect's record holds this port.
 
 A connection to localhost leaves the namespace only with the sysctl ``route_localnet``. With this
-sysctl, neighbours could reach what listens on loopback there (CVE-2020-8558), so a rule drops that.
+sysctl alone, neighbours could reach programs that listen on loopback (CVE-2020-8558). So a rule
+drops packets that arrive from the network with a loopback address.
 
-A session that a node has opened with a router outside before the redirect would stay, and a router
-passes no data between the node and its own peers. So the rules reset such a session.
+A node may have opened a session with a router outside before the redirect. If this session stayed,
+that router would pass no data between the node and the other peers of the router. So the rules
+reset the session.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -21,12 +23,12 @@ from rosproxy.setting_kinds import ZENOH_PORT
 from rosproxy_operator.docker.planner.model import ZENOH, Container, Member, RedirectContainer
 
 LOCAL_ROUTER = HostPort("127.0.0.1", ZENOH_PORT)
-"""Where nodes of rmw_zenoh look for a router by default."""
+"""The address at which nodes of rmw_zenoh look for a router by default."""
 FIRST_PORT = ZENOH_PORT + 1
-"""The first port of the proxy for containers."""
+"""The lowest port of the proxy's routers for containers."""
 ROUTE_LOCALNET = "net.ipv4.conf.all.route_localnet"
-# The guard sees packets before conntrack: answers to redirected connections do not have their
-# loopback addresses back yet.
+# Priority -300 is before conntrack (-200). So the guard does not drop replies to redirected
+# connections: conntrack has not restored the loopback addresses in these replies yet.
 _SET = Template("""\
 table ip $table {
   chain guard {
@@ -44,8 +46,8 @@ $redirects
   }
 $resets}
 """)
-# In these hooks redirected packets have the proxy's address on the way out, and their first address
-# again on the way in.
+# In the hook output, redirected packets already have the proxy's address and match no rule. In the
+# hook input, redirected packets have the router's address again, so `ct status dnat` comes first.
 _RESETS = Template("""\
   chain resets_out {
     type filter hook output priority 0; policy accept;
@@ -60,7 +62,10 @@ $in_
 
 
 def zenoh_rules(table: str, routers: Iterable[HostPort], proxy: HostPort) -> str:
-    """The table of nftables that leads these routers to a port of the proxy."""
+    """Return the nftables table that leads connections to ``routers`` to a port of the proxy.
+
+    The rules reset older sessions with routers outside.
+    """
     every = [*routers]
     outside = [router for router in every if router != LOCAL_ROUTER]
     reset = "reject with tcp reset"
@@ -80,12 +85,12 @@ def zenoh_rules(table: str, routers: Iterable[HostPort], proxy: HostPort) -> str
 
 
 def zenoh_sysctls(is_set: bool) -> dict[str, str]:
-    """The sysctls of a network namespace with or without a redirect."""
+    """Return the sysctls of a network namespace with or without a redirect."""
     return {ROUTE_LOCALNET: str(int(is_set))}
 
 
 def as_client(proxy: str) -> str:
-    """The variable by which nodes use the proxy, by its name, without a redirect."""
+    """Return the variable that makes nodes use the proxy, given by name, without a redirect."""
     return (
         f"""ZENOH_CONFIG_OVERRIDE='mode="client";connect/endpoints=["tcp/{proxy}:{FIRST_PORT}"]'"""
     )
@@ -94,7 +99,10 @@ def as_client(proxy: str) -> str:
 def with_all_routers(
     placed: Collection[tuple[Member, Container]],
 ) -> Iterator[tuple[Member, Container]]:
-    """The members with the routers that all members in the same network namespace look for."""
+    """Yield each member with the routers of all members in the same network namespace.
+
+    ``placed`` pairs each member with the container that owns the network namespace.
+    """
     for member, owner in placed:
         near = (other.redirected for other, place in placed if place.id == owner.id)
         routers = dict.fromkeys(sorted((router for routers in near for router in routers), key=str))
@@ -104,9 +112,9 @@ def with_all_routers(
 def router_ports(
     records: Iterable[RedirectContainer], targets: frozenset[str]
 ) -> Mapping[str, int]:
-    """The port of the proxy for each network namespace, by the id of the container that owns it.
+    """Return the proxy's port for each network namespace, by the id of the owning container.
 
-    A container keeps the port that its record has.
+    A network namespace keeps the port of its record. ``targets`` are the ids of all owners.
     """
     ports: dict[str, int] = {}
     for record in records:
