@@ -1,1 +1,1 @@
-"""The operator for a Kubernetes cluster: thin adapters around the planning core."""
+"""The operator for a Kubernetes cluster: thin adapters around the planner."""

@@ -1,8 +1,8 @@
 """Carries out the planned actions on the Kubernetes API.
 
-An action may run twice, or after somebody else did the same, or on an object that has vanished:
-that is no error, and the next look plans what is left to do. Before an object is deleted, what
-that was decided from is read again (`confirm`).
+An action may run twice, after another program did the same, or on an object that no longer exists.
+This is no error: the next look plans what is left to do. Before the operator deletes an object, it
+reads the facts behind the decision again (`confirm`).
 """
 
 import asyncio
@@ -50,26 +50,26 @@ from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
 log = logging.getLogger(__name__)
 
 AT_ONCE = 8
-"""Calls to the API server at the same time."""
+"""Most calls to the API server at the same time."""
 RETIRING = 10.0
-"""Seconds that a proxy has to unregister its nodes at the master before it is deleted."""
+"""Seconds that a proxy has to unregister its nodes before the operator deletes the proxy."""
 RELEASED = (0.2, 0.5, 1.0)
-"""Seconds between tries to create a Service under its former address, the only one pods know.
+"""Seconds between tries to create a Service again under the former address.
 
-The API server reports a Service as deleted before it frees the address.
+Pods know only this address. The API server reports a Service as deleted before the address is free.
 """
 
 _PATHS = {"Pod": "pods", "Service": "services", "NetworkPolicy": POLICIES}
-"""The kinds of objects that are created and deleted, in the API's paths."""
+"""The plurals in the API's paths, for the kinds that the operator creates and deletes."""
 Count = Callable[[Action, str], None]
 
 
 class ClusterApplier:
-    """Carries out actions, those of one RosProxy one after the other.
+    """Carries out actions: RosProxies in parallel, the actions of each RosProxy in order.
 
-    ``counted`` is called with each action and its outcome (ok, failed); ``doubted`` if the
-    watched state still differs from what is read: a watch has missed something. ``busy`` is the
-    number of actions that are under way or wait for their turn.
+    Calls ``counted`` with each action and the outcome (ok, failed). Calls ``doubted`` when the
+    watched state differs from a fresh read twice in a row: then a watch has missed a change.
+    ``busy`` is the number of actions that are under way or wait for a turn.
     """
 
     def __init__(
@@ -95,11 +95,11 @@ class ClusterApplier:
 
     @property
     def failed(self) -> int:
-        """How many actions have failed and are to be tried again."""
+        """The number of failed actions that the operator will try again."""
         return sum(map(len, self.failures.values())) + len(self.problems)
 
     def forget(self) -> None:
-        """Drop what is remembered: another operator has acted meanwhile."""
+        """Forget all failures and retirements: another operator may have acted meanwhile."""
         self.failures = {}
         self.problems = {}
         self._stale.clear()
@@ -107,7 +107,7 @@ class ClusterApplier:
         self._retired.clear()
 
     async def carry_out(self, actions: Iterable[Action], observed: ClusterSnapshot) -> None:
-        """Carry out what was planned from ``observed``. Failures are noted, not raised."""
+        """Carry out the actions planned from ``observed``. Failures are stored, not raised."""
         groups: dict[Name, list[Action]] = {}
         for action in actions:
             groups.setdefault(action.of, []).append(action)
@@ -130,14 +130,14 @@ class ClusterApplier:
                 if error is not None:
                     text = f"the operator can't write the status: {error}"
                     self.problems[name] = Problem(f"rosproxy {name}", text)
-        # A Normal Event says that an action was done. It does not name its action: so after a
-        # failure none of them is made.
+        # A Normal Event reports that an action was done. An Emit does not name the action, so after
+        # any failure the operator makes no Normal Event.
         emits = [action for action in actions if isinstance(action, Emit)]
         wanted = [emit for emit in emits if not (failures and emit.type == "Normal")]
         await asyncio.gather(*(self._perform(emit, observed) for emit in wanted))
 
     async def _perform(self, action: Action, observed: ClusterSnapshot) -> str | None:
-        """Carry out one action. Returns why it failed; None if it did not, or was not due."""
+        """Carry out an action. Return the error; None if the action succeeded or was postponed."""
         quiet = isinstance(action, PatchStatus | Emit)
         self.busy += 1
         try:
@@ -151,13 +151,13 @@ class ClusterApplier:
             self._doubt(_subject(action))
             return None
         except NotLeading:
-            return None  # another operator does it, or this one in a later term
+            return None  # the leader acts, or this operator in a later term
         except _nothing_left(action) as error:
             log.debug("%s: nothing to do: %s", describe(action), error)
             return None
         except ApiError as error:
             text = str(error)
-        except Exception as error:  # a mistake of ours must not stop the others
+        except Exception as error:  # a bug must not stop the other actions
             log.exception("action failed by an internal error: %s", describe(action))
             text = f"the operator failed: {error!r}"
         else:
@@ -176,7 +176,10 @@ class ClusterApplier:
         return text
 
     def _doubt(self, id: Name) -> None:
-        """The watched state was wrong: once a watch may lag, the second time it has lost events."""
+        """Note that an object differs from the watched state. The second time, call ``doubted``.
+
+        A first difference may come from a watch that lags.
+        """
         if id in self._stale:
             self._stale.clear()
             self._doubted()
@@ -184,11 +187,14 @@ class ClusterApplier:
             self._stale.add(id)
 
     async def _is_retired(self, action: Action, observed: ClusterSnapshot) -> bool:
-        """Whether a proxy has unregistered its nodes; if not, starts that if `confirm` agrees."""
-        assert isinstance(action, DeleteProxy)  # noqa: S101 - no other is to be retired
+        """Whether a proxy has unregistered its nodes.
+
+        If not, start a task for that, unless `confirm` raises StateChanged or ApiError.
+        """
+        assert isinstance(action, DeleteProxy)  # noqa: S101 - only a proxy retires
         if action.uid in self._retired:
             return True
-        if not self._api.gate.open():  # the proxy is asked directly, so no request passes the gate
+        if not self._api.gate.open():  # a call to the proxy itself does not pass the gate
             return False
         if action.uid not in self._retiring:
             self._retiring.add(action.uid)
@@ -213,7 +219,7 @@ class ClusterApplier:
                 confirm(api, action, observed)
                 api.evict(action.id, action.uid)
             case SetImage():
-                # A JSON patch finds a container by its index alone: the test makes sure of which.
+                # A JSON patch names a container only by index, so test the name first.
                 container = "/spec/containers/0"
                 name_test = {"op": "test", "path": f"{container}/name", "value": CONTAINER}
                 image = {"op": "replace", "path": f"{container}/image", "value": action.image}
@@ -222,14 +228,14 @@ class ClusterApplier:
                 spec = {"op": "replace", "path": "/spec", "value": action.spec}
                 api.patch(POLICIES, action.id, [_uid_test(action.uid), spec])
             case PatchStatus():
-                # `add` replaces as well, and works if there is no status yet (RFC 6902, 4.1).
+                # `add` also replaces, and works without a former status (RFC 6902, section 4.1).
                 status = {"op": "add", "path": "/status", "value": action.status}
                 api.patch(f"{PLURAL}/status", action.of, [_uid_test(action.uid), status])
             case Emit():
                 _emit(api, action)
 
     async def _retire(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
-        """Let a proxy unregister its nodes, then delete it, beside everything else."""
+        """Let a proxy unregister its nodes, within `RETIRING` seconds. Then delete the proxy."""
         fields = _log_fields(action)
         try:
             proxy = next((p for p in observed.proxies if p.pod.uid == action.uid), None)
@@ -243,18 +249,18 @@ class ClusterApplier:
             text = "nodes not unregistered at the master: proxy %s: %s"
             log.info(text, action.id, reason, extra=fields)
         finally:
-            self._retired.add(action.uid)  # a proxy that could not unregister them goes as well
+            self._retired.add(action.uid)  # delete the proxy also after a failure
             self._retiring.discard(action.uid)
             await self._perform(action, observed)
 
 
 def _uid_test(uid: str) -> Json:
-    """The first operation of a JSON patch, which fails if the object has another uid by now."""
+    """Return an operation of a JSON patch that fails if the object now has another uid."""
     return {"op": "test", "path": "/metadata/uid", "value": uid}
 
 
 def describe(action: Action) -> str:
-    """An action in one line."""
+    """Return a line of text for an action."""
     match action:
         case Creation():
             return f"create {action.kind} {_subject(action)}"
@@ -277,7 +283,7 @@ def _change_line(action: SetImage | SetPolicy | EvictPod) -> str:
 
 
 def _subject(action: Action) -> Name:
-    """The object that an action is about."""
+    """Return the name of the object that an action is about."""
     match action:
         case Creation():
             return name_of(action.body["metadata"])
@@ -288,15 +294,15 @@ def _subject(action: Action) -> Name:
 
 
 def _log_fields(action: Action) -> dict[str, str]:
-    """Extra fields of a log line about an action: the proxy's pod, if it is about one."""
+    """Return extra fields of a log line: the proxy's pod, if the action is about a proxy."""
     of_proxy = isinstance(action, CreateProxy | DeleteProxy | SetImage)
     return {"proxy": str(_subject(action))} if of_proxy else {}
 
 
 def _nothing_left(action: Action) -> tuple[type[ApiError], ...]:
-    """The errors that mean that there is nothing left to do.
+    """Return the errors after which nothing is left to do.
 
-    The object is gone, or its whole namespace is about to be; or it is another one by now.
+    The object or the namespace is gone, or another object has the name now.
     """
     if isinstance(action, ObjectAction | PatchStatus):
         return ApiNotFound, ApiConflict
@@ -304,9 +310,10 @@ def _nothing_left(action: Action) -> tuple[type[ApiError], ...]:
 
 
 def _create(api: Api, kind: str, body: Json, pauses: Sequence[float] = RELEASED) -> None:
-    """Create an object if it is not there; a Service under a new address if the former is refused.
+    """Create an object, unless the object exists.
 
-    Raises ApiError.
+    If the API server refuses the former address of a Service, try again after each of ``pauses``.
+    Then create the Service with a new address. Raises ApiError.
     """
     try:
         api.create(kind, body)
@@ -324,10 +331,10 @@ def _create(api: Api, kind: str, body: Json, pauses: Sequence[float] = RELEASED)
 
 
 def _check_ours(api: Api, kind: str, body: Json) -> None:
-    """Raise ApiError if the object that has the name already is not the operator's.
+    """Raise ApiConflict if an object that the operator did not create has the name already.
 
-    If it is the operator's, the plan was made from a list that was a little old, or a RosProxy of
-    the same name has just been deleted.
+    An object of the operator is no error: the snapshot was a little old, or a RosProxy of the same
+    name was just deleted.
     """
     try:
         metadata = submap(api.get(kind, name_of(body["metadata"])), "metadata")
@@ -339,7 +346,7 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
 
 
 def _emit(api: Api, event: Emit) -> None:
-    """Make an Event, or count it if it is there."""
+    """Create an Event, or increase the count of an existing Event."""
     now = time.time()
     body = event_body(event, now)
     try:

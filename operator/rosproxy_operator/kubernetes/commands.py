@@ -1,6 +1,6 @@
-"""The command below ``rosproxy-operator kubernetes``; it needs no running operator.
+"""The commands below ``rosproxy-operator kubernetes`` that need no running operator.
 
-It imports what it needs when it runs: the Kubernetes client may not be installed.
+A command imports modules only when the command runs: the Kubernetes client may be missing.
 """
 
 import click

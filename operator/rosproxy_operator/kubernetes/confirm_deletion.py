@@ -1,10 +1,13 @@
-"""Checks, before an object is deleted, that the facts behind that decision still hold.
+"""Checks, before a deletion or eviction, that the facts behind the decision still hold.
 
-Watches may lag. So the RosProxy, the node and the pods there that matter are read from the API
-server's store; if one of them differs from what the look had seen, nothing is deleted: the watch
-will deliver the change, and the next look decides. Then the object is deleted only if it is as it
-was read (uid and resourceVersion), so that nothing can change in between. Where the RosProxy is
-gone nothing else matters: the garbage collector deletes its pods already, so they keep changing.
+Watches may lag. So the operator first reads the RosProxy from the API server's store. For a proxy
+or a pod beside a proxy, the operator also reads the node and the pods there; for an eviction, the
+pod. If any of these objects differs from the snapshot, the operator deletes nothing: the watch will
+deliver the change, and the next look decides. Then the operator deletes the pod only in the
+version just read (uid, resourceVersion).
+
+If the RosProxy is gone, the operator checks nothing else: the garbage collector already deletes the
+pods, so the pods keep changing.
 """
 
 from collections.abc import Iterable
@@ -25,13 +28,13 @@ from rosproxy_operator.kubernetes.resources.records import pod_record, rosproxy_
 
 
 class StateChanged(Exception):
-    """The facts behind a deletion have changed; the message says which object differs."""
+    """The facts behind a deletion have changed. The message names the object that differs."""
 
 
 def confirm(api: Api, action: Deletion | EvictPod, observed: ClusterSnapshot) -> str:
-    """The version in which the object may be deleted; empty for any.
+    """Return the only resourceVersion in which the object may be deleted; empty for any version.
 
-    Raises StateChanged, ApiError.
+    Raises StateChanged if the snapshot is outdated, and ApiError.
     """
     is_gone = _check_rosproxy(api, action.of, observed)
     if isinstance(action, EvictPod):
@@ -55,12 +58,12 @@ def confirm(api: Api, action: Deletion | EvictPod, observed: ClusterSnapshot) ->
     )
     if _by_uid(current) != _by_uid(expected):
         raise StateChanged(f"the pods on node {target.node}")
-    # One that is not on that node yet is not in this list.
+    # A pod that the scheduler has not placed yet is not in the list of pods on the node.
     return version if target.pod.node == target.node else ""
 
 
 def _check_rosproxy(api: Api, name: Name, observed: ClusterSnapshot) -> bool:
-    """Whether the RosProxy is gone."""
+    """Whether the RosProxy is gone. Raises StateChanged."""
     objs = api.list_fresh(PLURAL, name.namespace, f"metadata.name={name.name}")
     current = {_requested(rosproxy_record(obj)) for obj in objs}
     expected = {_requested(rosproxy) for rosproxy in observed.rosproxies if rosproxy.id == name}
@@ -99,8 +102,9 @@ def _wiring(pod: Pod) -> tuple[object, ...]:
 
 
 def _requested(rosproxy: RosProxy | InvalidRosProxy) -> tuple[object, ...]:
-    # The generation counts changes of the spec, not of annotations, which `remakes` comes from
-    # (k8s.io/apiextensions-apiserver, pkg/registry/customresource/strategy.go, PrepareForUpdate).
+    # The generation counts changes of the spec, but not of annotations, and `remakes` comes from an
+    # annotation (k8s.io/apiextensions-apiserver, pkg/registry/customresource/strategy.go,
+    # PrepareForUpdate).
     flags = (rosproxy.deleting, rosproxy.remakes) if isinstance(rosproxy, RosProxy) else ()
     return rosproxy.uid, rosproxy.generation, *flags
 
@@ -111,12 +115,12 @@ def _pod(obj: Json) -> Pod:
 
 
 def _matters(pod: Pod, rosproxy: Name) -> bool:
-    """Whether a pod may want the proxy, or take its ports."""
+    """Whether a pod may want the proxy, or may hold ports of the proxy."""
     return pod.id.namespace == rosproxy.namespace or bool(pod.every_port)
 
 
 def _by_uid(pods: Iterable[Pod]) -> dict[str, object]:
-    """The facts about pods that a deletion is decided from, by the pods' uids."""
+    """Return the facts about pods that decide about a deletion, by uid."""
     return {
         pod.uid: (pod.labels, pod.ended, pod.deleting, pod.every_port, pod.host_network)
         for pod in pods

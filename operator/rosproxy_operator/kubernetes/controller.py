@@ -1,14 +1,15 @@
-"""Reconciles a cluster: look, plan, carry out, report. The loop around that is `ControlLoop`.
+"""Reconciles a cluster: look, plan, carry out, report. `ControlLoop` repeats the looks.
 
-Data flows in one direction: watches deliver objects, which are kept (`watch`), and wake the loop
-if they concern a RosProxy. A look takes the cluster from there, adds the proxies' reports
-(`proxies`), decides (`planner.plan`), and carries the decisions out (`apply`): Services and pods,
-then the RosProxies' statuses and the Events. Only the parts of the cluster that have changed are
-planned (`planner.partition`), and now and then all of them. Nothing is decided from an event alone,
-and nothing is decided in this file.
+Data flows in one direction. Watches deliver objects to the store (`watch`), and wake the loop if an
+object concerns a RosProxy. A look takes a snapshot of the store, adds the proxies' reports
+(`proxies`), plans (`planner.plan`), and carries out the plan (`apply`). For each RosProxy, the
+Services and pods come first, then the status and the Events. A look plans only the changed parts of
+the cluster (`planner.partition`), and every ``--resync`` seconds all parts. This module makes no
+decisions, and no decision depends on a single event.
 
-Of several operators one acts, for a term (`leader`). The others keep up with the cluster and with
-the proxies' reports, so that the next leader begins at once; at its end a term is forgotten.
+Of several operators, only the leader acts, for a term (`leader_election`). The other operators
+follow the cluster and the proxies' reports, so the next leader begins at once. At the end of a term
+the operator forgets the state of the term.
 """
 
 import asyncio
@@ -56,21 +57,22 @@ from rosproxy_operator.kubernetes.watch.store import ClusterStore
 log = logging.getLogger(__name__)
 
 DEBOUNCE = 0.1
-"""Least seconds between two looks: one roll-out makes dozens of events."""
+"""Least seconds between two looks: a roll-out makes dozens of events."""
 SETTLED = 1.0
-"""Seconds from an action to one more look, in case no watch reports its effect."""
+"""Seconds from an action to another look, in case no watch reports the effect."""
 LONGEST_LOOK = 90.0
-"""Seconds after which a look that has not ended is given up."""
+"""Seconds after which the loop gives up a look."""
 STANDING_BY = 5.0
 """Seconds between two looks of an operator that does not lead."""
 KEY_EVERY = 30.0
-"""Seconds between two checks whether the key of the proxies' tokens is another one."""
+"""Seconds between two checks whether the key of the proxies' tokens has changed."""
 
 
 class KubernetesController:
-    """Reconciles one cluster. `run` it in an event loop.
+    """Reconciles a cluster. Call `run` in an event loop.
 
-    `wake` and `dead` may be used from other threads, all else only from that loop.
+    `wake` and `dead` are safe in any thread. All other methods belong to the event loop. ``term``
+    returns the number of this operator's present term, or 0 if the operator does not lead.
     """
 
     def __init__(
@@ -116,7 +118,7 @@ class KubernetesController:
         self._log = ProblemLog()
 
     async def run(self) -> None:
-        """Look after the cluster until cancelled. Proxies go on without an operator."""
+        """Reconcile the cluster until cancelled. The proxies keep running without an operator."""
         call_soon = asyncio.get_running_loop().call_soon_threadsafe
         count_restart = self._metrics.watch_restarts.inc
         self._reflectors = reflectors = [
@@ -138,36 +140,36 @@ class KubernetesController:
                 await in_thread(reflector.join)
 
     async def _check_key(self) -> None:
-        """Plan everything once the key was replaced, or removed from its Secret: no watch tells."""
+        """Plan everything after a change of the key. No watch covers the key's Secret."""
         while True:
             await asyncio.sleep(KEY_EVERY)
-            with contextlib.suppress(ApiError):  # a look reports it
+            with contextlib.suppress(ApiError):  # the next look reports the error
                 if self._acting and await in_thread(self._key.read) != self._secret:
                     self._due.mark_all_due()
                     self._loop.wake()
 
     async def stop_acting(self) -> None:
-        """Cancel the tasks beside the looks. The next look finds that this one leads no more."""
+        """Cancel the tasks beside the looks. The next look ends the term."""
         await self._tasks.cancel()
 
     async def documents(self) -> dict[str, Document | str]:
-        """What the live pages of all proxies show, or why one can't be asked."""
+        """Return the live page's document of each proxy, or the reason of a failure, by pod."""
         return await self._proxies.documents(self._proxy_sync.admin_endpoints)
 
     async def look(self) -> float | None:
-        """One look and what follows from it; when to look again. Raises LookFailed."""
+        """Look and act. Return in how many seconds to look again, or None. Raises LookFailed."""
         try:
             return await self._look()
         except ApiError as error:
             raise LookFailed(str(error), away=isinstance(error, ApiUnavailable)) from error
         except BaseException:
-            # The store tells each change once, and this look may have planned none of them.
+            # The store reports each change only once, and this look may have planned no change.
             self._due.mark_all_due()
             raise
 
     async def _look(self) -> float | None:
         if self._term() != self._acting:
-            await self._change_term()  # even without the API server: another one may lead then
+            await self._change_term()  # also if the API server is away: another operator may lead
         await self._store.check()
         return await (self._act() if self._acting else self._stand_by())
 
@@ -175,12 +177,12 @@ class KubernetesController:
         return self._term() != 0
 
     async def _change_term(self) -> None:
-        """Begin a term, or end one and forget all that belongs to it."""
+        """End the present term, if any, and forget its state. Then begin the next term, if any."""
         if self._acting:
             await self._tasks.cancel()
             await self._proxy_sync.forget()
             self._applier.forget()
-            # The end of a term solves no problem.
+            # A new log does not report these problems as solved: the end of a term solves nothing.
             self._problems = {}
             self._log = ProblemLog()
             self._state = ClusterState(former=self._state.former)
@@ -190,12 +192,12 @@ class KubernetesController:
         self._due.mark_all_due()
 
     async def _stand_by(self) -> float:
-        """Remember what the next term needs. Returns in how many seconds to do that again."""
+        """Remember what the next term needs. Return in how many seconds to do so again."""
         remaining = self._stood_by + STANDING_BY - time.monotonic()
         if remaining > 0:
             return remaining
         self._secret = await in_thread(self._key.read)
-        self._store.take_changes()  # not needed: a term begins with a plan for everything
+        self._store.take_changes()  # drop the changes: a term begins by planning everything
         observed = self._store.snapshot(self._secret)
         self._proxy_sync.follow(observed.proxies, observed.key)
         observed = replace(observed, reports=self._proxy_sync.reports)
@@ -208,7 +210,7 @@ class KubernetesController:
         if self._due.is_all(started, self._settings.resync):
             self._secret = await in_thread(self._key.read)
         self._due.at_once(await self._sandbox.read(self._store.snapshot()))
-        # No await before all is planned: so the snapshot has exactly the changes noted so far.
+        # No await from here until the plan is made. So the snapshot has exactly these changes.
         touched = self._store.take_changes()
         observed = self._store.snapshot(self._secret)
         observed = self._sandbox.with_messages(observed)
@@ -232,7 +234,7 @@ class KubernetesController:
         return self._due.again_in(time.monotonic(), self._sandbox.again_in())
 
     def _planned(self, observed: ClusterSnapshot, scope: Partition | None) -> ClusterPlan:
-        """The plan for a part of the cluster, None for all; the state that it returns is kept."""
+        """Return the plan for ``scope`` (None: everything). Store the new state and problems."""
         now = time.monotonic()
         timestamp = stamp(time.time())
         settings = self._settings.plan
@@ -258,17 +260,17 @@ class KubernetesController:
         await self._applier.carry_out(planned.actions, observed)
         concerned = {action.of.namespace for action in planned.actions}
         if self._applier.failures != observed.failures:
-            self._wake_for(concerned)  # their statuses have to show it
+            self._wake_for(concerned)  # the statuses have to show the failures
         else:
             self._due.due_at(concerned, time.monotonic() + SETTLED)
 
     def _wake_for(self, namespaces: Iterable[str]) -> None:
-        """Plan these soon: something about them has changed that no watch reports."""
+        """Plan these namespaces soon, after a change that no watch reports."""
         self._due.at_once(namespaces)
         self._loop.wake()
 
     def _relist(self) -> None:
-        """The watched state is wrong: have everything listed anew."""
+        """Let all reflectors list again: the watched state is wrong."""
         for reflector in self._reflectors:
             reflector.relist()
 

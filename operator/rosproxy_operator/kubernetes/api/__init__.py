@@ -1,1 +1,1 @@
-"""The API server: how it is asked, and when nothing may be changed."""
+"""Requests to the API server, and the gate that stops changes."""

@@ -1,7 +1,8 @@
-"""The API server as far as the operator needs it: a thin layer over the `kubernetes` client.
+"""The requests that the operator sends to the API server: a thin layer over `kubernetes`.
 
-The operator's service account has exactly these rights. Those of the second group are for single
-objects, by name::
+The operator's service account has exactly these rights. The rights of the second group are for
+single objects, by name. The right to create leases is an exception: RBAC can't restrict it to a
+name::
 
     nodes                   list watch
     pods                    get list watch create delete patch
@@ -16,7 +17,8 @@ objects, by name::
     mutatingwebhookconfigurations          get patch
     leases                                 get create patch
 
-Objects go in and out as JSON: the client's models would drop fields that are newer than they are.
+Arguments and results are JSON: the client's models would drop fields that are newer than the
+client. The doctor calls some methods with the rights of its user.
 """
 
 import contextlib
@@ -43,24 +45,30 @@ from rosproxy_operator.kubernetes.resources.names import GROUP, OWN_SELECTOR, PL
 JsonObject = dict[str, Any]
 Timeout = tuple[float, float]
 WITHIN: Timeout = (3.0, 15.0)
-"""Seconds to connect and to wait for an answer."""
+"""Seconds to connect, and seconds to wait for an answer."""
 SOON: Timeout = (1.0, 2.0)
-"""The same while somebody waits for a pod to be admitted, or a Lease runs out."""
+"""The same while a pod waits for the webhook, or while a Lease object runs out."""
 ONCE: Timeout = (3.0, 10.0)
-"""The same where 429 is an answer: a PodDisruptionBudget does not allow it now."""
+"""The same for an eviction, without a retry after HTTP 429.
+
+For an eviction, HTTP 429 means that a PodDisruptionBudget forbids the eviction now.
+"""
 WATCHED_FOR = 300
-"""Seconds after which the API server is to end a watch; another one goes on from there."""
+"""Seconds after which the API server ends a watch. The next watch continues from there."""
 SILENT: Timeout = (3.0, 90.0)
-"""Seconds to connect for a watch, and without a word on it: a bookmark comes every minute."""
+"""Seconds to connect for a watch, and seconds of silence. A bookmark comes every minute."""
 PAGE = 500
-"""Objects in one answer to a list, if they have no more than `LONGEST_PAGE` together."""
+"""Objects in an answer to a list request, if the answer has at most `LONGEST_PAGE` bytes."""
 LONGEST_PAGE = 16 * 1024 * 1024
-"""Bytes of such an answer. 500 pods have 5 MB as a rule, but the API server takes one of 1.5 MB
-(etcd, --max-request-bytes), and any user that creates pods could fill the operator's memory."""
+"""Most bytes of such an answer, unless a single object has more.
+
+500 pods usually have 5 MB. But the API server accepts a pod of 1.5 MB (etcd, --max-request-bytes).
+So without this bound, any user that creates pods could fill the operator's memory.
+"""
 TRIES = 4
-"""How often a request is sent that the API server puts off (429)."""
+"""How often the operator sends a request while the API server answers HTTP 429."""
 LONGEST_PAUSE = 10.0
-"""Seconds that it may put it off at a time."""
+"""Most seconds to wait after such an answer, whatever Retry-After says."""
 WEBHOOKS = "mutatingwebhookconfigurations"
 POLICIES = "networkpolicies"
 LEASES = "leases"
@@ -74,23 +82,23 @@ _ROOTS = {
     ENDPOINTS: "/apis/discovery.k8s.io/v1",
     REVIEWS: "/apis/authorization.k8s.io/v1",
 }
-"""The API's paths for kinds that are not of the core group."""
+"""The API's paths for kinds outside the core group."""
 _ACCOUNTS = "system:serviceaccounts"
 """The group of all service accounts."""
 _TERMINATING = "because it is being terminated"
-"""What the admission plug-in NamespaceLifecycle says of a namespace that is being deleted.
+"""Part of the refusal when the operator creates an object in a namespace that is being deleted.
 
-Nothing can be created there, and nothing is to be.
+The admission plug-in NamespaceLifecycle refuses. The operator needs no object there.
 """
 _TEST_FAILED = "the server rejected our request due to an error in our request"
-"""All that the API server says when a ``test`` of a JSON patch fails."""
+"""The whole message of the API server when a ``test`` of a JSON patch fails."""
 _LONGEST = 500
 
 
 class ApiError(Exception):
-    """The API server did not do what it was asked; the message is one line.
+    """A request to the API server failed. The message is a single line.
 
-    Its subclasses say why, as far as that makes a difference.
+    A subclass gives the reason if callers treat that reason differently.
     """
 
 
@@ -99,33 +107,33 @@ class ApiUnavailable(ApiError):
 
 
 class NotLeading(ApiUnavailable):
-    """This operator does not lead: nothing was asked."""
+    """This operator does not lead. The request was not sent."""
 
 
 class ApiNotFound(ApiError):
-    """The object is not there, or the namespace is about to go that it is to be in."""
+    """The object does not exist, or the namespace for a new object is being deleted."""
 
 
 class ApiConflict(ApiError):
-    """The name is taken, or the object is another one by now."""
+    """The name is taken, or the object is no longer the expected object or version."""
 
 
 class ApiInvalid(ApiError):
-    """The object is not one that the API server takes."""
+    """The API server refuses the object or the request as invalid."""
 
 
 class ApiLost(ApiUnavailable):
-    """A watch has ended before its time: it goes on where it was."""
+    """A watch has ended early. The caller continues from the last version."""
 
 
 class ApiExpired(ApiError):
-    """A list or a watch can't go on from where it was (410): list anew."""
+    """A list or watch can't continue from the last version (HTTP 410). List again."""
 
 
 class Page(msgspec.Struct, frozen=True):
-    """A part of a list: the next one is asked for with ``continue_token``, empty for the last.
+    """A page of a list. ``continue_token`` requests the next page; empty for the last page.
 
-    ``version`` is that of the whole list: a watch goes on from there.
+    A watch continues from ``version``, the resourceVersion of the whole list.
     """
 
     items: Iterable[JsonObject]
@@ -134,27 +142,27 @@ class Page(msgspec.Struct, frozen=True):
 
 
 class _Listing(msgspec.Struct, frozen=True):
-    """A part of a list, as the API server answers."""
+    """A page of a list, as the API server answers."""
 
     items: list[msgspec.Raw]
     metadata: dict[str, Any] = {}
 
 
 class Event(msgspec.Struct, frozen=True):
-    """What a watch tells: ADDED, MODIFIED, DELETED, BOOKMARK (a version alone) or ERROR."""
+    """An event of a watch: ADDED, MODIFIED, DELETED, BOOKMARK (only a version) or ERROR."""
 
     type: str
     object: JsonObject
 
 
 class Watch:
-    """A watch that is open. Iterating gives events as they come, and ends with the watch."""
+    """An open watch. The iteration yields events as they arrive, and ends with the watch."""
 
     def __init__(self, response: Any) -> None:
         self._response = response
 
     def __iter__(self) -> Iterator[list[Event]]:
-        """Give events, those together that came together. Raises ApiLost."""
+        """Yield the events of each received chunk as a list. Raises ApiLost."""
         partial = b""
         try:
             for chunk in self._response.stream():
@@ -166,8 +174,8 @@ class Watch:
             self._response.close()
 
     def stop(self) -> None:
-        """End it, also from another thread."""
-        with contextlib.suppress(ValueError, RuntimeError, OSError):  # it has just ended
+        """End the watch. Safe in any thread."""
+        with contextlib.suppress(ValueError, RuntimeError, OSError):  # the watch has just ended
             self._response.shutdown()
 
 
@@ -176,7 +184,7 @@ _EVENT = msgspec.json.Decoder(Event)
 
 _KINDS: Mapping[int, type[ApiError]] = {
     400: ApiInvalid,
-    401: ApiUnavailable,  # the token has just been replaced, or the server does not know it yet
+    401: ApiUnavailable,  # a token that was just replaced, or that the server does not know yet
     404: ApiNotFound,
     409: ApiConflict,
     410: ApiExpired,
@@ -186,10 +194,11 @@ _KINDS: Mapping[int, type[ApiError]] = {
 
 
 class Api:
-    """The cluster that this process runs in, else the one that KUBECONFIG names.
+    """The cluster of this pod, or else of the kubeconfig file. Safe in any thread.
 
-    Any thread may use it. Every method raises ApiError. ``namespaces``: looked after; none: all.
-    Nothing is changed, but for Leases, while the `Gate` is closed: NotLeading.
+    Each failed request raises ApiError. ``namespaces`` are the managed namespaces; none means all.
+    While the `Gate` is closed, each request that changes something raises NotLeading. Requests for
+    Lease objects are an exception.
     """
 
     def __init__(self, namespaces: Sequence[str] = ()) -> None:
@@ -208,7 +217,11 @@ class Api:
         self._client.close()  # type: ignore[no-untyped-call]
 
     def rosproxies(self, namespace: str = "", within: Timeout = WITHIN) -> list[JsonObject]:
-        """All RosProxies, or those of a namespace, as they are at this moment."""
+        """Return all managed RosProxies, or only the RosProxies of ``namespace``.
+
+        The list comes from the API server's store, not from a cache. Raises ApiNotFound with a fix
+        if the cluster has no definition of RosProxies.
+        """
         places = (namespace,) if namespace else self._places
         try:
             lists = [self._ask("GET", _path(PLURAL, place), within=within) for place in places]
@@ -217,22 +230,24 @@ class Api:
         return [obj for listing in lists for obj in self._items(listing)]
 
     def own_pods(self) -> list[JsonObject]:
-        """The pods that the operator has made."""
+        """Return the pods that the operator has made, in the managed namespaces."""
         lists = (self.list_fresh("pods", place, labels=OWN_SELECTOR) for place in self._places)
         return [obj for objs in lists for obj in objs]
 
     def namespaces_of(self, kind: str) -> tuple[str, ...]:
-        """The namespaces in which a kind is watched; an empty one stands for all of them.
+        """Return the namespaces in which the operator watches a kind. Empty text means all.
 
-        Others' pods and Services count as well, so those are watched in all of the cluster.
+        Pods and Services matter in the whole cluster: foreign pods hold ports, and a master's
+        Service may be in any namespace.
         """
         return self._places if kind in (PLURAL, POLICIES) else ("",)
 
     def page(self, kind: str, place: str, token: str = "", fields: str = "") -> Page:
-        """A part of the list of a kind, as it is now. Raises ApiExpired, too.
+        """Return a page of the current list of a kind. Raises ApiExpired for an old ``token``.
 
-        ``fields`` is a selector. The items are decoded one at a time: decoded, they take ten times
-        as much memory.
+        ``fields`` is a field selector. The items are decoded during the iteration, because decoded
+        items take ten times as much memory. So the iteration raises ApiUnavailable if the API
+        server's answer is not valid.
         """
         limit = PAGE
         path = _path(kind, place)
@@ -253,7 +268,7 @@ class Api:
         return Page(self._decoded(listing.items, path), version, next_token)
 
     def each(self, kind: str, place: str, fields: str) -> Iterator[JsonObject]:
-        """The objects that a selector fits, as they are now, one at a time; as `page`."""
+        """Yield all objects that match a field selector, page by page. Raises as `page`."""
         token = ""
         while True:
             page = self.page(kind, place, token, fields)
@@ -270,7 +285,7 @@ class Api:
                 raise self._no_server(path) from None
 
     def watch(self, kind: str, place: str, version: str) -> Watch:
-        """What happens to a kind after a version of its list. Raises ApiExpired, too."""
+        """Watch the changes of a kind after ``version``. Raises ApiExpired for an old version."""
         query = {"watch": "1", "resourceVersion": version, "allowWatchBookmarks": "true"}
         query |= _watched(kind) | {"timeoutSeconds": str(WATCHED_FOR)}
         answer = self._send("GET", _path(kind, place), query, within=SILENT)
@@ -282,24 +297,24 @@ class Api:
     def list_fresh(
         self, kind: str, namespace: str, fields: str = "", labels: str = ""
     ) -> list[JsonObject]:
-        """The objects that both selectors fit, as they are now in the API server's store."""
-        # Without a resourceVersion a list is "most recent", as the docs of Kubernetes have it (API
-        # Concepts). The operator has no right to `get` nodes and RosProxies.
+        """Return the objects that match both selectors, from the API server's store."""
+        # Without a resourceVersion, a list is "most recent" (docs of Kubernetes, API Concepts). The
+        # operator lists because it has no right to `get` nodes and RosProxies.
         query = {"fieldSelector": fields, "labelSelector": labels}
         return self._items(self._ask("GET", _path(kind, namespace), query))
 
     def get(self, kind: str, id: Name, within: Timeout = WITHIN) -> JsonObject:
-        """One object, for example of the kind ``services``."""
+        """Return an object. ``kind`` is the plural, such as ``services``."""
         return self._ask("GET", _path(kind, id.namespace, id.name), within=within)
 
     def create(self, kind: str, body: Json, within: Timeout = WITHIN) -> None:
-        """Create an object in the namespace that it names."""
+        """Create an object in the namespace of its metadata."""
         self._ask("POST", _path(kind, body["metadata"]["namespace"]), body=body, within=within)
 
     def may_patch_status(self, account: Name, namespace: str) -> bool:
-        """Whether a service account may write the status of a namespace's RosProxies.
+        """Whether a service account may write the status of RosProxies in a namespace.
 
-        Only the doctor asks, with the rights of its user.
+        Only the doctor calls this, with the rights of its user.
         """
         groups = [_ACCOUNTS, f"{_ACCOUNTS}:{account.namespace}", "system:authenticated"]
         resource = {"verb": "patch", "group": GROUP, "resource": PLURAL, "subresource": "status"}
@@ -318,13 +333,16 @@ class Api:
         return submap(answer, "status").get("allowed") is True
 
     def delete(self, kind: str, id: Name, uid: str, version: str = "") -> None:
-        """Delete an object if it still has this uid, and this version if one is given."""
+        """Delete an object if the uid and a given version still match. Else raises ApiConflict."""
         preconditions = {"uid": uid, **({"resourceVersion": version} if version else {})}
         options = {"apiVersion": "v1", "kind": "DeleteOptions", "preconditions": preconditions}
         self._ask("DELETE", _path(kind, id.namespace, id.name), body=options)
 
     def evict(self, id: Name, uid: str) -> None:
-        """Delete a pod if it has this uid. ApiUnavailable: a PodDisruptionBudget forbids it."""
+        """Evict a pod if the uid still matches.
+
+        Raises ApiUnavailable if a PodDisruptionBudget forbids the eviction.
+        """
         body = {
             "apiVersion": "policy/v1",
             "kind": "Eviction",
@@ -334,13 +352,13 @@ class Api:
         self._ask("POST", _path("pods/eviction", id.namespace, id.name), body=body, within=ONCE)
 
     def patch(self, kind: str, id: Name, operations: list[Json], within: Timeout = WITHIN) -> None:
-        """Change an object, or a part of it as ``rosproxies/status``, by a JSON patch."""
+        """Change an object, or a subresource such as ``rosproxies/status``, by a JSON patch."""
         self._ask("PATCH", _path(kind, id.namespace, id.name), body=operations, within=within)
 
     def fill_secret(self, name: Name, secret: Json, entries: Mapping[str, str]) -> None:
-        """Write entries (in base64) into a Secret, if it is as it was when it was read.
+        """Write entries (base64) into a Secret, if the Secret has not changed since the read.
 
-        Raises ApiInvalid or ApiConflict if somebody else was faster, other ApiErrors.
+        Raises ApiInvalid or ApiConflict if another program has changed the Secret.
         """
         version = text_at(submap(secret, "metadata"), "resourceVersion")
         operations: list[Json] = [
@@ -383,7 +401,7 @@ class Api:
         within: Timeout = WITHIN,
         longest: int | None = None,
     ) -> bytes | None:
-        """The body of the answer; None if it has more than ``longest`` bytes."""
+        """Return the body of a successful answer; None if the body exceeds ``longest`` bytes."""
         answer = self._send_with_retries(method, path, query, body, within)
         data = self._body(answer, longest)
         if data is not None and not 200 <= answer.status <= 299:
@@ -398,9 +416,10 @@ class Api:
         body: Json | list[Json] | None,
         within: Timeout,
     ) -> Any:
-        """The answer; where it puts callers off (429: nothing was begun) asked again, as it says.
+        """Return the answer. Send the request again after HTTP 429, as Retry-After says.
 
-        Callers that have little time try again themselves.
+        HTTP 429 means that the API server has not begun the request. A caller with another
+        ``within`` than `WITHIN` gets the answer at once, and tries again itself.
         """
         for _ in range(TRIES if within is WITHIN else 1):
             answer = self._send(method, path, query, body, within)
@@ -419,7 +438,7 @@ class Api:
         body: Json | list[Json] | None = None,
         within: Timeout = WITHIN,
     ) -> Any:
-        """The answer, of which the body is yet to be read. Raises ApiUnavailable."""
+        """Return the answer with an unread body. Raises ApiUnavailable."""
         is_patch = isinstance(body, list)
         headers = {
             "Accept": "application/json",
@@ -434,7 +453,7 @@ class Api:
                 body=body,
                 auth_settings=["BearerToken"],
             )
-            # Leases are written by operators that do not lead yet.
+            # An operator that does not lead yet writes the Lease object to become the leader.
             if method == "GET" or path.startswith(_ROOTS[LEASES]):
                 return self._client.call_api(*request, _request_timeout=within)
             with self.gate.passing() as may_send:
@@ -445,9 +464,9 @@ class Api:
             raise self._away(error) from error
 
     def _body(self, answer: Any, longest: int | None = None) -> bytes | None:
-        """The body of an answer; None if it has more than ``longest`` bytes."""
+        """Return the body of an answer; None if the body exceeds ``longest`` bytes."""
         try:
-            # The answer to a caller that is put off has been read before.
+            # `_send_with_retries` has already read the body of an HTTP 429 with Retry-After.
             if longest is None or answer.data is not None:
                 return bytes(answer.read())
             data = bytes(answer.response.read(longest + 1))
@@ -464,32 +483,32 @@ class Api:
 
 
 def _watched(kind: str) -> dict[str, str]:
-    """The query for the objects of a kind that are watched: of NetworkPolicies only our own."""
+    """Return the query of a watch: of NetworkPolicies, only the operator's own."""
     return {"labelSelector": OWN_SELECTOR} if kind == POLICIES else {}
 
 
 def _path(kind: str, namespace: str, name: str = "") -> str:
-    """The path of a kind's objects, of one of them, or of a subresource (``pods/eviction``)."""
+    """Return the path of a kind's list, of an object, or of a subresource (``pods/eviction``)."""
     kind, _, sub = kind.partition("/")
     segments = ["namespaces", namespace, kind, name, sub] if namespace else [kind, name, sub]
     return "/".join([_ROOTS.get(kind, "/api/v1"), *(quote(s, safe="") for s in segments if s)])
 
 
 def crd_missing(kind: str) -> str:
-    """What to do about a kind that does not exist at all; empty for those that always do."""
+    """Return the error for RosProxies without a definition; empty for kinds that always exist."""
     if kind != PLURAL:
         return ""
     return (
         f"the CustomResourceDefinition {PLURAL}.{GROUP} is not installed. Install the chart "
-        "rosproxy, or apply manifests/; both contain the definition"
+        "rosproxy-operator, or apply manifests/; both contain the definition"
     )
 
 
 def refusal(status: int, reason: str, body: bytes) -> ApiError:
-    """The error for what the API server answered: HTTP status, reason phrase, body."""
+    """Return the error for an answer of the API server: HTTP status, reason phrase, body."""
     message = _message(body) or reason
     kind = _KINDS.get(status, ApiUnavailable if status >= 500 else ApiError)
-    if status == 403:  # by a role, or by an admission plug-in that has looked at the object
+    if status == 403:  # from RBAC, or from an admission plug-in that refuses the object
         if rule := missing_rule(message):
             return ApiError(f"{rule} ({message})")
         return ApiNotFound(message) if _TERMINATING in message else ApiInvalid(message)
@@ -503,8 +522,8 @@ def refusal(status: int, reason: str, body: bytes) -> ApiError:
 
 
 def _message(body: bytes) -> str:
-    """The message of the ``Status`` object with which the API server refuses."""
+    """Return the message of the API server's ``Status`` object, or else the start of the body."""
     text = body.decode(errors="replace")
-    with contextlib.suppress(ValueError, KeyError, TypeError):  # something else has answered
+    with contextlib.suppress(ValueError, KeyError, TypeError):  # not a Status object
         text = str(json.loads(text)["message"])
     return " ".join(text.split())[:_LONGEST]

@@ -1,4 +1,4 @@
-"""Where the API server is, and who this process is to it."""
+"""The address of the API server, and the credentials of this process."""
 
 import os
 from typing import Any
@@ -7,15 +7,18 @@ from kubernetes.client import Configuration
 from kubernetes.config import ConfigException, load_incluster_config, load_kube_config
 
 CONNECTIONS = 16
-"""Connections to the API server that are kept."""
+"""Connections to the API server that the client keeps open."""
 
 
 class NoCluster(Exception):
-    """No cluster is configured; the message has the fix."""
+    """No cluster is configured. The message has the fix."""
 
 
 def configuration() -> Any:
-    """How to reach the API server. Raises NoCluster."""
+    """Return the client's configuration: of this pod, or else from the kubeconfig file.
+
+    Raises NoCluster.
+    """
     settings = Configuration()
     try:
         if os.environ.get("KUBERNETES_SERVICE_HOST"):
@@ -27,7 +30,7 @@ def configuration() -> Any:
             f"no Kubernetes cluster is configured ({error}). Run this program in a pod with a "
             "service account, or name a kubeconfig file in KUBECONFIG"
         ) from error
-    # Callers try again themselves, and are to know of an error at once.
+    # Without urllib3's own retries, an error reaches the caller at once. The caller tries again.
     settings.retries = False
     settings.connection_pool_maxsize = CONNECTIONS
     return settings

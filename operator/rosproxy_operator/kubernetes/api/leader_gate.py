@@ -1,8 +1,8 @@
-"""Lets the operator write while it leads, and not a moment longer.
+"""The gate: lets the operator change the cluster only while the operator leads.
 
-Every request that changes something passes here just before it is sent, from whichever thread. One
-that was sent may still arrive late: so deletions name what they are for (uid, resourceVersion), and
-to create an object twice is refused by its name.
+Each request that changes something passes the gate just before it is sent, in any thread. After
+that, the request may still arrive late. So a deletion names the uid of the object, and some
+deletions the resourceVersion. The API server refuses a second object of the same name.
 """
 
 import threading
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 
 class Gate:
-    """Lets requests through while ``open`` says so. Any thread may use it."""
+    """Lets requests pass while ``open()`` is true. Safe in any thread."""
 
     def __init__(self, open: Callable[[], bool] = lambda: True) -> None:
         self.open = open
@@ -21,7 +21,7 @@ class Gate:
 
     @contextmanager
     def passing(self) -> Iterator[bool]:
-        """Whether a request may be sent, which counts as under way until this ends."""
+        """Yield whether a request may be sent. Until the block ends, the request is under way."""
         with self._changed:
             may_pass = not self._closed and self.open()
             self._passing += may_pass
@@ -33,7 +33,10 @@ class Gate:
                 self._changed.notify_all()
 
     def close(self, seconds: float) -> bool:
-        """Let nothing through any more; whether all that was under way has ended by then."""
+        """Let no more requests pass, and wait for the requests under way.
+
+        Return whether all requests have ended within ``seconds``.
+        """
         with self._changed:
             self._closed = True
             return self._changed.wait_for(lambda: not self._passing, seconds)

@@ -1,4 +1,4 @@
-"""Reads the missing right from a message of the API server, for users that grant the right."""
+"""Reads from a message of the API server which right is missing."""
 
 import re
 
@@ -9,7 +9,7 @@ _RBAC = re.compile(
 
 
 def missing_rule(message: str) -> str:
-    """The rule that the operator's role lacks, by the API server's words; empty if it is none."""
+    """Return which rule the operator's role lacks; empty if ``message`` is about anything else."""
     match = _RBAC.search(message)
     if match is None:
         return ""
@@ -22,7 +22,7 @@ def missing_rule(message: str) -> str:
 
 
 def missing_right(message: str) -> str:
-    """The right that the caller lacks, as ``kubectl auth can-i`` takes it; else empty."""
+    """Return the missing right as arguments of ``kubectl auth can-i``; empty if none is missing."""
     match = _RBAC.search(message)
     if match is None:
         return ""
