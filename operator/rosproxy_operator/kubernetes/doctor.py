@@ -1,9 +1,10 @@
-"""``rosproxy-operator kubernetes doctor``: what is wrong in a cluster, the first cause first.
+"""``rosproxy-operator kubernetes doctor``: finds faults in a cluster, the first cause first.
 
-First what the operator has written into the status of each RosProxy; then whether the webhook can
-work, and which Events there were (`doctor_facts`); then each proxy is asked by the doctor of its
-own pod (``kubectl exec``), which tests from the place of the proxy. All requests use the rights of
-the user that calls the doctor: a missing right becomes a finding, and the doctor checks the rest.
+The doctor checks in this order: the operators, the statuses of the RosProxies, the labelled pods,
+the webhook, and the last Events (`doctor_facts`). Then the doctor runs ``rosproxy doctor`` in the
+pod of each proxy, as ``kubectl exec`` does: this command tests from the place of the proxy. All
+requests use the rights of the user that calls the doctor. A missing right becomes a finding, and
+the doctor checks the rest.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -38,13 +39,17 @@ from rosproxy_operator.kubernetes.status.operator_findings import operator_findi
 from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
 
 AT_ONCE = 4
-"""Proxies that are asked at the same time: each doctor is a Python of its own."""
+"""Proxies checked at the same time: each doctor is a separate Python process in the pod."""
 WITHIN = 60
-"""Seconds that a doctor has: it tries what may not answer."""
+"""Seconds for the doctor of a proxy: this doctor waits for nodes that may not answer."""
 
 
 def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFinding]:
-    """All findings; of proxies about these nodes and topics, if any. Raises ApiError."""
+    """Return all findings.
+
+    If ``names`` are given, the proxies report only on these nodes, topics and services. Raises
+    ApiError.
+    """
     api = Api(namespaces)
     try:
         rosproxies = api.rosproxies()
@@ -73,12 +78,12 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
 
 
 def namespaces_of(objs: Iterable[Json]) -> frozenset[str]:
-    """The namespaces of objects."""
+    """Return the namespaces of objects."""
     return frozenset(text_at(submap(obj, "metadata"), "namespace") for obj in objs)
 
 
 def running_proxies(own_pods: Iterable[Json]) -> list[Json]:
-    """The pods that have a doctor: running proxies, without LAN relays and image checks."""
+    """Return the pods with a doctor: running proxies, without LAN relays and image checks."""
     return [
         pod
         for pod in own_pods
@@ -88,7 +93,7 @@ def running_proxies(own_pods: Iterable[Json]) -> list[Json]:
 
 
 def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
-    """What the doctor in a pod finds."""
+    """Yield the findings of the doctor in a pod; if the doctor can't run, a warning."""
     namespace = pod["namespace"]
     name = pod["name"]
     subject = f"proxy {namespace}/{name}"
@@ -105,8 +110,8 @@ def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
 
 
 def _run(namespace: str, pod: str, arguments: Sequence[str]) -> bytes:
-    """What a command prints in a pod, to its end."""
-    with ApiClient(configuration()) as client:  # a stream makes it one for streams alone
+    """Return all output of a command in a pod, after at most `WITHIN` seconds."""
+    with ApiClient(configuration()) as client:  # `stream` changes the client during the call
         channel = stream(
             CoreV1Api(client).connect_get_namespaced_pod_exec,
             pod,

@@ -1,7 +1,7 @@
-"""What the doctor reads besides RosProxies: the webhook, and Events. With the caller's rights.
+"""The facts that the doctor reads besides RosProxies: operators, pods, the webhook and Events.
 
-A question that the API server does not answer, most often for want of a right, becomes a finding,
-and the others are asked all the same.
+All requests use the rights of the doctor's user. A refused request becomes a finding, most often
+about a missing right, and the doctor sends the next request.
 """
 
 import time
@@ -37,11 +37,11 @@ from rosproxy_operator.kubernetes.status.webhook_findings import (
 
 T = TypeVar("T")
 MOST_LOOKED_FOR = 3 * MOST
-"""Pods at most that are looked for, to see whether an Event is about one that is there."""
+"""Most Events whose pod the doctor looks up: Events of deleted users' pods do not matter."""
 
 
 class DoctorFacts:
-    """Asks the API server. ``refused`` are findings about what it has not answered."""
+    """Reads facts from the API server. ``refused`` has a finding for each failed request."""
 
     def __init__(self, api: Api, namespaces: Sequence[str]) -> None:
         self._api = api
@@ -49,7 +49,10 @@ class DoctorFacts:
         self.refused: list[DoctorFinding] = []
 
     def operators(self, rosproxies: Iterable[Json]) -> Operators:
-        """The operators' pods, and where they may not write what the RosProxies' status is."""
+        """Return the operators' pods, and the namespaces where these may not write a status.
+
+        The doctor checks only namespaces with a RosProxy that no operator has looked at.
+        """
         pods = self._ask("operator", lambda: self._api.list_fresh("pods", "", labels=OPERATORS))
         found = Operators(None if pods is None else tuple(pods))
         account = service_account(found)
@@ -65,7 +68,7 @@ class DoctorFacts:
         return frozenset(n for n in sorted(namespaces) if not may_write(account, n))
 
     def meant_pods(self) -> list[Pod]:
-        """The users' pods with the label rosproxy.io/inject, or with a misspelt name."""
+        """Return the live pods with the label rosproxy.io/inject, or with a misspelt name."""
         found: list[Pod] = []
         for place in self._places:
             found += self._ask("pods", partial(self._meant, place)) or []
@@ -78,7 +81,7 @@ class DoctorFacts:
         return [pod for pod in meant if not (pod.ended or pod.deleting)]
 
     def webhook(self, operators: Operators, unreached: Sequence[str]) -> WebhookFacts:
-        """What there is of the webhook."""
+        """Return the webhook's configurations, and how many endpoints of each Service are ready."""
         api = self._api
         listed = self._ask("webhook", lambda: api.list_fresh(WEBHOOKS, ""))
         if listed is None:
@@ -92,7 +95,7 @@ class DoctorFacts:
         return WebhookFacts(ours, ready=ready, unreached=unreached)
 
     def events(self, rosproxies: Sequence[Json], own_pods: Sequence[Json]) -> list[RecentEvent]:
-        """The Warning Events of these, and of users' pods that are there, the newest first."""
+        """Return Warning Events of these objects and of users' existing pods, the newest first."""
         events: list[Json] = []
         for place in self._places:
             events += self._ask("events", partial(self._warnings, place)) or []
@@ -104,7 +107,7 @@ class DoctorFacts:
         return [*self._api.list_fresh("events", place, fields="type=Warning")]
 
     def _is_there(self, event: RecentEvent) -> bool:
-        """Whether a pod is there still. One that can't be looked for counts as there."""
+        """Whether the pod of an Event exists. After a failed request, the answer is yes."""
         try:
             pod = self._api.get("pods", event.id)
         except ApiNotFound:
@@ -114,7 +117,7 @@ class DoctorFacts:
         return text_at(submap(pod, "metadata"), "uid") == event.uid
 
     def _count_ready(self, service: Name, ready: dict[Name, int | None]) -> None:
-        """Note how many endpoints of a Service are ready; None if there is no such Service."""
+        """Store in ``ready`` how many endpoints of a Service are ready; None: no such Service."""
         try:
             self._api.get("services", service)
         except ApiNotFound:
@@ -126,7 +129,7 @@ class DoctorFacts:
         ready[service] = sum(submap(e, "conditions").get("ready") is not False for e in endpoints)
 
     def _ask(self, subject: str, question: Callable[[], T]) -> T | None:
-        """The answer; None if there is none, which becomes a finding."""
+        """Return the answer. If the request fails, add a finding to ``refused`` and return None."""
         try:
             return question()
         except ApiError as error:
@@ -144,7 +147,7 @@ class DoctorFacts:
 
 
 def ready_pods(pods: Iterable[Json]) -> frozenset[str]:
-    """The uids of the pods that are ready."""
+    """Return the uids of the pods that are ready."""
     return frozenset(
         text_at(submap(pod, "metadata"), "uid")
         for pod in pods

@@ -1,9 +1,9 @@
-"""Leader election among operators: reads the Lease, and writes it when it may.
+"""Leader election among operators: reads and writes the Lease object.
 
-`planner.leadership` decides; here are the clock, the requests and the notification of a change.
-The `leaderelection` of the `kubernetes` client does not do: it relies on the wall clock, renews in
-a loop that nobody can end and that never releases the Lease, and does not say until when its
-leader may act. kopf's peering says of itself that it locks nothing.
+`planner.leadership` decides. This module has the clock, the requests and the call that reports a
+change. Two alternatives were rejected. The `leaderelection` of the `kubernetes` client relies on
+the wall clock and does not say until when the leader may act. Its loop can't be stopped, and never
+releases the Lease object. The peering of kopf has no locks, as its documentation says.
 """
 
 import asyncio
@@ -33,18 +33,18 @@ from rosproxy_operator.kubernetes.resources.model import Json, Name
 log = logging.getLogger(__name__)
 
 LONGEST = 60.0
-"""Seconds that a Lease may last at most: no operator here has written a longer one."""
+"""Upper bound for the seconds that a Lease object lasts. No operator here writes a longer time."""
 
 
 def clock() -> float:
-    """Seconds of a clock that nobody sets, and that goes on while the machine sleeps."""
+    """Return the seconds of a clock that can't be set, and that runs while the machine sleeps."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 class LeaderElection:
-    """This operator's candidacy. Without a ``lease`` it has no rivals, and leads from the start.
+    """The candidacy of this operator. Without a ``lease``, this operator leads from the start.
 
-    `leads` may be asked from any thread, all else belongs to the event loop.
+    `leads` is safe in any thread. All other methods belong to the event loop.
     """
 
     def __init__(self, api: Api, lease: Name | None, metrics: ClusterMetrics) -> None:
@@ -54,46 +54,53 @@ class LeaderElection:
         self._candidate = Candidate(f"{socket.gethostname()}_{uuid.uuid4()}")
         self._leaving = False
         self._lock = asyncio.Lock()
-        self._shown = (-1, "")  # no term has this number, so the first state is reported
+        self._shown = (-1, "")  # no term has this number, so `_show` reports the first state
         self._error = ""
         metrics.leader.set(lease is None)
 
     def leads(self) -> bool:
-        """Whether this operator may act, at this moment."""
+        """Whether this operator may act at this moment."""
         return self._lease is None or self._candidate.leads(clock())
 
     def term(self) -> int:
-        """The number of this operator's present term, from 1; 0: it does not lead."""
+        """Return the number of this operator's term, from 1; 0: this operator does not lead."""
         return (1 if self._lease is None else self._candidate.terms) if self.leads() else 0
 
     async def run(self, changed: Callable[[], None]) -> None:
-        """Take part until it has left, or is cancelled. ``changed``: it leads now, or no more."""
+        """Take part in the election until `resign`, then wait until cancelled.
+
+        Calls ``changed`` when the leader or the term of this operator changes.
+        """
         while self._lease is not None and not self._leaving:
             async with self._lock:
                 if not self._leaving:
                     self._candidate = await in_thread(self._round, self._candidate, self._lease)
             self._show(changed)
-            # Candidates are spread in time; a leader that fails to renew has little time left.
+            # Random pauses keep candidates from writing at once. After a failed renewal, a leader
+            # also takes the short pause: little time is left to renew.
             calm = self.leads() and not self._error
             await asyncio.sleep(RENEW if calm else LOOK * random.uniform(0.5, 1.0))  # noqa: S311
-        await asyncio.Event().wait()  # the process ends with the first task that does (`run`)
+        await asyncio.Event().wait()  # `run` ends the process when any task ends
 
     def resign(self) -> None:
-        """Lead no more. The Lease is kept until `release`."""
+        """Stop leading. This operator remains the holder of the Lease object until `release`."""
         self._leaving = self._lease is not None
         self._candidate = leadership.after_resignation(self._candidate)
 
     async def release(self) -> None:
-        """Let another operator lead at once: this one has stopped acting."""
-        async with self._lock:  # a renewal may be under way
-            # If one was, its result has replaced what `resign` had noted.
+        """Release the Lease object, so that another operator leads at once.
+
+        Call this only after this operator has stopped acting.
+        """
+        async with self._lock:  # wait for a renewal under way
+            # The result of that renewal has replaced the candidate of `resign`, so resign again.
             self._candidate = leadership.after_resignation(self._candidate)
             if self._lease is not None:
                 await in_thread(self._release, self._lease)
         self._metrics.leader.set(0)
 
     def _round(self, candidate: Candidate, lease: Name) -> Candidate:
-        """Look at the Lease once, and write it if that is right."""
+        """Read the Lease object, and write a new record if `leadership` says so."""
         try:
             candidate = leadership.observe(candidate, self._read(lease), clock())
             record = leadership.next_record(candidate, clock())
@@ -130,7 +137,7 @@ class LeaderElection:
             return None
 
     def _write(self, lease: Name, record: LeaseRecord) -> None:
-        """Write it if it is still as it was read. Raises ApiError."""
+        """Write the Lease object. Raises ApiConflict if the object has changed since the read."""
         spec = lease_spec(record, datetime.now(UTC))
         if not record.version:
             meta = {"namespace": lease.namespace, "name": lease.name}
@@ -144,7 +151,7 @@ class LeaderElection:
         self._api.patch(LEASES, lease, operations, SOON)
 
     def _show(self, changed: Callable[[], None]) -> None:
-        """Report who leads, if that has changed."""
+        """Report which operator leads, if that has changed."""
         term = self.term()
         record = self._candidate.record
         rival = record.holder if record and record.holder != self._candidate.name else ""
@@ -164,7 +171,7 @@ class LeaderElection:
 
 
 def lease_record(obj: Json) -> LeaseRecord:
-    """A Lease, as k8s.io/api, coordination/v1/types.go, has it."""
+    """Return the record of a Lease object (k8s.io/api, coordination/v1/types.go)."""
     spec = submap(obj, "spec")
     return LeaseRecord(
         version=text_at(submap(obj, "metadata"), "resourceVersion"),
@@ -176,7 +183,10 @@ def lease_record(obj: Json) -> LeaseRecord:
 
 
 def lease_spec(record: LeaseRecord, now: datetime) -> Json:
-    """The spec of a Lease that is written ``now``; one that is taken says when that was."""
+    """Return the spec of a Lease object.
+
+    ``now`` is the renewal time, and for a new holder also the time of the acquisition.
+    """
     timestamp = now.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
     return {
         "holderIdentity": record.holder,

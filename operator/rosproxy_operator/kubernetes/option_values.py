@@ -11,21 +11,21 @@ from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 
 
 def read_namespace(text: str) -> str:
-    """The name of a namespace. Raises ValueError."""
+    """Return the name of a namespace. Raises ValueError."""
     if not is_label(text):
         raise ValueError(f"{text!r} can't be the name of a namespace")
     return text
 
 
 def read_object_name(text: str) -> str:
-    """The name of an object that has no namespace; empty for no text. Raises ValueError."""
+    """Return the name of an object without a namespace; empty for no text. Raises ValueError."""
     if text and not is_subdomain(text):
         raise ValueError(f"{text!r} can't be the name of an object")
     return text
 
 
 def read_name(text: str) -> Name | None:
-    """``NAMESPACE/NAME``; None for no text. Raises ValueError."""
+    """Return the name from ``NAMESPACE/NAME``; None for no text. Raises ValueError."""
     namespace, slash, name = text.partition("/")
     if not text:
         return None
@@ -35,17 +35,17 @@ def read_name(text: str) -> Name | None:
 
 
 def read_glob(text: str) -> str:
-    """A pattern with ``*`` and ``?``. Raises ValueError."""
+    """Return a pattern with ``*`` and ``?``. Raises ValueError."""
     if not text or any(c.isspace() for c in text):
         raise ValueError(f"{text!r} is not a pattern such as http://192.0.2.*:11311")
     return text
 
 
 def read_peers(text: str) -> tuple[Json, ...] | None:
-    """A JSON list of NetworkPolicyPeers (networking.k8s.io/v1); None for no text.
+    """Return a JSON list of NetworkPolicyPeers (networking.k8s.io/v1); None for no text.
 
-    Raises ValueError. What the API server does not know it would drop without a word, and the
-    operator would write it again and again: so it is refused here.
+    Raises ValueError, also for unknown fields. The API server would silently drop such a field, and
+    the operator would write the field again and again.
     """
     if not text:
         return None
@@ -56,7 +56,7 @@ def read_peers(text: str) -> tuple[Json, ...] | None:
 
 
 def read_pod_defaults(text: str) -> PodDefaults | None:
-    """The chart value ``proxy.pod`` as JSON; None for no text. Raises ValueError."""
+    """Return the chart value ``proxy.pod``, given as JSON; None for no text. Raises ValueError."""
     try:
         return pod_defaults(msgspec.json.decode(text)) if text else None
     except msgspec.DecodeError as error:
@@ -82,7 +82,7 @@ class _Block(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
 
 
 class _Peer(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """A NetworkPolicyPeer, as k8s.io/api, networking/v1/types.go, has it."""
+    """A NetworkPolicyPeer (k8s.io/api, networking/v1/types.go)."""
 
     podSelector: _Selector | None = None  # noqa: N815
     namespaceSelector: _Selector | None = None  # noqa: N815

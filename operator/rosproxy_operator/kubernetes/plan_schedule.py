@@ -1,6 +1,7 @@
-"""Which parts of a cluster are due to be planned: those that have changed.
+"""Decides which parts of a cluster the next look plans.
 
-All of them are due every ``resync`` seconds in any case: whatever was missed is found then.
+A part is due after a change, or at a time that the last plan has set. Every ``resync`` seconds all
+parts are due, so a missed change has an effect then.
 """
 
 from collections.abc import Iterable
@@ -10,7 +11,7 @@ from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 
 
 class PlanSchedule:
-    """When which namespace is to be planned again, in seconds of a monotonic clock."""
+    """The times at which namespaces are due. All times are seconds of a monotonic clock."""
 
     def __init__(self) -> None:
         self._at: dict[str, float] = {}
@@ -18,20 +19,20 @@ class PlanSchedule:
         self._all_at = 0.0
 
     def mark_all_due(self) -> None:
-        """Everything is due."""
+        """Make everything due."""
         self._all_due = True
 
     def at_once(self, namespaces: Iterable[str]) -> None:
-        """These namespaces are due now."""
+        """Make these namespaces due now."""
         self.due_at(namespaces, 0.0)
 
     def due_at(self, namespaces: Iterable[str], at: float) -> None:
-        """These namespaces are due at a time, if not before."""
+        """Make these namespaces due at a time, unless an earlier time is set."""
         for namespace in namespaces:
             self._at[namespace] = min(self._at.get(namespace, at), at)
 
     def is_all(self, now: float, resync: float) -> bool:
-        """Whether everything is due."""
+        """Whether everything is due: by `mark_all_due`, or after ``resync`` seconds."""
         self._all_due = self._all_due or now - self._all_at >= resync
         return self._all_due
 
@@ -42,7 +43,7 @@ class PlanSchedule:
         nodes: Iterable[str],
         now: float,
     ) -> Partition | None:
-        """The part to be planned now, with the given namespaces and nodes; None if it is all."""
+        """Return the part that is due, with the given namespaces and nodes; None: all is due."""
         if self._all_due:
             return None
         due = {namespace for namespace, at in self._at.items() if at <= now}
@@ -51,7 +52,10 @@ class PlanSchedule:
     def planned(
         self, scope: Partition | None, observed: ClusterSnapshot, again_in: float | None, now: float
     ) -> None:
-        """A part was planned just now, None: all; it is due again in ``again_in`` seconds."""
+        """Note that ``scope`` was planned at ``now``. None: everything was planned.
+
+        The planned namespaces are due again in ``again_in`` seconds; None: after a change.
+        """
         if scope is None:
             self._all_due = False
             self._all_at = now
@@ -67,6 +71,6 @@ class PlanSchedule:
             self.due_at(planned, now + again_in)
 
     def again_in(self, now: float, delay: float | None) -> float | None:
-        """In how many seconds something is due, ``delay`` at most; None: once something changes."""
+        """Return the seconds until a namespace is due, at most ``delay``; None: no time is set."""
         delays = [max(at - now, 0.0) for at in self._at.values()]
         return min([*delays, *([] if delay is None else [delay])], default=None)

@@ -1,4 +1,4 @@
-"""The redirect for containers of rmw_zenoh: connections to a router go to the proxy instead.
+"""The redirect for containers of rmw_zenoh: connections to a router lead to the proxy instead.
 
 Nodes of rmw_zenoh look for a router at localhost:7447. A router passes no data between two peers
 of the same router. So the proxy runs a separate router, at a separate port, for each network

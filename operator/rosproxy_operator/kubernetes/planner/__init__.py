@@ -1,1 +1,1 @@
-"""What is decided in a Kubernetes cluster: plain functions over data, as on a Docker host."""
+"""The decisions for a Kubernetes cluster: plain functions over data, as on a Docker host."""

@@ -1,4 +1,4 @@
-"""What the operator can do to a cluster: data, carried out by `apply`."""
+"""The actions of the operator in a cluster, as data. `apply` carries out the actions."""
 
 from typing import ClassVar
 
@@ -8,13 +8,13 @@ from rosproxy_operator.kubernetes.resources.model import Json, Name, Reference
 
 
 class ClusterAction(msgspec.Struct, frozen=True):
-    """Something to be done for the RosProxy ``of``."""
+    """An action for the RosProxy ``of``."""
 
     of: Name
 
 
 class ObjectAction(ClusterAction, frozen=True):
-    """Something to be done to the object ``id``, if it still has this uid."""
+    """An action on the object ``id``, only if the uid still matches."""
 
     id: Name
     uid: str
@@ -32,7 +32,10 @@ class Creation(ClusterAction, frozen=True):
 
 
 class Deletion(ObjectAction, frozen=True):
-    """Delete an object of this ``kind`` that is not as it ought to be, or ought not to exist."""
+    """Delete an object of ``kind`` that is wrong or no longer needed.
+
+    ``why`` gives the reason for the log and the Event.
+    """
 
     kind: ClassVar[str] = "Pod"
     why: str
@@ -53,7 +56,7 @@ class CreatePolicy(Creation, frozen=True):
 
 
 class SetPolicy(ObjectAction, frozen=True):
-    """Give a NetworkPolicy the spec that it ought to have."""
+    """Replace the spec of a NetworkPolicy."""
 
     spec: Json
 
@@ -71,14 +74,15 @@ class CreateProxy(Creation, frozen=True):
 class DeleteProxy(Deletion, frozen=True):
     """Delete a proxy's pod.
 
-    With ``retire`` its nodes are unregistered at the master first: no proxy takes over.
+    With ``retire``, no other proxy takes over, so the proxy first unregisters its nodes at the
+    master.
     """
 
     retire: bool = False
 
 
 class CreateHelper(Creation, frozen=True):
-    """Create a pod beside a proxy: its LAN relay or an image check, by ``component`` (`names`)."""
+    """Create a pod beside a proxy: a LAN relay or an image check, by ``component`` (`names`)."""
 
     component: str
 
@@ -90,28 +94,28 @@ class DeleteHelper(Deletion, frozen=True):
 
 
 class EvictPod(ObjectAction, frozen=True):
-    """Evict a user's pod that its controller makes anew."""
+    """Evict a user's pod. The pod's controller, such as a ReplicaSet, creates the pod again."""
 
     why: str
 
 
 class SetImage(ObjectAction, frozen=True):
-    """Give a proxy's pod another image: its ports and its address stay."""
+    """Replace the image of a proxy's pod. The pod keeps its ports and address."""
 
     image: str
 
 
 class PatchStatus(ClusterAction, frozen=True):
-    """Replace the status of a RosProxy, if it still has this uid."""
+    """Replace the status of a RosProxy, only if the uid still matches."""
 
     uid: str
     status: Json
 
 
 class Emit(ClusterAction, frozen=True):
-    """Make a Kubernetes Event.
+    """Create a Kubernetes Event. If the same Event exists, increase its count instead.
 
-    ``type`` is Normal or Warning. The same event is made once, and counted when it comes again.
+    ``type`` is Normal or Warning.
     """
 
     about: Reference

@@ -1,10 +1,10 @@
-"""Which range of ports each proxy gets on its node.
+"""Chooses the range of ports of each proxy on a node.
 
-A proxy keeps the range that it has, or had by the state or by its RosProxy's status, as long as the
-RosProxy allows the range and its ports are free. On each node proxies that have ports come first,
-then those that had some, then those that want some. A hostPort is taken if any pod of the node has
-it, whoever owns the pod. `state` says which ports were refused recently, and which proxies had to
-leave theirs.
+A proxy keeps its present or former range as long as the RosProxy allows the range and the ports are
+free. The state and the status of the RosProxy name former ranges. On each node, proxies that have
+ports come first, then proxies that had ports, then new proxies. A hostPort is taken if any pod of
+the node has the port, also a foreign pod. `state` says which ports were refused recently, and which
+proxies had to leave a range.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -45,10 +45,11 @@ from rosproxy_operator.kubernetes.status.findings import finding
 
 
 class ClusterRanges(msgspec.Struct, frozen=True):
-    """The range of each wanted proxy that can have one.
+    """The ranges of the wanted proxies.
 
-    ``published`` are the ports for a master in the cluster, where they are free. ``exhausted`` says
-    for each other place why it has no range, ``findings`` what could not be had as asked for.
+    ``given`` has the range of each place that gets a range. ``exhausted`` gives the reason for each
+    other place. ``published`` has the ports for a master in the cluster, where free. ``findings``
+    report ranges that are too short, and masters that are not published.
     """
 
     given: dict[ProxyPlace, PortRange] = {}
@@ -58,9 +59,9 @@ class ClusterRanges(msgspec.Struct, frozen=True):
 
 
 def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> ClusterRanges:
-    """A range for each wanted proxy: the one that it has or had, else the first that is free.
+    """Return a range for each wanted proxy: the present or former range, else the first free range.
 
-    A proxy that has its ports keeps them, unless its RosProxy or the settings now forbid them.
+    A proxy keeps the ports that it has, unless the RosProxy or the settings now forbid these ports.
     """
     ranges = ClusterRanges()
     kernel = {"NodePorts": settings.node_ports, "the nodes' ephemeral ports": settings.ephemeral}
@@ -72,7 +73,7 @@ def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> Clus
 
 
 class _Node(msgspec.Struct):
-    """A node whose ranges are given out, into ``ranges``."""
+    """Chooses the ranges on a node, and stores the result in ``ranges``."""
 
     view: View
     state: ClusterState
@@ -83,11 +84,14 @@ class _Node(msgspec.Struct):
 
     @property
     def proxies(self) -> tuple[ProxyPod, ...]:
-        """All proxies that hold ports on the node."""
+        """The proxies that hold ports on the node."""
         return self.view.proxies_by_node.get(self.node, ())
 
     def allocate(self, places: Iterable[ProxyPlace]) -> None:
-        """Proxies that have ports come before those that had some, and these before the rest."""
+        """Choose the ranges of these places.
+
+        Proxies that have ports come first, then proxies that had ports, then new proxies.
+        """
         wishes = {(place, False): self._wish(place) for place in sorted(places, key=self._rank)}
         published = {
             (place, True): self._master_wish(place)
@@ -112,7 +116,7 @@ class _Node(msgspec.Struct):
         return ranks.index(True), place
 
     def _wish(self, place: ProxyPlace) -> RangeWish:
-        """What a proxy wants, and what it can't have."""
+        """Return the wish of a proxy for a range, with the ports that are not available."""
         spec = self.view.rosproxies[place.of].spec
         reserved = self._reserved(spec)
         kernel = [*self.kernel.values()]
@@ -122,7 +126,7 @@ class _Node(msgspec.Struct):
         current = self.view.current.get(place)
         is_held = current is not None and has_ports(current) and allowed[:1] == ranges[:1]
         taken = set[int]() if is_held else self._taken(place)
-        # If possible, a new range is none that another RosProxy has had on this node.
+        # If possible, a new range is not the former range of another RosProxy on this node.
         others = (r.former_ranges.get(self.node) for r in self.view.rosproxies.values())
         return RangeWish(
             spec.ports,
@@ -135,7 +139,7 @@ class _Node(msgspec.Struct):
         )
 
     def _past(self, place: ProxyPlace) -> Iterator[PortRange]:
-        """The ranges that a proxy has or had, that of its present pod first."""
+        """Yield the present and former ranges of a proxy, first the range of the present pod."""
         current = self.view.current.get(place)
         proxies = [p for p in self.proxies if place_of(p) == place]
         yield from (p.range for p in sorted(proxies, key=lambda p: p is not current))
@@ -147,11 +151,12 @@ class _Node(msgspec.Struct):
         yield from filter(None, remembered)
 
     def _taken(self, place: ProxyPlace) -> set[int]:
-        """The ports that a proxy can't get back.
+        """Return the ports that a proxy can't get back.
 
-        Pods that are about to end free their ports in time for a proxy that has served; other
-        proxies' pods also for a proxy that waits for its ports already. The ports of another proxy
-        count if that proxy has got them, or if its place is not given another range.
+        A pod that is being deleted soon frees its ports. So these ports do not count for a proxy
+        that has served. For a proxy that has a pod and waits, the ports of other proxies that are
+        being deleted do not count either. The ports of another proxy count if that proxy has the
+        ports, or if no proxy is wanted at its place.
         """
         served = place in self.state.served
         is_waiting = served or self.view.current.get(place) is not None
@@ -163,7 +168,7 @@ class _Node(msgspec.Struct):
         return host_ports_of(pods, self.view.rosproxies[place.of].spec) | self.refused
 
     def _master_wish(self, place: ProxyPlace) -> RangeWish:
-        """The port for a master in the cluster."""
+        """Return the wish for the port of a master in the cluster."""
         proxy = self.view.current.get(place)
         port = self.view.rosproxies[place.of].spec.master.publish
         ports = PortRange(port, port)
@@ -172,7 +177,7 @@ class _Node(msgspec.Struct):
         return RangeWish(1, ports, blocked | self.refused, held=ports if is_held else None)
 
     def _unpublished(self, place: ProxyPlace) -> ClusterFinding:
-        """Why outside does not find a master in the cluster."""
+        """Return the finding that a master in the cluster is not published."""
         rosproxy = self.view.rosproxies[place.of]
         port = rosproxy.spec.master.publish
         pods = [str(pod.id) for pod in self._other_pods(place) if port in pod.host_ports]
@@ -186,7 +191,7 @@ class _Node(msgspec.Struct):
         return finding(rosproxy, "PortConflict", text)
 
     def _too_short(self, place: ProxyPlace, ports: PortRange) -> ClusterFinding:
-        """Why a range has not as many ports as it is to have."""
+        """Return the finding that a range is shorter than ``spec.ports``."""
         rosproxy = self.view.rosproxies[place.of]
         count = rosproxy.spec.ports
         missing = PortRange(ports.last + 1, ports.first + count - 1)
@@ -199,7 +204,7 @@ class _Node(msgspec.Struct):
         return finding(rosproxy, "PortsExhausted", text)
 
     def _exhaustion(self, place: ProxyPlace, error: PortsExhausted) -> str:
-        """Why there are no ports, and what to do."""
+        """Return why a proxy gets no range, and the fix."""
         window = error.window
         reasons = [f"{subject} {r}" for subject, r in self.kernel.items() if overlap(r, window)]
         pods = self._other_pods(place)
@@ -212,18 +217,18 @@ class _Node(msgspec.Struct):
         return f"{error}. Not available: {reason}. {fix}"
 
     def _other_pods(self, place: ProxyPlace) -> list[Pod]:
-        """All other pods that hold ports on the node."""
+        """Return all other pods that hold ports on the node."""
         proxy_pods = (p.pod for p in self.proxies if place_of(p) != place)
         return [*self._strangers(place), *proxy_pods]
 
     def _strangers(self, place: ProxyPlace) -> list[Pod]:
-        """Pods that are no proxies, among them the LAN relays of other RosProxies."""
+        """Return the node's pods that are not proxies, with the LAN relays of other RosProxies."""
         lan_relays = (r for r in self.view.observed.lan_relays if r.node == self.node)
-        # That of the same RosProxy holds the last port of the range: see `ProxySite.own_ports`.
+        # The LAN relay of the same RosProxy holds the last port of the range (`steps.lan_relay`).
         others = (lan_relay.pod for lan_relay in lan_relays if lan_relay.of != place.of)
         return [*self.view.other_pods_by_node.get(self.node, ()), *others]
 
     def _reserved(self, spec: RosProxySpec) -> set[int]:
-        # The proxy listens on these itself, and a hostPort is the container's port of that number.
+        # The proxy itself listens on these ports, and a hostPort has the container port's number.
         ros2_ports = well_known_ports(spec.ros2.number) if spec.ros2 else frozenset[int]()
         return {MASTER_PORT, ADMIN_PORT, spec.master.publish, *ros2_ports}

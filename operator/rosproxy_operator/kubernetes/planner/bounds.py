@@ -1,10 +1,13 @@
-"""What RosProxies may not ask for: beyond the administrator's bounds, or another's master.
+"""Checks what RosProxies ask for: the administrator's bounds, and masters of other namespaces.
 
-A user who may write RosProxies gets hostPorts, pods and a way to a master by it, so the operator's
-administrator has the last word (`Bounds`), and a namespace's owners say who may name its masters:
-by an annotation on the Service, which only they can write, as a ReferenceGrant does in the Gateway
-API. A RosProxy that asks for more is treated as one that can't be read: what it has stays as it
-is, and nothing is made or changed for it; its condition says what would allow it.
+A user with the right to write RosProxies gets hostPorts, pods and a way to a master. So the
+operator's administrator sets bounds (`Bounds`). The owners of a namespace decide which other
+namespaces may name a master there. An annotation on the master's Service says so, as a
+ReferenceGrant does in the Gateway API. Only users that may change the Service can write the
+annotation.
+
+The operator treats a RosProxy that asks for more like an unreadable RosProxy: existing proxies go
+on, and the operator makes and changes nothing. The condition says what would allow the RosProxy.
 """
 
 import re
@@ -32,18 +35,18 @@ from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 
 NOT_ALLOWED = "NotAllowed"
 Consents = Mapping[Name, frozenset[str]]
-"""By a master's Service, the namespaces whose RosProxies may name it, besides its own."""
+"""The other namespaces whose RosProxies may name a master's Service, by that Service."""
 MOST_PATTERNS = 5
-"""Allowed patterns that a refusal names."""
+"""Most allowed patterns that a refusal names."""
 _EVERYBODY = "*"
 _NUMERIC = re.compile(r"http://([0-9.*?]*[0-9][0-9.*?]*|\[.*\])(:[0-9*?]*)?")
-"""A pattern whose host has digits and no letters: it is meant for addresses."""
+"""A pattern for addresses: the host has digits and no letters, or is in brackets (IPv6)."""
 
 
 def within_bounds(observed: ClusterSnapshot, settings: ClusterSettings) -> ClusterSnapshot:
-    """What is seen, with the RosProxies that ask for more than they may among the unusable ones.
+    """Return the snapshot, with each RosProxy that violates a bound moved to ``unusable``.
 
-    A RosProxy that is being deleted asks for nothing.
+    A RosProxy that is being deleted violates no bound.
     """
     refused: dict[str, InvalidRosProxy] = {}
     for rosproxy in observed.rosproxies:
@@ -62,7 +65,7 @@ def within_bounds(observed: ClusterSnapshot, settings: ClusterSettings) -> Clust
 
 
 def bounds_violation(rosproxy: RosProxy, consents: Consents, settings: ClusterSettings) -> str:
-    """What a RosProxy asks for that it may not have: field, value, what to do. Empty if nothing."""
+    """Return the first violation of a RosProxy: field, value and fix; empty if there is none."""
     objections = (
         *_violations(rosproxy.spec, settings),
         _missing_consent(rosproxy, consents),
@@ -71,9 +74,10 @@ def bounds_violation(rosproxy: RosProxy, consents: Consents, settings: ClusterSe
 
 
 def is_allowed_master(master: str, allowed: tuple[str, ...]) -> bool:
-    """Whether a master's URI, without its path, fits one of some patterns.
+    """Whether a master's URI, without the path, fits a pattern of ``allowed``.
 
-    A pattern of digits and stars fits addresses only: 192.0.2.* is not for 192.0.2.7.example.com.
+    A pattern without letters in the host fits only addresses: ``http://192.0.2.*`` does not fit
+    ``http://192.0.2.7.example.com``.
     """
     host_port = parse_slave_uri(master)
     if host_port is None:
@@ -84,7 +88,7 @@ def is_allowed_master(master: str, allowed: tuple[str, ...]) -> bool:
 
 
 def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
-    """What goes beyond the administrator's bounds."""
+    """Yield the violations of the administrator's bounds."""
     bounds = settings.bounds
     if bounds.masters and spec.ros1:
         for uri in _masters(spec):
@@ -108,7 +112,7 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
 
 
 def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
-    """What goes beyond them of what it asks for of ROS 2."""
+    """Yield the violations in the peers and multicast of ROS 2."""
     for peer in spec.peers if bounds.peers else ():
         uri = slave_uri(HostPort(read_peer(peer).host, 1))
         if not is_allowed_master(uri, tuple(f"http://{p}:1" for p in bounds.peers)):
@@ -120,7 +124,7 @@ def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
 
 
 def _port_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
-    """What goes beyond them of the hostPorts that it asks for."""
+    """Yield the violations in the hostPorts."""
     if spec.ports > bounds.max_ports:
         fewer = f"Ask for {bounds.max_ports} at most"
         yield _refusal("spec.ports", spec.ports, fewer, "allow.maxPorts")
@@ -144,9 +148,10 @@ def _refusal(field: str, value: object, fix: str, allowing: str) -> str:
 
 
 def _masters(spec: RosProxySpec) -> Iterator[str]:
-    """The URIs where the master is really looked for.
+    """Yield the URIs at which the proxy really looks for the master.
 
-    Where the RosProxy itself gives addresses for its host's name, they count and not the name.
+    If the RosProxy itself gives addresses for the master's host name, yield these instead of the
+    name.
     """
     master = spec.master
     if master.service is not None:
@@ -163,14 +168,14 @@ def _masters(spec: RosProxySpec) -> Iterator[str]:
 
 
 def _fits(text: str, pattern: str) -> bool:
-    """Whether a text fits a pattern of ``*`` and ``?``; brackets are those of IPv6 addresses."""
+    """Whether a text fits a pattern of ``*`` and ``?``. Brackets mean themselves (IPv6)."""
     return fnmatchcase(text, pattern.replace("[", "[[]"))
 
 
 def _missing_consent(rosproxy: RosProxy, consents: Consents) -> str:
-    """Which consent a RosProxy lacks for a master in another namespace, and what command gives it.
+    """Return the missing consent for a master in another namespace, with the fix; else empty.
 
-    Whether that Service exists is not told: only the other namespace is to know.
+    The text does not tell whether the Service exists: only the other namespace may know that.
     """
     service = rosproxy.spec.master.service
     namespace = rosproxy.id.namespace
