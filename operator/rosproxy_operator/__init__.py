@@ -1,1 +1,1 @@
-"""Controllers that provide containers and pods with a proxy of their own."""
+"""The operators, which start proxies for labelled containers and pods."""

@@ -43,7 +43,7 @@ from rosproxy_operator.kubernetes.settings import (
 
 
 def _read_bind(example: HostPort, optional: bool, text: str) -> HostPort | None:
-    """``host:port`` to listen on; if ``optional``, ``none`` is None. Raises ValueError."""
+    """Parse ``host:port``; if ``optional``, ``none`` is None. Raises ValueError."""
     listener = parse_host_port(text)
     if listener is None and not (optional and text == "none"):
         raise ValueError(f"{text!r} is not of the form {example}")
@@ -53,7 +53,7 @@ def _read_bind(example: HostPort, optional: bool, text: str) -> HostPort | None:
 def _bind_option(
     name: str, example: HostPort, text: str, optional: bool = False
 ) -> Callable[[Command], Command]:
-    """An option with an address and port; the default is the example, or none if ``optional``."""
+    """An option for an address and port. The default is the example; if ``optional``, none."""
     kind = Parsed("address:port", partial(_read_bind, example, optional))
     return click.option(name, type=kind, default="none" if optional else str(example), help=text)
 
@@ -114,14 +114,14 @@ def docker(
 
     _need("docker", "docker")
     logs.set_up(log_format, log_level)
-    for library in ("docker", "urllib3"):  # they log each request otherwise
+    for library in ("docker", "urllib3"):  # these would log each request
         logging.getLogger(library).setLevel(logging.INFO)
     runs = context.invoked_subcommand is None
     unknown = _unknown_variables(log=not runs)
     with setting_errors():
         settings = make_plan_settings(options)
-    # A command with options tells what an operator with these options would do, whatever the
-    # running operator does.
+    # With options, a command shows the plan of an operator with these options, even if another
+    # operator is running.
     sources = (context.get_parameter_source(name) for name in options if name != "admin_bind")
     context.obj = docker_commands.CommandContext(
         settings, options["admin_bind"], ParameterSource.COMMANDLINE in sources, options["resync"]
@@ -134,12 +134,12 @@ def docker(
 
 
 def _unknown_variables(log: bool = True) -> list[UnknownVariable]:
-    # The proxy's variables have the same prefix, ROSPROXY_: here they are no mistake.
+    # The variables of the proxy have the same prefix, ROSPROXY_, so these are no mistakes here.
     return unknown_variables(main, proxy_main, log=log)
 
 
 def _need(library: str, extra: str) -> None:
-    """Exit if a library that an operator needs is missing, and print how to install it."""
+    """If a library is not installed, print how to install it, and exit."""
     if importlib.util.find_spec(library) is None:
         fail(
             f"the Python package {library} is not installed. Run pip install 'rosproxy[{extra}]' "
@@ -228,10 +228,10 @@ def health() -> None:
     """Exit with 0 if the operator is alive, with 1 if not; for container health checks."""
     from rosproxy.admin.admin_client import AdminClient, AdminError, default_url
 
-    # default_url() alone falls back to the port of a proxy, 11312, and the operator's is 11313.
+    # Without the variable, default_url() returns the port of a proxy, 11312, not 11313.
     url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else f"http://{DEFAULT_ADMIN}"
     try:
         AdminClient(url).get("/healthz", within=3.0)
     except AdminError as error:
-        # With an HTTP status the operator has answered, and the text says what is wrong.
+        # If the operator has answered with an HTTP status, the text says what is wrong.
         fail(error if "HTTP" in str(error) else f"no operator answers at {url}")

@@ -1,1 +1,1 @@
-"""What the operator needs on every engine."""
+"""Code that the operators of all engines share."""

@@ -1,4 +1,4 @@
-"""How a command ends: with exit status 0, or with 1 and a line each that says why."""
+"""The ends of a command: exit status 0, or exit status 1 with a line for each problem."""
 
 import contextlib
 import sys
@@ -14,7 +14,7 @@ from rosproxy_operator.common.problem import Problem
 
 @contextlib.contextmanager
 def exit_on_error(*expected: type[Exception]) -> Iterator[None]:
-    """Exit with one line if the engine or the API server can't be asked."""
+    """Print a LookFailed or ``expected`` error of the context in a line, and exit with 1."""
     errors: tuple[type[Exception], ...] = (LookFailed, *expected)
     try:
         yield
@@ -23,13 +23,13 @@ def exit_on_error(*expected: type[Exception]) -> Iterator[None]:
 
 
 def fail(reason: object) -> NoReturn:
-    """Say why, and exit."""
+    """Print the reason, and exit with 1."""
     click.echo(f"rosproxy-operator: {clean(reason)}", err=True)
     sys.exit(1)
 
 
 def exit_with(problems: Sequence[Problem]) -> NoReturn:
-    """Tell what is not as it ought to be, a line each; exit with 1 if anything is, else with 0."""
+    """Print a line for each problem. Exit with 1 if there are problems, else with 0."""
     for problem in problems:
         text = clean(f"{problem.subject}: {problem.text}")
         click.echo(f"rosproxy-operator: {text}", err=True)

@@ -1,13 +1,15 @@
 """The loop of an operator, for any engine: look, act, and wait for a reason to look again.
 
-A reason is an event (`wake`), a time (`wake_in`, or what the look returned), or the resync. A look
-is level-triggered: it sees everything, so an event says no more than that there was one, and a
-burst of them costs one look. A look that fails is repeated after a pause that grows. Events do not
-shorten it, since what could not be asked does not get better by being asked more often, but `retry`
-does: the engine is back.
+A reason is an event (`wake`), a time (`wake_in`, or the result of the look), or the resync. A look
+is level-triggered: each look reads the whole state. So an event needs no content, and a burst of
+events costs a single look.
 
-The loop knows nothing of what is looked at. All times are those of the event loop's clock, so that
-tests can let it jump.
+After a failed look, the loop pauses before the next look; each pause is longer than the previous.
+Events do not shorten the pause, because more requests do not help an engine that does not answer.
+`retry` ends the pause: the engine is back.
+
+The loop does not depend on the engine. All times are times of the event loop's clock, so tests can
+advance the clock.
 """
 
 import asyncio
@@ -21,21 +23,23 @@ from rosproxy_operator.common.operator_metrics import CommonMetrics
 log = logging.getLogger(__name__)
 
 PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
-"""Seconds until an engine is asked again that did not answer; the last is repeated."""
+"""Seconds from a failed look to the next look; the last value repeats."""
 BEAT = 1.0
-"""Seconds between two signs of life of the event loop."""
+"""Seconds between two notes of the event loop that it runs."""
 LONGEST_BEAT = 20.0
-"""Seconds without a sign of life after which the event loop counts as hanging."""
+"""Seconds without a note after which the event loop counts as hanging."""
 
 UNSETTLED = 1.0
-"""Seconds until the next look of `ControlLoop.run_until`, if nothing happens."""
+"""Seconds until the next look of `ControlLoop.run_until` without an event."""
 
 Look = Callable[[], Awaitable[float | None]]
-"""Looks and acts; returns in how many seconds to look again at the latest. Raises LookFailed."""
+"""Looks and acts. Returns the longest time in seconds to the next look; None: the resync interval.
+
+Raises LookFailed."""
 
 
 class LookFailed(Exception):
-    """A look was not possible, in one line. ``is_engine_away``: the engine can't be asked."""
+    """A look failed; the message is a line. ``is_engine_away``: the engine does not answer."""
 
     def __init__(self, message: str, away: bool = False) -> None:
         super().__init__(message)
@@ -43,15 +47,15 @@ class LookFailed(Exception):
 
 
 class LookImpossible(LookFailed):
-    """No later look of this process can succeed either: the process has to end."""
+    """No look of this process can succeed any more, so the process must end."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
     """The times of a loop, in seconds.
 
-    ``resync`` is the longest and ``debounce`` the least time between two looks. ``longest`` is
-    what a look may take before it is given up; ``engine`` says what is looked at.
+    ``resync`` is the longest and ``debounce`` the shortest time from the end of a look to the next
+    look. The loop cancels a look that takes more than ``longest``. Messages name the ``engine``.
     """
 
     engine: str
@@ -61,7 +65,7 @@ class Pace:
 
 
 class ControlLoop:
-    """Looks again and again. `wake`, `wake_in` and `retry` belong to the event loop's thread."""
+    """Looks again and again. Call `wake`, `wake_in` and `retry` only in the event loop's thread."""
 
     def __init__(self, pace: Pace, metrics: CommonMetrics) -> None:
         self._pace = pace
@@ -78,9 +82,9 @@ class ControlLoop:
         self._awaiting_look: list[asyncio.Future[None]] = []
 
     async def run(self, look: Look) -> None:
-        """Look until cancelled, also after an unexpected error: a bug must not end the loop.
+        """Look until cancelled. Raises LookImpossible.
 
-        Raises LookImpossible.
+        The loop goes on after an unexpected error, because a bug must not end the operator.
         """
         async with self._alive():
             while True:
@@ -95,9 +99,9 @@ class ControlLoop:
                 await self._pause(self._pace.resync)
 
     async def run_until(self, look: Look, settled: Callable[[], bool], seconds: float) -> None:
-        """Look until one that succeeded has ``settled`` everything, for so many seconds at most.
+        """Look until ``settled()`` after a successful look, for so many seconds at most.
 
-        Raises LookFailed if the engine is away.
+        Raises LookFailed if a look reports that the engine is away, and LookImpossible.
         """
         async with self._alive():
             with contextlib.suppress(TimeoutError):
@@ -115,26 +119,27 @@ class ControlLoop:
         self._woken.set()
 
     def wake_threadsafe(self) -> None:
-        """The same from any thread, also before the loop runs or after it has ended."""
+        """Look again soon. Any thread may call this at any time."""
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the event loop has ended
                 self._loop.call_soon_threadsafe(self._woken.set)
 
     def wake_in(self, seconds: float) -> None:
-        """Look again in so many seconds; replaces the time of an earlier call."""
+        """Look again in so many seconds. The time of the previous call no longer counts."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = asyncio.get_running_loop().call_later(seconds, self._woken.set)
 
     def retry(self) -> None:
-        """Look again soon, also after a failure: the engine is back."""
+        """Look again soon, also after a failed look: the engine is back."""
         self._woken.set()
         self._back.set()
 
     async def look_anew(self) -> None:
-        """Have a look that begins from now on, and wait for its end.
+        """Wait for the end of a look that begins after this call.
 
-        Raises LookFailed if it was no success, or the one before was not: then it takes long.
+        Raises LookFailed if this look fails. Also raises LookFailed, at once, if the previous look
+        failed: the loop may then pause for up to 10 s before the next look.
         """
         if self._failures:
             raise LookFailed(self._error or "")
@@ -146,7 +151,7 @@ class ControlLoop:
             raise LookFailed(self._error)
 
     def dead(self) -> str | None:
-        """Why the loop is not alive; None if it is. May be asked from any thread."""
+        """Return why the loop hangs; None if it is alive or not started. Works in any thread."""
         if self._loop is None:
             return None
         now = self._loop.time()
@@ -158,13 +163,14 @@ class ControlLoop:
         return None
 
     def unready(self) -> str | None:
-        """Why the last look was no success; None if it was."""
+        """Return why the last look failed, or that no look has ended; None after a success."""
         return self._error
 
     async def _try(self, look: Look, patient: bool = True) -> bool:
-        """One look; whether it succeeded.
+        """Look once. Return whether the look succeeded.
 
-        Raises LookImpossible, and LookFailed only if the engine is away.
+        Raises LookImpossible. Without ``patient``, also raises LookFailed if the look reports that
+        the engine is away. A look that takes too long only counts as failed.
         """
         self._woken.clear()
         self._back.clear()
@@ -180,7 +186,7 @@ class ControlLoop:
         except LookFailed as error:
             is_final = isinstance(error, LookImpossible)
             if is_final or (error.is_engine_away and not patient):
-                raise  # the caller reports it
+                raise  # the caller reports the error
             self._failed(error)
         else:
             if self._failures:
@@ -193,7 +199,7 @@ class ControlLoop:
             self._looking_since = None
             self._looked_at = asyncio.get_running_loop().time()
             for ended in awaiting:
-                if not ended.done():  # whoever waited may have given up
+                if not ended.done():  # a caller may have stopped waiting
                     ended.set_result(None)
         return not self._failures
 
@@ -206,7 +212,7 @@ class ControlLoop:
         self._metrics.up.set(0 if error.is_engine_away else 1)
 
     async def _pause(self, resync: float) -> None:
-        """Wait until it is time for another look."""
+        """Wait until the next look is due."""
         if self._failures:
             reason = self._back
             seconds = PAUSES[min(self._failures, len(PAUSES)) - 1]
@@ -217,7 +223,7 @@ class ControlLoop:
             async with asyncio.timeout(seconds):
                 await reason.wait()
         now = asyncio.get_running_loop().time()
-        # Events that come in this time cost no look of their own: `_try` clears them.
+        # Events during this sleep cause no further look: `_try` clears `_woken` before the look.
         await asyncio.sleep(self._looked_at + self._pace.debounce - now)
 
     @contextlib.asynccontextmanager

@@ -1,7 +1,8 @@
-"""The operator's own endpoint: /healthz, /readyz, /metrics, /status, and its proxies' live page.
+"""The admin endpoint of an operator: /healthz, /readyz, /metrics, /status, and the live page.
 
-As at a proxy's endpoint, no path answers by a name that a stranger may have registered, an address
-has a few connections, and callers that ask for the metrics at the same time share one reply.
+The same rules hold as at the admin endpoint of a proxy. The server refuses a ``Host`` name that a
+stranger may have registered. Each address may have a few connections. Callers that request the
+metrics at the same time share a reply.
 """
 
 import socket
@@ -26,18 +27,19 @@ from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.proxy_client import Json
 
 MOST_CONNECTIONS = 32
-"""Connections from one address: the kubelet, Prometheus and a browser have some each."""
+"""Connections from an address at most. The kubelet, Prometheus and a browser need a few each."""
 
 Check = Callable[[], str | None]
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 GetStatus = Callable[[], Awaitable[Json]]
-"""Makes the document at ``/status``; raises LookFailed."""
+"""Returns the document at ``/status``. Raises LookFailed."""
 
 
 class HealthServer:
-    """Serves what orchestrators ask. ``alive`` and ``ready`` give None or the reason why not.
+    """The HTTP server of the admin endpoint.
 
-    ``status`` is for callers on loopback, as the page is.
+    ``alive`` and ``ready`` return None, or the reason for HTTP 503. ``status`` and the ``page``
+    answer only callers on loopback.
     """
 
     def __init__(
@@ -62,7 +64,7 @@ class HealthServer:
         self._runner = web.ServerRunner(BoundedServer(partial(_answer, routes), MOST_CONNECTIONS))
 
     async def start(self, listener: HostPort) -> None:
-        """Listen. Raises SettingError if the address can't be bound."""
+        """Start to listen. Raises SettingError if the address can't be bound."""
         await self._runner.setup()
         try:
             site = web.TCPSite(self._runner, listener.host, listener.port, backlog=BACKLOG)
@@ -72,7 +74,7 @@ class HealthServer:
             raise SettingError("--admin-bind", text) from None
 
     async def stop(self) -> None:
-        """Stop listening."""
+        """Stop listening, and close all connections."""
         await self._page.close()
         self._exposition.close()
         await self._runner.cleanup()
@@ -82,7 +84,7 @@ async def _answer(
     routes: Mapping[tuple[str, str], Handler], request: web.BaseRequest
 ) -> web.StreamResponse:
     host = request.headers.get("Host", "")
-    # A stranger may have registered any other name; see `host_rule`.
+    # DNS rebinding: a stranger may have registered any other name (`rosproxy.admin.host_rule`).
     if not is_own_host(host, {socket.gethostname().lower()}):
         return web.Response(status=403, text=refusal(host))
     method = "GET" if request.method == "HEAD" else request.method

@@ -1,10 +1,10 @@
-"""The name of a container image, as options have it."""
+"""The kind of options that name a container image."""
 
 from rosproxy.setting_kinds import Text
 
 
 def read_image(text: str) -> str:
-    """The name of a container image. Raises ValueError."""
+    """Check and return the name of a container image. Raises ValueError."""
     if not text or any(c.isspace() for c in text):
         raise ValueError(f"{text!r} is not the name of an image")
     return text
