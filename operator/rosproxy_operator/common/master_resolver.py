@@ -1,4 +1,4 @@
-"""Where the masters are: their hosts' addresses, as this host resolves them."""
+"""Resolves the host names of the masters to addresses, on the operator's host."""
 
 import asyncio
 import time
@@ -8,16 +8,16 @@ from rosproxy.net.addresses import is_address, is_loopback, plain_address
 from rosproxy.net.resolver import resolve
 
 AGAIN = 15.0
-"""Seconds after which a name is resolved anew."""
+"""Seconds after which the resolver resolves a name again."""
 AGAIN_UNRESOLVED = 3.0
-"""The same for a name that could not be resolved."""
+"""Seconds after which the resolver retries a name without an address."""
 
 
 class MasterResolver:
-    """The addresses of masters' hosts. The last good one is kept while a name server fails.
+    """The addresses of the masters' hosts. While a name server fails, the last address stays.
 
-    ``changed`` is called when an address has changed. The host of every method is a name or an
-    address, in lower case.
+    `refresh` calls ``changed`` after a change of an address. In all methods, a host is a name or
+    an address, in lower case.
     """
 
     def __init__(self, changed: Callable[[], None]) -> None:
@@ -28,7 +28,7 @@ class MasterResolver:
         self._excluded: frozenset[str] = frozenset()
 
     def address(self, host: str) -> str:
-        """The address of a host; empty if it could not be resolved yet."""
+        """Return the address of a host; empty if the resolver has no address yet."""
         if is_address(host):
             return plain_address(host)
         return self._resolved.get(host) or self._fallback.get(host, "")
@@ -36,10 +36,10 @@ class MasterResolver:
     async def learn(
         self, hosts: Iterable[str], fallback: Mapping[str, str], excluded: Iterable[str]
     ) -> None:
-        """Resolve those hosts that are new and forget those that are not named any more.
+        """Resolve the new hosts among ``hosts``, and forget hosts that are no longer there.
 
-        ``fallback`` are addresses for hosts that can't be resolved. ``excluded`` are no master's:
-        they are the proxies' own, which answer to their masters' names.
+        ``fallback`` has addresses for hosts that do not resolve. ``excluded`` are the addresses of
+        the proxies: a proxy answers to the name of its master, so that name may resolve to the proxy.
         """
         self._fallback = fallback
         self._excluded = frozenset(excluded)
@@ -49,7 +49,7 @@ class MasterResolver:
         await self._ask([host for host, when in self._asked_at.items() if not when])
 
     async def refresh(self) -> None:
-        """Resolve anew what is due."""
+        """Resolve the names that are due, and call ``changed`` if an address changes."""
         now = time.monotonic()
         previous = dict(self._resolved)
         await self._ask(
@@ -68,7 +68,7 @@ class MasterResolver:
                 continue
             self._asked_at[host] = time.monotonic()
             usable = [a for a in addresses if not is_loopback(a) and a not in self._excluded]
-            # A name with several addresses keeps the one that was chosen: name servers change the
-            # order of their answers, and each change would be told to the proxy.
+            # A name with several addresses keeps the chosen address. Name servers change the order
+            # of addresses, and the operator would send each change to the proxy.
             if usable and self._resolved.get(host) not in usable:
                 self._resolved[host] = usable[0]

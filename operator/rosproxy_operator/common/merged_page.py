@@ -1,15 +1,15 @@
-"""The live pages of several proxies as one document.
+"""Merges the live pages of several proxies into a single document.
 
-Each proxy has its own nodes inside. Outside is the same for all proxies of one master, so its
-nodes appear once, and a link between two nodes does; and what is outside for one proxy may be
-inside for another. A master on loopback is another one on each host. Participants of ROS 2 are the
-same wherever they have one name, which is made to be nobody else's. A proxy that can't be asked is
-a node that says why.
+Each proxy has its own nodes inside. All proxies of a master have the same nodes outside, so the
+merged page shows each node and each link once. A node outside one proxy may be inside another. A
+master on loopback is a different master on each host. A participant of ROS 2 has the same key at
+all proxies: the domain and the GUID prefix, which is unique. If a proxy does not answer, its node
+on the page says why.
 
-A proxy may be in hostile hands. So each one has a fair share of the nodes, links and findings that
-are shown, and its texts are shortened as those of a proxy of this release are. No key that it makes
-up is that of another proxy or of a node inside of another one, and it tells of no link between two
-nodes that are not its own.
+An attacker may control a proxy. So each proxy gets a fair share of the nodes, links and findings,
+and the operator shortens all texts as a proxy of this release does. A proxy can't forge the key of
+another proxy or of a node inside another proxy. The operator drops a link if neither end is inside
+the proxy that reports the link.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Set
@@ -48,11 +48,11 @@ _LONG_TEXTS = ("text", "fix")
 _MOST_LEFT_OUT = 10**9
 Row = TypeVar("Row", PageNode, PageLink, PageFinding, PageProxy)
 _RANKS = {WARNING: 1, BROKEN: 2}
-"""How bad a state is; others are not."""
+"""How bad a state is. All other states have rank 0."""
 
 
 def read_document(text: str) -> Document:
-    """The document in a proxy's answer. Raises ValueError."""
+    """Parse and shorten the document in a proxy's answer. Raises ValueError."""
     try:
         document = msgspec.json.decode(text, type=Document)
     except (msgspec.DecodeError, RecursionError) as error:
@@ -63,9 +63,10 @@ def read_document(text: str) -> Document:
 def merged(
     documents: Mapping[str, Document | str], version: str, logs: Callable[[str], str]
 ) -> Json:
-    """One document of those of all proxies, by name; a text says why one can't be asked.
+    """Return a single document from the documents of all proxies.
 
-    ``logs`` gives the command that shows those of a proxy.
+    ``documents`` has a document for each proxy name, or a text that says why the proxy does not
+    answer. ``logs`` returns the command that shows the logs of a proxy.
     """
     nodes: dict[str, PageNode] = {}
     links: dict[str, PageLink] = {}
@@ -85,11 +86,11 @@ def merged(
         }
         for key, node in document.nodes.items():
             if node.lane != CONTAINER and names[key] in inside:
-                names[key] = inside[names[key]]  # another proxy tells of it, who knows it better
+                names[key] = inside[names[key]]  # the proxy around the node knows more
                 continue
             known = nodes.get(names[key])
             if known and _RANKS.get(known.state, 0) > _RANKS.get(node.state, 0):
-                continue  # a proxy before has found more wrong with it
+                continue  # an earlier proxy reports a worse state
             label = name if node.kind == PROXY else node.label or key
             owner = name if node.lane == CONTAINER else ""
             nodes[names[key]] = replace(node, label=label, proxy=owner)
@@ -109,7 +110,7 @@ def merged(
 
 
 def _shortened(document: Document) -> Document:
-    """A document whose texts and numbers are as a proxy of this release makes them."""
+    """Return the document with texts and numbers within the bounds of a proxy of this release."""
     nodes = islice(document.nodes.items(), 2 * MOST_NODES)
     links = islice(document.links.items(), 2 * MOST_LINKS)
     proxy = document.proxy
@@ -124,7 +125,7 @@ def _shortened(document: Document) -> Document:
 
 
 def _brief(row: Row) -> Row:
-    """A row with shortened texts."""
+    """Return the row with shortened texts."""
     texts = {
         name: (shown_text if name in _LONG_TEXTS else shown_name)(text)
         for name in row.__struct_fields__
@@ -134,7 +135,7 @@ def _brief(row: Row) -> Row:
 
 
 def _shares(documents: Mapping[str, Document | str]) -> dict[str, Document | str]:
-    """The documents with as many nodes and links as the share of each proxy has."""
+    """Return the documents, each cut to the proxy's fair share of nodes and links."""
     read = {name: d for name, d in documents.items() if not isinstance(d, str)}
     nodes = fair_shares([len(document.nodes) for document in read.values()], MOST_NODES)
     links = fair_shares([len(document.links) for document in read.values()], MOST_LINKS)
@@ -146,17 +147,17 @@ def _shares(documents: Mapping[str, Document | str]) -> dict[str, Document | str
 
 
 def _size(document: Document | str) -> int:
-    """How many nodes and links a document has."""
+    """The number of nodes and links in a document."""
     return 0 if isinstance(document, str) else len(document.nodes) + len(document.links)
 
 
 def _telling(link: PageLink) -> tuple[int, bool, bool]:
-    """How much a link tells, where several proxies have it: the worst, then who carries it."""
+    """The rank of a proxy's report of a link: worst state first, OK before unknown, then a port."""
     return _RANKS.get(link.state, 0), link.state == OK, link.port is not None
 
 
 def _inside(documents: Mapping[str, Document | str]) -> dict[str, str]:
-    """The keys of the nodes inside, by those that they have for proxies outside which they are."""
+    """Return the keys of all nodes inside, by the keys that other proxies give these nodes."""
     return {
         _outside_key(name, document, key, node, documents.keys() - {name}): f"{name} {key}"
         for name, document in documents.items()
@@ -167,14 +168,18 @@ def _inside(documents: Mapping[str, Document | str]) -> dict[str, str]:
 
 
 def _key(name: str, document: Document, key: str, node: PageNode, others: Set[str]) -> str:
-    """A node's key, different for each proxy, but the same for one node outside."""
+    """Return the key of a node on the page. A node outside has the same key at all proxies."""
     if node.lane == CONTAINER or node.kind == PROXY:
         return f"{name} {key}"
     return _outside_key(name, document, key, node, others)
 
 
 def _outside_key(name: str, document: Document, key: str, node: PageNode, others: Set[str]) -> str:
-    """A node's key outside. One that reads like a key of the ``others`` gets ``name`` in front."""
+    """Return the key of a node as a node outside.
+
+    If the first word is the name of one of the ``others``, ``name`` comes first. Otherwise a proxy
+    could forge a key of another proxy.
+    """
     outside_key = key
     if node.kind != PARTICIPANT:
         master = document.proxy.master or name
@@ -185,10 +190,10 @@ def _outside_key(name: str, document: Document, key: str, node: PageNode, others
 
 
 def _own_links(name: str, document: Document, names: Mapping[str, str]) -> Iterator[PageLink]:
-    """The links with an end inside a proxy, by the ``names`` of their ends on the page.
+    """Yield the links with an end inside a proxy. ``names`` has the keys of the ends on the page.
 
-    A proxy shows no others (`rosproxy.page.graph_document`). Each link with a port has the key of
-    this proxy's node, if the document has one.
+    A proxy shows no other links (`rosproxy.page.graph_document`). Each link with a port gets the
+    key of this proxy's node, if the document has such a node.
     """
     carriers = (names[key] for key, node in document.nodes.items() if node.kind == PROXY)
     carrier = next(carriers, "")
@@ -203,5 +208,5 @@ def _own_links(name: str, document: Document, names: Mapping[str, str]) -> Itera
 
 
 def _first_word(key: str) -> str:
-    """The name of the proxy whose node a key means, if it means one inside."""
+    """Return the first word of a key: for a proxy or a node inside, the name of the proxy."""
     return key.partition(" ")[0]

@@ -1,8 +1,9 @@
-"""The live page of all proxies of an operator, served as a proxy's own is (`rosproxy.page`).
+"""The live page of all proxies of an operator, served like the page of a proxy (`rosproxy.page`).
 
-While somebody looks, every proxy is asked for its document each `EVERY` seconds, which keeps it
-looking; when nobody does, none is asked. It is for callers on loopback: who may look at one proxy
-may not therefore look at all.
+While a page is open, the operator requests the document of every proxy in rounds, with pauses of
+`EVERY` seconds. The requests also keep the proxies collecting data. Without an open page, the
+operator requests nothing. The page answers only callers on loopback, because a user with the token
+of a single proxy may not see all proxies.
 """
 
 import asyncio
@@ -19,12 +20,12 @@ from rosproxy.page.visitors import Visitors
 from rosproxy_operator.common.merged_page import merged
 
 EVERY = 2.0
-"""Seconds between two rounds."""
+"""Seconds from the end of a round to the next round."""
 Documents = Callable[[], Awaitable[Mapping[str, Document | str]]]
 
 
 def operator_page(documents: Documents, logs: Callable[[str], str]) -> Page:
-    """The page over what ``documents`` asks of the proxies, by their names; ``logs``: `merged`."""
+    """Return the page. ``documents`` requests the documents of all proxies; ``logs``: `merged`."""
 
     async def make() -> AsyncGenerator[dict[str, Any]]:
         while True:

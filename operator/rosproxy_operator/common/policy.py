@@ -1,9 +1,13 @@
-"""Policies, as operators hand them to proxies: whose rules they are, and how they get there.
+"""The policies that operators give to proxies: the administrator's layer, bounds, and the variable.
 
-A proxy gets its policy twice. In a variable, when it is created, so that it serves for no moment
-without. And by ``POST /policy``, whenever it has changed or the proxy has been started: another
-policy makes no proxy anew. So one that is started again waits some seconds for its operator's word
-before it registers anything, and if that is away begins with the policy of its creation.
+A proxy gets its policy in two ways:
+
+- In a variable at its creation, so that the proxy never serves without a policy.
+- By ``POST /policy`` after each change of the policy and each start of the proxy. So a new policy
+  does not recreate the proxy.
+
+A restarted proxy first waits up to `AWAITED` seconds for ``POST /policy``, and registers nothing
+meanwhile. If the operator is away, the proxy then uses the policy of its creation.
 """
 
 import json
@@ -14,19 +18,19 @@ from rosproxy.access.rules import MOST_RULES, Rule
 from rosproxy.setting_kinds import SettingError
 
 ADMINISTRATOR = "administrator"
-"""Name of the layer that the operator's options make, which is for every proxy."""
+"""Name of the layer from the operator's options. This layer is for all proxies."""
 AWAITED = 3.0
-"""Seconds that a proxy waits for its operator, as for an update about a new caller."""
+"""Seconds that a started proxy waits for ``POST /policy``. Calls of new callers wait as long."""
 MOST_AUTHORS_RULES = MOST_RULES // 2
-"""Rules of one author, so that those of the administrator and of another always fit together."""
+"""Rules of an author at most, so that the rules of the administrator and another author fit."""
 LONGEST_VARIABLE = 96 * 1024
-"""Bytes: Linux starts no program with a variable of 128 KiB (MAX_ARG_STRLEN)."""
+"""Bytes of the variable at most: Linux allows less than 128 KiB (execve(2), MAX_ARG_STRLEN)."""
 LONGEST_POLICY = LONGEST_VARIABLE // 3
-"""Bytes, as JSON, of one author's layer: the administrator's and another's fit into a variable."""
+"""Bytes of an author's layer as JSON at most. Two such layers fit into a variable."""
 
 
 def administrators_policy(rules: Iterable[tuple[Rule, ...]], mode: str) -> tuple[PolicyLayer, ...]:
-    """The layer of the operator's options, none if they give no rules. Raises SettingError."""
+    """Return the layer of the operator's options; empty without rules. Raises SettingError."""
     all_rules = tuple(rule for group in rules for rule in group)
     layers = (PolicyLayer(ADMINISTRATOR, all_rules, PolicyMode(mode)),) if all_rules else ()
     if problem := too_much(layers):
@@ -35,7 +39,7 @@ def administrators_policy(rules: Iterable[tuple[Rule, ...]], mode: str) -> tuple
 
 
 def too_much(layers: Sequence[PolicyLayer]) -> str:
-    """Why these are more than a proxy can take from one author; empty if they are not."""
+    """Return why the layers are too much for a proxy from an author; empty if they are not."""
     count = sum(len(layer.rules) for layer in layers)
     if count > MOST_AUTHORS_RULES:
         return f"{count} rules, at most {MOST_AUTHORS_RULES} are accepted"
@@ -44,9 +48,10 @@ def too_much(layers: Sequence[PolicyLayer]) -> str:
 
 
 def as_variable(layers: Sequence[PolicyLayer]) -> str:
-    """Layers as a proxy takes them at its creation; empty if there are none.
+    """Return the layers as JSON for the variable of a new proxy; empty without layers.
 
-    Where all are too long for a variable, only those that are for all of its nodes.
+    If all layers are too long for a variable, the JSON has only the layers for all nodes. If these
+    are too long as well, the text is empty.
     """
     common = [layer for layer in layers if layer.addresses is None]
     texts = (json.dumps(layers_as_json(subset)) for subset in (layers, common) if subset)
