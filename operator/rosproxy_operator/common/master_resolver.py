@@ -39,7 +39,7 @@ class MasterResolver:
         """Resolve the new hosts among ``hosts``, and forget hosts that are no longer there.
 
         ``fallback`` has addresses for hosts that do not resolve. ``excluded`` are the addresses of
-        the proxies: a proxy answers to the name of its master, so that name may resolve to the proxy.
+        the proxies: a proxy answers to the name of its master, so this name may resolve to it.
         """
         self._fallback = fallback
         self._excluded = frozenset(excluded)

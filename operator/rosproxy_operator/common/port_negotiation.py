@@ -1,8 +1,9 @@
-"""Which range of ports each proxy gets, and when it leaves the range: the same for every engine.
+"""Chooses the range of ports of each proxy, for all engines.
 
-A proxy's range is a promise: ROS nodes are registered at the master under its ports. So `keep`
-gives each proxy the range that it has or had, where that range is free. Then `fill` gives ranges to
-the other proxies, and more ports to proxies that have too few. What is free is data of the engine.
+Ports should stay, because ROS nodes are registered at the master under the ports of the range. So
+`keep` gives each proxy its present range, or a former range that is free. Then `fill` gives ranges
+to the other proxies, and more ports to proxies with too few. Each engine tells which ports are not
+free.
 """
 
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping
@@ -13,18 +14,18 @@ from rosproxy.leases.ports import PortRange
 
 LAST_PORT = 65535
 RETRY_FOR = 20.0
-"""Seconds for which a proxy that has served is tried again on its ports before it leaves them."""
+"""Seconds for which the operator retries the range of a proxy that has served."""
 TAKEN_FOR = 300.0
-"""Seconds for which a port is avoided that the engine has refused."""
+"""Seconds for which the operator avoids a port that the engine has refused."""
 MOVED_FOR = 600.0
-"""Seconds for which it is reported that a proxy had to leave its range."""
+"""Seconds for which the operator reports that a proxy had to leave its range."""
 Proxy = TypeVar("Proxy", bound=Hashable)
-"""What tells the proxies of an engine apart."""
+"""The key of a proxy, unique in an engine."""
 
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A proxy had to leave the range on which it had served."""
+    """A proxy had to leave the range ``ports``, on which it had served, at the time ``at``."""
 
     ports: PortRange
     at: float
@@ -32,7 +33,7 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class FormerRange:
-    """A range that a proxy had. Others have the ports ``blocked`` and ``ranges``."""
+    """A range that a proxy had. The ports ``blocked`` and ``ranges`` are not free for the proxy."""
 
     ports: PortRange
     blocked: Collection[int]
@@ -41,12 +42,12 @@ class FormerRange:
 
 @dataclass(frozen=True, slots=True)
 class RangeWish:
-    """The ports that a proxy is to have on its host: ``count`` in a row, from ``window``.
+    """The ports that a proxy needs on the host: ``count`` consecutive ports of ``window``.
 
-    ``held`` is the range that the proxy has now and keeps. Without one, the proxy keeps the first
-    range of ``former`` that is free. New ports are none of ``blocked``, none of ``ranges``, and
-    none of ``growing``, the ranges of other proxies. If possible, a new range has no port of
-    ``avoided``, and all ranges have ``room`` to grow to so many times their length.
+    ``held`` is the range that the proxy has now and keeps. Without ``held``, the proxy keeps the
+    first range of ``former`` that is free. New ports are not in ``blocked``, ``ranges`` or
+    ``growing``, the ranges of other proxies. If possible, a new range has no port of ``avoided``,
+    and the new and the ``growing`` ranges can grow to ``room`` times the length.
     """
 
     count: int
@@ -61,10 +62,10 @@ class RangeWish:
 
 
 def after_move(ros1: bool, ros2: bool) -> str:
-    """What happens to nodes behind a proxy that had to leave its range, and what to do.
+    """Return what happens to the nodes of a proxy that had to leave its range, and what to do.
 
-    ROS 1's nodes have to register anew. Participants of ROS 2 meet anew by themselves, if the
-    operator has seen what ports they had.
+    Nodes of ROS 1 have to register again. Participants of ROS 2 rediscover each other, if the
+    operator knows the participants' former ports.
     """
     texts = {
         "Restart the nodes that registered on the old ports: outside can't reach them": ros1,
@@ -75,9 +76,9 @@ def after_move(ros1: bool, ros2: bool) -> str:
 
 
 class PortsExhausted(Exception):
-    """A window has not as many free ports in a row as were asked for.
+    """A window does not have ``count`` consecutive free ports.
 
-    ``free`` are the lengths of its free stretches.
+    ``free`` are the lengths of the free stretches in the window.
     """
 
     def __init__(self, count: int, window: PortRange, free: Collection[int]) -> None:
@@ -90,7 +91,7 @@ class PortsExhausted(Exception):
 
 
 def keep(wishes: Mapping[Proxy, RangeWish]) -> dict[Proxy, PortRange]:
-    """Return the ranges that proxies of a host keep. The first wishes come first."""
+    """Return the ranges that the proxies of a host keep. Earlier wishes have priority."""
     given: dict[Proxy, PortRange] = {}
     for proxy, wish in wishes.items():
         possible = (
@@ -106,9 +107,10 @@ def keep(wishes: Mapping[Proxy, RangeWish]) -> dict[Proxy, PortRange]:
 def fill(
     wishes: Mapping[Proxy, RangeWish], kept: Mapping[Proxy, PortRange]
 ) -> tuple[dict[Proxy, PortRange], dict[Proxy, PortsExhausted]]:
-    """Return the ranges of the proxies of a host, and why some proxies have none.
+    """Return the ranges of the proxies of a host, and for the others why there is no range.
 
-    ``kept`` are the ranges of `keep`. Ranges that are too short get more ports, if those are free.
+    ``kept`` are the ranges of `keep`. A range that is too short gets more ports at its end, if all
+    of these ports are free.
     """
     given = dict(kept)
     exhausted: dict[Proxy, PortsExhausted] = {}
@@ -125,7 +127,7 @@ def fill(
 
 
 def _extended(ports: PortRange, wish: RangeWish, growing: Iterable[PortRange]) -> PortRange:
-    """Return the range with ports added at its end, if those are free; else the range itself."""
+    """Return the range with more ports at its end if they are free, else the unchanged range."""
     wanted = PortRange(ports.first, ports.first + wish.count - 1)
     added = PortRange(ports.last + 1, wanted.last)
     is_possible = ports.last < wanted.last <= wish.window.last
@@ -134,7 +136,10 @@ def _extended(ports: PortRange, wish: RangeWish, growing: Iterable[PortRange]) -
 
 
 def _new_range(wish: RangeWish, growing: Collection[PortRange]) -> PortRange:
-    """The first range that is free, if possible with room for it and its neighbours to grow."""
+    """Return the first free range, if possible with room to grow for all ranges.
+
+    Raises PortsExhausted.
+    """
     more = wish.room - 1
     widened = [PortRange(r.first, min(r.last + more * len(r), LAST_PORT)) for r in growing]
     preferred = [*wish.ranges, *wish.avoided, *widened]
@@ -148,7 +153,7 @@ def _new_range(wish: RangeWish, growing: Collection[PortRange]) -> PortRange:
 def new_moves(
     former: Mapping[Proxy, PortRange], given: Mapping[Proxy, PortRange], now: float
 ) -> dict[Proxy, Move]:
-    """Which proxies leave which ranges."""
+    """Return the moves of the proxies that leave their ranges, at the time ``now``."""
     return {
         proxy: Move(ports, now)
         for proxy, ports in former.items()
@@ -157,14 +162,14 @@ def new_moves(
 
 
 def is_moved(former: PortRange, ports: PortRange) -> bool:
-    """Whether a range is another one, and has not only grown or shrunk at its end."""
+    """Whether the first port differs. A range that grows or shrinks at its end does not move."""
     return former.first != ports.first
 
 
 def negotiate(
     count: int, window: PortRange, blocked: Collection[int], ranges: Iterable[PortRange] = ()
 ) -> PortRange:
-    """The first ``count`` consecutive free ports of a window.
+    """Return the first ``count`` consecutive free ports of a window.
 
     ``blocked`` are single ports that are not free, ``ranges`` whole ranges. Raises PortsExhausted.
     """
@@ -186,14 +191,14 @@ def overlap(ports: PortRange, other_ports: PortRange) -> bool:
 
 
 def within(inner: PortRange, outer: PortRange) -> bool:
-    """Whether the outer range has all ports of the inner one."""
+    """Whether ``outer`` has all ports of ``inner``."""
     return outer.first <= inner.first and inner.last <= outer.last
 
 
 def _gaps(
     window: PortRange, blocked: Collection[int], ranges: Iterable[PortRange]
 ) -> Iterator[PortRange]:
-    """The free stretches of a window, in order."""
+    """Yield the free stretches of a window, in order."""
     intervals = [(port, port) for port in blocked] + [(ports.first, ports.last) for ports in ranges]
     first = window.first
     for start, end in sorted(intervals):

@@ -1,4 +1,4 @@
-"""What is wrong, for every engine: texts for users, each logged once."""
+"""Problems that the operators of all engines report and log."""
 
 import logging
 from collections.abc import Iterable
@@ -9,10 +9,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Something that keeps an object from what its user wants; the text says what to do.
+    """A problem of an object. The text says what is wrong and what to do.
 
     ``subject`` names the object: ``container talker``, ``network app``, ``proxy rosproxy-…``.
-    With ``fatal`` the object is left out; otherwise the problem is a warning.
+    ``fatal``: the operator leaves the object out. Otherwise the problem is a warning.
     """
 
     subject: str
@@ -21,24 +21,24 @@ class Problem:
 
     @property
     def log_fields(self) -> dict[str, str]:
-        """What a log entry about it has as fields, to be given as ``extra``."""
+        """The fields of a log entry about the problem, for ``extra``."""
         kind, _, name = self.subject.partition(" ")
         return {kind: name} if kind in ("container", "pod", "proxy") else {}
 
 
 def bounded(text: str, most: int) -> str:
-    """A text of at most so many characters."""
+    """Return the text, with at most so many characters. A cut text ends in an ellipsis."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 class ProblemLog:
-    """Logs each problem once, and when it is solved."""
+    """Logs each problem once, and logs when an object has no more problems."""
 
     def __init__(self) -> None:
         self._logged: dict[Problem, None] = {}
 
     def update(self, problems: Iterable[Problem]) -> None:
-        """Take note of the problems that there are now."""
+        """Log new problems and solved subjects. ``problems`` are all current problems."""
         current = dict.fromkeys(problems)
         for problem in current:
             if problem not in self._logged:

@@ -1,4 +1,4 @@
-"""What an administrator lets each proxy take: the options of ``rosproxy run`` of the same names."""
+"""Bounds of all proxies, from options of the operator. ``rosproxy run`` has the same options."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,12 +9,12 @@ from rosproxy.setting_kinds import declared
 from rosproxy.settings import Settings
 
 PREFIX = "proxy-"
-"""Before the names of the operator's options."""
+"""The prefix of the operator's options."""
 _OWN = {setting.field: setting.default for setting in declared(Settings)}
 
 
 class ProxyBounds(msgspec.Struct, frozen=True):
-    """Bounds of each proxy, MiB and numbers of connections; the defaults are the proxy's own."""
+    """Bounds of each proxy, in MiB and in connections. The defaults are the proxy's defaults."""
 
     max_buffered: int = _OWN["max_buffered"]
     max_body: int = _OWN["max_body"]
@@ -26,5 +26,5 @@ OWN_BOUNDS = ProxyBounds()
 
 
 def make_proxy_bounds(options: Mapping[str, Any]) -> ProxyBounds:
-    """The bounds from the values of the command line's options, by their names."""
+    """Return the bounds from the values of the operator's options. Keys are parameter names."""
     return ProxyBounds(*(options[f"proxy_{name}"] for name in ProxyBounds.__struct_fields__))

@@ -1,4 +1,4 @@
-"""The client of running proxies' admin endpoints."""
+"""The client of the admin endpoints of running proxies."""
 
 import asyncio
 import errno
@@ -20,31 +20,31 @@ from rosproxy_operator.common.merged_page import read_document
 
 Json = dict[str, Any]
 WITHIN = 3.0
-"""Seconds that a proxy has to answer."""
+"""Seconds in which a proxy must answer."""
 PAGES_AT_ONCE = 8
-"""Proxies that are asked for their page at the same time."""
+"""Proxies from which the operator requests the page document at the same time."""
 LONGEST = 64 * 1024
-"""Bytes of an answer at most. A proxy in hostile hands can't mislead its operator: no redirect is
-followed, and nothing is decompressed."""
+"""Bytes of an answer at most. An attacker may control a proxy, so the client follows no redirects
+and decompresses no answers."""
 LONGEST_STATUS = MOST_BYTES + LONGEST
-"""The same of a status: reading one keeps all other proxies waiting."""
+"""Bytes of a status at most. While the operator reads a status, all other proxies wait."""
 LONGEST_PAGE = 8 * 1024 * 1024
-"""The same of the page's document, whose nodes and links have 5 MiB."""
+"""Bytes of a page document at most. The nodes and links of the document have up to 5 MiB."""
 WITHIN_PAGE = 12.0
-"""The same where it makes the page's document first, for which it may take ten."""
+"""Seconds for a page document. A proxy takes up to 10 s for the first document (`page.routes`)."""
 WITHIN_MASTER = 40.0
-"""The same where it asks its master first, which may hang for 30 s."""
+"""Seconds for a call for which the proxy first calls the master, which may take 30 s."""
 _KEEP_ALIVE = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 3, socket.TCP_KEEPCNT: 3}
-"""Seconds of silence, seconds between questions, and how many go unanswered, see tcp(7)."""
+"""Seconds until the first probe, seconds between probes, and probes without a reply: tcp(7)."""
 
 
 class ProxyError(Exception):
-    """A proxy did not do what it was asked.
+    """A proxy did not carry out a request.
 
-    ``is_unreachable`` if nothing at all is there: no route, or no answer. ``lacks_master`` if it is
-    well, but needs its master, which can't be asked now. ``status`` is that of an HTTP answer, 0
-    without one. ``is_unreadable`` if it answers with more than the operator reads: then the process
-    is still the one that the operator knows.
+    ``is_unreachable``: there is no route to the proxy, or no answer. ``lacks_master``: the proxy is
+    well, but its master does not answer. ``status`` is the HTTP status; 0 without an HTTP answer.
+    ``is_unreadable``: the answer has more bytes than the operator reads. The process of the proxy
+    is still the same then, so the operator need not send everything again.
     """
 
     def __init__(
@@ -58,17 +58,17 @@ class ProxyError(Exception):
 
 
 class PolicyRefused(ProxyError):
-    """A proxy does not take its policy; the message says what to do."""
+    """A proxy refuses its policy, or supports none. The message says what to do."""
 
 
 class ProxyClient:
-    """Calls the admin endpoints of proxies. Every call raises ProxyError."""
+    """Calls the admin endpoints of proxies. All calls raise ProxyError."""
 
     def __init__(self) -> None:
         self._session: aiohttp.ClientSession | None = None
 
     async def status(self, admin: HostPort) -> ProxyStatus:
-        """What a proxy's ``/status`` says."""
+        """Request the ``/status`` of a proxy."""
         text = await self._ask("GET", admin, "/status", longest=LONGEST_STATUS)
         try:
             return parse_status(text)
@@ -78,9 +78,9 @@ class ProxyClient:
     async def changes(
         self, admin: HostPort, token: str, since: str, within: float
     ) -> tuple[str, ProxyStatus]:
-        """The version of its status, and the status, once the version is not ``since``.
+        """Wait until the version of the status differs from ``since``. Return version and status.
 
-        After ``within`` seconds in any case. A proxy of a former release does not know this (404).
+        Returns after ``within`` seconds in any case. A proxy of a former release answers HTTP 404.
         """
         path = f"/status/changes?since={quote(since)}&within={within:g}"
         within += WITHIN
@@ -96,7 +96,7 @@ class ProxyClient:
             raise _no_rosproxy(admin) from None
 
     async def document(self, admin: HostPort, token: str) -> Document:
-        """What a proxy's live page shows."""
+        """Request the document of a proxy's live page."""
         try:
             text = await self._ask(
                 "GET", admin, "/graph", token, within=WITHIN_PAGE, longest=LONGEST_PAGE
@@ -114,7 +114,7 @@ class ProxyClient:
     async def documents(
         self, proxies: Mapping[str, tuple[HostPort, str]]
     ) -> dict[str, Document | str]:
-        """The same of many, by name; for one that can't be asked, the reason."""
+        """Request many page documents, by name of the proxy. Instead of an error, return a text."""
         room = asyncio.Semaphore(PAGES_AT_ONCE)
 
         async def ask(admin: HostPort, token: str) -> Document | str:
@@ -128,19 +128,20 @@ class ProxyClient:
         return dict(zip(proxies, answers, strict=True))
 
     async def master_address(self, admin: HostPort, token: str, address: str) -> None:
-        """Tell where the master's host is now."""
+        """Send the current address of the master's host."""
         await self._ask("POST", admin, "/master-address", token, {"address": address})
 
     async def containers(self, admin: HostPort, token: str, body: Mapping[str, Any]) -> Json:
-        """Tell which containers are gone, have moved or arrived; how many nodes that concerned."""
+        """Send which containers have gone, moved or arrived. Return counts of affected nodes."""
         text = await self._ask("POST", admin, "/containers", token, body, WITHIN_MASTER)
         return _read(text, admin)
 
     async def policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
-        """Tell the layers of its policy, instead of those told before. Raises PolicyRefused, too.
+        """Send the policy's layers, which replace all earlier layers. Raises PolicyRefused, too.
 
-        They are in force at once; where its master can't be asked (503) the proxy goes on trying to
-        tell it. A proxy of a former release has no policy, which is right if there is none.
+        The layers are in force at once. HTTP 503 is no error: the master does not answer now, and
+        the proxy keeps trying to tell the master. HTTP 404 comes from a proxy of a former release,
+        which has no policy; without layers, this is no error.
         """
         try:
             body = {"layers": layers_as_json(layers)}
@@ -169,10 +170,10 @@ class ProxyClient:
         peers: Collection[str] | None = None,
         former: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
-        """Tell which addresses may use it as their master: those of what its labels select.
+        """Send the addresses that may use the proxy as their master.
 
-        And its peers of ROS 2, and the ports of participants at the proxy before it, by their GUID
-        prefixes, if there are any to be told.
+        ``peers`` are the peers of ROS 2; None: unchanged. ``former`` are the ports that
+        participants had at the previous proxy, by GUID prefix.
         """
         body: dict[str, Any] = {"selected": sorted(addresses)}
         if peers is not None:
@@ -182,7 +183,7 @@ class ProxyClient:
         await self._ask("POST", admin, "/containers", token, body)
 
     async def retire(self, admin: HostPort, token: str) -> Json:
-        """Let it unregister everything it holds at the master."""
+        """Let the proxy unregister all nodes and end all participants. Return their number."""
         return _read(await self._ask("POST", admin, "/retire", token, {}, WITHIN_MASTER), admin)
 
     async def close(self) -> None:
@@ -200,12 +201,13 @@ class ProxyClient:
         within: float = WITHIN,
         longest: int = LONGEST,
     ) -> str:
-        """The body of the answer, if that is HTTP 200 and has ``longest`` bytes at most."""
+        """Send a request. Return the body of an HTTP 200 answer with ``longest`` bytes at most."""
         if self._session is None:
-            # No limit: each proxy that is waited for takes one; the callers bound the others.
+            # No limit: each waiting call of `changes` takes a connection, and the callers bound the
+            # other calls.
             connector = aiohttp.TCPConnector(limit=0, socket_factory=_kept_alive)
             self._session = aiohttp.ClientSession(connector=connector, auto_decompress=False)
-        # One that is not there is to be found out soon, however long an answer may take.
+        # A missing proxy should fail soon, even if an answer may take long.
         limits = aiohttp.ClientTimeout(total=within, sock_connect=WITHIN)
         headers = {"Accept-Encoding": "identity"}
         if token:
@@ -233,7 +235,7 @@ class ProxyClient:
 
 
 def _kept_alive(info: aiohttp.AddrInfoType) -> socket.socket:
-    """A socket by which the kernel notices that a machine is gone while nothing is sent."""
+    """Return a socket with TCP keep-alive, which notices a dead machine on an idle connection."""
     sock = socket.socket(family=info[0], type=info[1], proto=info[2])
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in _KEEP_ALIVE.items():

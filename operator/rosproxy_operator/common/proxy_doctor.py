@@ -1,7 +1,7 @@
-"""Asking a proxy's own doctor, in its container: the command, and what it prints.
+"""The doctor in a proxy's container: the command, and the findings in the output.
 
-The proxy may be of another version, and what it says quotes what ROS nodes say: nothing is taken
-that does not fit.
+The proxy may be of another version, and the output quotes texts of ROS nodes. So the operator
+rejects malformed output, and shortens all texts.
 """
 
 import json
@@ -13,18 +13,18 @@ from rosproxy.telemetry.text import brief
 
 MOST_FINDINGS = 500
 LONGEST_TEXT = 2000
-"""Characters of one text."""
+"""Characters of a text at most."""
 _SEVERITIES = {severity.name.lower(): severity for severity in Severity}
 
 
 def command(names: Sequence[str]) -> tuple[str, ...]:
-    """What is run in a proxy's container, for all or for some topics, nodes and services."""
-    # After "--" a name is never taken for an option.
+    """Return the command. ``names`` are topics, nodes and services to check; empty: all."""
+    # After "--", a name that begins with "-" is no option.
     return ("rosproxy", "doctor", "--json", "--", *names)
 
 
 def read_findings(proxy: str, output: bytes) -> list[DoctorFinding]:
-    """The findings in what a proxy's doctor has printed."""
+    """Return the findings in the output of a proxy's doctor. Malformed output is a warning."""
     try:
         rows = json.loads(output)["findings"]
         return [_finding(proxy, row) for row in rows[:MOST_FINDINGS]]
@@ -39,7 +39,7 @@ def read_findings(proxy: str, output: bytes) -> list[DoctorFinding]:
 def without_names_of_others(
     findings_by_proxy: Sequence[Sequence[DoctorFinding]], names: Sequence[str]
 ) -> list[DoctorFinding]:
-    """The findings of all proxies; a name that one proxy knows is unknown to none.
+    """Return the findings of all proxies, without "unknown name" if any proxy knows the name.
 
     Each proxy has a graph of its own, and a topic of ROS 1 is in no domain of ROS 2.
     """
@@ -53,13 +53,13 @@ def without_names_of_others(
 
 
 def _known(findings: Sequence[DoctorFinding], names: Sequence[str]) -> set[str]:
-    """The names that a proxy says something about."""
+    """Return the ``names`` that are subjects of a proxy's findings, except unknown names."""
     told = {word for f in findings if f.check != UNKNOWN_NAME for word in _words(f)}
     return told & {*names}
 
 
 def _words(finding: DoctorFinding) -> set[str]:
-    """The words of a finding's subject, such as ``proxy a: /topic from /talker to /listener``."""
+    """Return the words of the subject, such as ``proxy a: /topic from /talker to /listener``."""
     return {*finding.subject.split()}
 
 

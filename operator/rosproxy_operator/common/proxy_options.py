@@ -1,6 +1,6 @@
-"""Options of both operators with which an administrator sets policy and bounds of all proxies.
+"""Options of both operators: the administrator's policy, and the bounds of all proxies.
 
-They have the values of the options of ``rosproxy run``.
+The values are the values of the options of ``rosproxy run``.
 """
 
 import click
@@ -35,10 +35,10 @@ _BOUNDS = [
 
 
 def proxy_bound_options(command: Command) -> Command:
-    """The bounds of each proxy."""
+    """Add the options with the bounds of each proxy."""
     return with_options(command, _BOUNDS)
 
 
 def policy_options(command: Command) -> Command:
-    """The administrator's policy."""
+    """Add the options with the administrator's policy."""
     return with_options(command, _POLICY)

@@ -1,8 +1,8 @@
-"""One proxy as its operator deals with it: where it is asked, and what it has confirmed to know.
+"""The operator's session with a proxy: the admin endpoint, and the facts that the proxy confirmed.
 
-A proxy keeps nothing: one that is started again knows neither its policy nor who may use it. So
-what it confirmed is remembered here, by the run of the process (`ProxySession.forget`), and the
-operator of each engine decides when to tell the rest.
+A proxy stores nothing on disk. After a restart, the proxy lacks the current policy and the selected
+addresses. So the session notes what the running process has confirmed (`ProxySession.forget`). The
+operator of each engine decides when to send the rest.
 """
 
 import asyncio
@@ -19,10 +19,11 @@ from rosproxy_operator.common.proxy_status import Leases
 
 @dataclass(frozen=True, slots=True)
 class AllowedCallers:
-    """The addresses of all that may use a proxy.
+    """The addresses that may use a proxy.
 
-    ``peers`` are those of ROS 2, None where the proxy is not for it. ``former_leases`` are the
-    ports that participants had at the proxy before it.
+    ``peers`` are the peers of ROS 2; None: unchanged, for ROS 1, and on Docker, where an option of
+    the proxy has the peers. ``former_leases`` are the ports that participants had at the previous
+    proxy.
     """
 
     addresses: tuple[str, ...]
@@ -31,7 +32,7 @@ class AllowedCallers:
 
 
 class ProxySession:
-    """Tells one proxy what it is to know. Every call raises ProxyError."""
+    """Sends facts to a proxy, and notes what the proxy confirms. All calls raise ProxyError."""
 
     def __init__(self, client: ProxyClient, admin: HostPort, token: str) -> None:
         self.admin = admin
@@ -43,39 +44,39 @@ class ProxySession:
         self._runs = 0
 
     def forget(self) -> None:
-        """Note that another process may answer from now on, which knows nothing."""
+        """Note that a new process of the proxy may answer, which has confirmed nothing."""
         self._policy = self._callers = None
         self._runs += 1
 
     def has_policy(self, layers: tuple[PolicyLayer, ...]) -> bool:
-        """Whether it has confirmed these layers, and none since."""
+        """Whether these are the last layers that the running process has confirmed."""
         return layers == self._policy
 
     def has_callers(self, callers: AllowedCallers) -> bool:
-        """Whether it has confirmed these callers, and none since."""
+        """Whether these are the last callers that the running process has confirmed."""
         return callers == self._callers
 
     async def status(self) -> ProxyStatus:
-        """What its ``/status`` says."""
+        """Request the ``/status`` of the proxy."""
         return await self._client.status(self.admin)
 
     async def changes(self, since: str, within: float) -> tuple[str, ProxyStatus]:
-        """The version of its status, and the status; see `ProxyClient.changes`."""
+        """Wait for another status (`ProxyClient.changes`). Return version and status."""
         return await self._client.changes(self.admin, self.token, since, within)
 
     async def tell_policy(self, layers: tuple[PolicyLayer, ...]) -> None:
-        """Tell the layers of its policy, unless it has them. Raises PolicyRefused, too."""
-        # Of two tasks that want it told the second one waits, and finds that it has been.
+        """Send the policy's layers if they are not confirmed. Raises PolicyRefused, too."""
+        # If two tasks send the same layers, the second task waits, and then sends nothing.
         async with self._telling_policy:
             if self.has_policy(layers):
                 return
             run = self._runs
             await self._client.policy(self.admin, self.token, layers)
-            if run == self._runs:  # else the process that confirmed it may be the former one
+            if run == self._runs:  # else the former process may have confirmed
                 self._policy = layers
 
     async def tell_callers(self, callers: AllowedCallers) -> None:
-        """Tell who may use it, whether or not it knows."""
+        """Send the callers, even if the proxy has confirmed them already."""
         run = self._runs
         peers = callers.peers
         former = callers.former_leases
@@ -84,9 +85,9 @@ class ProxySession:
             self._callers = callers
 
     async def tell_containers(self, body: Mapping[str, Any]) -> Json:
-        """Tell which containers are gone, have moved or arrived; how many nodes that concerned."""
+        """Send which containers have gone, moved or arrived. Return counts of affected nodes."""
         return await self._client.containers(self.admin, self.token, body)
 
     async def tell_master_address(self, address: str) -> None:
-        """Tell where the master's host is now."""
+        """Send the current address of the master's host."""
         await self._client.master_address(self.admin, self.token, address)

@@ -1,8 +1,8 @@
-"""What the operator reads from a proxy's ``/status``, for any engine.
+"""Reads facts for the operator from the ``/status`` of a proxy, for all engines.
 
-The document itself is `rosproxy.admin.status_document`. It holds what ROS nodes say of themselves,
-and the proxy may be in hostile hands. So no size in it is to be trusted, and nothing that another
-proxy refuses gets to that proxy.
+The document is `rosproxy.admin.status_document`. ROS nodes choose many texts in the document, and
+an attacker may control the proxy. So the operator bounds all sizes, and drops values that the next
+proxy would refuse.
 """
 
 from collections import defaultdict
@@ -14,16 +14,17 @@ from rosproxy.admin.status_document import EndpointStatus, ParticipantStatus, Pr
 from rosproxy.net.addresses import parse_host_port, plain_address
 
 Leases = Mapping[str, tuple[int, ...]]
-"""The ports of participants, in the order of their locators, by GUID prefix."""
+"""The ports of participants by GUID prefix, in the order of the participant's locators."""
 MOST_LEASED = 512
-"""Participants whose ports are kept: a proxy has as many inside (docs/reference/limits.md)."""
+"""Participants whose ports the operator keeps. A proxy has no more participants inside
+(docs/reference/limits.md)."""
 MOST_PORTS = 16
-"""Ports that are kept of one participant: it has no more."""
+"""Ports of a participant that the operator keeps. A proxy gives a participant no more ports."""
 _LAST_PORT = 65535
 
 
 def nodes_by_address(status: ProxyStatus) -> Mapping[str, tuple[EndpointStatus, ...]]:
-    """A proxy's nodes by the address where they are; without those that it has given up."""
+    """Return the nodes of a proxy by IP address, except the nodes that the proxy has given up."""
     nodes: defaultdict[str, list[EndpointStatus]] = defaultdict(list)
     for node in status.nodes:
         host_port = parse_host_port(node.address)
@@ -33,7 +34,7 @@ def nodes_by_address(status: ProxyStatus) -> Mapping[str, tuple[EndpointStatus, 
 
 
 def participants_by_address(status: ProxyStatus) -> Mapping[str, tuple[ParticipantStatus, ...]]:
-    """A proxy's participants of ROS 2 that are inside, by the address where they are."""
+    """Return the participants inside of a proxy by IP address."""
     participants: defaultdict[str, list[ParticipantStatus]] = defaultdict(list)
     for domain in status.domains:
         for participant in domain.inside:
@@ -42,7 +43,7 @@ def participants_by_address(status: ProxyStatus) -> Mapping[str, tuple[Participa
 
 
 def leases(status: ProxyStatus) -> Leases:
-    """The ports of a proxy's participants inside, as the next proxy takes them."""
+    """Return the ports of a proxy's participants inside, for the next proxy."""
     readable = (
         participant
         for domain in status.domains
@@ -58,10 +59,10 @@ def leases(status: ProxyStatus) -> Leases:
 
 
 def inside_addresses(status: ProxyStatus) -> frozenset[str]:
-    """The addresses where a proxy has nodes or participants.
+    """Return the addresses where a proxy has nodes or participants inside.
 
-    Nodes that the proxy has unregistered count, too: they may be silent, and come back. The proxy
-    shows them as faults until it is told that their container is gone.
+    Nodes that the proxy has unregistered count, too, because a silent node may come back. The proxy
+    shows such a node as a fault until the operator sends that the node's container has gone.
     """
     host_ports = (parse_host_port(node.address) for node in status.nodes if not node.has_ended)
     nodes = (plain_address(host_port.host) for host_port in host_ports if host_port is not None)
