@@ -1,4 +1,4 @@
-"""What both engines know of ROS 2: versions, domains, peers, well-known ports and the LAN relay."""
+"""ROS 2 for both operators: versions, domains, peers, well-known ports and the LAN relay."""
 
 import hashlib
 import hmac
@@ -9,45 +9,45 @@ from rosproxy.setting_kinds import read_peer
 from rosproxy.settings import LEAST_PER_DOMAIN
 
 LAST_DOMAIN = 232
-"""The last one whose well-known ports are ports (DDSI-RTPS 2.5, 9.6.2.3)."""
+"""The last domain whose well-known ports are below 65536 (DDSI-RTPS 2.5, 9.6.2.3)."""
 MOST_PEERS = 32
-"""Hosts that one label or field may name: each announcement goes to 32 ports of each."""
+"""Hosts in a label or field at most. Each announcement goes to at least 32 ports of each host."""
 LEAST_PORTS = LEAST_PER_DOMAIN + 1
-"""Ports of a proxy for ROS 2 with a LAN relay: what the proxy has at least, and the relay's one."""
+"""Ports of a ROS 2 proxy with a LAN relay at least: the proxy's ports, and a port of the relay."""
 ROS1_DISTROS = frozenset(
     {"fuerte", "groovy", "hydro", "indigo", "jade", "kinetic", "lunar", "melodic", "noetic"}
 )
-"""There will be no more of them, so any other is one of ROS 2."""
+"""All distributions of ROS 1: noetic is the last, so any other distribution has ROS 2."""
 LAN_RELAY_COMMAND = ("rosproxy", "lan-relay")
-"""What the proxy's image does as a LAN relay."""
+"""The command of a LAN relay, in the proxy's image."""
 
 
 def discovery_port(domain: int) -> int:
-    """The well-known port at which the first participant of a machine gets announcements."""
+    """Return the well-known port where the first participant of a machine gets announcements."""
     return SPDP_UNICAST + PORTS_PER_DOMAIN * domain
 
 
 def well_known_ports(domain: int) -> frozenset[int]:
-    """The ports on which a domain's proxy listens besides its range."""
+    """Return the ports besides the range on which the proxy of a domain listens."""
     return frozenset({SPDP_MULTICAST + PORTS_PER_DOMAIN * domain, discovery_port(domain)})
 
 
 def read_peer_name(text: str) -> str:
-    """A peer, ``host`` or ``host:port``, in its one form. Raises ValueError."""
+    """Parse and return a peer: ``host`` in lower case, or ``host:port``. Raises ValueError."""
     peer = read_peer(text)
     return str(peer) if peer.port else peer.host.lower()
 
 
 def is_dds(rmw: str) -> bool:
-    """Whether an RMW_IMPLEMENTATION, empty for the default, is one that can be proxied."""
+    """Whether an RMW_IMPLEMENTATION is not rmw_zenoh. An empty value is the default, a DDS."""
     return "zenoh" not in rmw
 
 
 def relay_secret(key: bytes, proxy: str) -> str:
-    """The secret of a proxy and its LAN relay, 64 hex digits: HMAC-SHA256 (RFC 2104) of the proxy.
+    """Return the secret of a proxy and the LAN relay: 64 hex digits, HMAC-SHA256 (RFC 2104).
 
-    ``key`` is what the operator makes the tokens of proxies of, so that an operator that starts
-    again tells both the same secret. No token is one: the proxy's name never begins like this.
+    ``key`` is also the key of the proxies' tokens, so a restarted operator computes the same
+    secret. The text ``LAN relay of`` keeps the secret different from all tokens.
     """
     return hmac.new(key, f"LAN relay of {proxy}".encode(), hashlib.sha256).hexdigest()
 
@@ -55,7 +55,7 @@ def relay_secret(key: bytes, proxy: str) -> str:
 def lan_relay_variables(
     domain: int, lan: str, bind: HostPort, proxy: HostPort, secret: str
 ) -> dict[str, str]:
-    """What a LAN relay is told; see `rosproxy.ros2.lan_relay.relay.LanRelaySettings`."""
+    """Return the variables of a LAN relay (`rosproxy.ros2.lan_relay.relay.LanRelaySettings`)."""
     return {
         "ROSPROXY_LAN_RELAY_DOMAIN": str(domain),
         "ROSPROXY_LAN_RELAY_LAN": lan,

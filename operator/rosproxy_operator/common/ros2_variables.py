@@ -1,7 +1,7 @@
-"""The variables of ROS 2 and DDS in a container: which say its version, and which keep nodes apart.
+"""The variables of ROS 2 and DDS in a container that show the version or prevent discovery.
 
-A profile of DDS can say anything, and the operator does not read files in containers. So such a
-variable is told only where the proxy has heard no participant of the container.
+A DDS profile may contain anything, and the operator does not read files in containers. So the
+operator reports these variables only if the proxy discovers no participant of the container.
 """
 
 from collections.abc import Callable, Mapping
@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from rosproxy.telemetry.text import brief
 
 LONGEST_VALUE = 80
-"""Characters of a variable's value that are told."""
+"""Characters of a variable's value in a report at most."""
 
 _PROFILE = (
     "The DDS profile may name other interfaces, other addresses or a discovery server. Unset the "
@@ -48,15 +48,15 @@ _KEEP_APART: dict[str, tuple[Callable[[str], bool], str]] = {
     "FASTDDS_DEFAULT_PROFILES_FILE": (_always, _PROFILE),
     "FASTRTPS_DEFAULT_PROFILES_FILE": (_always, _PROFILE),
 }
-"""Variables that may keep participants from being heard, the surest cause first: for which values
-they do, and why and what to do."""
+"""Variables that may prevent discovery, the surest cause first. Each has the test of the value, and
+the cause with the fix."""
 
 OF_ROS2 = frozenset({*_KEEP_APART, "ROS_DOMAIN_ID", "ROS_STATIC_PEERS", "RMW_IMPLEMENTATION"})
 """Variables that ROS 1 does not have."""
 
 
 def why_unheard(variables: Mapping[str, str]) -> str:
-    """Why no participant of a container may be heard, and what to do; empty if nothing says it."""
+    """Return why discovery may fail for a container, and the fix; empty without such a variable."""
     for name, (keeps_apart, text) in _KEEP_APART.items():
         value = variables.get(name, "")
         if value and keeps_apart(value):

@@ -1,21 +1,22 @@
-"""The name that somebody may have meant, for names of labels and annotations."""
+"""Finds the label or annotation that a misspelt name probably means."""
 
 import difflib
 from functools import lru_cache
 
 VERY_NEAR = 0.9
+"""Least similarity (0 to 1) of any name: a less similar name may belong to another program."""
 NEAR = 0.75
-"""How near a name is that can hardly be another program's; and one that begins as ours do."""
+"""Least similarity of a name that begins like the operator's names."""
 
 
 def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str:
-    """The known name that is spelt much like a name, whatever its case; empty if none is."""
-    # Of a name that is twice as long as another one the ratio to that is below 0.67.
+    """Return the most similar known name, ignoring case; empty if all are below ``cutoff``."""
+    # A name with more than twice the length of a known name has a similarity below 0.67.
     longest = 2 * max(map(len, known))
     return _nearest(name.lower(), known, cutoff) if len(name) <= longest else ""
 
 
 @lru_cache(maxsize=1024)
 def _nearest(name: str, known: tuple[str, ...], cutoff: float) -> str:
-    """The same, cached: hundreds of objects have the same few names."""
+    """Compare the names. Cached, because hundreds of objects have the same few names."""
     return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), "")

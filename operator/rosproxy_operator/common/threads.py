@@ -1,4 +1,4 @@
-"""Blocking calls beside the event loop, in threads that never keep the process from ending."""
+"""Blocking calls in daemon threads, which do not delay the end of the process."""
 
 import asyncio
 import threading
@@ -10,18 +10,18 @@ T = TypeVar("T")
 
 
 async def in_thread(function: Callable[..., T], *arguments: object) -> T:
-    """What ``function`` returns or raises, called in a daemon thread of its own.
+    """Call ``function`` in a new daemon thread. Return the result, or raise the exception.
 
-    Unlike the threads of asyncio's executor it is not waited for at the end of the process, and a
-    call that hangs takes no place from another one.
+    The threads of asyncio's executor would delay the end of the process, and a call that hangs
+    would occupy a thread of the executor.
     """
     done: Future[T] = Future()
-    done.set_running_or_notify_cancel()  # who waits may give up; the call itself goes on
+    done.set_running_or_notify_cancel()  # a caller that stops waiting can't cancel this
 
     def work() -> None:
         try:
             done.set_result(function(*arguments))
-        except BaseException as error:  # raised again where it is awaited
+        except BaseException as error:  # the caller of `in_thread` gets the exception
             done.set_exception(error)
 
     threading.Thread(target=work, daemon=True, name=getattr(function, "__name__", "call")).start()

@@ -1,7 +1,7 @@
-"""What both engines know of rmw_zenoh: which containers have it, and which run a router.
+"""Reads the endpoints of rmw_zenoh from a container's variable, and the router from the command.
 
-`ZENOH_CONFIG_OVERRIDE` has ``key=value`` pairs with semicolons between (rmw_zenoh,
-zenoh_utils.cpp); an endpoint is ``protocol/host:port``.
+``ZENOH_CONFIG_OVERRIDE`` has ``key=value`` pairs, separated by semicolons (rmw_zenoh,
+zenoh_utils.cpp). An endpoint is ``protocol/host:port``.
 """
 
 import re
@@ -14,25 +14,25 @@ from rosproxy.setting_kinds import ZENOH_PORT
 OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
 SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"
 MOST_ENDPOINTS = 32
-"""Endpoints that are read of a variable."""
+"""Endpoints that the operator reads from a variable at most."""
 _ENDPOINT = re.compile(r"[\"']([a-z]+)/([^\"'/?#;]{1,300})[^\"']*[\"']")
 _ROUTER = re.compile(r"(^|[\s/;&])(rmw_)?zenohd($|[\s;&])")
 
 
 class Endpoint(NamedTuple):
-    """An endpoint: its protocol, such as ``tcp``, its host and its port."""
+    """The protocol, such as ``tcp``, and the address of an endpoint."""
 
     protocol: str
     address: HostPort
 
 
 def connect_endpoints(override: str) -> list[Endpoint]:
-    """The endpoints to which the sessions of a container connect, by its variable."""
+    """Return the endpoints to which the sessions of a container connect."""
     return _endpoints("connect", override)
 
 
 def router_port(override: str) -> int:
-    """The port at which the router of a container listens, by its variable."""
+    """Return the TCP port on which the router of a container listens."""
     ports = [e.address.port for e in _endpoints("listen", override) if e.protocol == "tcp"]
     return ports[0] if ports else ZENOH_PORT
 

@@ -1,1 +1,1 @@
-"""The operator of one Docker host."""
+"""The operator of a Docker host."""
