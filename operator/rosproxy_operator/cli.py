@@ -130,7 +130,9 @@ def docker(
         mistakes = [Problem(f"variable {v.name}", v.text, fatal=False) for v in unknown]
         _run(settings, options["resync"], options["admin_bind"], once, mistakes)
     elif once:
-        raise click.UsageError(f"--once and {context.invoked_subcommand} exclude each other")
+        raise click.UsageError(
+            f"--once and {context.invoked_subcommand} exclude each other. Omit --once"
+        )
 
 
 def _unknown_variables(log: bool = True) -> list[UnknownVariable]:

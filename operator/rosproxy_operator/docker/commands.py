@@ -1,6 +1,6 @@
-"""The commands below ``rosproxy-operator docker``: they tell what there is, and change nothing.
+"""The commands of ``rosproxy-operator docker``. Only ``uninstall`` changes something.
 
-They import what they need when they run: the Docker SDK may not be installed.
+Each command imports its modules when the command runs, because the Docker SDK may be missing.
 """
 
 import sys
@@ -17,10 +17,11 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 @dataclass(frozen=True, slots=True)
 class CommandContext:
-    """What was given before a command.
+    """The options before a command.
 
-    ``admin`` is where an operator would listen. One is to be asked for its status there unless
-    options were ``given``; ``settings`` count then, and where none answers. ``resync`` in seconds.
+    ``admin`` is the admin endpoint of a running operator. A command asks that operator for the
+    status. But if the command line has options (``given``), or no operator answers, the command
+    uses ``settings``. ``resync`` is in seconds.
     """
 
     settings: PlanSettings
@@ -30,7 +31,7 @@ class CommandContext:
 
     @property
     def operator(self) -> HostPort | None:
-        """Where an operator is to be asked; None for nowhere."""
+        """The admin endpoint of the operator to ask; None: ask no operator."""
         return None if self.given else self.admin
 
 
@@ -57,7 +58,7 @@ def status(context: CommandContext, as_json: bool, watch: bool, wait: float) -> 
     master or outside can't be reached; else with 1.
     """
     if as_json and watch:
-        raise click.UsageError("--json and --watch exclude each other; give one of them")
+        raise click.UsageError("--json and --watch exclude each other. Omit one option")
     from rosproxy_operator.docker.errors import EngineError
     from rosproxy_operator.docker.host_status import HostStatus, show_status, watch_status
 

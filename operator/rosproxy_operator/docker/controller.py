@@ -1,9 +1,12 @@
-"""Reconciling a Docker host: look, plan, carry out, report. The loop is `ControlLoop`.
+"""Reconciles a Docker host: look, plan, act, report. The loop is `ControlLoop`.
 
-How a label takes effect: the engine's events (`engine_client`) tell that something has changed and
-wake the loop. A look lists everything anew and reads the labels (`snapshot`), decides
-(`planner.plan`), begins to carry out what was decided (`executor`), and brings the running proxies
-up to date (`proxy_sync`). Work goes on beside later looks; nothing here decides.
+How a label takes effect:
+
+1. The engine reports an event (`engine_client`), which wakes the loop.
+2. A look lists all containers and networks, and reads the labels (`snapshot`).
+3. `planner.plan` decides.
+4. The running proxies get the changes (`proxy_sync`).
+5. The actions of the plan start (`executor`), and may go on during later looks.
 """
 
 import asyncio
@@ -49,30 +52,29 @@ from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 log = logging.getLogger(__name__)
 
 DEBOUNCE = 0.05
-"""Least seconds between two looks: one ``compose up`` makes dozens of events."""
+"""Shortest time in seconds between two looks: ``compose up`` causes dozens of events."""
 SETTLED = 0.25
-"""Seconds after an event at which there is one more look: an engine tells of some things before it
-lists them."""
+"""Seconds from an event to a further look: some events come before the engine's lists change."""
 LONGEST_LOOK = 60.0
-"""Seconds after which a look that has not ended is given up."""
+"""Seconds after which the loop cancels a look."""
 ONCE = 60.0
-"""Seconds that ``--once`` and ``uninstall`` have to reach what is wanted."""
+"""Seconds in which ``--once`` and ``uninstall`` must finish."""
 
 Decide = Callable[[HostState, LabelReading, PlanSettings, DockerMemory, float], DockerPlan]
-"""From what a look has seen, settings, memory and the time to what is to be done: `plan`."""
+"""Returns the plan from the state, the labels, the settings, the memory, and the monotonic time."""
 
 
 def run_once(settings: PlanSettings, resync: float, mistakes: Sequence[Problem]) -> list[Problem]:
-    """Look and act until nothing is left to do; what is not as wanted. Raises LookFailed.
+    """Look and act until no step is left. Return the problems. Raises LookFailed.
 
-    ``mistakes`` as of `run`.
+    ``mistakes`` as in `run`.
     """
     controller = DockerController(settings, resync, DockerMetrics(), mistakes=mistakes)
     return asyncio.run(controller.run_once(ONCE))
 
 
 def uninstall(settings: PlanSettings, resync: float) -> list[Problem]:
-    """Remove all that operators have made on this host; what is left. Raises LookFailed."""
+    """Remove everything that operators created on this host. Return problems. Raises LookFailed."""
     controller = DockerController(settings, resync, DockerMetrics(), decide=Uninstall())
     return asyncio.run(controller.run_once(ONCE))
 
@@ -80,11 +82,11 @@ def uninstall(settings: PlanSettings, resync: float) -> list[Problem]:
 def run(
     settings: PlanSettings, resync: float, admin: HostPort, mistakes: Sequence[Problem]
 ) -> None:
-    """Run the operator until a signal ends it; its proxies go on.
+    """Run the operator until SIGINT or SIGTERM. The proxies go on without the operator.
 
-    Raises SettingError, and LookImpossible where only a new start of its container can help.
-    ``resync`` is in seconds: how long it waits at most between two looks. ``admin`` is where it
-    serves its own health. ``mistakes`` are what is wrong with how it was started, to be told.
+    ``resync`` is the longest time in seconds between two looks. ``admin`` is the address of the
+    admin endpoint. The operator reports ``mistakes``, problems with environment variables. Raises
+    SettingError, and LookImpossible if only a restart of the operator's container can help.
     """
     asyncio.run(_run(settings, resync, admin, mistakes))
 
@@ -105,14 +107,14 @@ async def _run(
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, running.cancel)
     with contextlib.suppress(asyncio.CancelledError):
-        await running  # raises what it died of
+        await running  # raises the exceptions of the controller
     if sign:
         sign.close()
     await health.stop()
 
 
 class DockerController:
-    """Reconciles one engine's host, as ``decide`` says. `run` it in an event loop."""
+    """Reconciles the host of an engine with the plans of ``decide``. `run` needs an event loop."""
 
     def __init__(
         self,
@@ -146,7 +148,7 @@ class DockerController:
         self._last: tuple[DockerSnapshot, DockerPlan] | None = None
 
     async def run(self) -> None:
-        """Look after the engine until cancelled. Proxies go on without an operator."""
+        """Reconcile until cancelled. The proxies go on without the operator."""
         listen(self._engine, self._hear)
         self._tasks.repeat(self._masters.refresh, AGAIN_UNRESOLVED, "resolving masters")
         try:
@@ -155,9 +157,9 @@ class DockerController:
             await self._close()
 
     async def run_once(self, seconds: float) -> list[Problem]:
-        """Look and act until nothing is left to do, for so many seconds at most.
+        """Look and act until no step is left, for so many seconds at most. Return the problems.
 
-        Returns what is not as it should be. Raises LookFailed if the engine can't be reached.
+        Raises LookFailed if the operator can't reach the engine.
         """
         listen(self._engine, self._hear)
         try:
@@ -167,9 +169,9 @@ class DockerController:
             await self._close()
 
     async def documents(self) -> dict[str, Document | str]:
-        """What the live pages of all proxies show, or why one can't be asked.
+        """Return the page document of each proxy by name, or a text why there is no document.
 
-        A proxy that has just been started is left out until it answers.
+        A proxy that has just started is missing until it answers.
         """
         if self._last is None:
             return {}
@@ -186,8 +188,8 @@ class DockerController:
         return stopped | {name: answers[name] for name in answers if name not in starting}
 
     async def status(self) -> Json:
-        """What a new look sees and plans, and what proxies say now. Raises LookFailed."""
-        await self._loop.look_anew()  # the last one may not have seen a container just started
+        """Look anew, ask all proxies, and return the status document. Raises LookFailed."""
+        await self._loop.look_anew()  # the last look may lack a new container
         if self._last is None:
             raise LookFailed("the operator has not looked at the engine yet")
         snapshot, planned = self._last
@@ -198,9 +200,10 @@ class DockerController:
         )
 
     async def look(self) -> float | None:
-        """One look and what follows from it; when to look again.
+        """Look, plan, and start the actions. Return the longest time in seconds to the next look.
 
-        Raises LookFailed; LookImpossible where this container has the socket of a former engine.
+        None: the resync interval. Raises LookFailed, and LookImpossible if the operator's container
+        has the socket of a former engine.
         """
         started = time.monotonic()
         try:
@@ -222,8 +225,8 @@ class DockerController:
         self._memory = planned.memory
         self._last = (snapshot, planned)
         if snapshot.state.busy and not self._observer.waiting:
-            self._loop.wake_in(SETTLED)  # no event says when the list is right
-        self._proxy_sync.update(snapshot, planned.members)  # first, as new containers' calls wait
+            self._loop.wake_in(SETTLED)  # no event reports that the list is up to date
+        self._proxy_sync.update(snapshot, planned.members)  # first: new nodes wait
         self._executor.start(
             planned.groups, lambda action: self._applier.carry_out(action, snapshot), started
         )
@@ -238,9 +241,9 @@ class DockerController:
         return min((t for t in times if t is not None), default=None)
 
     def _current(self, snapshot: DockerSnapshot, planned: DockerPlan) -> list[Problem]:
-        """All problems; those of what is being worked on as they were before.
+        """Return all problems. While an action on an object runs, its earlier problems stay.
 
-        What a look finds and plans in the midst of it is outdated a moment later.
+        A look during the action would report problems that are outdated a moment later.
         """
         latest = [
             *self._mistakes,
@@ -256,11 +259,11 @@ class DockerController:
         return self._shown
 
     def _settled(self) -> bool:
-        """Whether nothing is left to be done or waited for."""
+        """Whether no step is left, and the operator waits for nothing."""
         if self._last is None or self._executor.busy or self._loop.woken:
             return False
         snapshot, planned = self._last
-        # --once does not wait for what has failed to be tried again: it ends and tells of it.
+        # --once does not wait until the operator retries a failed step, but reports the failure.
         failed = any(problem.fatal for problem in self._executor.problems)
         if failed or self._proxy_sync.problems(snapshot):
             return True
@@ -268,7 +271,7 @@ class DockerController:
         return not waiting and not _required(planned) and not self._silent(planned)
 
     def _silent(self, planned: DockerPlan) -> list[str]:
-        """The proxies that are wanted and do not answer."""
+        """Return the names of the wanted proxies that do not answer."""
         names = (proxy_name(desired.key) for desired in planned.desired if desired.live)
         return [name for name in names if not self._proxy_sync.answers(name)]
 
@@ -280,7 +283,7 @@ class DockerController:
         problems = [problem for problem in self._current(snapshot, planned) if problem.fatal]
         subjects = {problem.subject for problem in problems}
         problems += [
-            Problem(f"proxy {name}", "does not answer")
+            Problem(f"proxy {name}", "does not answer. Read docker logs of the container")
             for name in self._silent(planned)
             if f"proxy {name}" not in subjects
         ]
@@ -294,7 +297,7 @@ class DockerController:
         self._memory = self._memory.port_taken(name, port, time.monotonic())
 
     def _hear(self, event: Json | None) -> None:
-        """Take note of an event; None is a new connection: what happened before was missed."""
+        """Note an event. None: a new connection to the engine, so earlier events may be missing."""
         if event is None:
             self._observer.mark_doubtful(None)
             self._memory = replace(self._memory, engine_returned=True)
@@ -310,5 +313,5 @@ class DockerController:
 
 
 def _required(planned: DockerPlan) -> list[Group]:
-    """The groups of a plan without which something is not as wanted."""
+    """Return the groups of a plan whose failure is a fatal problem."""
     return [group for group in planned.groups if group.fatal]

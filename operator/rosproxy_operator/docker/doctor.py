@@ -1,8 +1,8 @@
-"""``rosproxy-operator docker doctor``: what is wrong on a host, the first cause first.
+"""``rosproxy-operator docker doctor``: the faults of a host, the first cause first.
 
-First comes what the operator sees: images, networks, masters, labels, and what is yet to be done.
-Then each proxy is asked by the doctor of its own container (``docker exec``), which looks from
-where the proxy is.
+First come the findings of the operator: images, networks, masters, labels, and remaining steps.
+Then the doctor runs in the container of each proxy (``docker exec``), and checks from the proxy's
+network.
 """
 
 import asyncio
@@ -19,15 +19,18 @@ from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.host_status import HostStatus
 
 AT_ONCE = 4
-"""Proxies that are asked at the same time: each doctor is a Python of its own."""
+"""Doctors of proxies that run at the same time: each doctor is a Python process."""
 _CAUSES = ("engine", "proxy image", "network", "master", "container", "proxy")
-"""What may follow from what: the kinds of subjects, first causes first."""
+"""The kinds of subjects, causes before consequences."""
 _BEING_MADE = ("absent", "created")
 """States of a proxy's container while an operator makes the proxy."""
 
 
 def examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding]:
-    """All findings; of proxies about these nodes and topics, if any. Raises EngineError."""
+    """Return all findings. Raises EngineError.
+
+    ``names`` are the topics, nodes and services that the doctors of the proxies check; empty: all.
+    """
     return asyncio.run(_examine(host, names))
 
 
@@ -58,24 +61,24 @@ async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding
 
 
 def served_participants(status: Json) -> frozenset[str]:
-    """The GUID prefixes of participants in containers, which have a proxy on this host."""
+    """Return the GUID prefixes of the participants that the proxies of this host serve."""
     participants = (p for c in status["containers"] for p in c["participants"])
     return frozenset(p["guid_prefix"] for p in participants)
 
 
 def _is_about(finding: DoctorFinding, served: frozenset[str]) -> bool:
-    """Whether a proxy says that it does not hear a participant that another proxy serves."""
+    """Whether a proxy misses a participant that another proxy of this host serves."""
     is_of_another = finding.check in (OTHER_DOMAIN, OWN_MACHINE)
     return is_of_another and finding.subject.rpartition(" ")[2] in served
 
 
 def host_findings(status: Json) -> Iterator[DoctorFinding]:
-    """What there is to say of a host, from its status, the first cause first."""
+    """Yield the findings in the status of a host, the first cause first."""
     problems = sorted(status["problems"], key=_order)
     for problem in problems:
         report = error if problem["fatal"] else warning
         yield report(problem["subject"].partition(" ")[0], problem["subject"], problem["text"])
-    # What an operator that runs could not do is among the problems.
+    # If an operator runs, the problems have its failed steps.
     runs = bool(status["operator"])
     for proxy in status["proxies"]:
         if proxy["state"] != "running":
@@ -99,5 +102,5 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
 
 def _order(problem: Json) -> tuple[bool, int]:
     kinds = [kind for kind in _CAUSES if problem["subject"].startswith(kind)]
-    # The first: "proxy image" stands before "proxy", which begins alike.
+    # The first kind: "proxy image" also begins with "proxy", and stands before "proxy".
     return not problem["fatal"], _CAUSES.index(kinds[0]) if kinds else len(_CAUSES)

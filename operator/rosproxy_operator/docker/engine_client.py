@@ -1,8 +1,7 @@
-"""The Docker engine as far as the operator needs it: a thin layer over the SDK's APIClient.
+"""The client of the Docker engine: a thin layer over the SDK's APIClient.
 
-docs/reference/permissions.md lists what a socket proxy in front of the engine has to let through,
-with ``/v1.41`` (whatever version both sides know) before each path but the first; the GETs are
-enough for ``rosproxy-operator docker status`` and ``plan``.
+docs/reference/permissions.md lists the calls that a socket proxy in front of the engine must allow.
+``rosproxy-operator docker status`` and ``plan`` need only the GETs.
 """
 
 import asyncio
@@ -30,11 +29,11 @@ from rosproxy_operator.docker.errors import (
 Json = dict[str, Any]
 DEFAULT_SOCKET = "unix:///var/run/docker.sock"
 READ_TIMEOUT = 20
-"""Seconds that the engine has to answer a question."""
+"""Seconds in which the engine must answer a read call."""
 WRITE_TIMEOUT = 300
-"""Seconds that it has to do something: publishing or freeing 1000 ports takes it a minute."""
+"""Seconds for a call that changes something: 1000 ports to publish or free take a minute."""
 RUN_TIMEOUT = 60
-"""Seconds for a command in a container: the doctor tries what may not answer."""
+"""Seconds for a command in a container: the doctor waits for nodes that do not answer."""
 FILTERS = {
     "type": ["container", "network", "image"],
     "event": [
@@ -43,16 +42,16 @@ FILTERS = {
         *("tag", "untag", "pull", "load", "import", "delete"),
     ],
 }
-"""Events that may change a plan: not the frequent ones of health checks and ``docker exec``."""
+"""Events that may change a plan. Events of health checks and ``docker exec`` would be frequent."""
 PAUSES = (0.2, 0.5, 1.0, 2.0, 5.0)
-"""Seconds between attempts to listen to events again; the last one is repeated."""
+"""Seconds before each new attempt to listen to events; the last value repeats."""
 
 
 class DockerClient:
-    """The engine that DOCKER_HOST names, or the one of this machine. Can be used by many threads.
+    """The client of the engine in DOCKER_HOST, or else of this machine. Safe for many threads.
 
-    Every method raises EngineError: Unavailable if the engine can't be reached, NoSuchObject,
-    Conflict or PortTaken where it refuses for that reason.
+    Every method raises EngineError. Subclasses: Unavailable if the client can't reach the engine;
+    NoSuchObject, Conflict and PortTaken if the engine refuses the call.
     """
 
     def __init__(self) -> None:
@@ -63,56 +62,57 @@ class DockerClient:
 
     @property
     def deletes_udp_entries(self) -> bool:
-        """Whether the engine deletes conntrack entries for the UDP ports that it publishes.
+        """Whether the engine deletes conntrack entries for published UDP ports.
 
-        Docker does since 23.0, whose API is 1.42 (github.com/moby/moby/pull/44742).
+        Docker does so since 23.0, which has API 1.42 (github.com/moby/moby/pull/44742). False until
+        the client has connected.
         """
         return self._last_version >= (1, 42)
 
     def containers(self) -> list[Json]:
-        """All containers, whatever their state, as the engine lists them."""
+        """List all containers, in all states."""
         return list(self._call(READ_TIMEOUT, "containers", all=True))
 
     def container(self, name: str) -> Json:
-        """Everything about a container, by id or name."""
+        """Inspect a container, by id or name."""
         inspected: Json = self._call(READ_TIMEOUT, "inspect_container", name)
         return inspected
 
     def networks(self) -> list[Json]:
-        """All networks."""
+        """List all networks."""
         return list(self._call(READ_TIMEOUT, "networks"))
 
     def image_id(self, image: str) -> str:
-        """The id of an image, empty if the host does not have it."""
+        """Return the id of an image; empty if the host does not have the image."""
         try:
             return str(self._call(READ_TIMEOUT, "inspect_image", image)["Id"])
         except NoSuchObject:
             return ""
 
     def run(self, container: str, *command: str) -> bytes:
-        """What a command prints in a running container, to its end."""
+        """Run a command in a running container until its end. Return the stdout."""
         instance = self._call(READ_TIMEOUT, "exec_create", container, list(command), stderr=False)
         output: bytes = self._call(RUN_TIMEOUT, "exec_start", instance["Id"])
         return output
 
     def events(self) -> Iterator[Json]:
-        """The events from now on that may change a plan; ends when the connection does.
+        """Connect, and return the events of FILTERS from now on.
 
-        The connection stands when this returns, so that what is listed later has either happened
-        before or is going to be an event.
+        The iterator ends with the connection. When this method returns, the connection is open. So
+        a later list shows all earlier changes, and each later change causes an event.
         """
         with self._translated():
-            # A client for the stream alone, which is read for good. The SDK sets no time-out for
-            # it, so that an engine with nothing to tell is no failure.
+            # The stream has a client of its own, because reading the stream does not end. The SDK
+            # sets no time-out for the stream, so an engine without events is no failure.
             stream = self._connect().events(filters=FILTERS, decode=True)
         return self._read_events(stream)
 
     def do(self, method: str, *arguments: Any, **keywords: Any) -> None:
-        """Let the engine do something, by a method of the SDK's APIClient."""
+        """Call a method of the SDK's APIClient that changes something."""
         self._call(WRITE_TIMEOUT, method, *arguments, **keywords)
 
     def _call(self, within: int, method: str, *arguments: Any, **keywords: Any) -> Any:
-        """Call the SDK with a client that no other thread uses now: clients are not shareable."""
+        """Call a method of an SDK client that is idle: threads must not share a client."""
         with self._translated():
             try:
                 client = self._idle.pop()
@@ -126,7 +126,7 @@ class DockerClient:
 
     def _connect(self) -> Any:
         if self.url.startswith("unix://"):
-            # Where nobody listens, the SDK would leave a socket open each time.
+            # Without a listener, the SDK would leave a socket open after each attempt.
             with socket.socket(socket.AF_UNIX) as probe:
                 probe.settimeout(READ_TIMEOUT)
                 probe.connect(self.url.removeprefix("unix://"))
@@ -143,7 +143,7 @@ class DockerClient:
 
     @contextlib.contextmanager
     def _translated(self) -> Iterator[None]:
-        """Turn what the SDK raises into EngineError."""
+        """Turn exceptions of the SDK into EngineError."""
         try:
             yield
         except APIError as error:
@@ -151,7 +151,7 @@ class DockerClient:
             line = f"{request.method} {request.path_url.partition('?')[0]}" if request else ""
             raise refusal(error.status_code or 0, str(error.explanation or error), line) from error
         except (DockerException, TLSParameterError, requests.RequestException, OSError) as error:
-            self._version = None  # the next engine behind this address may be another one
+            self._version = None  # the next engine may have another API version
             self._idle.clear()
             raise unreachable(self.url, error) from error
         except (ValueError, KeyError, TypeError) as error:
@@ -160,17 +160,17 @@ class DockerClient:
 
 
 def listen(engine: DockerClient, tell: Callable[[Json | None], None]) -> None:
-    """Listen to the engine for good, in a thread of its own. Needs a running event loop.
+    """Start a thread that listens to the engine's events. Needs a running event loop.
 
-    ``tell`` is called in the event loop, with each event of FILTERS, and with None after each
-    connect: the engine is there, and what happened before that was missed.
+    The event loop calls ``tell`` with each event of FILTERS. After each connect, it first calls
+    ``tell(None)``: the engine answers, and events before the connect may be missing.
     """
     loop = asyncio.get_running_loop()
 
     def work() -> None:
         failures = 0
         while not loop.is_closed():
-            # Looks report errors of the engine; the event loop may have been closed meanwhile.
+            # EngineError: the looks report this error. RuntimeError: the event loop is closed.
             with contextlib.suppress(EngineError, RuntimeError):
                 events = engine.events()
                 failures = 0

@@ -1,7 +1,7 @@
-"""From the engine's JSON to the planner's data: plain functions that ask the engine nothing.
+"""Converts the engine's JSON to the planner's data. These functions do not call the engine.
 
-The engine's list of containers has states, labels, addresses and networks; the rest only an
-inspection of a container tells. Whatever the engine has nothing to say of may be missing or null.
+The engine's list of containers has states, labels, addresses and networks. Only an inspection of a
+container has the rest. Any empty field may be missing or null.
 """
 
 from collections.abc import Iterable
@@ -25,15 +25,15 @@ _VARIABLES = OF_ROS2 | {
     *("ROS_VERSION", "ROS_DISTRO", "ROS_IP", "ROS_HOSTNAME"),
     *(OVERRIDE, SESSION_FILE),
 }
-"""Variables that tell the version of ROS in a container, and how its nodes find each other."""
+"""Variables that show the version of ROS in a container, and how the nodes find each other."""
 _KEPT_VARIABLES = _VARIABLES | {"ROS_MASTER_URI", FORMER_TOKEN}
 LONGEST_TEXT = 4096
-"""Characters that are kept of a variable or an argument; a longer one ends in an ellipsis.
+"""Characters of a variable or an argument that the operator keeps; longer texts get an ellipsis.
 
-An image can have megabytes of both, and they are kept as long as the container is there.
+An image may have megabytes of both, and the operator keeps these as long as the container exists.
 """
 MOST_ARGUMENTS = 16
-"""Arguments that are kept of a command: those of the operator's own containers have two."""
+"""Arguments of a command that the operator keeps: the operator's containers have six at most."""
 
 
 class _State(TypedDict, total=False):
@@ -56,7 +56,8 @@ class _Binding(TypedDict, total=False):
 
 class _HostConfig(TypedDict, total=False):
     PortBindings: dict[str, list[_Binding] | None] | None
-    # Only compared with what the operator gives its own: whatever these are in other containers.
+    # Other containers may have any values here: the operator only compares these fields with the
+    # values of its own containers.
     NetworkMode: Any
     ReadonlyRootfs: Any
     CapAdd: list[str] | None
@@ -94,7 +95,7 @@ class _Inspection(TypedDict, total=False):
 
 
 def check_inspection(inspection: object) -> Json:
-    """What is read of an inspection, bounded. Raises msgspec.ValidationError for wrong types."""
+    """Return the used fields of an inspection, bounded. Raises msgspec.ValidationError."""
     document = dict(msgspec.convert(inspection, _Inspection))
     config = dict(dig(document, "Config") or {})
     variables = (text for text in config.get("Env") or () if _name(text) in _KEPT_VARIABLES)
@@ -113,14 +114,14 @@ def _name(variable: str) -> str:
 
 
 def dig(document: Any, *keys: str) -> Any:
-    """What is under these keys, each within the one before; None if one is missing."""
+    """Return the value under nested keys; None if a key is missing."""
     for key in keys:
         document = (document or {}).get(key)
     return document
 
 
 def container_of(event: Json) -> str:
-    """The id of the container that an event is about, or whose network it is; empty if of none."""
+    """Return the id of the container in an event of a container or network; empty without one."""
     actor = event.get("Actor") or {}
     if event.get("Type") == "container":
         return str(actor.get("ID") or "")
@@ -128,27 +129,28 @@ def container_of(event: Json) -> str:
 
 
 def environment(inspected: Json | None) -> dict[str, str]:
-    """A container's variables, from its inspection."""
+    """Return the environment variables of a container."""
     return dict(text.partition("=")[::2] for text in dig(inspected, "Config", "Env") or ())
 
 
 def endpoints(row: Json | None) -> dict[str, Json]:
-    """A container's connections by network, from its row in the list or its inspection."""
+    """Return a container's endpoints by network, from a row of the list or an inspection."""
     networks = dig(row, "NetworkSettings", "Networks") or {}
     return {name: endpoint or {} for name, endpoint in networks.items()}
 
 
 def signature(row: Json) -> tuple[tuple[str, str], ...]:
-    """What changes in a container's row of the list whenever its aliases may have changed.
+    """Return a value that changes if the aliases of a container may have changed.
 
-    For one without a network of its own: its state.
+    The value has the networks and endpoint ids in the container's row of the list. For a container
+    without a network of its own, the value is the state.
     """
     connections = sorted((name, e.get("EndpointID") or "") for name, e in endpoints(row).items())
     return tuple(connections) or (("", str(row.get("State"))),)
 
 
 def read_making(inspected: Json | None) -> CreationFacts:
-    """How a container was made, from its inspection."""
+    """Return how a container was created, from an inspection."""
     argvs = (dig(inspected, "Config", key) or () for key in ("Entrypoint", "Cmd"))
     return CreationFacts(
         image=dig(inspected, "Image") or "",
@@ -159,19 +161,19 @@ def read_making(inspected: Json | None) -> CreationFacts:
 
 
 def uplink_secret(rows: Iterable[Json], uplink: str) -> str:
-    """The secret that the uplink network has, from the list of networks; empty if it is not there.
+    """Return the secret of the uplink network, from the list of networks; empty without network.
 
-    Labels of a network come from whoever made it, and no container can read them. A network that
-    somebody made without one has at least an id of 256 random bits, which no container knows
-    either; but it shows wherever a container on that network is inspected.
+    The secret is in a label of the network: containers can't read this label. If a user created the
+    network without the label, the secret is the network's id, which has 256 random bits. The id is
+    weaker: each inspection of a container on the network shows this id.
     """
     network = next((row for row in rows if row.get("Name") == uplink), None)
     return str(dig(network, "Labels", SECRET) or network["Id"]) if network else ""
 
 
 def name_of(row: Json) -> str:
-    """A container's name, from its row in the list."""
-    # One that is just being removed may have no name any more; one with a slash is a link's.
+    """Return a container's name, from a row of the list."""
+    # During the removal, a container may have no name. A second slash marks the name of a link.
     names = [name.lstrip("/") for name in row.get("Names") or () if name.count("/") == 1]
     return str(names[0] if names else row["Id"][:12])
 
@@ -179,9 +181,9 @@ def name_of(row: Json) -> str:
 def read_container(
     row: Json, inspected: Json | None, networks: Iterable[Network] = ()
 ) -> Container:
-    """A container from its row in the engine's list and its inspection, if there is one."""
-    # Engines tell a network by its id where the container was created so, and by "default" where it
-    # was created without one; newer engines store "bridge" instead (moby: container_routes.go).
+    """Return a container, from a row of the engine's list and an inspection, if there is any."""
+    # The engine repeats the network of the creation: name or id. If the creation named no network,
+    # engines say "default", newer engines "bridge" (moby: container_routes.go).
     network_names = {network.id: network.name for network in networks} | {"default": "bridge"}
     mode = dig(row, "HostConfig", "NetworkMode") or ""
     name = name_of(row)
@@ -217,7 +219,7 @@ def read_container(
 
 
 def read_network(row: Json) -> Network:
-    """A network from the engine's list."""
+    """Return a network, from a row of the engine's list. Subnets and gateway are IPv4 only."""
     configs = dig(row, "IPAM", "Config") or []
     gateways = [config.get("Gateway") or "" for config in configs]
     subnets = [ip_network(c["Subnet"], strict=False) for c in configs if c.get("Subnet")]
@@ -233,12 +235,12 @@ def read_network(row: Json) -> Network:
 
 
 def _aliases(endpoint: Json) -> list[str]:
-    """All names of an endpoint: engines since 25 list the container's own under DNSNames."""
+    """Return all names of an endpoint. Since Docker 25, DNSNames has the container's names."""
     return [*(endpoint.get("Aliases") or ()), *(endpoint.get("DNSNames") or ())]
 
 
 def _bound_ports(inspected: Json | None, protocol: str) -> frozenset[int]:
-    """The ports of the host that it asks for; all of a range, of which one is chosen."""
+    """Return the host ports that a container requests. A range counts with all ports."""
     return frozenset(
         port
         for key, bindings in (dig(inspected, "HostConfig", "PortBindings") or {}).items()
@@ -249,7 +251,7 @@ def _bound_ports(inspected: Json | None, protocol: str) -> frozenset[int]:
 
 
 def _host_ports(text: str) -> range:
-    """``8000``, ``8000-8010``; none for an empty text or 0, which let the engine choose."""
+    """Parse ``8000`` or ``8000-8010``. No ports for empty or 0: the engine chooses the port."""
     first, _, last = text.partition("-")
     if not first.isdecimal() or not (last or first).isdecimal() or int(first) == 0:
         return range(0)
@@ -257,7 +259,7 @@ def _host_ports(text: str) -> range:
 
 
 def _public_ports(row: Json, protocol: str) -> frozenset[int]:
-    """The ports of the host that the engine has given it."""
+    """Return the host ports that the engine has published for a container."""
     return frozenset(
         port["PublicPort"]
         for port in row.get("Ports") or ()

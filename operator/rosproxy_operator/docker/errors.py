@@ -1,4 +1,4 @@
-"""What can go wrong with the engine, and what to do about it, in one line."""
+"""Errors of the Docker engine. Each message is a single line."""
 
 import errno
 import os
@@ -11,23 +11,23 @@ _PORT = re.compile(r"(?:[0-9.]+|\[[0-9A-Fa-f:]*\]|::):([0-9]{1,5})\b")
 _FOREIGN_ADDRESS = re.compile(r"(\S+): bind: cannot assign requested address")
 _IDS = re.compile(r"\b[0-9a-f]{64}\b")
 _ENGINES_OWN = re.compile(r"endpoint|network|container")
-"""What the engine speaks of when it answers 403 itself; a proxy in front of it does not."""
+"""Words in refusals of the engine. Refusals of a proxy in front of the engine lack these words."""
 
 
 class EngineError(Exception):
-    """The engine did not do what it was asked; the message is one line."""
+    """The engine did not carry out a call. The message is a line."""
 
 
 class Unavailable(EngineError):
-    """The engine can't be reached, or does not answer."""
+    """The operator can't reach the engine, or the engine does not answer."""
 
 
 class FormerSocket(Unavailable):
-    """The socket is that of an engine which has ended; its file was mounted into this container."""
+    """The mounted socket file belongs to an engine process that has ended."""
 
 
 class Conflict(EngineError):
-    """The name is taken, or another request is at work on it."""
+    """HTTP 409: the name is in use, or another call changes the same object."""
 
 
 class NoSuchObject(EngineError):
@@ -35,7 +35,7 @@ class NoSuchObject(EngineError):
 
 
 class PortTaken(EngineError):
-    """A port to publish is held by another program or container; which one is not always told."""
+    """Another program or container holds a port to publish. ``port`` is None if it is unknown."""
 
     def __init__(self, message: str, port: int | None) -> None:
         super().__init__(message)
@@ -43,16 +43,16 @@ class PortTaken(EngineError):
 
 
 def refusal(status: int, text: str, request: str) -> EngineError:
-    """The error for what an engine (or a proxy in front of it) answered to a request."""
+    """Return the error for a failed ``request`` to the engine or a proxy in front of the engine."""
     message = _IDS.sub(lambda match: match[0][:12], " ".join(text.split()))
-    # "page not found" is about the path of the request, not about an object: engines answer so to
-    # calls that they don't know (moby: daemon/server/server.go, CreateMux).
+    # "page not found" is no missing object: the engine does not know the path of the request
+    # (moby: daemon/server/server.go, CreateMux).
     if status == 404 and "page not found" not in message:
         return NoSuchObject(message)
     if status == 409:
         return Conflict(message)
     if _PORT_TAKEN.search(message):
-        # The endpoint's name before the ports may hold anything.
+        # The endpoint's name may contain anything. The ports come after the name.
         ports = map(int, _PORT.findall(message.rpartition("endpoint ")[2]))
         # Docker Desktop names port 0 as well: "exposing port TCP 0.0.0.0:80 -> 127.0.0.1:0".
         return PortTaken(message, next(filter(None, ports), None))
@@ -69,7 +69,7 @@ def refusal(status: int, text: str, request: str) -> EngineError:
 
 
 def unreachable(url: str, error: BaseException) -> Unavailable:
-    """The error for an engine at ``url`` that can't be asked."""
+    """Return the error for an engine at ``url`` that the operator can't reach."""
     path = url.removeprefix("unix://")
     chain = [error]  # requests and urllib3 wrap an OSError in two layers, the SDK in a third
     while cause := chain[-1].__cause__ or chain[-1].__context__:
@@ -96,7 +96,7 @@ def unreachable(url: str, error: BaseException) -> Unavailable:
 
 
 def _is_removed(path: str) -> bool:
-    """Whether a file was removed and is here only since it is mounted by itself."""
+    """Whether a file is removed on the host. A mount of the file keeps the old file."""
     try:
         return os.stat(path).st_nlink == 0
     except OSError:
