@@ -1,4 +1,4 @@
-"""The ends of a command: exit status 0, or exit status 1 with a line for each problem."""
+"""Ends a command with exit status 0, or with 1 and a line for each problem."""
 
 import contextlib
 import sys

@@ -4,9 +4,8 @@ A reason is an event (`wake`), a time (`wake_in`, or the result of the look), or
 is level-triggered: each look reads the whole state. So an event needs no content, and a burst of
 events costs a single look.
 
-After a failed look, the loop pauses before the next look; each pause is longer than the previous.
-Events do not shorten the pause, because more requests do not help an engine that does not answer.
-`retry` ends the pause: the engine is back.
+After a failed look, the loop pauses (`PAUSES`). Events do not shorten the pause, because more
+requests do not help an engine that does not answer. `retry` ends the pause: the engine is back.
 
 The loop does not depend on the engine. All times are times of the event loop's clock, so tests can
 advance the clock.
@@ -99,7 +98,7 @@ class ControlLoop:
                 await self._pause(self._pace.resync)
 
     async def run_until(self, look: Look, settled: Callable[[], bool], seconds: float) -> None:
-        """Look until ``settled()`` after a successful look, for so many seconds at most.
+        """Look until a look succeeds and ``settled()`` is true, for so many seconds at most.
 
         Raises LookFailed if a look reports that the engine is away, and LookImpossible.
         """
@@ -125,7 +124,7 @@ class ControlLoop:
                 self._loop.call_soon_threadsafe(self._woken.set)
 
     def wake_in(self, seconds: float) -> None:
-        """Look again in so many seconds. The time of the previous call no longer counts."""
+        """Look again in so many seconds, instead of the time of the previous call."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = asyncio.get_running_loop().call_later(seconds, self._woken.set)
@@ -174,7 +173,7 @@ class ControlLoop:
         """
         self._woken.clear()
         self._back.clear()
-        awaiting = self._awaiting_look
+        awaiting = self._awaiting_look  # later callers wait for the next look
         self._awaiting_look = []
         self._looking_since = asyncio.get_running_loop().time()
         try:

@@ -86,7 +86,7 @@ def merged(
         }
         for key, node in document.nodes.items():
             if node.lane != CONTAINER and names[key] in inside:
-                names[key] = inside[names[key]]  # the proxy around the node knows more
+                names[key] = inside[names[key]]  # the proxy with the node inside knows more
                 continue
             known = nodes.get(names[key])
             if known and _RANKS.get(known.state, 0) > _RANKS.get(node.state, 0):
@@ -177,8 +177,8 @@ def _key(name: str, document: Document, key: str, node: PageNode, others: Set[st
 def _outside_key(name: str, document: Document, key: str, node: PageNode, others: Set[str]) -> str:
     """Return the key of a node as a node outside.
 
-    If the first word is the name of one of the ``others``, ``name`` comes first. Otherwise a proxy
-    could forge a key of another proxy.
+    If the first word is in ``others``, ``name`` comes first. Otherwise a proxy could forge a key
+    of another proxy.
     """
     outside_key = key
     if node.kind != PARTICIPANT:

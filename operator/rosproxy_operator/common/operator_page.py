@@ -3,7 +3,7 @@
 While a page is open, the operator requests the document of every proxy in rounds, with pauses of
 `EVERY` seconds. The requests also keep the proxies collecting data. Without an open page, the
 operator requests nothing. The page answers only callers on loopback, because a user with the token
-of a single proxy may not see all proxies.
+of a single proxy must not see all proxies.
 """
 
 import asyncio

@@ -2,8 +2,8 @@
 
 Ports should stay, because ROS nodes are registered at the master under the ports of the range. So
 `keep` gives each proxy its present range, or a former range that is free. Then `fill` gives ranges
-to the other proxies, and more ports to proxies with too few. Each engine tells which ports are not
-free.
+to the other proxies, and more ports to proxies with too few. The operator of each engine finds out
+which ports are not free.
 """
 
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping
@@ -14,7 +14,7 @@ from rosproxy.leases.ports import PortRange
 
 LAST_PORT = 65535
 RETRY_FOR = 20.0
-"""Seconds for which the operator retries the range of a proxy that has served."""
+"""Seconds for which a proxy that has served keeps a refused range before it gets another."""
 TAKEN_FOR = 300.0
 """Seconds for which the operator avoids a port that the engine has refused."""
 MOVED_FOR = 600.0

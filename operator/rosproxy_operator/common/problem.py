@@ -12,7 +12,7 @@ class Problem:
     """A problem of an object. The text says what is wrong and what to do.
 
     ``subject`` names the object: ``container talker``, ``network app``, ``proxy rosproxy-…``.
-    ``fatal``: the operator leaves the object out. Otherwise the problem is a warning.
+    ``fatal``: the object does not get what its user wants. Otherwise the problem is a warning.
     """
 
     subject: str

@@ -35,7 +35,7 @@ WITHIN_PAGE = 12.0
 WITHIN_MASTER = 40.0
 """Seconds for a call for which the proxy first calls the master, which may take 30 s."""
 _KEEP_ALIVE = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 3, socket.TCP_KEEPCNT: 3}
-"""Seconds until the first probe, seconds between probes, and probes without a reply: tcp(7)."""
+"""Keep-alive, see tcp(7): seconds until the first probe and between probes, and lost probes."""
 
 
 class ProxyError(Exception):
@@ -183,7 +183,7 @@ class ProxyClient:
         await self._ask("POST", admin, "/containers", token, body)
 
     async def retire(self, admin: HostPort, token: str) -> Json:
-        """Let the proxy unregister all nodes and end all participants. Return their number."""
+        """Let the proxy unregister all nodes and end all participants. Return the count."""
         return _read(await self._ask("POST", admin, "/retire", token, {}, WITHIN_MASTER), admin)
 
     async def close(self) -> None:

@@ -21,9 +21,8 @@ from rosproxy_operator.common.proxy_status import Leases
 class AllowedCallers:
     """The addresses that may use a proxy.
 
-    ``peers`` are the peers of ROS 2; None: unchanged, for ROS 1, and on Docker, where an option of
-    the proxy has the peers. ``former_leases`` are the ports that participants had at the previous
-    proxy.
+    ``peers`` are the peers of ROS 2. None: not sent, for ROS 1 and on Docker; there, an option of
+    the proxy has the peers. ``former_leases`` are the ports of participants at the previous proxy.
     """
 
     addresses: tuple[str, ...]
@@ -72,7 +71,7 @@ class ProxySession:
                 return
             run = self._runs
             await self._client.policy(self.admin, self.token, layers)
-            if run == self._runs:  # else the former process may have confirmed
+            if run == self._runs:  # else maybe the former process has confirmed
                 self._policy = layers
 
     async def tell_callers(self, callers: AllowedCallers) -> None:

@@ -62,7 +62,7 @@ def inside_addresses(status: ProxyStatus) -> frozenset[str]:
     """Return the addresses where a proxy has nodes or participants inside.
 
     Nodes that the proxy has unregistered count, too, because a silent node may come back. The proxy
-    shows such a node as a fault until the operator sends that the node's container has gone.
+    shows such a node as a fault until the operator reports that the container has gone.
     """
     host_ports = (parse_host_port(node.address) for node in status.nodes if not node.has_ended)
     nodes = (plain_address(host_port.host) for host_port in host_ports if host_port is not None)

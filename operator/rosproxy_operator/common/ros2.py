@@ -17,7 +17,7 @@ LEAST_PORTS = LEAST_PER_DOMAIN + 1
 ROS1_DISTROS = frozenset(
     {"fuerte", "groovy", "hydro", "indigo", "jade", "kinetic", "lunar", "melodic", "noetic"}
 )
-"""All distributions of ROS 1: noetic is the last, so any other distribution has ROS 2."""
+"""All distributions of ROS 1. There will be no more, so any other distribution is ROS 2."""
 LAN_RELAY_COMMAND = ("rosproxy", "lan-relay")
 """The command of a LAN relay, in the proxy's image."""
 

@@ -18,5 +18,5 @@ def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str:
 
 @lru_cache(maxsize=1024)
 def _nearest(name: str, known: tuple[str, ...], cutoff: float) -> str:
-    """Compare the names. Cached, because hundreds of objects have the same few names."""
+    """Return the most similar known name. Cached: hundreds of objects have the same few names."""
     return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), "")

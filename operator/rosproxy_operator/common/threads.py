@@ -16,7 +16,7 @@ async def in_thread(function: Callable[..., T], *arguments: object) -> T:
     would occupy a thread of the executor.
     """
     done: Future[T] = Future()
-    done.set_running_or_notify_cancel()  # a caller that stops waiting can't cancel this
+    done.set_running_or_notify_cancel()  # a caller that stops waiting can't cancel the call
 
     def work() -> None:
         try:

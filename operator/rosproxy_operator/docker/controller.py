@@ -226,7 +226,7 @@ class DockerController:
         self._last = (snapshot, planned)
         if snapshot.state.busy and not self._observer.waiting:
             self._loop.wake_in(SETTLED)  # no event reports that the list is up to date
-        self._proxy_sync.update(snapshot, planned.members)  # first: new nodes wait
+        self._proxy_sync.update(snapshot, planned.members)  # first: calls of new nodes wait
         self._executor.start(
             planned.groups, lambda action: self._applier.carry_out(action, snapshot), started
         )
@@ -241,7 +241,7 @@ class DockerController:
         return min((t for t in times if t is not None), default=None)
 
     def _current(self, snapshot: DockerSnapshot, planned: DockerPlan) -> list[Problem]:
-        """Return all problems. While an action on an object runs, its earlier problems stay.
+        """Return all problems. While an action on an object runs, it keeps its earlier problems.
 
         A look during the action would report problems that are outdated a moment later.
         """
@@ -283,7 +283,9 @@ class DockerController:
         problems = [problem for problem in self._current(snapshot, planned) if problem.fatal]
         subjects = {problem.subject for problem in problems}
         problems += [
-            Problem(f"proxy {name}", "does not answer. Read docker logs of the container")
+            Problem(
+                f"proxy {name}", "does not answer. Read the logs of this container (docker logs)"
+            )
             for name in self._silent(planned)
             if f"proxy {name}" not in subjects
         ]

@@ -78,7 +78,7 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
     for problem in problems:
         report = error if problem["fatal"] else warning
         yield report(problem["subject"].partition(" ")[0], problem["subject"], problem["text"])
-    # If an operator runs, the problems have its failed steps.
+    # If an operator runs, its failed steps are among the problems.
     runs = bool(status["operator"])
     for proxy in status["proxies"]:
         if proxy["state"] != "running":

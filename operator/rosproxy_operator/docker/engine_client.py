@@ -42,7 +42,7 @@ FILTERS = {
         *("tag", "untag", "pull", "load", "import", "delete"),
     ],
 }
-"""Events that may change a plan. Events of health checks and ``docker exec`` would be frequent."""
+"""Events that may change a plan, without the many of health checks and ``docker exec``."""
 PAUSES = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Seconds before each new attempt to listen to events; the last value repeats."""
 

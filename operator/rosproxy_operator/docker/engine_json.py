@@ -182,8 +182,8 @@ def read_container(
     row: Json, inspected: Json | None, networks: Iterable[Network] = ()
 ) -> Container:
     """Return a container, from a row of the engine's list and an inspection, if there is any."""
-    # The engine repeats the network of the creation: name or id. If the creation named no network,
-    # engines say "default", newer engines "bridge" (moby: container_routes.go).
+    # The engine repeats the network of the creation call, by name or id. Without a network in that
+    # call, engines say "default", newer engines "bridge" (moby: container_routes.go).
     network_names = {network.id: network.name for network in networks} | {"default": "bridge"}
     mode = dig(row, "HostConfig", "NetworkMode") or ""
     name = name_of(row)
