@@ -1,10 +1,10 @@
-"""Carrying out what was planned, each key's work apart from the others'.
+"""Carry out plans, in a job for each proxy, each redirect, each flush and the uplink.
 
-A key's work may take a minute (the engine publishes a thousand ports) or fail for ever; meanwhile
-looks go on and the other keys are served.
+A job may take a minute (the engine publishes a thousand ports) or fail at every try. Meanwhile the
+operator looks again, and other jobs run.
 
-Every action may be carried out twice, or after somebody else did it, or on something that has
-vanished meanwhile: that is no error, the next look sees what is left to do.
+An action may already be done, and its object may have vanished since the look. Neither is an error:
+the next look shows what is left to do. A creation fails if the image or network has vanished.
 """
 
 import asyncio
@@ -60,13 +60,14 @@ from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 log = logging.getLogger(__name__)
 
 BACK_OFF = (1.0, 2.0, 5.0, 15.0, 60.0)
-"""Seconds until the same actions are tried again that have failed; the last is repeated."""
+"""Seconds until failed actions are tried again, by failures in a row; the last value repeats."""
 QUIET = 120.0
-"""Seconds without a failure after which the same one is worth a line in the log again."""
+"""Seconds after a failure of an action until the same failure is logged as a warning again."""
 STOP_TIMEOUT = 2
-"""Seconds that a process has to end before it is killed."""
+"""Seconds that a container has to end before the engine kills it."""
 DONE: dict[type, tuple[str, ...]] = {
-    # moby has them in libnetwork and in daemon/{unpause,rename,delete,container_operations}.go.
+    # moby has these texts in libnetwork and in
+    # daemon/{unpause,rename,delete,container_operations}.go.
     CreateNetwork: ("already exists",),
     Start: ("is not running",),
     Restart: (),
@@ -78,26 +79,32 @@ DONE: dict[type, tuple[str, ...]] = {
     Remove: ("is already in progress",),
     RemoveNetwork: (),
 }
-"""Parts of the engine's error that mean there is nothing left to do; so does NoSuchObject."""
+"""Parts of the engine's errors that mean that nothing is left to do, by type of action.
+
+For these types NoSuchObject means the same. For all other types every error is a failure.
+"""
 
 LONGEST_RUN = 30.0
-"""Seconds after which a container that does one thing is given up.
+"""Seconds after which the operator removes a helper container that has not ended.
 
-Setting a redirect takes milliseconds. Deleting entries takes 13 s where each of 1,000 ports has
-some.
+Setting a redirect takes milliseconds. Deleting conntrack entries takes 13 s if each of 1,000 ports
+has entries.
 """
 RUNNING = 0.03
-"""Seconds between two checks whether it has ended."""
+"""Seconds between two checks whether a helper container has ended."""
 
 CarryOut = Callable[[Action], Awaitable[None]]
 Job = tuple[Key | None, str]
-"""What is worked on independently: a group's key, and what it is about."""
+"""The groups with the same key and subject. Different jobs run at the same time."""
 UPLINK: Job = (None, "")
 
 
 @dataclass(slots=True)
 class _Failure:
-    """What failed for a key, how often in a row, when to try again, and the problem to report."""
+    """The failed actions of a job, failures in a row, and the problem to report.
+
+    ``retry_at`` is in monotonic seconds.
+    """
 
     actions: list[Action]
     count: int
@@ -106,11 +113,12 @@ class _Failure:
 
 
 class Executor:
-    """Carries groups of actions out, those of one key one after the other.
+    """Carries out groups of actions. The groups of a job run one after the other.
 
-    ``finished`` is called when a key's work is over, ``port_taken`` with a container's name and the
-    port (None if unknown) when it could not be started for that, ``counted`` with each action and
-    its outcome (ok, failed, taken). ``now`` is the clock, in monotonic seconds.
+    ``finished`` is called when a job has ended. ``port_taken`` is called when a taken port keeps a
+    container from starting: with the container's name, and the port or None if unknown. ``counted``
+    is called with each action and its outcome: ok, failed or taken. ``now`` is the clock, in
+    monotonic seconds.
     """
 
     def __init__(
@@ -133,25 +141,25 @@ class Executor:
 
     @property
     def busy(self) -> frozenset[str]:
-        """What is being worked on, as problems name it."""
+        """The subjects of the running jobs, as problems name these subjects."""
         return frozenset(map(_subject, self._busy))
 
     @property
     def problems(self) -> list[Problem]:
-        """What has failed and was not put right yet."""
+        """The problem of each planned job whose last run failed."""
         return [failure.problem for failure in self._failures.values()]
 
     @property
     def again_in(self) -> float | None:
-        """Seconds until something that has failed may be tried again; None if nothing has."""
+        """Seconds until the first failed job may be tried again; None without such a job."""
         times = [f.retry_at for job, f in self._failures.items() if job not in self._busy]
         return max(min(times) - self._now(), 0.0) if times else None
 
     def start(self, groups: Iterable[Group], carry_out: CarryOut, looked_at: float) -> None:
-        """Begin what is not under way and did not fail just now, and return.
+        """Start the jobs of a plan, and return. Skip jobs that run or wait after a failure.
 
-        ``looked_at`` is when the look began (monotonic) from which the groups were planned: a job
-        that ended later may have done something that it did not see.
+        ``looked_at`` is the monotonic time at which the look of this plan began. Jobs that ended
+        later are skipped as well: the look may not have seen their results.
         """
         now = self._now()
         self._refused = {a: r for a, r in self._refused.items() if r[1] > now - QUIET}
@@ -164,10 +172,11 @@ class Executor:
         self._failures = {
             job: f for job, f in self._failures.items() if job in by_job or job in self._ended_at
         }
-        for job in sorted(by_job, key=lambda job: job[0] is not None):  # the uplink first
+        # The uplink first: in _run, the other jobs wait for the running job of the uplink.
+        for job in sorted(by_job, key=lambda job: job[0] is not None):
             actions = [action for group in by_job[job] for action in group.actions]
             failure = self._failures.get(job)
-            # Other actions than those that failed are tried at once: something has changed.
+            # If the actions differ from the failed ones, the host has changed: try at once.
             waiting = failure and failure.actions == actions and now < failure.retry_at
             if actions and not waiting and job not in self._busy:
                 work = self._run(job, by_job[job], actions, carry_out)
@@ -176,14 +185,14 @@ class Executor:
     async def _run(
         self, job: Job, groups: list[Group], actions: list[Action], carry_out: CarryOut
     ) -> None:
-        """Carry out all groups, after the uplink's, and note the first thing that goes wrong."""
+        """Wait for the uplink's job, carry out all groups, and record the first problem."""
         problem: Problem | None = None
         try:
             if job != UPLINK and UPLINK in self._busy:
                 await asyncio.wait([self._busy[UPLINK]])
             problems = [await self._carry_out_group(group, carry_out) for group in groups]
             problem = next(filter(None, problems), None)
-        except Exception as error:  # a mistake of ours: no reason to try it in a tight loop
+        except Exception as error:  # a fault of the operator: wait as after other failures
             log.exception("work for %s failed", _subject(job))
             problem = Problem(_subject(job), f"the operator failed: {error!r}")
         finally:
@@ -197,9 +206,10 @@ class Executor:
             self._finished()
 
     async def _carry_out_group(self, group: Group, carry_out: CarryOut) -> Problem | None:
-        """Carry a group out as far as possible; returns what went wrong.
+        """Carry out a group until an action fails, and return the last problem.
 
-        A network that can't be joined or left does not keep a proxy from serving the others.
+        A group continues after a failed Connect or Disconnect: the proxy can still serve other
+        networks. A taken port is no problem here: the next plan chooses another range.
         """
         problem: Problem | None = None
         for action in group.actions:
@@ -217,7 +227,10 @@ class Executor:
         return problem
 
     async def _carry_out_action(self, action: Action, carry_out: CarryOut) -> None:
-        """Carry an action out, and log why it failed: once while it is tried again and again."""
+        """Carry out an action, and log a failure. Raises EngineError.
+
+        If the next tries fail for the same reason, the log level is DEBUG (QUIET).
+        """
         previous, _ = self._refused.get(action, (None, 0.0))
         fields = action.log_fields
         log.log(logging.INFO if previous is None else logging.DEBUG, "%s", action, extra=fields)
@@ -230,7 +243,7 @@ class Executor:
         except EngineError as error:
             reason = str(error)
             if isinstance(error, PortTaken):
-                outcome = reason = "taken"  # maybe another port each time
+                outcome = reason = "taken"  # the port may differ at each try
             level = logging.DEBUG if reason == previous else logging.WARNING
             log.log(level, "%s: %s", action, error, extra=fields)
             self._refused[action] = reason, self._now()
@@ -246,7 +259,7 @@ def _subject(job: Job) -> str:
 
 
 class DockerApplier:
-    """Carries out actions, each in a thread."""
+    """Carries out single actions at the engine, each in a thread."""
 
     def __init__(self, engine: DockerClient, settings: PlanSettings, proxies: ProxyClient) -> None:
         self._engine = engine
@@ -254,7 +267,7 @@ class DockerApplier:
         self._proxies = proxies
 
     async def carry_out(self, action: Action, snapshot: DockerSnapshot) -> None:
-        """Carry out an action that was planned from a look. Raises EngineError."""
+        """Carry out an action that was planned from ``snapshot``. Raises EngineError."""
         if isinstance(action, Remove) and action.retire and action.name in snapshot.access:
             await self._retire(action.name, snapshot.access[action.name])
         await in_thread(self._do, action, snapshot)
@@ -308,17 +321,21 @@ class DockerApplier:
         match action:
             case CreateNetwork(name):
                 labels = {MANAGED: "true", SECRET: snapshot.new_secret}
-                # Without check_duplicate engines before API 1.44 may make a second one of the name.
+                # Without check_duplicate, engines before API 1.44 may create a second network of
+                # this name.
                 do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
             case RemoveNetwork(name):
                 do("remove_network", name)
             case Connect(name, network, aliases):
                 do("connect_container_to_network", name, network, aliases=list(aliases))
-            case Disconnect(name, network):  # also from one that does not exist any more
+            case Disconnect(name, network):  # with force, also from a network that has vanished
                 do("disconnect_container_from_network", name, network, force=True)
 
     def _await_end(self, name: str) -> None:
-        """Wait until a container has ended. Raises EngineError if it failed or takes too long."""
+        """Wait until a helper container has ended, and remove the container after LONGEST_RUN.
+
+        Raises EngineError after the removal, and for an exit code other than 0.
+        """
         since = time.monotonic()
         while (state := self._engine.container(name)["State"])["Running"]:
             if time.monotonic() > since + LONGEST_RUN:
@@ -352,11 +369,12 @@ class DockerApplier:
                 self._engine.do("stop", name, timeout=STOP_TIMEOUT)
             except EngineError as error:
                 log.debug("container not stopped, so it is killed: %s: %s", name, error)
-        # The engine lays the published ports anew over each network that a container still has
-        # when it ends, which takes 2 s per network.
+        # When a container ends, the engine publishes the ports anew over each network of the
+        # container, which takes 2 s per network. So the operator disconnects these networks first.
         networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
         for network in networks:
-            if network not in (self._settings.uplink, "host"):  # no container leaves the latter
+            # The engine disconnects no container from the network host.
+            if network not in (self._settings.uplink, "host"):
                 self._do(Disconnect(name, network), snapshot)
         self._engine.do("remove_container", name, force=True)
 
@@ -364,8 +382,8 @@ class DockerApplier:
         try:
             self._engine.do("create_container_from_config", config, name)
         except Conflict:
-            # Our own of that name is all right: an earlier call may have made it and its answer
-            # been lost. The next look compares it with what is wanted.
+            # An earlier call may have created this container although the answer was lost. The next
+            # look compares the container with the plan.
             container = self._engine.container(name)
             own = read_own(container["Config"].get("Labels") or {})
             making = engine_json.read_making(container)

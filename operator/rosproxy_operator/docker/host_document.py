@@ -1,7 +1,7 @@
-"""What a host's status tells, as one document: from a look, its plan, and what proxies say.
+"""The status of a host as a JSON document, made from a look, a plan, and the answers of proxies.
 
-``status --json`` prints it, `rosproxy_operator.docker.planner.report` makes a text of it, and the
-running operator answers with it.
+``status --json`` prints the document, `rosproxy_operator.docker.planner.report` renders the
+document as text, and the running operator serves the document at ``/status``.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -32,11 +32,11 @@ from rosproxy_operator.docker.planner.specs import lan_relay_name, proxy_name, s
 from rosproxy_operator.docker.settings import PlanSettings
 
 ProxyStatuses = Mapping[str, ProxyStatus]
-"""The status of each proxy that answers, by the name of its container."""
+"""The status of each proxy that answers, by container name."""
 STARTING = 8.0
-"""Seconds for which a proxy may be silent before that is a problem: it may just be starting."""
+"""Seconds after the start of a proxy in which a missing answer is no problem."""
 SETTLED = 15.0
-"""Seconds after the start of a container and of its proxy in which no participant is missed."""
+"""Seconds after the start of container and proxy in which missing nodes are no problem."""
 
 
 def host_document(
@@ -47,13 +47,14 @@ def host_document(
     settings: PlanSettings,
     now: float,
 ) -> Json:
-    """The document. ``answers`` are those of proxies, by name, or why one does not answer.
+    """Return the document.
 
+    ``answers`` has, by name, the status of each running proxy or the reason for a missing answer.
     ``now`` is Unix time.
 
-    Containers are those that have a proxy, are to have one, or whose labels are wrong; one with
-    both versions of ROS is listed twice. Actions for what the engine is busy with, and tells
-    nothing of, are left out.
+    The document lists the members of proxies and the containers with a problem. A container with
+    nodes of ROS 1 and ROS 2 is listed twice. No actions are listed for a proxy that has a busy
+    container (`HostState`).
     """
     statuses = {name: answer for name, answer in answers.items() if isinstance(answer, ProxyStatus)}
     problems = [*problems]
@@ -88,7 +89,7 @@ def host_document(
 
 
 def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: PlanSettings) -> Json:
-    """One row per proxy; its sandbox is only mentioned where that is what is wrong."""
+    """Return the row of a proxy. Faults of the sandbox and the LAN relay are in ``problems``."""
     proxy = _best(observed.proxies_of(key), proxy_name(key))
     sandbox = _best(observed.sandboxes_of(key), sandbox_name(key))
     own = sandbox or proxy
@@ -130,7 +131,7 @@ def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: Pla
 
 
 def _best(containers: Iterable[OwnContainer], name: str) -> OwnContainer | None:
-    """The container of this name, if it runs; else any that runs; else any."""
+    """Return a running container, else any, preferably of this name; None without containers."""
     return min(
         containers,
         key=lambda own: (own.container.state != "running", own.container.name != name),
@@ -164,7 +165,7 @@ def _zenoh_node(node: ZenohNodeStatus) -> Json:
 def _redirects(
     members: Iterable[Member], observed: HostState
 ) -> dict[tuple[str, Key | None], Json]:
-    """The redirects in containers' networks, by container and proxy."""
+    """Return the planned redirects of living containers, by container id and key of the proxy."""
     by_id = {container.id: container for container in observed.containers}
     return {
         (member.container.id, member.key): {
@@ -179,17 +180,17 @@ def _redirects(
 
 
 def just_started(observed: HostState, now: float) -> frozenset[str]:
-    """The names of the proxies that may be silent yet; ``now`` is Unix time."""
+    """Return the names of proxies started less than STARTING seconds ago; ``now`` is Unix time."""
     containers = (proxy.container for proxy in observed.proxies)
     ages = {container.name: now - _unix_time(container.started_at) for container in containers}
-    # The engine may run on a machine whose clock is ahead.
+    # If the clock of the engine's machine is ahead, the age is negative and says nothing.
     return frozenset(name for name, age in ages.items() if 0 <= age < STARTING)
 
 
 def _silent(
     answers: Mapping[str, ProxyStatus | Problem], observed: HostState, now: float
 ) -> list[Problem]:
-    """Why proxies do not answer, but for those that have just been started."""
+    """Return the problems of proxies that do not answer, except proxies that have just started."""
     starting = just_started(observed, now)
     return [
         answer
@@ -201,7 +202,10 @@ def _silent(
 def _unheard(
     members: Iterable[Member], observed: HostState, statuses: ProxyStatuses, now: float
 ) -> Iterator[Problem]:
-    """Containers of ROS 2 without a participant, whose variables may be why."""
+    """Yield problems for ROS 2 containers without participants, if variables may be the cause.
+
+    A variable alone is no problem, since the operator does not read DDS profiles.
+    """
     for member in members:
         container = member.container
         status = statuses.get(proxy_name(member.key))
@@ -218,7 +222,7 @@ def _unheard(
 def _unconnected(
     members: Iterable[Member], observed: HostState, statuses: ProxyStatuses, now: float
 ) -> Iterator[Problem]:
-    """Containers of rmw_zenoh without a session at the proxy, whose own file may be why."""
+    """Yield a problem for each container that has a session file for zenoh, but no session."""
     for member in members:
         container = member.container
         status = statuses.get(proxy_name(member.key))
@@ -238,13 +242,13 @@ def _unconnected(
 
 
 def _is_settled(container: Container, status: ProxyStatus, now: float) -> bool:
-    """Whether a container and its proxy have run long enough for nodes to be missed."""
+    """Return whether a container and the proxy have both run for SETTLED seconds."""
     age = now - _unix_time(container.started_at)
     return container.state == "running" and min(status.uptime, age) >= SETTLED
 
 
 def _unix_time(text: str) -> float:
-    """A time of the engine's as Unix time; 0 if it is none."""
+    """Return a time of the engine as Unix time; 0 for a text that is no time."""
     try:
         seconds = text.partition(".")[0].removesuffix("Z")
         return datetime.fromisoformat(f"{seconds}+00:00").timestamp()
@@ -253,7 +257,7 @@ def _unix_time(text: str) -> float:
 
 
 def _addresses(container: Container, observed: HostState) -> dict[str, str]:
-    """The addresses of a container by network; those of the container whose networks it shares."""
+    """Return the addresses by network, of the container that owns the network namespace."""
     by_id = {other.id: other for other in observed.containers}
     owner = network_owner(container, by_id)
     return {a.network: a.address for a in owner.attachments if a.address}

@@ -1,10 +1,10 @@
-"""The commands ``status`` and ``plan``: what there is on a host.
+"""The commands ``status`` and ``plan``, which show a host and the next actions of the operator.
 
-The operator that runs is asked for it: it has its own options, and remembers what it has tried.
-Where none answers, or options are given that another one might have, the command looks for itself.
+A command asks the running operator, which knows its own options and failures. If no operator
+answers, or if options stand before the command, the command looks at the host itself.
 
-Their exit codes tell scripts: of ``status`` 0 if all is as wanted, of ``plan`` 0 if nothing is to
-be done and STEPS_LEFT if something is; 1 of both if something is wrong.
+Exit codes for scripts: ``status`` returns 0 if no action is left, nothing is wrong and all proxies
+work, else 1. ``plan`` returns STEPS_LEFT if actions are left, else 1 if something is wrong, else 0.
 """
 
 import asyncio
@@ -31,19 +31,20 @@ from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerObserver
 
 STEPS_LEFT = 3
-"""The exit code of ``plan`` if there is something to do."""
+"""The exit code of ``plan`` if actions are left."""
 WAIT_INTERVAL = 1.0
 """Seconds between two looks of ``--wait``."""
 ASKING = 10.0
-"""Seconds that the operator gets: it looks anew, and asks its proxies."""
+"""Seconds that the operator has to answer: the operator looks anew, and asks all proxies."""
 PATIENCE = 3.0
-"""Seconds to wait for inspections: there is no second look."""
+"""Seconds to wait for the inspection of containers: there is no second look."""
 
 
 class HostStatus:
-    """What there is on a host, from the operator that listens at ``operator``, None for no such.
+    """The status of a host, from the operator that listens at ``operator``.
 
-    Else by a look of its own, with the plan that an operator with these settings would have.
+    If ``operator`` is None or does not answer, the status is what an operator with ``settings``
+    would see and plan.
     """
 
     def __init__(self, settings: PlanSettings, operator: HostPort | None) -> None:
@@ -51,9 +52,9 @@ class HostStatus:
         self.operator = operator
 
     async def now(self) -> Json:
-        """The document (`host_document`), with ``operator``: who has told it, or None.
+        """Return the document (`host_document`). Raises EngineError.
 
-        Raises EngineError.
+        The field ``operator`` is the URL of the operator that has answered, or None.
         """
         return await asyncio.to_thread(self._ask_operator) or {
             **await survey(self.settings),
@@ -61,16 +62,17 @@ class HostStatus:
         }
 
     def _ask_operator(self) -> Json | None:
-        """What the operator says; None if none answers, or not one of this version."""
+        """Return the document of the operator; None if no operator of this version answers."""
         document = ask_operators(self.operator) if self.operator else None
-        # One of another version may tell other things.
+        # The document of another version may have other fields.
         return document if document and document.get("version") == __version__ else None
 
 
 def ask_operators(first: HostPort) -> Json | None:
-    """What the first operator of this machine that answers tells; None without one.
+    """Return the document of the first operator on this machine that answers; None without answer.
 
-    As ``operator`` it has that one's URL. ``first`` is asked before those that have put up signs.
+    The field ``operator`` has the URL of that operator. ``first`` is asked before the operators
+    with signs.
     """
     return next(filter(None, map(_ask, operators(first, DockerClient().url))), None)
 
@@ -81,23 +83,23 @@ def _ask(endpoint: HostPort) -> Json | None:
         document = json.loads(client.get("/status", within=ASKING))
     except (AdminError, ValueError, RecursionError):
         return None
-    # A proxy may listen there: its status has no uplink.
+    # A proxy may listen at this endpoint. The status of a proxy has no field uplink.
     is_document = isinstance(document, dict) and "uplink" in document
     return {**document, "operator": client.url} if is_document else None
 
 
 def show_plan(host: HostStatus, as_json: bool, wait: float) -> int:
-    """Print what would be done now, and what is wrong; the exit code. Raises EngineError.
+    """Print the next actions and the problems, and return the exit code. Raises EngineError.
 
-    ``wait`` are the seconds in which there may come to be nothing to do and nothing wrong: a proxy
-    that has just been started does not answer yet.
+    Wait up to ``wait`` seconds until nothing is left to do and nothing is wrong: a proxy that has
+    just started does not answer yet.
     """
     status = _await(host, wait, lambda status: not status["actions"] and not _is_wrong(status))
     shown = {key: status[key] for key in ("actions", "problems")}
     if as_json:
         write(json.dumps(shown, indent=2))
     else:
-        # Names of labels are whatever an image says, and stand in texts of problems.
+        # Problems quote names of labels. An image can put control characters into these names.
         write("\n".join(map(clean, status["actions"])) or "Nothing to do.")
         for problem in status["problems"]:
             write(clean(f"{problem['subject']}: {problem['text']}"))
@@ -105,9 +107,9 @@ def show_plan(host: HostStatus, as_json: bool, wait: float) -> int:
 
 
 def show_status(host: HostStatus, as_json: bool, wait: float) -> int:
-    """Print what there is on the host; the exit code. Raises EngineError.
+    """Print the status of the host, and return the exit code. Raises EngineError.
 
-    ``wait`` are the seconds in which all may come to be as wanted.
+    Wait up to ``wait`` seconds until the exit code is 0.
     """
     status = _await(host, wait, _is_as_wanted)
     write(json.dumps(status, indent=2) if as_json else render(status, size()[0]))
@@ -115,7 +117,7 @@ def show_status(host: HostStatus, as_json: bool, wait: float) -> int:
 
 
 def _await(host: HostStatus, seconds: float, good: Callable[[Json], bool]) -> Json:
-    """A status that is good, or the last one after so many seconds. Raises EngineError."""
+    """Return the first good status, or the status after so many seconds. Raises EngineError."""
     end = time.monotonic() + seconds
     while not good(status := asyncio.run(host.now())) and time.monotonic() < end:
         time.sleep(WAIT_INTERVAL)
@@ -123,13 +125,16 @@ def _await(host: HostStatus, seconds: float, good: Callable[[Json], bool]) -> Js
 
 
 def _is_as_wanted(status: Json) -> bool:
-    """Whether nothing is left to do, nothing is wrong, and every proxy can do its work."""
+    """Return whether no action is left, nothing is wrong, and every proxy works."""
     works = all(map(_works, status["proxies"]))
     return works and not status["actions"] and not _is_wrong(status)
 
 
 def _works(proxy: Json) -> bool:
-    """Whether a proxy answers, and nothing shows that its master or outside is cut off from it."""
+    """Return whether a proxy answers, reaches its master and routers, and is reached by outside.
+
+    Checks without a result (None) count as passed.
+    """
     links = proxy["links"].values()
     return proxy["reachable"] and False not in (proxy["master_up"], proxy["reached"], *links)
 
@@ -139,7 +144,7 @@ def _is_wrong(status: Json) -> bool:
 
 
 def watch_status(host: HostStatus) -> None:
-    """Draw the status again and again until interrupted, also while no engine answers."""
+    """Draw the status again and again until interrupted. An engine error does not end the loop."""
 
     def draw(columns: int, lines: int | None) -> str:
         try:
@@ -151,12 +156,12 @@ def watch_status(host: HostStatus) -> None:
 
 
 async def survey(settings: PlanSettings) -> Json:
-    """The document of a host, as an operator with these settings would see it. Raises EngineError.
+    """Return the document of a host, as an operator with these settings would see the host.
 
-    It has none of the memory of an operator that runs.
+    Unlike a running operator, the survey has no memory of earlier looks. Raises EngineError.
     """
     proxies = ProxyClient()
-    # Nobody has to be woken: there is no second look.
+    # The callbacks wake a control loop. Here is none: there is no second look.
     observer = DockerObserver(DockerClient(), settings, MasterResolver(lambda: None), lambda: None)
     try:
         snapshot = await observer.look(PATIENCE)

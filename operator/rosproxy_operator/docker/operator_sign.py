@@ -1,7 +1,7 @@
-"""Where operators for Docker listen on this machine: each puts up a sign (`rosproxy.net.signs`).
+"""Find the Docker operators on this machine. Each operator publishes a sign (`rosproxy.net.signs`).
 
-So commands find one that was given another ``--admin-bind``. Whoever a sign names is asked, as
-whoever listens at the default is: on loopback, where only this machine's programs listen.
+So a command finds an operator that has another ``--admin-bind``. Any program can publish a sign, so
+a command follows signs to loopback alone, where only programs of this machine listen.
 """
 
 import hashlib
@@ -11,19 +11,22 @@ from rosproxy.net import signs
 from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
 
 MOST = 4
-"""Operators that are asked."""
+"""Most endpoints that a command asks."""
 
 
 def publish_sign(admin: HostPort, engine: str) -> socket.socket | None:
-    """Put up the sign of an operator that listens there; it stays until the socket is closed.
+    """Publish the sign of an operator that listens at ``admin``, until the socket is closed.
 
-    ``engine`` is the URL of the engine that it looks after.
+    ``engine`` is the URL of the operator's engine. None if the kernel refuses the socket.
     """
     return signs.put_up(f"{_begin(engine)}/{admin}")
 
 
 def operators(first: HostPort, engine: str) -> list[HostPort]:
-    """Where operators of this engine may listen: ``first``, then where signs say; MOST at most."""
+    """Return endpoints at which operators of this engine may listen, MOST at most.
+
+    ``first`` comes first, then the endpoints of the signs on loopback or a wildcard address.
+    """
     matches = signs.read_all(_begin(engine) + r"/([0-9a-f.:\[\]]{1,60})")
     listeners = (parse_host_port(match[1]) for match in matches)
     near = (at for at in listeners if at and (is_loopback(at.host) or at.host in ("0.0.0.0", "::")))
@@ -31,5 +34,5 @@ def operators(first: HostPort, engine: str) -> list[HostPort]:
 
 
 def _begin(engine: str) -> str:
-    """How signs begin: a machine may have several engines, with an operator each."""
+    """Return the beginning of all signs for this engine: a machine may have several engines."""
     return f"rosproxy-operator/docker/{hashlib.sha256(engine.encode()).hexdigest()[:16]}"

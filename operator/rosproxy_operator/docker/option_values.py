@@ -1,4 +1,4 @@
-"""Kinds of values of the Docker operator's options; see `rosproxy.setting_kinds`."""
+"""Kinds of values of the Docker operator's options. See `rosproxy.setting_kinds`."""
 
 import re
 from pathlib import Path
@@ -9,15 +9,16 @@ from rosproxy.setting_kinds import Number, Text, read_address, read_master_uri
 from rosproxy_operator.common.ros2 import read_peer_name
 
 MOST_PORTS = 1000
-"""Ports that a proxy can have: each costs rules and, by default, a process of the engine."""
+"""Most ports of a proxy. Each port costs the engine rules and, by default, a process."""
 NOWHERE = "none"
-"""What stands for no LAN."""
+"""The value of ``--ros2-lan`` for no LAN."""
 LEAST_MEMORY = 64 * 1024**2
 MOST_MEMORY = 1024**4
-"""Bytes that a proxy may be bounded to: one that does nothing has 32 MiB."""
+"""Least and most bytes of a memory bound. An idle proxy takes 32 MiB."""
 LEAST_PIDS = 256
-"""Threads that a proxy needs for a hundred connections."""
+"""Threads and processes that a proxy needs for a hundred connections."""
 LEAST_SECRET = 32
+"""Characters."""
 _MEMORY = re.compile(r"([0-9]{1,15})([bkmg]?)b?")
 _UNITS = {"": 1, "b": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
 _NETWORK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -28,9 +29,10 @@ _NAME_PATTERN = re.compile(r"[a-z0-9_.*?-]{1,253}")
 
 
 def read_host_pattern(text: str) -> str:
-    """A pattern of masters or peers, ``host:port`` in lower case; * and ? are wildcards.
+    """Return a pattern of masters or peers as ``host:port`` in lower case. Raises ValueError.
 
-    It may begin with ``http://``, as a master's URI does. Raises ValueError.
+    ``*`` and ``?`` are wildcards. A text without a port gets the port ``*``. The text may begin
+    with ``http://``, like a master's URI.
     """
     match = _PATTERN.fullmatch(text.strip().lower())
     if match is None:
@@ -41,7 +43,7 @@ def read_host_pattern(text: str) -> str:
 
 
 def read_name_pattern(text: str) -> str:
-    """A pattern of host names, in lower case; * and ? are wildcards. Raises ValueError."""
+    """Return a pattern of host names in lower case, with wildcards * and ?. Raises ValueError."""
     pattern = text.strip().lower()
     if not _NAME_PATTERN.fullmatch(pattern):
         raise ValueError(f"{text[:40]!r} is not a host name such as robot or *.lab.example")
@@ -49,7 +51,7 @@ def read_name_pattern(text: str) -> str:
 
 
 def read_shared_master_uri(text: str) -> str:
-    """The URI of a master as all containers can use it; empty for no text. Raises ValueError."""
+    """Return the URI of a master that is not on loopback; empty for no text. Raises ValueError."""
     master = parse_slave_uri(read_master_uri(text)) if text else None
     if master and is_loopback(master.host):
         raise ValueError(
@@ -61,7 +63,7 @@ def read_shared_master_uri(text: str) -> str:
 
 
 def read_lan(text: str) -> str:
-    """An IPv4 address of this host on the LAN, or the word for none. Raises ValueError."""
+    """Return an IPv4 address; NOWHERE and an empty text stay as they are. Raises ValueError."""
     if text in ("", NOWHERE):
         return text
     address = read_address(text)
@@ -73,7 +75,10 @@ def read_lan(text: str) -> str:
 
 
 def read_memory(text: str) -> int:
-    """Bytes, as ``docker run --memory`` has them: 512m, 1g; 0 for no bound. Raises ValueError."""
+    """Return bytes from a size as of ``docker run --memory``, such as 512m. Raises ValueError.
+
+    0 is no bound.
+    """
     match = _MEMORY.fullmatch(text.strip().lower())
     size = int(match[1]) * _UNITS[match[2]] if match else -1
     if size and not LEAST_MEMORY <= size <= MOST_MEMORY:
@@ -84,7 +89,7 @@ def read_memory(text: str) -> int:
 
 
 def read_pids(text: str) -> int:
-    """How many threads and processes; 0 for no bound. Raises ValueError."""
+    """Return a number of threads and processes; 0 for no bound. Raises ValueError."""
     digits = text.strip()
     count = int(digits) if re.fullmatch(r"[0-9]{1,7}", digits, re.ASCII) else -1
     if count and count < LEAST_PIDS:
@@ -95,7 +100,10 @@ def read_pids(text: str) -> int:
 
 
 def read_secret(path: str) -> str:
-    """The secret in a file, without blanks around it; empty for no path. Raises ValueError."""
+    """Return the stripped secret of a file; empty for no path. Raises ValueError.
+
+    A secret with fewer than LEAST_SECRET characters is an error.
+    """
     if not path:
         return ""
     try:
@@ -112,7 +120,7 @@ def read_secret(path: str) -> str:
 
 
 def read_uplink(text: str) -> str:
-    """The name of a network. Raises ValueError."""
+    """Return the name of a Docker network. Raises ValueError."""
     if not _NETWORK.fullmatch(text):
         raise ValueError(f"{text!r} can't be the name of a Docker network")
     return text

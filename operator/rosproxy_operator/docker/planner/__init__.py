@@ -1,1 +1,1 @@
-"""What is decided on a Docker host. Sees, waits and does nothing: plain functions over data."""
+"""The decisions of the Docker operator: pure functions without engine calls, clock and waiting."""
