@@ -209,7 +209,7 @@ class Executor:
         """Carry out a group until an action fails, and return the last problem.
 
         A group continues after a failed Connect or Disconnect: the proxy can still serve other
-        networks. A taken port is no problem here: the next plan chooses another range.
+        networks. A taken port is no problem here: the next plan decides on the range (allocation).
         """
         problem: Problem | None = None
         for action in group.actions:

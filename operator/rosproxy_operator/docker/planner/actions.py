@@ -1,7 +1,7 @@
-"""What the operator can do to a Docker host: data, carried out by `docker.executor`.
+"""The actions of the operator on a Docker host, as data. `docker.executor` carries actions out.
 
-Containers are named, not numbered: a plan may start what it has yet to create. The text of an
-action says what it does, in one plain and harmless line.
+Actions name containers instead of ids: a plan may start a container that the same plan creates. The
+text of an action is one line without control characters.
 """
 
 from typing import ClassVar
@@ -17,7 +17,7 @@ from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec
 
 
 class Action(msgspec.Struct, frozen=True):
-    """Something to be done to the container or network ``name``; its text begins with ``does``."""
+    """An action on the container or network ``name``. ``does`` is the beginning of the text."""
 
     does: ClassVar[str]
     name: str
@@ -27,11 +27,11 @@ class Action(msgspec.Struct, frozen=True):
 
     @property
     def log_fields(self) -> dict[str, str]:
-        """What a log entry about it has as fields: the container's name, or the network's."""
+        """The fields of a log entry: the name, under ``container`` or ``network``."""
         return {self.does.rpartition(" ")[2]: self.name}
 
     def _details(self) -> str:
-        """The rest of the text."""
+        """Return the rest of the text."""
         return ""
 
 
@@ -45,13 +45,13 @@ class CreateNetwork(Action, frozen=True):
 
 
 class RemoveNetwork(Action, frozen=True):
-    """Remove a network that the operator has made."""
+    """Remove a network that the operator has created."""
 
     does = "remove network"
 
 
 class _CreateContainer(Action, frozen=True):
-    """Create one of a proxy's containers, without starting it."""
+    """Create a container for the proxy of ``key``, and do not start the container."""
 
     does = "create container"
     key: Key
@@ -59,7 +59,7 @@ class _CreateContainer(Action, frozen=True):
 
 
 class CreateSandbox(_CreateContainer, frozen=True):
-    """Create the sandbox of a proxy with this ``spec``, on the uplink network."""
+    """Create the sandbox of a proxy with the options ``spec``, on the uplink network."""
 
     spec: ProxySpec = OWN_SPEC
     fingerprint: str = ""
@@ -69,11 +69,11 @@ class CreateSandbox(_CreateContainer, frozen=True):
 
 
 class Create(_CreateContainer, frozen=True):
-    """Create the container in which a proxy runs, in the namespace of the one named ``sandbox``.
+    """Create the container of a proxy, in the network namespace of the container ``sandbox``.
 
-    ``replaces`` names the one in whose place it comes, if any. ``policy`` are the layers of its
-    containers' labels. Of ROS 2: ``peers`` are told of its participants, and ``lan_relay`` is where
-    its LAN relay listens, on the uplink's gateway.
+    ``replaces`` is the name of the former container, or empty. ``policy`` has the layers from
+    labels. ``peers`` and ``lan_relay``, the endpoint of the LAN relay, are for ROS 2. For rmw_zenoh
+    ``peers`` are routers outside.
     """
 
     sandbox: str
@@ -97,8 +97,8 @@ class Create(_CreateContainer, frozen=True):
 class CreateLanRelay(_CreateContainer, frozen=True):
     """Create the LAN relay of a proxy for ROS 2, in the host's network.
 
-    ``lan`` is this host's address on the LAN, ``bind`` where the LAN relay hears the proxy,
-    ``proxy`` where the proxy hears the LAN relay.
+    ``lan`` is this host's address on the LAN. The LAN relay receives from the proxy at ``bind``,
+    and sends to the proxy at ``proxy``.
     """
 
     lan: str
@@ -114,10 +114,10 @@ class CreateLanRelay(_CreateContainer, frozen=True):
 
 
 class CreateRedirect(_CreateContainer, frozen=True):
-    """Create what sets rules in the network of a container, and ends.
+    """Create a helper container that sets the rules of a redirect in a container's network.
 
-    ``target`` is that container's id, ``started`` when it was started. There these ``addresses``
-    are to lead to ``proxy``; without both, what led there is taken away.
+    ``target`` is the id of that container, ``started`` the time of its start. The rules lead
+    ``addresses`` to ``proxy``. Without ``proxy``, the helper removes the rules.
     """
 
     target: str
@@ -135,7 +135,7 @@ class CreateRedirect(_CreateContainer, frozen=True):
 
 
 class CreateFlush(_CreateContainer, frozen=True):
-    """Create what deletes the host's conntrack entries for a sandbox's UDP ports, and ends."""
+    """Create a helper container that deletes conntrack entries for a sandbox's UDP ports."""
 
     fingerprint: str = ""
 
@@ -147,7 +147,7 @@ class CreateFlush(_CreateContainer, frozen=True):
 
 
 class Run(Action, frozen=True):
-    """Start a container that does one thing, and wait until it has ended."""
+    """Start a helper container, and wait until the helper has ended."""
 
     does = "run container"
 
@@ -159,13 +159,13 @@ class Start(Action, frozen=True):
 
 
 class Restart(Action, frozen=True):
-    """End a proxy and start it again: it runs in a namespace that is there no more."""
+    """Restart a proxy that still runs in the former network namespace of its sandbox."""
 
     does = "restart container"
 
 
 class Unpause(Action, frozen=True):
-    """Resume a container that was paused."""
+    """Resume a paused container."""
 
     does = "resume container"
 
@@ -181,7 +181,7 @@ class Rename(Action, frozen=True):
 
 
 class Connect(Action, frozen=True):
-    """Join a sandbox to a network under these aliases."""
+    """Connect a sandbox to a network under ``aliases``."""
 
     does = "connect container"
     network: str
@@ -193,7 +193,7 @@ class Connect(Action, frozen=True):
 
 
 class Disconnect(Action, frozen=True):
-    """Take a sandbox off a network."""
+    """Disconnect a sandbox from a network."""
 
     does = "disconnect container"
     network: str
@@ -205,10 +205,10 @@ class Disconnect(Action, frozen=True):
 class Remove(Action, frozen=True):
     """Kill and remove a container.
 
-    With ``retire`` no other proxy takes over: the proxy first unregisters its nodes at the master
-    (ROS 1), or sends dispose messages for its participants (ROS 2). With ``stop`` it is ended
-    properly first: it goes together with its network, and what the kernel forwards there would
-    never be closed.
+    ``retire`` is for a proxy without a successor: the proxy first unregisters the nodes at the
+    master (ROS 1), or sends dispose messages for the participants (ROS 2). ``stop`` is for a proxy
+    whose network namespace goes, too: the proxy first closes the connections that the kernel
+    forwards. Otherwise these connections would never be closed.
     """
 
     does = "remove container"

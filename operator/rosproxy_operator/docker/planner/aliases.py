@@ -1,7 +1,8 @@
-"""The names under which the nodes of containers find their proxies, by network.
+"""The names under which the nodes of containers find the proxies, by network.
 
-An engine answers with all containers that have a name, in any order. So a proxy gets no name that
-a container has: nodes would reach now one, now the other. A proxy that has such a name loses it.
+If several containers on a network have the same name, the engine resolves this name to all of
+these containers, in any order. So a proxy gets no name that a container has, and loses such a name:
+nodes would reach the proxy or the container by chance.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -26,14 +27,14 @@ from rosproxy_operator.docker.planner.taken_names import (
 from rosproxy_operator.docker.settings import PlanSettings
 
 Aliases = Mapping[Key, Mapping[str, tuple[str, ...]]]
-"""For a key and a network, the names of the key's proxy there."""
+"""The names of a proxy on a network, by key and network."""
 
 
 @dataclass(frozen=True, slots=True)
 class Naming:
-    """The names of the proxies, by key and network, and problems of containers without theirs.
+    """The names of all proxies, and the problems of containers that can't find the proxy.
 
-    ``withdrawn`` are names, by network, that no proxy there may have or keep.
+    ``withdrawn`` has, by network, the names that no proxy may have or keep there.
     """
 
     aliases: Aliases
@@ -41,11 +42,12 @@ class Naming:
     problems: tuple[Problem, ...]
 
     def is_misnamed(self, sandbox: Container, network: str) -> bool:
-        """Whether a sandbox has a name on a network that no proxy may have there.
+        """Return whether a sandbox has a withdrawn name on a network.
 
-        The engine takes no single name away: to lose one, the sandbox has to join the network anew.
+        The engine removes no single name. To lose a name, a sandbox disconnects from the network,
+        and connects again without that name.
         """
-        # The engine gives these names by itself, so that joining anew would change nothing.
+        # The engine adds these two names at each connection, so connecting again changes nothing.
         lasting = {sandbox.name.lower(), sandbox.id[:12]}
         withdrawn = self.withdrawn.get(network, frozenset()) - lasting
         return any(answers_to(sandbox, network, name) for name in withdrawn)
@@ -53,9 +55,10 @@ class Naming:
 
 @dataclass(frozen=True, slots=True)
 class _Claim:
-    """A name on a network, the proxies that want it, and the containers and proxies with it.
+    """A name on a network, and the proxies that want this name (``claimants``).
 
-    ``refusal`` says why a label may not give the name; it is empty if a label may.
+    ``containers`` and ``holders`` are the containers and the proxies that have the name now.
+    ``refusal`` is the reason why a label may not give the name, or empty.
     """
 
     network: str
@@ -72,10 +75,10 @@ class _Claim:
 
     @property
     def owner(self) -> Key | None:
-        """The proxy that gets the name; None if no proxy may have the name, or wants it.
+        """The proxy that gets the name; None if no proxy may have or wants the name.
 
-        A proxy that already has the name keeps it, so that no connection is cut. Otherwise the
-        first proxy gets it whose containers look for it, else the first that wants it.
+        A proxy that has the name keeps the name, so that no connection is cut. Otherwise the name
+        goes to the first claimant whose containers look for the name, else to the first claimant.
         """
         if self.withdrawn or not self.claimants:
             return None
@@ -87,7 +90,7 @@ class _Claim:
 
 @dataclass(frozen=True, slots=True)
 class _NameFacts:
-    """What decides on a name: the host, the names of its containers, and the settings."""
+    """The facts that decide on a name: host, present and former names, and settings."""
 
     observed: HostState
     settings: PlanSettings
@@ -98,9 +101,9 @@ class _NameFacts:
 def assign_aliases(
     desired: Collection[Desired], observed: HostState, settings: PlanSettings, former: FormerNames
 ) -> Naming:
-    """The names of the proxies, and the containers that won't find theirs.
+    """Return the names of the proxies, and problems of containers that won't find the proxy.
 
-    ``desired`` is sorted by key. ``former`` are the names that containers have or had.
+    ``desired`` is sorted by key. ``former`` has the names that containers have or had.
     """
     aliases: dict[Key, dict[str, tuple[str, ...]]] = {}
     withdrawn: dict[str, frozenset[str]] = {}
@@ -123,7 +126,7 @@ def assign_aliases(
 
 
 def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
-    """The containers of a proxy on a network that look for it by this name."""
+    """Return the containers of a proxy on a network that look for the proxy by ``alias``."""
     return tuple(member.container.name for member in _seekers(desired, network, alias))
 
 
@@ -132,7 +135,7 @@ def _seekers(desired: Desired, network: str, alias: str) -> Iterator[Member]:
 
 
 def answers_to(container: Container, network: str, alias: str) -> bool:
-    """Whether a container answers to a name on a network; case does not matter to engines."""
+    """Return whether a container has a name on a network. Engines ignore the case of names."""
     return any(
         alias.lower() in map(str.lower, attachment.names)
         for attachment in container.attachments
@@ -141,8 +144,12 @@ def answers_to(container: Container, network: str, alias: str) -> bool:
 
 
 def _names(key: Key) -> tuple[str, ...]:
-    """The names that a proxy is to have: its container's own, too, which has no endpoint itself."""
-    if key.ros != "1":  # found by multicast, as a peer, or by a redirect
+    """Return the names that a proxy wants.
+
+    The name of the proxy's container has to be an alias of the sandbox: only the sandbox is on
+    networks.
+    """
+    if key.ros != "1":  # nodes find the proxy by multicast, as a peer, or by a redirect
         return (proxy_name(key),)
     host = master(key).host
     return (ALIAS, proxy_name(key), *(() if is_address(host) else (host,)))
@@ -158,7 +165,7 @@ def _claim(network: str, alias: str, proxies: Collection[Desired], facts: _NameF
     }
     holding = [s for s in observed.sandboxes if answers_to(s.container, network, alias)]
     staying = [d.key for d in proxies if d.key in {s.key for s in holding}]
-    # One that is restarting can't leave the network: it answers there again in a moment.
+    # A sandbox that restarts can't leave the network, and has the name again in a moment.
     stuck = sorted(s.key for s in holding if s.container.state == "restarting")
     return _Claim(
         network,
@@ -171,7 +178,7 @@ def _claim(network: str, alias: str, proxies: Collection[Desired], facts: _NameF
 
 
 def _refusal(alias: str, places: Iterable[tuple[str, str]], facts: _NameFacts) -> str:
-    """Why the name of a master's host is not for a proxy, though no container has the name now."""
+    """Return why no proxy may have a name; empty if a proxy may. Present names are not checked."""
     if refusal := alias_refusal(alias, facts.settings):
         return refusal
     former = next((facts.former[place] for place in places if place in facts.former), "")
@@ -181,9 +188,9 @@ def _refusal(alias: str, places: Iterable[tuple[str, str]], facts: _NameFacts) -
 
 
 def _problems(claim: _Claim, common: _Claim | None) -> Iterator[Problem]:
-    """Warnings for containers that look for their proxy by a name that the proxy has not.
+    """Yield warnings for containers that look for the proxy by a name that the proxy lacks.
 
-    ``common`` is the claim to the name that all proxies would have.
+    ``common`` is the claim to ALIAS, the name that all proxies want.
     """
     for claimant in claim.claimants:
         key = claimant.key
@@ -193,7 +200,7 @@ def _problems(claim: _Claim, common: _Claim | None) -> Iterator[Problem]:
         for member in _seekers(claimant, claim.network, claim.alias):
             fix = f"ROS_MASTER_URI=http://{host}:{master(key).port}"
             if MASTER_URI not in member.container.labels:
-                # Without it a variable that names a proxy leaves open which master is meant.
+                # A variable that names a proxy does not say which master the container means.
                 fix += f" and the label {MASTER_URI}={key.master_uri}"
             text = (
                 f"the nodes look for the proxy by the name {claim.alias}, but "
@@ -203,9 +210,9 @@ def _problems(claim: _Claim, common: _Claim | None) -> Iterator[Problem]:
 
 
 def _obstacle(claim: _Claim, key: Key, fix: str) -> str:
-    """What keeps a proxy from a name, and what the user or the administrator can do.
+    """Return what keeps a proxy from having a name, and the fix.
 
-    ``fix`` is the variable to set, and perhaps a label.
+    ``fix`` has the variable to set, and a label if the container lacks the label.
     """
     if claim.refusal and not claim.containers:
         return (
@@ -223,12 +230,12 @@ def _obstacle(claim: _Claim, key: Key, fix: str) -> str:
 
 
 def _has_name(claim: _Claim, key: Key) -> bool:
-    """Whether the proxy answers to the name, or will, and no other proxy does."""
+    """Return whether the proxy has or gets the name, and no other proxy has the name."""
     return key == claim.owner and len(claim.holders) <= 1
 
 
 def _holder(claim: _Claim, key: Key) -> str:
-    """A proxy that has the name, and the containers for which it is there: they may be wrong."""
+    """Return the text for a proxy that has the name, with its containers: a label may be wrong."""
     containers = [
         member.container.name
         for claimant in claim.claimants

@@ -1,4 +1,4 @@
-"""Which range of ports each proxy of a Docker host gets, and when it must leave it."""
+"""Choose the port range of each proxy on a Docker host, and decide when a proxy leaves a range."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -35,10 +35,11 @@ from rosproxy_operator.docker.settings import PlanSettings
 def after_refusals(
     observed: HostState, live: Collection[Key], memory: DockerMemory, now: float
 ) -> DockerMemory:
-    """The memory after the engine's refusals to start sandboxes.
+    """Return the memory after the engine's refusals to start sandboxes.
 
-    A range that has never served is given up at once: its refused ports become ``taken``. One that
-    has served is given up after `RETRY_FOR` seconds, since its ports may only be slow to be let go.
+    A range that has never served is given up at once: the refused ports become ``taken``. A range
+    that has served is given up after `RETRY_FOR` seconds, since the engine may be slow to free the
+    ports. ``live`` are the keys of wanted proxies, ``now`` is in monotonic seconds.
     """
     refusals = dict(memory.refusals)
     taken = dict(memory.taken)
@@ -50,8 +51,8 @@ def after_refusals(
         served = memory.served.get(sandbox.key)
         port = refusal.port
         suspects = {port} if port and port in sandbox.range else {*sandbox.range.ports()}
-        # Of a range that was made longer only the added ports can be another's: on the others its
-        # proxy has served, and the engine may only be slow to let go of them.
+        # In a range that was made longer, only the added ports count as taken. The proxy has
+        # served on the former ports, so the engine may only be slow to free these ports.
         unserved = {port for port in suspects if served is None or port not in served}
         if served is not None and not unserved:
             if now - refusal.since < RETRY_FOR:
@@ -64,7 +65,7 @@ def after_refusals(
 
 @dataclass(frozen=True, slots=True)
 class _Host:
-    """The ports of a host. ``live`` are the wanted proxies, ``serving`` those that serve."""
+    """The ports of a host. ``live`` has the wanted proxies, ``serving`` the proxies that serve."""
 
     observed: HostState
     memory: DockerMemory
@@ -72,29 +73,29 @@ class _Host:
     serving: frozenset[Key]
 
     def published(self, containers: Collection[Container], key: Key) -> frozenset[int]:
-        """The ports refused, and those that containers publish by the protocols of a proxy."""
+        """Return refused ports, and ports that containers publish by the protocols of a proxy."""
         tcp = frozenset(port for c in containers for port in c.host_ports)
         udp = frozenset(port for c in containers for port in c.udp_ports)
         return self._matching(key, tcp, udp) | self.memory.taken.keys()
 
     def wish(self, key: Key, settings: PlanSettings) -> RangeWish:
-        """What a key's proxy wants, and what it can't have."""
+        """Return the ports that a proxy wants, and the ports that the proxy can't have."""
         observed = self.observed
         claimed = self.published(observed.containers, key) | reserved_ports(key)
         blocked = claimed | self._matching(key, observed.listening, observed.listening_udp)
-        # The ports of the proxy for rmw_zenoh are not the host's.
+        # The host does not publish the ports of the proxy for rmw_zenoh.
         others = [s for s in observed.sandboxes if s.key not in (key, ZENOH)]
         ranges = [s.range for s in others]
         former: list[FormerRange] = []
         if served := self.memory.served.get(key):
-            # What listens there does not count: it may be what is left of that very proxy.
+            # Listening programs do not count: the engine may still hold ports for this proxy.
             started = [c for c in observed.containers if c.state in STARTED]
             held = (s for s in others if s.key not in self.live or s.key in self.serving)
             taken = self.published(started, key)
             former.append(FormerRange(served, taken, [s.range for s in held]))
         created = [s.range for s in observed.sandboxes_of(key)]
         if planned := self.memory.planned.get(key) or next(iter(created), None):
-            # What listens on the ports of such a sandbox may be the engine, which is starting it.
+            # On the ports of a created sandbox, the engine itself may listen to start the sandbox.
             taken = claimed if planned in created else blocked
             former.append(FormerRange(planned, taken, [observed.ephemeral, *ranges]))
         return RangeWish(
@@ -109,7 +110,7 @@ class _Host:
         )
 
     def _matching(self, key: Key, tcp: frozenset[int], udp: frozenset[int]) -> frozenset[int]:
-        """Those of these ports whose protocol a key's proxy publishes."""
+        """Return the ports of the protocols that a proxy publishes."""
         if key.is_ros2:
             return udp
         return tcp | udp if self.live[key].spec.udp else tcp
@@ -123,17 +124,18 @@ def allocate(
     now: float,
     frozen: bool = False,
 ) -> tuple[DockerMemory, list[Problem]]:
-    """Plan a range for each live proxy: the one that it has or had, else the first that is free.
+    """Plan a range for each live proxy: the present or a former range, else the first free range.
 
-    The memory's ``planned`` has those of all that can have one. A proxy that serves is never moved.
-    One that has served and does not is only moved if others are seen on its ports. With ``frozen``
-    no range gets longer: nothing can be created.
+    Return the memory and the problems. ``planned`` in the memory has the ranges. A proxy that
+    serves never moves. A proxy that has served moves only if the engine has refused ports of the
+    range, or if other containers or proxies hold such ports. With ``frozen`` no range gets longer,
+    since no container can be created.
     """
     live = {d.key: d for d in desired if d.live}
     routers = live.pop(ZENOH, None)
     serving = frozenset(s.key for s in observed.sandboxes if s.container.state in SERVING)
     host = _Host(observed, memory, live, serving)
-    # Keys with ports come first, then those that had some, then those that want some.
+    # Proxies that serve come first, then proxies that have served, then planned, then new proxies.
     groups = (serving, memory.served, memory.planned, live)
     order = sorted(live, key=lambda key: ([key in group for group in groups].index(True), key))
     wishes = {key: host.wish(key, settings) for key in order}
@@ -169,7 +171,7 @@ def allocate(
 def _too_short(
     wishes: Mapping[Key, RangeWish], ranges: Mapping[Key, PortRange], ephemeral: PortRange
 ) -> Iterator[Problem]:
-    """The ranges that could not get as many ports as they are to have, and what to do."""
+    """Yield a problem for each range with fewer ports than the proxy wants, with the fix."""
     for key, ports in ranges.items():
         count = wishes[key].count
         if len(ports) >= count:
@@ -193,7 +195,7 @@ def _too_short(
                 "net.ipv4.ip_local_port_range"
             )
         else:
-            fix = "Stop the programs that hold them (see ss -ltnup)"
+            fix = "Stop the programs that hold these ports (see ss -ltnup)"
             why = f"ports {missing} are not all free. {fix}"
         text = (
             f"has only the {len(ports)} ports {ports}, although --ports or the label "
@@ -203,7 +205,10 @@ def _too_short(
 
 
 def _router_ports(count: int, memory: DockerMemory) -> PortRange:
-    """The ports of the proxy for rmw_zenoh, which are not the host's. They never get fewer."""
+    """Return the ports of the proxy for rmw_zenoh, which the host does not publish.
+
+    The number of these ports never falls.
+    """
     former = memory.served.get(ZENOH) or memory.planned.get(ZENOH)
     return PortRange(FIRST_PORT, FIRST_PORT + max(count, len(former) if former else 0) - 1)
 

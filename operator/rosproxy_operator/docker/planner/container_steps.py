@@ -1,11 +1,11 @@
-"""What is to be done for a proxy's two containers: its sandbox, and the one in which it runs.
+"""Plan the actions for the two containers of a proxy: the sandbox and the proxy's own container.
 
-The sandbox holds the proxy's ports and networks. The order is such that the operator may be killed
-after any step: what it leaves is recognised and finished, and nothing that runs goes before what
-takes over has been created.
+The sandbox holds the ports and networks of the proxy. The operator may be killed after any action:
+the next look recognises the state, and the next plan finishes the work. A container that serves is
+removed only after the successor has been created.
 
-Networks are joined after the start: an engine that starts a container with several networks joins
-them in any order, and may lay the published ports over one and then move them to the uplink.
+A sandbox joins networks after the start. If a container starts with several networks, the engine
+joins these in any order, and may publish the ports over one network and move them to the uplink.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -56,15 +56,15 @@ from rosproxy_operator.docker.planner.specs import (
 from rosproxy_operator.docker.settings import PlanSettings
 
 REPLACED = "replaced by another container"
-"""Why a container is removed whose successor has been created."""
+"""The reason in `Remove` for a container that has a successor."""
 _CHANGEABLE = frozenset({"created", "running", "paused", "exited"})
 
 
 @dataclass(frozen=True, slots=True)
 class PlanContext:
-    """One key that is wanted, what there is for it, and what it gets: ports, and names.
+    """A wanted proxy, the state of the host, and the ports and names for the proxy.
 
-    ``creatable``: the image and the uplink are there or can be made.
+    ``creatable``: the image exists, and the uplink is usable or can be created.
     """
 
     observed: HostState
@@ -75,23 +75,23 @@ class PlanContext:
     creatable: bool
 
     def aliases(self, network: str) -> tuple[str, ...]:
-        """The proxy's names on a network."""
+        """Return the names of the proxy on a network."""
         return self.naming.aliases.get(self.desired.key, {}).get(network, ())
 
     def taken(self, own: Iterable[OwnContainer]) -> frozenset[str]:
-        """The names of all containers but these."""
+        """Return the names of all containers except ``own``."""
         containers = [*self.observed.containers, *(o.container for o in self.observed.own)]
         return frozenset(c.name for c in containers) - {o.container.name for o in own}
 
     @property
     def label_policy(self) -> tuple[PolicyLayer, ...]:
-        """The layers of its containers' labels."""
+        """The layers from the labels of the proxy's containers."""
         by_id = {container.id: container for container in self.observed.containers}
         return label_layers(self.desired.members, by_id, self.desired.networks)
 
     @property
     def lan_relay(self) -> HostPort | None:
-        """Where the proxy's LAN relay listens; None if it is to have none."""
+        """The endpoint of the LAN relay; None if the proxy gets no LAN relay."""
         if not self.desired.key.is_ros2 or self.settings.ros2_lan == NOWHERE:
             return None
         gateway = self.observed.gateway(self.settings.uplink)
@@ -104,10 +104,11 @@ class PlanContext:
         fingerprint: str,
         fits: Callable[[Container], bool],
     ) -> Selection:
-        """Decide which of these stays and which goes.
+        """Decide which of the containers ``own`` stays and which goes.
 
-        Right is one that ``fits``, has the ports, and the ``fingerprint`` of one that would be made
-        now; if none can be, any fingerprint will do.
+        A container is right if ``fits`` accepts the container, and if the container has the planned
+        ports and the ``fingerprint`` of a new container. If no container can be created, any
+        fingerprint is right.
         """
         matching = [o for o in own if o.fingerprint == fingerprint or not self.creatable]
         candidates = [o.container for o in matching if o.range == self.ports]
@@ -116,10 +117,10 @@ class PlanContext:
 
 @dataclass(frozen=True, slots=True)
 class _SandboxChoice:
-    """The sandbox in which a proxy is to run.
+    """The sandbox for a proxy.
 
-    ``id`` is empty if it is yet to be created. ``starts``: the steps start it, so that a proxy
-    which was in it must be started anew; else ``started_at`` is when it was.
+    ``id`` is empty if the plan creates the sandbox. If the plan ``starts`` the sandbox, a proxy in
+    the sandbox has to restart. Otherwise ``started_at`` is the time of the last start.
     """
 
     name: str
@@ -129,9 +130,9 @@ class _SandboxChoice:
 
 
 def wanted_steps(context: PlanContext) -> list[Action] | None:
-    """The next actions for a key that is wanted, but for networks that its sandboxes leave.
+    """Return the next actions for a wanted proxy, without the actions of `disconnect_steps`.
 
-    None if a container ought to be created but can't.
+    None if a container is missing and can't be created.
     """
     actions, home = _sandbox_steps(context)
     if actions is None or home is None:
@@ -143,8 +144,11 @@ def wanted_steps(context: PlanContext) -> list[Action] | None:
 def removal_steps(
     observed: HostState, key: Key, reason: str, again: bool = False
 ) -> Iterator[Action]:
-    """Remove everything of a key; ``again`` also what the engine is removing already."""
-    # A proxy that retires reaches the LAN by its relay, and all of outside by its sandbox.
+    """Yield the actions that remove all containers of a proxy.
+
+    With ``again``, the actions include containers that the engine is removing already.
+    """
+    # A proxy that retires needs the LAN relay to reach the LAN, and the sandbox to reach outside.
     ordered = (*observed.proxies_of(key), *observed.lan_relays_of(key), *observed.sandboxes_of(key))
     for own in ordered:
         if own.container.state == "paused" and not isinstance(own, Sandbox):
@@ -163,10 +167,11 @@ def disconnect_steps(
     uplink: str,
     naming: Naming,
 ) -> Iterator[Disconnect]:
-    """Take sandboxes that stay off the networks on which no container wants them any more.
+    """Yield the actions by which sandboxes leave the networks that need no proxy any more.
 
-    ``planned`` are the key's other actions, which may say so themselves. Without any, a sandbox
-    also leaves where it has a name that it must not have: no other step makes it join anew.
+    ``planned`` has the other actions of the proxy, which may include a Disconnect already. If the
+    proxy is not live or ``planned`` is None, a sandbox also leaves networks where it has a
+    withdrawn name: no other action removes that name.
     """
     is_idle = not desired.live or planned is None
     planned = planned or ()
@@ -187,15 +192,16 @@ def _removed(actions: Iterable[Action]) -> set[str]:
 
 
 def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _SandboxChoice | None]:
-    """The actions for the sandbox, and which one it is then; None if none is going to run.
+    """Return the actions for the sandbox, and the sandbox; None if no sandbox is going to run.
 
-    No actions but None if one ought to be created but can't.
+    The actions are None if a sandbox is missing and can't be created.
     """
     key = context.desired.key
     sandboxes = context.observed.sandboxes_of(key)
     taken = context.taken(sandboxes)
-    # A sandbox where the kernel forwarded is not used without: a proxy that was killed has left its
-    # rules there, and one without the capability can't take them away.
+    # The fingerprint depends on the data plane, so a proxy that loses the kernel plane gets another
+    # sandbox. In the former sandbox, a killed proxy may have left rules. A proxy without NET_ADMIN
+    # can't remove these rules.
     action = CreateSandbox(sandbox_name(key), key, context.ports, context.desired.spec)
     expected = sandbox_fingerprint(action, context.settings)
     selection = context.select(
@@ -214,8 +220,8 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _SandboxC
             *_connect(context, action.name),
         ]
         return actions, _SandboxChoice(action.name, starts=True)
-    # One that is restarting has no network namespace until it is up again: nothing can be joined,
-    # and no proxy started in it (moby: daemon/container_operations.go, getNetworkedContainer).
+    # A sandbox that restarts has no network namespace, so the engine refuses to connect the sandbox
+    # and to start a proxy there (moby: daemon/container_operations.go, getNetworkedContainer).
     if kept is None or kept.state == "restarting":
         return actions, None
     name = kept.name if selection.waiting or action.name in taken else action.name
@@ -227,12 +233,12 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _SandboxC
 
 
 def _usable(sandbox: Container, observed: HostState) -> bool:
-    """Whether it runs or the engine can start it: not when one of its networks is gone."""
+    """Return whether a sandbox runs, or can start: the engine needs all networks of a container."""
     return sandbox.state in SERVING or all(_has_network(observed, a) for a in sandbox.attachments)
 
 
 def _has_network(observed: HostState, attachment: Attachment) -> bool:
-    """Whether the network is still the one that was joined, and not a new one of its name."""
+    """Return whether the network of an attachment exists; a new network of this name is another."""
     return any(
         network.name == attachment.network and attachment.network_id in ("", network.id)
         for network in observed.networks
@@ -240,12 +246,12 @@ def _has_network(observed: HostState, attachment: Attachment) -> bool:
 
 
 def _joined(observed: HostState, container: Container) -> list[str]:
-    """The networks that a container is on, without those that are gone."""
+    """Return the names of a container's networks that still exist."""
     return sorted(a.network for a in container.attachments if _has_network(observed, a))
 
 
 def _join_steps(context: PlanContext, kept: Container) -> Iterator[Action]:
-    """Resume a sandbox that is paused, and join the networks that it is not on."""
+    """Resume a paused sandbox, and join the missing networks."""
     if kept.state == "paused":
         yield Unpause(kept.name)
     if context.settings.uplink not in kept.networks:
@@ -260,9 +266,9 @@ def _join_steps(context: PlanContext, kept: Container) -> Iterator[Action]:
 
 
 def _lacks_alias(context: PlanContext, kept: Container, network: str) -> bool:
-    """Whether to join a network anew for a name that is missing.
+    """Return whether a sandbox has to join a network again to get a missing name.
 
-    That cuts the connections there, so it is done only where somebody looks for that name.
+    Only a name that a container looks for counts, since joining again cuts all connections there.
     """
     return any(
         needed_by(context.desired, network, alias)
@@ -290,7 +296,7 @@ def _connect(context: PlanContext, name: str) -> Iterator[Action]:
 
 
 def _emptying_steps(context: PlanContext, old: Container) -> Iterator[Action]:
-    """End the proxies properly that are in a sandbox, before it goes."""
+    """Yield the actions that stop and remove the proxies in a sandbox, before the sandbox goes."""
     for proxy in context.observed.proxies_of(context.desired.key):
         if proxy.container.network_container == old.id and proxy.container.state != "removing":
             yield Remove(proxy.container.name, "the sandbox is replaced", stop=True)
@@ -299,9 +305,9 @@ def _emptying_steps(context: PlanContext, old: Container) -> Iterator[Action]:
 def _process_steps(
     context: PlanContext, home: _SandboxChoice, gone: Collection[str]
 ) -> list[Action] | None:
-    """The actions for the container in which the proxy runs; None if one can't be created.
+    """Return the actions for the proxy's own container; None if no such container can be created.
 
-    ``gone`` are the names of containers that are removed before.
+    ``gone`` has the names of the containers that earlier actions remove.
     """
     key = context.desired.key
     wanted_name = proxy_name(context.desired.key)
@@ -346,7 +352,7 @@ def _process_steps(
 def keep_running_steps(
     selection: Selection, kept: Container, lost: bool = False
 ) -> Iterator[Action]:
-    """Have a container run that stays; one that is ``lost`` is to be started anew."""
+    """Yield the actions that keep a container running. A ``lost`` container restarts."""
     if selection.predecessor:
         yield Remove(selection.predecessor.name, REPLACED)
     if kept.state == "paused":
@@ -360,17 +366,17 @@ def keep_running_steps(
 
 
 def _lost(kept: Container, home: _SandboxChoice) -> bool:
-    """Whether a proxy runs in the namespace that its sandbox had before it was started anew."""
+    """Return whether a proxy runs in a former network namespace: the sandbox has started later."""
     if home.starts:
         return True
-    # One that is restarting enters the sandbox's present namespace by itself.
+    # A proxy that restarts enters the present namespace of the sandbox.
     if not kept.started_at or not home.started_at or kept.state == "restarting":
         return False
     return instant(kept.started_at) < instant(home.started_at)
 
 
 def former_name(old: Container | None, name: str, taken: Collection[str]) -> str:
-    """What to call the old one, if any, so that the one that takes over can have the name."""
+    """Return the name for the old container, which frees ``name``; empty without old container."""
     if old is None:
         return ""
     return free_name(f"{name}-old", taken) if old.name == name else old.name
@@ -382,9 +388,9 @@ def creation_steps(
     former: str,
     ended: Iterable[Action] = (),
 ) -> Iterator[Action]:
-    """Create and start a container, in the place of an old one, now to be ``former``, if any.
+    """Yield the actions that create and start a container, in place of the predecessor, if any.
 
-    ``ended``: what must go before the old one does.
+    The predecessor is renamed to ``former``, and removed after the actions ``ended``.
     """
     if selection.predecessor and selection.predecessor.name != former:
         yield Rename(selection.predecessor.name, former)

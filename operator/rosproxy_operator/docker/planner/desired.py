@@ -1,4 +1,4 @@
-"""From members to the proxies that there ought to be."""
+"""Decide which proxies have to exist, and merge the options of each proxy."""
 
 from collections.abc import Collection, Iterable, Iterator
 
@@ -12,7 +12,7 @@ from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, merged
 
 ROUTERS_STEP = 32
-"""The routers of a proxy for rmw_zenoh are a multiple of this, of half a megabyte each."""
+"""The number of routers of a proxy for rmw_zenoh is a multiple. A router takes half a megabyte."""
 
 
 def desire(
@@ -22,11 +22,11 @@ def desire(
     memory: DockerMemory,
     now: float,
 ) -> tuple[tuple[Desired, ...], tuple[Problem, ...]]:
-    """One Desired for each key that a container asks for or that has a proxy, sorted by key.
+    """Return a Desired for each key that a container asks for or that has a proxy, sorted by key.
 
-    A member for networks that are not there (any more) is dropped. Containers that have exited
-    keep networks joined that a proxy is on, and what else their labels made it, for the settings'
-    grace, but join none.
+    Return the problems, too. A member without an existing network is ignored. The labels of an
+    exited container count for ``grace`` seconds: the proxy keeps options and peers, and stays on
+    joined networks, but joins no other network for that container. ``now`` is in monotonic seconds.
     """
     bad = _before_uplink(observed, settings.uplink)
     usable = {network.name for network in observed.networks} - BUILT_IN - bad
@@ -60,8 +60,8 @@ def desire(
 
 
 def proxy_spec(key: Key, members: Iterable[Member], settings: PlanSettings) -> ProxySpec:
-    """The options of a proxy with these containers."""
-    if key == ZENOH:  # none is for its routers
+    """Return the options of a proxy with these containers."""
+    if key == ZENOH:  # no option is for routers of rmw_zenoh
         return OWN_SPEC
     names = (name for name, wish in WISHES.items() if wish.ros in ("", key.ros))
     defaults = ProxySpec(**{name: getattr(settings, name) for name in names})
@@ -69,8 +69,9 @@ def proxy_spec(key: Key, members: Iterable[Member], settings: PlanSettings) -> P
 
 
 def _ports(key: Key, members: Collection[Member], settings: PlanSettings) -> int:
-    """The least number of ports of a proxy with these containers."""
-    if key == ZENOH:  # in steps: with each change of the number its nodes have to connect again
+    """Return the least number of ports of a proxy with these containers."""
+    # A change of the number recreates the proxy, and all nodes connect again: so in steps.
+    if key == ZENOH:
         steps = max(-(-len(members) // ROUTERS_STEP), 1)
         return min(steps * ROUTERS_STEP, MOST_ZENOH_PORTS)
     ports = max([settings.ports, *(member.ports for member in members)])
@@ -80,7 +81,7 @@ def _ports(key: Key, members: Collection[Member], settings: PlanSettings) -> int
 def _peers(
     key: Key, members: Iterable[Member], observed: HostState, settings: PlanSettings
 ) -> tuple[str, ...]:
-    """The peers of a proxy for ROS 2: its containers', and for DDS the operator's."""
+    """Return the peers from the labels, and for DDS the peers of the operator; empty for ROS 1."""
     peers = {peer for member in members for peer in member.peers}
     if key == ZENOH:
         gateway = observed.gateway(settings.uplink) or THIS_HOST
@@ -93,13 +94,13 @@ def _networks(members: Iterable[Member]) -> frozenset[str]:
 
 
 def _before_uplink(observed: HostState, uplink: str) -> set[str]:
-    """Networks that would take the published ports and the default route over from the uplink.
+    """Return the networks that would take published ports and default route from the uplink.
 
-    The engine gives both to the network whose name sorts first, internal ones aside, and moving
-    them cuts all connections.
+    The engine gives ports and default route to the network whose name sorts first, internal
+    networks aside. Such a move cuts all connections.
     """
-    # The order is that of moby's Endpoint.Less (libnetwork/sandbox.go): not internal, then with
-    # gateways for both IPv4 and IPv6, then by name, which Go compares by bytes.
+    # moby sorts by Endpoint.Less (libnetwork/sandbox.go): networks that are not internal first,
+    # then networks with gateways for IPv4 and IPv6, then by name. Go compares names by bytes.
     return {
         network.name
         for network in observed.networks
@@ -117,7 +118,7 @@ def _bad_network(name: str, uplink: str) -> Problem:
 
 
 def _outvoted(desired: Iterable[Desired]) -> Iterator[Problem]:
-    """Warn the containers whose proxy is not as their labels ask."""
+    """Yield warnings for containers that ask for another option than the proxy has."""
     for wanted in desired:
         plane = wanted.spec.data_plane
         winners = [m.container.name for m in wanted.members if m.wishes.get("data_plane") == plane]

@@ -1,7 +1,8 @@
-"""Which of several containers for one thing stays, and which goes.
+"""Decide which of several containers in the same role stays, and which goes.
 
-There are several when settings have changed and one is to take over from another, when the operator
-was killed in between, or when somebody has meddled.
+A role is the sandbox, the proxy or the LAN relay of a key. Several containers have the same role
+while a container takes over after a change of settings, after the operator was killed meanwhile, or
+after a user has changed containers.
 """
 
 from collections.abc import Collection, Iterable
@@ -10,17 +11,18 @@ from dataclasses import dataclass
 from rosproxy_operator.docker.planner.model import SERVING, Container, OwnContainer
 
 IDLE = frozenset({"created", "exited"})
-"""States of a container that can be started; a dead one can't."""
+"""States in which a container can be started. A dead container can't be started."""
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What is to become of the containers for one thing.
+    """What happens to the containers of a role.
 
-    ``kept`` is as it ought to be, running or not; None if one is to be created. ``predecessor``
-    serves, or has served, until that one takes over. ``surplus`` are left over. ``waiting``: one is
-    just being removed, so nothing can be created, removed or started. ``stuck``: one ought to be
-    created but can't.
+    ``kept`` is the container that stays, running or not; None if a container has to be created.
+    ``predecessor`` serves, or has served, until the kept or the new container takes over.
+    ``surplus`` are all other containers. ``waiting``: the engine is removing a container, so
+    nothing can be created, removed or started. ``stuck``: a container is missing and can't be
+    created.
     """
 
     kept: Container | None = None
@@ -33,13 +35,13 @@ class Selection:
 def select(
     own: Iterable[OwnContainer], name: str, fit_ids: Collection[str], creatable: bool
 ) -> Selection:
-    """Decide which of several containers for one thing stays, and which goes.
+    """Decide which container of a role stays, and which goes.
 
     Args:
-        own: All that there are for one thing.
-        name: What the one that stays is to be called.
-        fit_ids: The ids of those that are as they ought to be, and run or can be started.
-        creatable: Whether one can be created. If not, one that runs stays as it is.
+        own: All containers of the role.
+        name: The name for the container that stays.
+        fit_ids: The ids of containers that are as planned, and that run or can be started.
+        creatable: Whether a container can be created. If not, a running container stays as it is.
     """
     containers = sorted((c.container for c in own), key=lambda c: (c.name != name, c.name))
     present = [c for c in containers if c.state != "removing"]
@@ -63,7 +65,7 @@ def select(
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
-    """The name, with a number behind it if it is taken."""
+    """Return the name, with a number at the end if the name is taken."""
     number = 1
     while (free := name if number == 1 else f"{name}-{number}") in taken:
         number += 1

@@ -1,19 +1,19 @@
-"""The host's conntrack entries for a sandbox's UDP ports, deleted after each start of the sandbox.
+"""Delete the host's conntrack entries for a sandbox's UDP ports after each start of the sandbox.
 
-A datagram from outside that comes while its port is not published makes a conntrack entry without
-DNAT. The kernel looks at NAT rules for the first datagram of an entry alone, and such an entry
-lasts as long as outside goes on sending. So later datagrams bypass the port that is published by
-then: they end at the host, or come from Docker's port proxy with the gateway's address as source.
-Docker deletes such entries by itself since 23.0 (moby, pull request 44742), and needs no flush.
+A datagram to a port that is not published yet creates a conntrack entry without DNAT. The kernel
+applies NAT rules to the first datagram of an entry alone, and the entry lasts as long as outside
+sends. So later datagrams bypass the published port: the datagrams end at the host, or come from
+Docker's port proxy with the gateway's address as source. Docker deletes such entries by itself
+since 23.0 (moby, pull request 44742), and needs no flush.
 
-A container of the proxy's image deletes the entries. The container joins the host's network, has
-NET_ADMIN there, runs ``conntrack`` for the ports of the sandbox, and ends. An entry that is deleted
-in vain costs nothing: the next datagram makes another one.
+A helper container of the proxy's image deletes the entries. The container joins the host's network,
+has NET_ADMIN there, runs ``conntrack`` for the ports of the sandbox, and ends. Deleting a good
+entry does no harm: the next datagram creates another entry.
 
-The ended container stays as the record of its last run, since the operator has no disk. The
-container runs again after each start of the sandbox, whether by the operator or by the engine, and
-when the engine has returned: with live-restore an engine publishes the ports of running sandboxes
-anew.
+The operator has no disk, so the ended container stays as the record of the last run. The container
+runs again after each start of the sandbox, by the operator or by the engine. The container also
+runs again when the engine has returned: with live-restore, an engine publishes the ports of running
+sandboxes anew.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -38,7 +38,7 @@ from rosproxy_operator.proxy_spec.fingerprint import digest
 
 @dataclass(frozen=True, slots=True)
 class FlushSteps:
-    """The steps for the flush of one key. ``fix`` says what users can do where a step fails."""
+    """The actions for the flush of a key. ``fix`` says what users can do if an action fails."""
 
     key: Key
     actions: tuple[Action, ...]
@@ -46,7 +46,7 @@ class FlushSteps:
 
 
 def flush_config(action: CreateFlush, settings: PlanSettings) -> dict[str, Any]:
-    """The body of the engine's ``POST /containers/create`` for what deletes conntrack entries."""
+    """Return the body of the engine's ``POST /containers/create`` for a flush container."""
     command = flush_command(action.key, action.range)
     return {
         **helper_config(settings, "host"),
@@ -62,9 +62,9 @@ def flush_steps(
     desired: Iterable[Desired],
     outdated: Mapping[str, str],
 ) -> Iterator[FlushSteps]:
-    """The steps after which no sandbox has entries from before its ports were published.
+    """Yield the steps that delete all entries made before the ports of a sandbox were published.
 
-    ``outdated`` are records whose last run does not count, by id with the time of that run.
+    ``outdated`` has the records whose last run does not count, by id, with the time of that run.
     """
     live = {wanted.key for wanted in desired if wanted.live}
     records: dict[Key, list[FlushContainer]] = {}
@@ -84,13 +84,13 @@ def flush_steps(
 
 
 def _is_busy(key: Key, observed: HostState) -> bool:
-    """Whether not everything is known of a key's records or sandboxes."""
+    """Return whether the operator does not know all about a key's records or sandboxes yet."""
     containers = [*observed.flushes, *observed.sandboxes]
     return any(o.key == key and o.container.name in observed.busy for o in containers)
 
 
 def _published(key: Key, observed: HostState) -> Sandbox | None:
-    """The running sandbox of a key that publishes UDP ports; None without one."""
+    """Return the running sandbox of a key that publishes UDP ports; None without such a sandbox."""
     running = (s for s in observed.sandboxes_of(key) if s.container.state == "running")
     return next((s for s in running if s.container.udp_ports), None)
 
@@ -119,14 +119,14 @@ def _steps(
 
 
 def _is_current(record: FlushContainer, sandbox: Sandbox, outdated: Mapping[str, str]) -> bool:
-    """Whether a record's last run came after the ports of a sandbox were published."""
+    """Return whether a record's last run succeeded, later than the ports were published."""
     ran_at = record.container.started_at
     is_later = instant(ran_at) > instant(sandbox.container.started_at)
     return record.done and is_later and outdated.get(record.container.id) != ran_at
 
 
 def _fix(sandbox: Sandbox) -> str:
-    """How users delete the entries themselves."""
+    """Return the command with which users delete the entries themselves."""
     ports = own_range(sandbox.key, sandbox.range)
     return (
         "Datagrams of nodes that went on sending while the ports were not published may bypass the "

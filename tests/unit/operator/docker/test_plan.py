@@ -523,7 +523,7 @@ def test_more_ports_that_can_not_be_had() -> None:
     assert "asks for 40: " in port_problem(plan)
     text = "has only the 32 ports 11400-11431, although --ports or the label rosproxy.ports asks"
     assert text in port_problem(plan)
-    text = "11432-11439 are not all free. Stop the programs that hold them"
+    text = "11432-11439 are not all free. Stop the programs that hold these ports"
     assert text in port_problem(plan)
 
 
