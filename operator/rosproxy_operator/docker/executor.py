@@ -115,10 +115,9 @@ class _Failure:
 class Executor:
     """Carries out groups of actions. The groups of a job run one after the other.
 
-    ``finished`` is called when a job has ended. ``port_taken`` is called when a taken port keeps a
-    container from starting: with the container's name, and the port or None if unknown. ``counted``
-    is called with each action and its outcome: ok, failed or taken. ``now`` is the clock, in
-    monotonic seconds.
+    ``finished`` is called when a job has ended. If a taken port keeps a container from starting,
+    ``port_taken`` is called with the container's name and the port, or None if unknown. ``counted``
+    is called with each action and its outcome: ok, failed or taken. ``now`` is a monotonic clock.
     """
 
     def __init__(
@@ -141,7 +140,7 @@ class Executor:
 
     @property
     def busy(self) -> frozenset[str]:
-        """The subjects of the running jobs, as problems name these subjects."""
+        """The subjects of the running jobs, as in problems."""
         return frozenset(map(_subject, self._busy))
 
     @property
@@ -176,7 +175,7 @@ class Executor:
         for job in sorted(by_job, key=lambda job: job[0] is not None):
             actions = [action for group in by_job[job] for action in group.actions]
             failure = self._failures.get(job)
-            # If the actions differ from the failed ones, the host has changed: try at once.
+            # Other actions than the failed ones start at once: the host has changed.
             waiting = failure and failure.actions == actions and now < failure.retry_at
             if actions and not waiting and job not in self._busy:
                 work = self._run(job, by_job[job], actions, carry_out)
@@ -321,8 +320,7 @@ class DockerApplier:
         match action:
             case CreateNetwork(name):
                 labels = {MANAGED: "true", SECRET: snapshot.new_secret}
-                # Without check_duplicate, engines before API 1.44 may create a second network of
-                # this name.
+                # Without check_duplicate, engines before API 1.44 may create a second network.
                 do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
             case RemoveNetwork(name):
                 do("remove_network", name)

@@ -62,9 +62,9 @@ def has(address: str) -> bool:
 def own_address_towards(master: str, gateways: Collection[str]) -> str:
     """Return the address at which a master reaches this host; empty without a route.
 
-    ``master`` is an address. If the route leads to a container or to this host itself, the source
-    is loopback or one of the engine's ``gateways``. No other host can use that address, so the
-    result is `far_address`. Without a far address, the result is the gateway.
+    ``master`` is an address. If the route starts at loopback or at one of the engine's
+    ``gateways``, no other host can use that source. Then the result is `far_address`, or the
+    gateway if there is no far address.
     """
     own = address_towards(master)
     if own in gateways or is_loopback(own):

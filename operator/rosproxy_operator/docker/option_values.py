@@ -75,10 +75,7 @@ def read_lan(text: str) -> str:
 
 
 def read_memory(text: str) -> int:
-    """Return bytes from a size as of ``docker run --memory``, such as 512m. Raises ValueError.
-
-    0 is no bound.
-    """
+    """Return bytes of a size such as 512m or 1g; 0 for no bound. Raises ValueError."""
     match = _MEMORY.fullmatch(text.strip().lower())
     size = int(match[1]) * _UNITS[match[2]] if match else -1
     if size and not LEAST_MEMORY <= size <= MOST_MEMORY:
@@ -100,9 +97,9 @@ def read_pids(text: str) -> int:
 
 
 def read_secret(path: str) -> str:
-    """Return the stripped secret of a file; empty for no path. Raises ValueError.
+    """Return the stripped secret of a file; empty for no path.
 
-    A secret with fewer than LEAST_SECRET characters is an error.
+    Raises ValueError for an unreadable file, and for fewer than LEAST_SECRET characters.
     """
     if not path:
         return ""

@@ -106,9 +106,8 @@ class PlanContext:
     ) -> Selection:
         """Decide which of the containers ``own`` stays and which goes.
 
-        A container is right if ``fits`` accepts the container, and if the container has the planned
-        ports and the ``fingerprint`` of a new container. If no container can be created, any
-        fingerprint is right.
+        A right container has the planned ports and ``fingerprint``, and ``fits`` accepts it. If no
+        container can be created, any fingerprint is right.
         """
         matching = [o for o in own if o.fingerprint == fingerprint or not self.creatable]
         candidates = [o.container for o in matching if o.range == self.ports]
@@ -233,12 +232,12 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _SandboxC
 
 
 def _usable(sandbox: Container, observed: HostState) -> bool:
-    """Return whether a sandbox runs, or can start: the engine needs all networks of a container."""
+    """Return whether a sandbox runs or can start. To start, all of the networks have to exist."""
     return sandbox.state in SERVING or all(_has_network(observed, a) for a in sandbox.attachments)
 
 
 def _has_network(observed: HostState, attachment: Attachment) -> bool:
-    """Return whether the network of an attachment exists; a new network of this name is another."""
+    """Return whether the network of an attachment exists: a new network may have the same name."""
     return any(
         network.name == attachment.network and attachment.network_id in ("", network.id)
         for network in observed.networks

@@ -12,7 +12,7 @@ from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, merged
 
 ROUTERS_STEP = 32
-"""The number of routers of a proxy for rmw_zenoh is a multiple. A router takes half a megabyte."""
+"""The step in the number of routers of a proxy for rmw_zenoh. A router takes half a megabyte."""
 
 
 def desire(

@@ -1,8 +1,8 @@
-"""The peers in containers' labels: a proxy for ROS 2 takes a bounded number of all of them.
+"""Bound the number of peers that a proxy for ROS 2 or rmw_zenoh gets from labels.
 
-A proxy gets its peers in one variable, and Linux starts no program with a variable of 128 KiB
-(MAX_ARG_STRLEN). Where the labels of a proxy's containers name too many, the labels with the most
-peers are ignored: a container with many takes nothing from a container with few.
+A proxy gets all peers in one variable, and Linux starts no program with a variable of 128 KiB
+(MAX_ARG_STRLEN). If the labels of a proxy's containers name too many peers, the operator ignores
+the labels with the most peers. So a container with many peers takes nothing from other containers.
 """
 
 from collections import defaultdict
@@ -16,16 +16,19 @@ from rosproxy_operator.docker.planner.model import ZENOH, Key, Member
 from rosproxy_operator.docker.settings import PlanSettings
 
 MOST_OF_PROXY = 256
-"""Peers of one proxy that labels name: 66 KiB, as a host has 253 characters at most and a port."""
+"""Most peers of a proxy from labels. These take 66 KiB: a host has 253 characters at most."""
 
 
 def with_bounded_peers(
     members: Collection[Member], settings: PlanSettings
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
-    """The members, some without the peers of their labels, and the problems of these."""
+    """Return the members and the problems. Members with too many peers come back without peers.
+
+    Peers of the operator's option --ros2-peer do not count.
+    """
     named: dict[Key, frozenset[str]] = defaultdict(frozenset)
     ignored: list[Member] = []
-    # Containers that run come first: one that has exited only keeps its peers for a while.
+    # Living containers first: the peers of an exited container count for the grace only (`desire`).
     order = sorted(members, key=lambda m: (not m.container.alive, len(m.peers), m.container.name))
     for member in order:
         peers = named[member.key] | member.peers
@@ -49,7 +52,7 @@ def _most(key: Key) -> int:
 
 
 def _ignored(key: Key) -> str:
-    """Why the peers of a container are ignored, and what to do."""
+    """Return why the peers of a container are ignored, and the fix."""
     common = "" if key == ZENOH else ", or start the operator with --ros2-peer for common peers"
     return (
         f"label {PEERS} is ignored: a proxy takes at most {_most(key)} peers from all labels of "

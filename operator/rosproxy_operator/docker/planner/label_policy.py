@@ -1,7 +1,8 @@
-"""The policies in containers' labels: layers of rules for the nodes at their addresses alone.
+"""The policies in containers' labels: layers of rules for the nodes at a container's addresses.
 
-A proxy holds a bounded number of rules. Where those of its containers are too many together, the
-containers with the most are left out: who has many takes nothing from who has few.
+A proxy holds a bounded number of rules. If the containers of a proxy have too many rules together,
+the containers with the most rules get no proxy. So a container with many rules takes nothing from
+other containers.
 """
 
 from collections import Counter
@@ -17,16 +18,17 @@ from rosproxy_operator.docker.planner.model import Container, Key, Member
 from rosproxy_operator.docker.settings import PlanSettings
 
 OUTLIVES = 10.0
-"""Seconds for which an address keeps its layers after its container has gone.
+"""Seconds for which an address keeps the layers of a container that has gone.
 
-What its nodes have registered is removed a moment later, and must not become visible before.
+The proxy unregisters the nodes of that container a moment later. Until then the layers have to hide
+the denied names.
 """
 
 
 def with_bounded_rules(
     members: Collection[Member], settings: PlanSettings
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
-    """The members whose rules their proxies can hold, and problems of the others."""
+    """Return the members whose rules the proxies can hold, and problems of all other members."""
     common = sum(len(layer.rules) for layer in settings.policy)
     rules: Counter[Key] = Counter()
     layers: Counter[Key] = Counter()
@@ -54,7 +56,7 @@ def with_bounded_rules(
 def label_layers(
     members: Iterable[Member], by_id: Mapping[str, Container], networks: Collection[str]
 ) -> tuple[PolicyLayer, ...]:
-    """The layers of a proxy's containers, for their addresses on these networks."""
+    """Return the layers of living members, each for the container's addresses on ``networks``."""
     layers: list[PolicyLayer] = []
     for member in members:
         owner = network_owner(member.container, by_id)
@@ -67,12 +69,12 @@ def label_layers(
 
 
 def network_owner(container: Container, by_id: Mapping[str, Container]) -> Container:
-    """The container in whose network namespace another one is: itself, if it has its own."""
+    """Return the container that owns the network namespace of ``container``."""
     return by_id.get(container.network_container or container.id, container)
 
 
 class RecentLayers:
-    """The layers of containers' labels, and for some seconds those of containers that are gone."""
+    """The layers of containers' labels, also of containers that have gone OUTLIVES seconds ago."""
 
     def __init__(self) -> None:
         self._last_seen: dict[tuple[PolicyLayer, str], float] = {}
@@ -80,9 +82,10 @@ class RecentLayers:
     def look(
         self, layers: Iterable[PolicyLayer], taken: Collection[str], now: float
     ) -> tuple[PolicyLayer, ...]:
-        """All layers that a proxy is to have, the ``layers`` of this look included.
+        """Return the ``layers`` of this look, and the remembered layers of earlier looks.
 
-        ``taken`` are the addresses of all containers: layers of earlier looks keep none of them.
+        ``taken`` has the addresses of all containers. At these addresses only the layers of this
+        look count. ``now`` is in monotonic seconds.
         """
         current = {
             (structs.replace(layer, addresses=None), address): now
@@ -95,14 +98,14 @@ class RecentLayers:
             if now < since + OUTLIVES and pair[1] not in taken
         }
         self._last_seen = recent | current
-        # What is remembered is the first to give way: the proxy refuses a policy that is too large.
+        # The proxy refuses a policy that is too large. So remembered layers are left out first.
         joined = _joined(self._last_seen)
         fits = sum(len(layer.rules) for layer in joined) <= MOST_RULES and len(joined) < MOST_LAYERS
         return joined if fits else _joined(current)
 
 
 def _joined(pairs: Mapping[tuple[PolicyLayer, str], float]) -> tuple[PolicyLayer, ...]:
-    """Layers with all their addresses, in a steady order."""
+    """Return each layer once, with all addresses. The order is always the same."""
     addresses: dict[PolicyLayer, set[str]] = {}
     for layer, address in pairs:
         addresses.setdefault(layer, set()).add(address)

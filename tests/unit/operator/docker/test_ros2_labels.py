@@ -166,7 +166,8 @@ def test_peers_that_are_not_allowed_are_left_out() -> None:
     assert member.peers == {"robot", "arm:11400", "base:11400", "base"}
     assert told == (
         "label rosproxy.peers names victim, which the operator does not allow in labels. The proxy "
-        "announces no participants there. To allow it, start the operator with --allow-peer victim"
+        "announces no participants there. To allow these peers, start the operator with "
+        "--allow-peer victim"
     )
 
 

@@ -1,1 +1,1 @@
-"""From the labels of containers to what they want of a proxy."""
+"""Read the labels of containers, and decide which proxy each container gets."""

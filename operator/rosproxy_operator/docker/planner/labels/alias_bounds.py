@@ -1,12 +1,14 @@
-"""Which names a label may give a proxy on a network: the administrator's, else those of a LAN.
+"""Decide which names a label may give a proxy on a network.
 
 A proxy answers to the host name of its master, so that ``ROS_MASTER_URI`` needs no change. An image
-can carry that name: all containers of the network would then reach the proxy in place of the
-service of that name. No list of names or ports tells a robot from a database. So there are two
-rules: the name has the form of a LAN's names, or the administrator lists the name; and no container
-has or had the name (`planner.taken_names`).
+can carry any name: all containers of the network would then reach the proxy in place of the service
+of that name. No list of names or ports tells a robot from a database. So there are two rules:
 
-The address of a name is no criterion. Services of a company have private addresses as robots do.
+1. The administrator lists the name. Without a list, the name has the form of a LAN's names.
+2. No container has the name. If the administrator does not list the name, no container had the name
+   before, either (`planner.taken_names`).
+
+The address of a name is no criterion. Services of a company have private addresses, like robots.
 The owner of a public name can give the name a private address. A robot can have a public address.
 Besides, the answer of a name server changes, and each change would cut connections.
 """
@@ -24,26 +26,26 @@ LAN_SUFFIXES = ("local", "lan", "home", "localdomain", "home.arpa", "test")
 ``local``: RFC 6762, 3. ``lan`` and ``home``: RFC 6762, appendix G. ``home.arpa``: RFC 8375, 3.
 ``test``: RFC 6761, 6.2. ``localdomain``: the end that Debian's and Red Hat's hosts files have.
 """
-# Private as well, but left out, since services have such names: corp, intranet and private
-# (RFC 6762, appendix G) are the networks of companies. ICANN has reserved internal for private use
-# (Board resolution 2024.07.29.06), but there are metadata.google.internal, host.docker.internal,
+# Other private suffixes are left out, since services have such names. Companies use corp, intranet
+# and private (RFC 6762, appendix G). ICANN has reserved internal for private use (Board resolution
+# 2024.07.29.06), but there are metadata.google.internal, host.docker.internal,
 # gateway.docker.internal and host.containers.internal.
 _CLUSTER_SUFFIX = "cluster.local"
-"""The end of a Kubernetes cluster's names (kubelet: --cluster-domain)."""
+"""The default suffix of names in a Kubernetes cluster (kubelet: --cluster-domain)."""
 _OWN_PREFIX = "rosproxy"
-"""How the names of the operator's and the proxies' containers begin."""
+"""The beginning of the names of all containers of the operator."""
 _HOST_NAME = re.compile(r"(?!-)[a-z0-9_-]{1,63}(?<!-)(\.(?!-)[a-z0-9_-]{1,63}(?<!-))*")
 
 
 def is_allowed_by_administrator(name: str, settings: PlanSettings) -> bool:
-    """Whether an option of the administrator names a host, given in lower case."""
+    """Return whether --master-uri or --allow-alias names a host. ``name`` is in lower case."""
     master = parse_slave_uri(settings.master_uri or "")
     is_own_master = master is not None and name == master.host.lower()
     return is_own_master or any(fnmatchcase(name, p) for p in settings.allow_alias)
 
 
 def alias_refusal(name: str, settings: PlanSettings) -> str:
-    """Why labels may not give a proxy a name (in lower case); empty for a name that they may."""
+    """Return why labels may not give a proxy a name in lower case; empty for an allowed name."""
     if not _HOST_NAME.fullmatch(name) or len(name) > LONGEST_HOST:
         return "the name is not a host name"
     if is_allowed_by_administrator(name, settings):
@@ -56,7 +58,7 @@ def alias_refusal(name: str, settings: PlanSettings) -> str:
 
 
 def _lan_refusal(name: str) -> str:
-    """Why a name is not that of a LAN's host; empty for the name of one."""
+    """Return why a name is no name of a host in a LAN; empty if the name has that form."""
     if name.startswith(_OWN_PREFIX):
         return f"names that begin with {_OWN_PREFIX} are reserved for the operator"
     if _ends_in(name, _CLUSTER_SUFFIX):

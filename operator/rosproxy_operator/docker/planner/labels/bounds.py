@@ -1,12 +1,12 @@
-"""What labels may ask for: the administrator's bounds, which they can only narrow.
+"""Keep labels within the bounds of the administrator. A label can only narrow these bounds.
 
-Whoever starts a container chooses its image, and often does not know what labels that carries. A
-label can have ports of the host published, a capability given to a proxy, a name taken on a
-network (the master's host name leads to the proxy there), and announcements sent to other hosts.
-The operator's options say how far.
+A user that starts a container chooses an image, and often does not know the labels of the image. A
+label can publish ports of the host, and give a capability to a proxy. A label can take a name on a
+network: the host name of the master leads to the proxy there. A label can also send announcements
+to other hosts. The options of the operator set the bounds.
 
-A master that is not allowed leaves the container out. Of anything else that goes too far, the
-container gets what is allowed, and a warning.
+A container with a master that is not allowed gets no proxy. For all other labels, the container
+gets the part that is allowed, and a warning.
 """
 
 from dataclasses import replace
@@ -20,15 +20,15 @@ from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.spec import WISHES
 
 LEAST_PORT = 1024
-"""Where no master is named, the least port of one that a label may name.
+"""The least port of a master in a label, if the operator has no --allow-master.
 
-rosmaster is started by people who are not root, at 11311 as a rule, and can have none below. There
-are the web and mail servers in whose place a proxy must not stand.
+Users start rosmaster without root, usually at 11311, so a master has no port below 1024. Web and
+mail servers have such ports, and a proxy must not take the place of these servers.
 """
 
 
 def refused_master(uri: str, settings: PlanSettings) -> str:
-    """Why a container may not have a master, given as a URI; empty if it may."""
+    """Return why a container may not have the master at ``uri``; empty for an allowed master."""
     master = parse_slave_uri(uri)
     option = parse_slave_uri((settings.master_uri or "").lower())
     if master is None or master == option or _is_allowed_master(master, settings.allow_master):
@@ -40,13 +40,13 @@ def refused_master(uri: str, settings: PlanSettings) -> str:
 
 
 def allowed_planes(settings: PlanSettings) -> frozenset[DataPlane]:
-    """The data planes that labels may ask for."""
+    """Return the data planes that labels may ask for."""
     free = WISHES["data_plane"].free
     return frozenset({*(settings.allow_data_plane or free), settings.data_plane})
 
 
 def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[str, ...]]:
-    """What a container gets of what its labels ask for, and the warnings about the rest."""
+    """Return the request reduced to the allowed part, and warnings about the refused part."""
     warnings: list[str] = []
     limit = max(settings.max_ports, settings.ports)
     if request.ports > limit:
@@ -60,25 +60,26 @@ def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[str
     if plane not in allowed_planes(settings):
         warnings.append(
             f"label rosproxy.data-plane={plane} is ignored: the operator does not allow this value "
-            f"in labels. To allow it, start the operator with --allow-data-plane {plane}"
+            f"in labels. To allow this value, start the operator with --allow-data-plane {plane}"
         )
         del wishes["data_plane"]
     if wishes.get("slave_control") == "any" and settings.slave_control == "master":
         warnings.append(
             "label rosproxy.slave-control=any is ignored: the operator has --slave-control master, "
-            "and a label can only narrow this option"
+            "and a label can only narrow this option. Remove the label"
         )
         del wishes["slave_control"]
     if request.redirect and not settings.redirect:
         warnings.append(
             "label rosproxy.redirect=true is ignored: the operator has --no-redirect, and a label "
-            "can't override this option"
+            "can't override this option. Remove the label"
         )
     if refused := {peer for peer in request.peers if not _is_allowed_peer(peer, settings)}:
         warnings.append(
             f"label rosproxy.peers names {', '.join(sorted(refused))}, which the operator does not "
-            "allow in labels. The proxy announces no participants there. To allow it, start the "
-            f"operator with {' '.join(f'--allow-peer {peer}' for peer in sorted(refused))}"
+            "allow in labels. The proxy announces no participants there. To allow these peers, "
+            "start the operator with "
+            f"{' '.join(f'--allow-peer {peer}' for peer in sorted(refused))}"
         )
         request = replace(request, peers=request.peers - refused)
     return replace(request, wishes=wishes), tuple(warnings)
@@ -94,7 +95,7 @@ def _is_allowed_peer(peer: str, settings: PlanSettings) -> bool:
 
 
 def is_allowed_router(router: HostPort, settings: PlanSettings) -> bool:
-    """Whether the proxy for rmw_zenoh may connect to a router outside."""
+    """Return whether the proxy for rmw_zenoh may connect to a router outside."""
     return not settings.allow_peer or _matches(router, settings.allow_peer)
 
 

@@ -1,4 +1,4 @@
-"""From the labels of containers to what they want of a proxy."""
+"""Read the labels of all containers, and find the members of each proxy."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
@@ -25,22 +25,23 @@ from rosproxy_operator.docker.planner.specs import MANAGED, master, unresolved_m
 from rosproxy_operator.docker.settings import PlanSettings
 
 _PREFIX = "rosproxy"
-# One that has exited may come back: for the grace its proxy stays on its networks (see `desire`).
+# An exited container may start again: the proxy stays on its networks for the grace (`desire`).
 _COUNTED = ALIVE | {"exited"}
 MOST_LABELS = 256
-"""Labels of a container whose spelling is checked: each check takes some 30 microseconds."""
+"""Labels of a container that are checked for their spelling. A check takes some 30 microseconds."""
 MOST_UNKNOWN = 8
-"""Unknown labels of a container that are told one by one; the others are counted."""
+"""Unknown labels of a container with a warning each. Further unknown labels are only counted."""
 LONGEST_NAME = 80
-"""Characters of a label's name that are told."""
+"""Characters of a label's name in a warning."""
 
 
 @dataclass(frozen=True, slots=True)
 class LabelReading:
-    """What all labels ask for, in order of the containers' names, and what is wrong with them.
+    """The requests of all labels, in the order of container names, and the problems of labels.
 
-    It is not known yet where the masters are: the keys of ``requests`` have an empty
-    ``advertise_host`` where neither a label nor an option names it, and what they need is open.
+    The addresses of the masters are unknown here. So a key in ``requests`` has an empty
+    ``advertise_host`` if no label or option sets that host, and the alias and the redirect of the
+    master are still open.
     """
 
     requests: tuple[Member, ...] = ()
@@ -50,8 +51,8 @@ class LabelReading:
 def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
     """Read the labels of all containers.
 
-    A container that can't have what it wants is left out and has a problem, and no other is
-    touched by it. Containers that do not run have no problems.
+    A container with an unusable label gets a problem instead of a request, and does not affect
+    other containers. Containers that are not alive get no problems.
     """
     proxies = frozenset(own.container.name for own in observed.own)
     requests: list[Member] = []
@@ -72,7 +73,7 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
 
 
 def master_hosts(reading: LabelReading, observed: HostState) -> tuple[str, ...]:
-    """The hosts of all masters that a proxy is wanted for or there for, in lower case, sorted."""
+    """Return the master hosts of all wanted and existing proxies, in lower case, sorted."""
     wanted = {r.key for r in reading.requests if r.container.alive}
     keys = (key for key in observed.keys | wanted if key.ros == "1")
     return tuple(sorted({master(key).host.lower() for key in keys}))
@@ -81,7 +82,11 @@ def master_hosts(reading: LabelReading, observed: HostState) -> tuple[str, ...]:
 def find_members(
     reading: LabelReading, observed: HostState, settings: PlanSettings
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
-    """The containers that belong to a proxy, and problems of those whose proxy is not known."""
+    """Return the members of all proxies, and the problems.
+
+    A request without a known advertised host becomes a problem. Other problems are warnings about
+    ROS_MASTER_URI, ROS_IP and ROS_HOSTNAME.
+    """
     members: list[Member] = []
     problems: list[Problem] = []
     for request in reading.requests:
@@ -104,14 +109,17 @@ def find_members(
 
 
 def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tuple[Member, str]:
-    """A container whose key is known, with how its nodes find the proxy, and a warning."""
+    """Return the member with the alias or redirect by which nodes find the proxy, and a warning.
+
+    The key of ``request`` is complete. The warning may be empty.
+    """
     container = request.container
     key = request.key
     if key.is_ros2:
         return request, ""
     needs, text = readers.proxy_alias(container, key)
     if not container.master_uri and ros_versions.is_guessed(container):
-        text = ""  # it may be of ROS 2: first its version has to be known
+        text = ""  # the container may be of ROS 2, and has a warning about the unknown version
     by_address = readers.master_by_address(container, key)
     if by_address is None:
         return replace(request, wanted_alias=needs), text
@@ -126,8 +134,8 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
             f". Or remove {readers.named(REDIRECT, container.labels)}: the operator then redirects "
             "the address to the proxy"
         )
-    # Without a route to the master's address connect(2) fails before the rule could take effect:
-    # the kernel looks for a route before there is a packet (net/ipv4/tcp_ipv4.c, tcp_v4_connect).
+    # Without a route to the master's address connect(2) fails before the rule takes effect: the
+    # kernel looks up the route before the first packet (net/ipv4/tcp_ipv4.c, tcp_v4_connect).
     elif (joined := readers.network_owner(container, observed).networks) and joined <= internal:
         text += (
             ". The operator can't redirect the address to the proxy, since all networks of the "
@@ -139,9 +147,10 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
 
 
 def _why_no_host(key: Key, observed: HostState) -> str:
-    """Why it is not known how outside reaches this host, the first cause first.
+    """Return why the advertised host is unknown, and the fix.
 
-    It follows from the master's address, which often is what is not known.
+    This host's address depends on the route to the master. So an unknown address of the master is
+    the first cause.
     """
     if not key.is_ros2 and observed.masters.get(master(key).host.lower()) == "":
         return f"no address of the master: {unresolved_master(master(key).host)}"
@@ -155,7 +164,10 @@ def _why_no_host(key: Key, observed: HostState) -> str:
 def _requests(
     container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
 ) -> tuple[list[Member], list[str]]:
-    """What a container gets of what it asks for, by version of ROS, and the warnings for it."""
+    """Return a member for each ROS version of a container, within the bounds, and warnings.
+
+    Raises UnusableLabel.
+    """
     readers.refuse_long_values(container.labels)
     served = ros_versions.versions(container)
     of_range = sorted(served - {"zenoh"})
@@ -181,7 +193,10 @@ def _request(
     settings: PlanSettings,
     proxies: Collection[str],
 ) -> Member:
-    """What a container asks for, for its nodes of one version of ROS."""
+    """Return the request of a container for the nodes of one ROS version, 1 or 2.
+
+    Raises UnusableLabel.
+    """
     labels = container.labels
     is_ros2 = ros == "2"
     uri = "" if is_ros2 else _master_uri(container, settings, proxies)
@@ -202,7 +217,7 @@ def _request(
 
 
 def _master_uri(container: Container, settings: PlanSettings, proxies: Collection[str]) -> str:
-    """The URI of a container's master. Raises UnusableLabel if it has none."""
+    """Return the URI of a container's master. Raises UnusableLabel without a usable master."""
     try:
         return readers.master_uri(container, settings, proxies)
     except NoMaster:
@@ -219,12 +234,12 @@ def _problem(container: Container, text: str, fatal: bool) -> Problem:
 
 
 def _unusable(container: Container, text: str) -> Problem:
-    """A failure only if a label asks for a proxy; a mere variable is no request."""
+    """Return a problem, fatal only if a label asks for a proxy: a variable alone is no request."""
     return _problem(container, text, fatal=bool(_own(container)))
 
 
 def _exposed(container: Container, settings: PlanSettings) -> bool:
-    """Whether a container that does not say gets a proxy."""
+    """Return whether a container without the label rosproxy.enable gets a proxy."""
     if not settings.expose_by_default:
         return False
     is_ros2 = not ros_versions.versions(container) <= {"1"}
@@ -232,10 +247,10 @@ def _exposed(container: Container, settings: PlanSettings) -> bool:
 
 
 def _own(container: Container) -> list[str]:
-    """The labels that are meant for this operator, misspelt ones too."""
+    """Return the labels that are meant for this operator, also misspelt labels."""
     prefixed = [name for name in container.labels if name.lower().startswith(f"{_PREFIX}.")]
-    # Without the prefix only a name that is very near counts, as it may be another program's.
-    # io.rosproxy.domain, the operator's own, is 0.91 near to rosproxy.domain.
+    # A label without the prefix may belong to another program, so only very similar names count.
+    # Labels io.rosproxy.… are the operator's: io.rosproxy.domain is 0.91 near to rosproxy.domain.
     others = (name for name in container.labels if not name.startswith(f"io.{_PREFIX}."))
     checked = islice(others, MOST_LABELS)
     near = [name for name in checked if nearest(name, LABELS, VERY_NEAR)]
@@ -273,9 +288,10 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
 
 
 def _advertised(request: Member, observed: HostState) -> str:
-    """This host's address towards a master, else what a proxy for it advertises already.
+    """Return this host's address towards a master, else the advertised host of an existing proxy.
 
-    A name that can't be resolved for a moment must not take a proxy away.
+    So a proxy stays if the name of the master does not resolve for a moment. A proxy on a network
+    of the container comes first. Empty without address and proxy.
     """
     key = request.key
     networks = request.container.networks

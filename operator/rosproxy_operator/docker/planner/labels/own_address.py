@@ -1,10 +1,11 @@
-"""What a container's variables say of its own address, where that keeps its nodes from working.
+"""Find values of ROS_IP and ROS_HOSTNAME that keep the nodes of a container from working.
 
-A node gives others the address in ROS_IP, or the name in ROS_HOSTNAME, as its own. Through the
-proxy most values do no harm, since the proxy gives its own instead. Two do: with a loopback address
-rospy and roscpp listen there alone, so that the proxy can't reach them; and with the address of
-this host, as manuals of drivers have it, roslaunch finds nobody at its own address and ends before
-it has asked a master (`ROSLaunchNode.start` in roslaunch/server.py).
+A node announces the address in ROS_IP, or the name in ROS_HOSTNAME. Most values do no harm, since
+the proxy replaces the address. Two values do harm:
+
+- A loopback address: rospy and roscpp listen on loopback alone, so the proxy can't reach the nodes.
+- The address of this host, as in manuals of drivers. roslaunch does not reach its own server at
+  that address, and ends before any call to a master (`ROSLaunchNode.start` in roslaunch/server.py).
 """
 
 from rosproxy.net.addresses import is_loopback
@@ -15,7 +16,7 @@ VARIABLES = ("ROS_IP", "ROS_HOSTNAME")
 
 
 def wrong_own_address(container: Container, key: Key, observed: HostState) -> str:
-    """What is wrong with how a container of ROS 1 calls its own host; empty if nothing is."""
+    """Return what is wrong with the own address of a ROS 1 container; empty for no fault."""
     for name in VARIABLES:
         value = container.variables.get(name, "").strip().lower()
         fix = f"Unset {name}: no node behind a proxy needs this variable"
@@ -33,7 +34,7 @@ def wrong_own_address(container: Container, key: Key, observed: HostState) -> st
 
 
 def _of_this_host(key: Key, observed: HostState) -> frozenset[str]:
-    """This host's addresses and names, as far as they are known."""
+    """Return the known addresses and names of this host, in lower case."""
     gateways = (network.gateway for network in observed.networks)
     towards = observed.advertise.values()
     return frozenset({key.advertise_host.lower(), observed.far, *gateways, *towards} - {""})

@@ -1,6 +1,6 @@
-"""What each of a container's labels says, and which master it means.
+"""Read the labels of a container, and find the master of the container.
 
-Each function that reads a label raises UnusableLabel for a value that can't be.
+Each function that reads a label raises UnusableLabel for an impossible value.
 """
 
 import re
@@ -37,15 +37,15 @@ LABELS = (
 )
 
 ALIAS = "rosproxy"
-"""The name under which every proxy is found on the networks of its containers."""
+"""The name that every proxy for ROS 1 wants on the networks of its containers."""
 BUILT_IN = frozenset({"bridge", "host", "none"})
-"""Networks that every engine has. No names resolve on them, so no proxy can be found there."""
+"""Networks that every engine has. No names resolve there, so nodes can't find a proxy."""
 MOST_LABEL_RULES = 100
-"""Rules that a container may have."""
+"""Most rules of a container."""
 LONGEST_VALUE = 16 * 1024
-"""Characters of a label's value: those of all rules of a container."""
+"""Most characters of a label's value. The rules of a container are the longest value."""
 LONGEST_HOST = 253
-"""Characters of a host name (RFC 1035, 2.3.4)."""
+"""Most characters of a host name (RFC 1035, 2.3.4)."""
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
@@ -53,7 +53,7 @@ Labels = Mapping[str, str]
 
 
 class UnusableLabel(Exception):
-    """Why a container is left out: what is wrong, and what to do."""
+    """A container gets no proxy. The message says what is wrong, and what to do."""
 
 
 class NoMaster(UnusableLabel):
@@ -61,17 +61,17 @@ class NoMaster(UnusableLabel):
 
 
 def quoted(value: str) -> str:
-    """A value as messages may show it: shortened and escaped."""
+    """Return a value for messages, shortened and escaped."""
     return repr(bounded(value, 80))
 
 
 def named(label: str, labels: Labels) -> str:
-    """A label and its value, as messages show it."""
+    """Return a label and its value for messages."""
     return f"label {label}={quoted(labels[label])}"
 
 
 def refuse_long_values(labels: Labels) -> None:
-    """Raise UnusableLabel for a value that is too long to be read with each look."""
+    """Raise UnusableLabel for a long value, since the operator reads all values at each look."""
     for label in LABELS:
         if len(labels.get(label, "")) > LONGEST_VALUE:
             fix = "Join rules by globs" if label == POLICY else "Shorten the value"
@@ -79,18 +79,18 @@ def refuse_long_values(labels: Labels) -> None:
 
 
 def enabled(labels: Labels, otherwise: bool) -> bool:
-    """Whether a container wants a proxy; ``otherwise`` if it does not say."""
+    """Return whether a container wants a proxy; ``otherwise`` without the label."""
     flag = _flag(ENABLE, labels)
     return otherwise if flag is None else flag
 
 
 def redirect(labels: Labels) -> bool | None:
-    """Whether a master given by address may be led to the proxy, or None."""
+    """Return whether a redirect of the master's address is allowed; None without the label."""
     return _flag(REDIRECT, labels, "false")
 
 
 def ports(labels: Labels) -> int:
-    """How many ports the proxy is to have at least, or 0."""
+    """Return the least number of ports of the proxy; 0 without the label."""
     if PORTS not in labels:
         return 0
     digits = labels[PORTS].strip()
@@ -105,9 +105,10 @@ def ports(labels: Labels) -> int:
 def wishes(
     labels: Labels, ros: str, joined: Collection[str], networks: Iterable[Network]
 ) -> dict[str, Any]:
-    """The options that the labels ask for, for nodes of this version of ROS.
+    """Return the options that the labels ask for, for nodes of ROS version ``ros``.
 
-    Of the networks that it ``joined``, a container on an internal one has no route outwards.
+    If one of the ``joined`` networks is internal, the container may have no route outwards. So the
+    direction is ``both`` unless the label sets the direction.
     """
     internal = any(n.internal and n.name in joined for n in networks)
     asked = {
@@ -119,9 +120,10 @@ def wishes(
 
 
 def policy(labels: Labels) -> tuple[Rule, ...]:
-    """The rules for a container's own nodes, none without the label.
+    """Return the rules for the nodes of a container; empty without the label.
 
-    One that can't be read leaves the container out: what its user wants to hide is not to be seen.
+    A container with an unreadable rule gets no proxy: names that the user wants to hide must not
+    become visible.
     """
     try:
         rules = parse_rules(labels.get(POLICY, ""))
@@ -134,7 +136,7 @@ def policy(labels: Labels) -> tuple[Rule, ...]:
 
 
 def advertise_host(labels: Labels, settings: PlanSettings) -> str:
-    """This host's name in lower case, or its address: the label's, else the option's, or empty."""
+    """Return the advertised host in lower case, from the label, else the option, else empty."""
     if ADVERTISE_HOST in labels:
         return _host(named(ADVERTISE_HOST, labels), labels[ADVERTISE_HOST])
     option = settings.advertise_host
@@ -142,7 +144,7 @@ def advertise_host(labels: Labels, settings: PlanSettings) -> str:
 
 
 def networks(container: Container, observed: HostState, uplink: str) -> frozenset[str]:
-    """The container's user-defined networks but the uplink, or the one that its label names."""
+    """Return the network in the label, else all user-defined networks except the uplink."""
     net_owner = network_owner(container, observed)
     own = (net_owner.networks or _future_network(net_owner, observed)) - BUILT_IN - {uplink}
     if NETWORK in container.labels:
@@ -153,7 +155,7 @@ def networks(container: Container, observed: HostState, uplink: str) -> frozense
 
 
 def _flag(label: str, labels: Labels, usual: str = "true") -> bool | None:
-    """Whether a label says true or false, None without it; ``usual`` is what most would want."""
+    """Return whether a label says true; None without the label. The fix names ``usual``."""
     value = labels.get(label, "").strip().lower()
     if label in labels and value not in ("true", "false"):
         text = f"{named(label, labels)} is neither true nor false. Write {label}={usual}"
@@ -162,7 +164,7 @@ def _flag(label: str, labels: Labels, usual: str = "true") -> bool | None:
 
 
 def _wish(wish: Wish, choices: Collection[str], labels: Labels) -> str | bool | None:
-    """What a label says: one of the choices, else true or false."""
+    """Return the value of a label: one of the choices, or a flag if there are no choices."""
     value = labels[wish.label].strip().lower()
     if not choices:
         return _flag(wish.label, labels)
@@ -188,7 +190,10 @@ def _host(source: str, value: str) -> str:
 
 
 def _future_network(container: Container, observed: HostState) -> frozenset[str]:
-    """The network of a container that the engine is just creating, and lists without networks."""
+    """Return the network of a container in the state created; empty in all other states.
+
+    The engine lists such a container without networks for a moment.
+    """
     if container.state != "created":
         return frozenset()
     mode = container.network_mode
@@ -196,7 +201,7 @@ def _future_network(container: Container, observed: HostState) -> frozenset[str]
 
 
 def _named_network(labels: Labels, own: frozenset[str]) -> str:
-    """The network that the label means; compose puts its project's name in front."""
+    """Return the network that the label means, also without Compose's prefix ``PROJECT_``."""
     label = labels[NETWORK]
     for name in (label, f"{labels.get('com.docker.compose.project')}_{label}"):
         if name in own:
@@ -209,7 +214,10 @@ def _named_network(labels: Labels, own: frozenset[str]) -> str:
 
 
 def network_owner(container: Container, observed: HostState) -> Container:
-    """The container whose networks it has: itself, or the one that it shares them with."""
+    """Return the container that owns the network namespace of ``container``.
+
+    Raises UnusableLabel if that container does not exist, and for a loop of containers.
+    """
     visited = {container.id}
     while (target := container.network_container) is not None:
         sharer = next((c for c in observed.containers if target in (c.id, c.name)), None)
@@ -235,7 +243,8 @@ def _why_no_network(owner: Container) -> str:
             "is on the host's own network, where nodes need no proxy. Remove the labels, or start "
             f"the container on a user-defined network: {anew}"
         )
-    if owner.network_mode == "none":  # the engine lets it join no other
+    # The engine connects no container of the mode none to another network.
+    if owner.network_mode == "none":
         return f"is on no network. Start the container on a user-defined network: {anew}"
     live = f"docker network create ros; docker network connect ros {owner.name}"
     if "bridge" in owner.networks or owner.network_mode in ("bridge", "default"):
@@ -245,10 +254,10 @@ def _why_no_network(owner: Container) -> str:
 
 
 def master_uri(container: Container, settings: PlanSettings, proxies: Collection[str]) -> str:
-    """The URI of the real master: from the label, else the environment, else the settings.
+    """Return the URI of the real master: from the label, else the variable, else --master-uri.
 
-    ``proxies`` are names of the operator's own containers. Raises NoMaster if there is none,
-    UnusableLabel if it can't be one.
+    A variable that names a proxy does not count. ``proxies`` are the names of the operator's own
+    containers. Raises NoMaster without a URI, and UnusableLabel for an impossible URI.
     """
     if MASTER_URI in container.labels:
         source = named(MASTER_URI, container.labels)
@@ -267,14 +276,15 @@ def master_uri(container: Container, settings: PlanSettings, proxies: Collection
 
 
 def proxy_alias(container: Container, key: Key) -> tuple[str, str]:
-    """The name by which a container's nodes look for their proxy, and what is wrong with it.
+    """Return the name by which a container's nodes look for the proxy, and a warning.
 
-    The name is empty if no alias can help. The second text is empty if nothing is wrong.
+    The name is empty if no alias can help. The warning is empty if nothing is wrong.
     """
     real = master(key)
     fix = f"Set ROS_MASTER_URI=http://{ALIAS}:{real.port}"
     if not container.master_uri:
-        # Which ROS's setup script takes (ros_comm/tools/roslaunch/env-hooks/10.roslaunch.sh.in).
+        # Without the variable, ROS's setup script sets ROS_MASTER_URI to localhost
+        # (ros_comm/tools/roslaunch/env-hooks/10.roslaunch.sh.in).
         nodes = "the nodes look for a master on localhost, unless a script sets the variable"
         return ALIAS, f"has no variable ROS_MASTER_URI, so {nodes}. {fix}"
     target = parse_slave_uri(container.master_uri)
@@ -287,16 +297,17 @@ def proxy_alias(container: Container, key: Key) -> tuple[str, str]:
             return host, ""
         return host, f"{variable} has the wrong port, the proxy listens on {real.port}. {fix}"
     if MASTER_URI not in container.labels:
-        # A variable that names the proxy no longer says which master is meant.
+        # A variable that names the proxy does not say which master the container means.
         fix += f" and the label {MASTER_URI}={key.master_uri}"
     return "", f"{variable} {_wrong_master(host, key, fix)}"
 
 
 def master_by_address(container: Container, key: Key) -> HostPort | None:
-    """The address and port in a container's ROS_MASTER_URI that stand for its master.
+    """Return the address in a container's ROS_MASTER_URI that a redirect may lead to the proxy.
 
-    That is its master's own address, or where a label gives the master by name any address: the
-    name may lead to another one by now. None for a name, and for IPv6.
+    If a label gives the master by name, any address is accepted: the name may resolve to another
+    address by now. Otherwise the address has to be the master's. None for a wrong port, a name,
+    loopback and IPv6.
     """
     target = parse_slave_uri(container.master_uri)
     real = master(key)
@@ -327,7 +338,10 @@ def _names_proxy(host: str, proxies: Collection[str]) -> bool:
 
 
 def _allowed_master(source: str, uri: str, settings: PlanSettings, proxies: Collection[str]) -> str:
-    """A master that a container names: an image may carry both the label and the variable."""
+    """Return the URI of a master that a container names, if the administrator allows that master.
+
+    An image may carry the label or the variable, so the operator checks both.
+    """
     parsed = _parse_master(source, uri, proxies)
     if refusal := bounds.refused_master(parsed, settings):
         raise UnusableLabel(f"{source} {refusal}")
@@ -335,7 +349,7 @@ def _allowed_master(source: str, uri: str, settings: PlanSettings, proxies: Coll
 
 
 def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:
-    """A master's URI in its one form: host in lower case, no slash at the end."""
+    """Return the canonical URI of a master: the host in lower case, no slash at the end."""
     host_port = parse_slave_uri(uri.strip())
     path = urlsplit(uri.strip()).path.rstrip("/") if host_port else ""
     is_readable = host_port and host_port.host.isascii() and len(host_port.host) <= LONGEST_HOST
