@@ -5,7 +5,8 @@ the next look recognises the state, and the next plan finishes the work. A conta
 removed only after the successor has been created.
 
 A sandbox joins networks after the start. If a container starts with several networks, the engine
-joins these in any order, and may publish the ports over one network and move them to the uplink.
+joins these in any order. So the engine may publish the ports over one network, and move the ports
+to the uplink later.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator

@@ -1,8 +1,8 @@
 """Decide which of several containers in the same role stays, and which goes.
 
 A role is the sandbox, the proxy or the LAN relay of a key. Several containers have the same role
-while a new container takes over, after the operator was killed meanwhile, or after a user has
-created or renamed containers.
+while a new container takes over. The reason may also be an operator that was killed, or a change by
+a user.
 """
 
 from collections.abc import Collection, Iterable

@@ -40,8 +40,8 @@ class LabelReading:
     """The requests of all labels, in the order of container names, and the problems of labels.
 
     The addresses of the masters are unknown here. So a key in ``requests`` has an empty
-    ``advertise_host`` if no label or option sets that host, and the alias and the redirect of the
-    master are still open.
+    ``advertise_host`` if no label or option sets that host. Aliases and redirects of masters are
+    still open.
     """
 
     requests: tuple[Member, ...] = ()
