@@ -1,8 +1,9 @@
-"""What each proxy is told: its policy, which pods may use it, its peers, and which pods are gone.
+"""What the operator sends each proxy: policy, callers, peers, former ports and gone pods.
 
-The pods that may use a proxy as their master are those on its node that its RosProxy selects. A pod
-that is being deleted counts, since its ROS nodes unregister while they end. A pod that another
-RosProxy selects as well counts, too: it may have been wired before that RosProxy was created.
+The callers of a proxy are the selected pods on the proxy's node. A pod that is being deleted
+counts, because its ROS nodes unregister while they end. A pod that a second RosProxy selects as
+well counts, too: the webhook may have wired the pod before the second RosProxy existed. A pod in
+the host's network is no caller.
 """
 
 from collections.abc import Mapping
@@ -19,12 +20,13 @@ from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 
 class Briefing(msgspec.Struct, frozen=True):
-    """What a proxy is told.
+    """What the operator sends a proxy.
 
-    ``policy`` are all layers of its policy, ``callers`` the addresses of pods that may use it; None
-    where its RosProxy is gone or can't be read: the proxy goes on with what it knows. ``peers`` are
-    those of ROS 2, ``former_ports`` the ports of participants at the proxy before it. ``gone`` are
-    the addresses of pods that are no more.
+    ``policy`` has all layers. ``callers`` has the IP addresses of the pods that may use the proxy.
+    Both are None if the RosProxy is gone, is being deleted or can't be read: the proxy then keeps
+    the policy and callers that it has. ``peers`` has the ROS 2 peers, None without ROS 2.
+    ``former_ports`` has the ports of ROS 2 participants at the former proxy. ``gone`` has IP
+    addresses that no pod has any more.
     """
 
     policy: tuple[PolicyLayer, ...] | None = None
@@ -41,10 +43,10 @@ def briefings(
     former_ports: Mapping[str, Leases],
     gone: Mapping[str, tuple[str, ...]],
 ) -> dict[str, Briefing]:
-    """Return what all proxies are told, by the uid of their pods.
+    """Return the briefing of each proxy, by the uid of the proxy's pod.
 
-    ``peers``, ``former_ports`` and ``gone`` are by the same uid. ``observed`` also has RosProxies
-    that ask for more than they may: their proxies go on.
+    ``peers``, ``former_ports`` and ``gone`` have the same keys. ``observed`` is the snapshot before
+    `within_bounds`, so the proxies of a RosProxy that asks for too much still get updates.
     """
     rosproxies = {r.uid: r for r in observed.rosproxies if not r.deleting}
     live_pods = (pod for pod in observed.pods if not (pod.ended or pod.host_network))

@@ -1,6 +1,6 @@
-"""What is seen in a cluster, put in order: which proxies are wanted where, and which exist.
+"""The snapshot of a cluster, sorted: the proxies that pods want, and the proxies that exist.
 
-Everything after this works by place, that is a RosProxy on a node, and not by pod.
+The later steps of a plan work by place. A place is a pair of a RosProxy and a node.
 """
 
 from collections import defaultdict
@@ -32,17 +32,21 @@ V = TypeVar("V")
 
 
 class View(msgspec.Struct, frozen=True):
-    """A `ClusterSnapshot` by RosProxy and by node.
+    """A `ClusterSnapshot`, sorted by RosProxy and by node.
 
-    ``rosproxies`` are those that are not being deleted; ``proxies`` those that belong to one of
-    them, ``orphans`` those of RosProxies that are gone. ``current`` is the proxy of a place, under
-    the name that it is to have, unless it is being deleted. ``proxies_by_node`` are, by the node
-    that they are meant for, all proxies that hold ports, of any RosProxy. ``wanted`` are the
-    places where pods want a proxy, and those pods; ``places`` those where a proxy is wanted or
-    exists, in order; ``selected_pods`` all pods that a RosProxy has taken, wherever they are.
-    ``other_pods_by_node`` are, by node, the pods that hold ports and are neither proxies nor LAN
-    relays, ``other_pod_names`` the names of all such pods, with ports or not, ``names`` those of
-    all proxies. ``findings`` are those about pods.
+    - ``rosproxies``: the RosProxies that are not being deleted.
+    - ``proxies``: the proxies of these RosProxies.
+    - ``current``: the proxy that has the right name for its place and is not being deleted.
+    - ``orphans``: the proxies of RosProxies that are gone or being deleted. The proxies of an
+      unusable RosProxy are no orphans.
+    - ``proxies_by_node``: by intended node, all proxies whose pods have not ended.
+    - ``wanted``: the places where pods want a proxy, with these pods.
+    - ``places``: by RosProxy, the places where a proxy is wanted or exists, sorted.
+    - ``selected_pods``: by RosProxy, the pods that the RosProxy takes, on any node.
+    - ``other_pods_by_node``: the pods that hold ports and do not belong to the operator.
+    - ``other_pod_names``: the names of all pods that do not belong to the operator.
+    - ``names``: the names of all proxies.
+    - ``findings``: the findings about pods.
     """
 
     observed: ClusterSnapshot
@@ -61,23 +65,29 @@ class View(msgspec.Struct, frozen=True):
 
 
 def place_of(proxy: ProxyPod) -> ProxyPlace:
-    """The place that a proxy is meant for."""
+    """Return the place that a proxy is meant for."""
     return ProxyPlace(proxy.of, proxy.node)
 
 
 def serves(proxy: ProxyPod) -> bool:
-    """Whether a proxy has its ports and is up, or has been and will be again."""
+    """Whether a proxy runs, or has run and the kubelet will start the container again.
+
+    Such a pod has all hostPorts, because the kubelet starts no container without them.
+    """
     running = proxy.ready or proxy.restarts > 0 or proxy.pod.phase == "Running"
     return running and not proxy.pod.ended
 
 
 def has_ports(proxy: ProxyPod) -> bool:
-    """Whether the scheduler has given a proxy its node, and with it its ports."""
+    """Whether a proxy's pod holds its hostPorts.
+
+    The scheduler reserves the ports when it binds the pod to a node. The kubelet may refuse them.
+    """
     return bool(proxy.pod.node) and not proxy.pod.ended and proxy.stuck is not PodFailure.PORTS
 
 
 def view(observed: ClusterSnapshot) -> View:
-    """Put in order what is seen."""
+    """Return the sorted view of a snapshot."""
     rosproxies = {r.id: r for r in observed.rosproxies if not r.deleting}
     proxies = group_by_key((place_of(p), p) for p in observed.proxies if _owned(p, rosproxies))
     unusable = {r.uid for r in observed.unusable.values()}
@@ -117,14 +127,15 @@ def _owned(proxy: ProxyPod, rosproxies: Mapping[Name, RosProxy]) -> bool:
 def _taken(
     observed: ClusterSnapshot, rosproxies: Mapping[Name, RosProxy]
 ) -> tuple[dict[Name, tuple[Pod, ...]], list[ClusterFinding]]:
-    """Which RosProxy has taken which pods, and what is wrong with that."""
+    """Return the pods that each RosProxy takes, and findings about selected pods left out."""
     pods = [pod for pod in observed.pods if not (pod.ended or pod.deleting or is_own(pod.labels))]
     choices = [(select_rosproxy(pod, rosproxies.values()), pod) for pod in pods]
     taken = group_by_key(
         (choice.id, pod) for choice, pod in choices if isinstance(choice, RosProxy)
     )
     refused = [(choice, pod) for choice, pod in choices if isinstance(choice, ClusterFinding)]
-    # Each RosProxy that selects the pod reports that.
+    # `select_rosproxy` names a single RosProxy in a finding, but the status of each RosProxy that
+    # selects the pod has to show the finding.
     findings = [
         replace(choice, of=r.id)
         for choice, pod in refused
@@ -139,7 +150,7 @@ def _wanted(
     rosproxies: Mapping[Name, RosProxy],
     taken: Mapping[Name, Iterable[Pod]],
 ) -> tuple[dict[ProxyPlace, tuple[Pod, ...]], list[ClusterFinding]]:
-    """The places where pods want a proxy, and findings about pods that get none."""
+    """Return the places where pods want a proxy, and findings about pods that get no proxy."""
     places = group_by_key(
         (ProxyPlace(n, pod.node), pod) for n, pods in taken.items() for pod in pods
     )
@@ -163,12 +174,12 @@ def _wanted(
 
 
 def abbreviated(texts: Iterable[str]) -> str:
-    """A few of the texts, and how many more there are."""
+    """Return the first five texts, sorted and without duplicates, and the number of the rest."""
     return listed(sorted(set(texts)))
 
 
 def group_by_key(pairs: Iterable[tuple[K, V]]) -> dict[K, tuple[V, ...]]:
-    """The values of each key, in their order."""
+    """Return the values of each key, in the order of the pairs."""
     groups: dict[K, list[V]] = defaultdict(list)
     for key, value in pairs:
         groups[key].append(value)

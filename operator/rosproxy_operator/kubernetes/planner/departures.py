@@ -1,8 +1,9 @@
-"""What a proxy is to be told of the pods on its node: which addresses no pod has any more.
+"""Finds addresses of ROS nodes that no pod has any more, so that the proxy unregisters the nodes.
 
-A proxy finds out by probing that a ROS node is gone, which takes long; the operator knows from the
-API server that a pod is gone. It compares the addresses at which a proxy has ROS nodes with those
-of the pods that are there, and is careful: what is unregistered by mistake is not found again.
+A proxy finds out by probing that a ROS node is gone, which takes long. The API server tells the
+operator sooner that a pod is gone. So the operator compares the addresses of a proxy's ROS nodes
+with the addresses of the pods on the node. The operator has to be sure: a ROS 1 node that the proxy
+unregisters by mistake does not register again.
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -17,33 +18,36 @@ from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Prox
 from rosproxy_operator.kubernetes.resources.model import ClusterNode
 
 UNKNOWN_ADDRESS_GRACE = 15.0
-"""Seconds after which an address in a node's pod network counts as gone that no pod was seen with.
+"""Seconds until an address in a node's pod networks counts as gone, if no pod was seen with it.
 
-A pod's containers run before the API server knows its address.
+A pod's containers run before the API server knows the address of the pod.
 """
 REMEMBERED = 15.0
-"""Seconds for which the address of a pod that is gone is remembered, though no proxy names it.
+"""Seconds that the operator remembers the address of a gone pod that no proxy reports.
 
-A proxy's answer may be older than the look: what has just registered is named in the next one.
+The report of a proxy may be older than the look. A node that has just registered is in the next
+report.
 """
 LONGEST = 3600.0
-"""The same while a proxy does not answer at all."""
+"""The same time, in seconds, while a proxy of the node does not answer."""
 LOOK_AGAIN_AFTER = 3.0
-"""Seconds until proxies are looked at again whose pods have just gone."""
+"""Seconds to the next look after pods have gone."""
 
 
 class Departures(msgspec.Struct, frozen=True):
-    """The addresses that are gone, by the uid of the proxy's pod, and what is remembered."""
+    """The gone addresses, by the uid of the proxy's pod, and the next state of the operator."""
 
     addresses: Mapping[str, tuple[str, ...]]
     state: ClusterState
 
 
 def find_departures(observed: ClusterSnapshot, state: ClusterState, now: float) -> Departures:
-    """Compare where the proxies' ROS nodes are with the pods that there are.
+    """Return the addresses that proxies report and that no running pod of the node has.
 
-    An address counts as gone if a pod was seen with it and none has it now; or if it belongs to the
-    node's pod networks and every pod there has had another one for `UNKNOWN_ADDRESS_GRACE` seconds.
+    An address that a pod of the node had at a former look counts as gone at once. Any other address
+    has to be in the pod networks of the node, and counts as gone after `UNKNOWN_ADDRESS_GRACE`
+    seconds. Such an address does not count while a pod of the node has no address yet. Proxies that
+    do not answer and nodes that are not ready are skipped.
     """
     pod_by_uid = {pod.uid: pod for pod in (*(p.pod for p in observed.proxies), *observed.pods)}
     pods = group_by_key((pod.node, pod) for pod in pod_by_uid.values())
@@ -63,7 +67,7 @@ def find_departures(observed: ClusterSnapshot, state: ClusterState, now: float) 
         unseen = {ip for ip in missing - last_seen[node.name].keys() if _is_pod_ip(ip, proxy, node)}
         since = {ip: state.strange.get((node.name, ip), now) for ip in unseen}
         strange |= {(node.name, ip): at for ip, at in since.items()}
-        # A pod that is listed without an address yet may be the one at the unseen address.
+        # A pod that the API server lists without an address may have the unseen address.
         has_pending = any(not pod.ip and not pod.host_network for pod in living)
         late = {
             ip for ip, at in since.items() if now - at >= UNKNOWN_ADDRESS_GRACE and not has_pending
@@ -76,9 +80,9 @@ def find_departures(observed: ClusterSnapshot, state: ClusterState, now: float) 
 
 
 def _is_pod_ip(address: str, proxy: ProxyPod, node: ClusterNode) -> bool:
-    """Whether an address is in the pod networks, and of the family that pods are listed with.
+    """Whether an address is in the node's pod networks and of the proxy's IP version.
 
-    Of a pod with addresses of both families only one is known here.
+    The comparison knows only the first address of a pod with addresses of both IP versions.
     """
     try:
         ip = ip_address(address)
@@ -92,7 +96,7 @@ def _is_pod_ip(address: str, proxy: ProxyPod, node: ClusterNode) -> bool:
 def _kept(
     reports: Collection[ProxyReport | None], last_seen: Mapping[str, float], now: float
 ) -> dict[str, float]:
-    """Which addresses are worth remembering: those that a proxy names, or may name yet."""
+    """Return the addresses to remember: a proxy reports the address, or may still report it."""
     answered = [report for report in reports if report is not None and report.answered]
     named = {address for report in answered for address in report.addresses}
     longest = REMEMBERED if len(answered) == len(reports) else LONGEST
@@ -100,8 +104,8 @@ def _kept(
 
 
 def next_checks(departed: Departures, now: float) -> Iterator[float]:
-    """In how many seconds there may be something to tell the proxies."""
-    # The addresses that pods have at this moment were all seen at `now`.
+    """Yield the seconds until the next look that may find gone addresses."""
+    # An address with another time than `now` is of a pod that this look has not seen.
     recent = (at for ips in departed.state.addresses.values() for at in ips.values() if at != now)
     if departed.addresses or any(now - at < REMEMBERED for at in recent):
         yield LOOK_AGAIN_AFTER

@@ -1,9 +1,9 @@
-"""Which ports participants of ROS 2 had, for a proxy whose pod is made anew.
+"""Remembers the ports of ROS 2 participants, for the next proxy of the place.
 
-A proxy that is started again in its pod is told that by the participants themselves. A new pod has
-another address, at which they don't answer it (see
-`rosproxy.ros2.ports.former_ports`): then the operator tells it what the former proxy
-reported last, if it has seen that; otherwise nobody does.
+The participants themselves tell these ports to a proxy that starts again in the same pod (see
+`rosproxy.ros2.ports.former_ports`). A new pod has another address, and the participants don't
+answer a proxy at that address. So the operator sends the new proxy the ports that the former proxy
+reported last. If the operator has seen no such report, the new proxy does not learn the ports.
 """
 
 from collections.abc import Mapping
@@ -16,18 +16,19 @@ from rosproxy_operator.kubernetes.resources.model import ProxyPlace
 
 
 class FormerPorts(msgspec.Struct, frozen=True):
-    """The ports at the proxy whose pod has this uid."""
+    """The ports of participants at the proxy whose pod has this ``uid``."""
 
     uid: str
     leases: Leases
 
 
 def remember(view: View, former: Mapping[ProxyPlace, FormerPorts]) -> dict[ProxyPlace, FormerPorts]:
-    """The ports by place: as its proxy reports them now, or as the former one did last.
+    """Return the last reported ports of each place.
 
-    Those of the former proxy count until the new one has participants. The last ports count as
-    well where a proxy has none any more: it may have unregistered its participants because it is to
-    be made anew, and the dispose messages are datagrams, of which some may be lost.
+    The ports of the former proxy stay until the new proxy reports participants. Ports also stay if
+    the same proxy reports no participants any more: the operator may have had the proxy unregister
+    the participants before a recreation. Outside may have missed the dispose messages, which are
+    datagrams.
     """
     latest = {place: ports for place, ports in former.items() if place.of in view.rosproxies}
     for place, proxy in view.current.items():
@@ -40,7 +41,7 @@ def remember(view: View, former: Mapping[ProxyPlace, FormerPorts]) -> dict[Proxy
 
 
 def former_ports(view: View, former: Mapping[ProxyPlace, FormerPorts]) -> dict[str, Leases]:
-    """What proxies are to be told of their predecessors, by the uid of their pod."""
+    """Return the ports at the former proxy, by the uid of the pod of the present proxy."""
     return {
         proxy.pod.uid: former[place].leases
         for place, proxy in view.current.items()

@@ -1,39 +1,45 @@
-"""Which of several operators acts: decided by each of them alone, from a Lease that all see.
+"""Decides which operator leads. Each operator decides by itself, from the same Lease object.
 
-The Lease (coordination.k8s.io/v1) names its holder, who writes it anew every `RENEW` seconds. The
-rules are those of k8s.io/client-go, tools/leaderelection:
+The Lease object (coordination.k8s.io/v1) names the holder. The holder renews the object every
+`RENEW` seconds. The rules are from k8s.io/client-go, tools/leaderelection:
 
-- The operator that wrote it last and knows so acts for `DEADLINE` seconds, counted from before
-  that write was sent; not a moment longer, unless the next write has succeeded.
-- An operator that sees the same version of it for `DURATION` seconds takes it, counted from when
-  that version was first seen, which is after it was written.
-- A write goes through only if the Lease is still the version that was seen (resourceVersion).
+- The holder acts for `DEADLINE` seconds after a successful write, and stops unless the next write
+  succeeds. The time counts from before the operator sent the write.
+- An operator that sees the same version of the Lease object for `DURATION` seconds takes the
+  object, or later if the holder wrote a longer duration. The time counts from when the operator
+  first saw the version, which is after the write.
+- A write succeeds only if the Lease object still has the version that was read (resourceVersion).
 
-`DURATION` is longer than `DEADLINE`, so that no operator begins before the former one has ended.
-Each counts on a clock of its own; the times that stand in the Lease are for people alone.
+`DURATION` is longer than `DEADLINE`, so the former leader has stopped before the next leader acts.
+Each operator counts on its own clock. The times in the Lease object are only for people.
 """
 
 import msgspec
 from msgspec.structs import replace
 
 DURATION = 10.0
-"""Seconds without a renewal after which another operator takes the Lease."""
+"""Seconds without a renewal after which another operator takes the Lease object."""
 DEADLINE = 6.0
-"""Seconds for which a holder acts after a renewal. Its requests have until `DURATION` to arrive."""
+"""Seconds that a holder acts after a renewal. Requests under way may arrive until `DURATION`."""
 RENEW = 2.0
 """Seconds between two renewals."""
 LOOK = 1.0
-"""Seconds at most between two looks of an operator that stands by."""
+"""Longest time between two reads of the Lease object by a standby, in seconds."""
 NEVER = float("-inf")
 NOBODY = "nobody"
-"""The holder of a Lease that was missing and is made anew: it, too, has to run out first."""
+"""Holder of a Lease object that an operator creates because there is none.
+
+This Lease object has to expire, too, before an operator takes it: a leader may still act, if a user
+has deleted the former Lease object.
+"""
 
 
 class LeaseRecord(msgspec.Struct, frozen=True):
-    """A Lease as it is in one ``version``; an empty ``holder``: it was released.
+    """A Lease object in one ``version``, its resourceVersion.
 
-    ``duration`` is what its holder promises, in seconds. ``transitions``: how often another holder
-    has taken it. ``acquired``: when this one has, in its own words.
+    ``holder`` is empty if the holder has released the Lease object. ``duration`` is in seconds.
+    ``transitions`` is the number of changes of the holder. ``acquired`` is the time when the
+    holder took the Lease object, as the holder wrote this time; empty if not written yet.
     """
 
     version: str
@@ -44,11 +50,13 @@ class LeaseRecord(msgspec.Struct, frozen=True):
 
 
 class Candidate(msgspec.Struct, frozen=True):
-    """What one operator knows. ``name`` is like no other's, not even that of its former process.
+    """What an operator knows about the Lease object.
 
-    ``record`` is the Lease as it was read last, None if there is none, ``seen_since`` when that
-    version was first seen, or that there is none; None: it was not read yet. It acts until
-    ``leads_until``; ``terms`` are how often it has begun to.
+    ``name`` is unique to the process: a restarted operator has another name. ``record`` is the
+    Lease object at the last read, None if it does not exist. ``seen_since`` is the time of the
+    first read with the same result, None before the first read. The operator leads until
+    ``leads_until``. ``terms`` is the number of times that the operator has begun to lead. Times are
+    in seconds of the operator's own clock.
     """
 
     name: str
@@ -58,12 +66,12 @@ class Candidate(msgspec.Struct, frozen=True):
     terms: int = 0
 
     def leads(self, now: float) -> bool:
-        """Whether it may act."""
+        """Whether the operator may act."""
         return now < self.leads_until
 
 
 def observe(candidate: Candidate, record: LeaseRecord | None, now: float) -> Candidate:
-    """What is known after the Lease was read; ``now`` is after the answer."""
+    """Return the candidate after a read of the Lease object; ``now`` is after the answer."""
     if record == candidate.record and candidate.seen_since is not None:
         return candidate
     is_holder = record is not None and record.holder == candidate.name
@@ -72,10 +80,10 @@ def observe(candidate: Candidate, record: LeaseRecord | None, now: float) -> Can
 
 
 def next_record(candidate: Candidate, now: float) -> LeaseRecord | None:
-    """What is to be written over what was read; None: nothing, somebody else holds it."""
+    """Return the record to write; None if another operator holds the Lease object."""
     record = candidate.record
     since = now if candidate.seen_since is None else candidate.seen_since
-    if record is None:  # it may have been deleted while an operator acts
+    if record is None:  # a user may have deleted the Lease object while an operator acts
         return LeaseRecord("", NOBODY)
     if record.holder == candidate.name:
         return replace(record, duration=DURATION)
@@ -85,7 +93,7 @@ def next_record(candidate: Candidate, now: float) -> LeaseRecord | None:
 
 
 def after_write(candidate: Candidate, record: LeaseRecord, begun: float, now: float) -> Candidate:
-    """What is known after a write that was sent at ``begun`` is known at ``now`` to be there."""
+    """Return the candidate after a write that was sent at ``begun`` and confirmed at ``now``."""
     if record.holder != candidate.name:
         return candidate
     terms = candidate.terms if candidate.leads(now) else candidate.terms + 1
@@ -93,14 +101,15 @@ def after_write(candidate: Candidate, record: LeaseRecord, begun: float, now: fl
 
 
 def after_resignation(candidate: Candidate) -> Candidate:
-    """What is known by a candidate that acts no more."""
+    """Return the candidate of an operator that has stopped acting."""
     return replace(candidate, leads_until=NEVER)
 
 
 def released_record(record: LeaseRecord | None, name: str) -> LeaseRecord | None:
-    """What a candidate that acts no more is to write; None if the Lease is not its own."""
+    """Return the record that releases the Lease object; None if ``name`` does not hold it."""
     if record is None or record.holder != name:
         return None
-    # Anybody may take it at once. 0 would be refused: ValidateLeaseSpec in k8s.io/kubernetes,
+    # Without a holder, any operator may take the Lease object at once. The API server refuses a
+    # duration of 0: ValidateLeaseSpec in k8s.io/kubernetes,
     # pkg/apis/coordination/validation/validation.go.
     return replace(record, holder="", duration=1.0)
