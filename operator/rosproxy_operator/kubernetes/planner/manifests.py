@@ -1,4 +1,4 @@
-"""What the operator creates in a cluster, as the API server takes it."""
+"""The Kubernetes objects that the operator creates, as JSON for the API server."""
 
 import hashlib
 from collections.abc import Iterator, Mapping
@@ -42,12 +42,12 @@ from rosproxy_operator.proxy_spec.fingerprint import LIVE_VARIABLES, digest
 from rosproxy_operator.proxy_spec.spec import WISHES
 
 STOPS_WITHIN = 5
-"""Seconds that a proxy has to end before it is killed, `_LINGERS` included."""
+"""Seconds from the deletion of a proxy until the kubelet kills the proxy, `_LINGERS` included."""
 _LINGERS = 2
-"""Seconds for which a proxy goes on after its deletion.
+"""Seconds that a proxy goes on after its deletion.
 
-The garbage collector deletes the proxies of a RosProxy that is gone before the operator knows:
-this is the time to tell them that nobody takes over.
+The garbage collector deletes the proxies of a deleted RosProxy before the operator knows of the
+deletion. In these seconds the operator has the proxies unregister their nodes at the master.
 """
 _TAINTS = (
     ("not-ready", "NoExecute"),
@@ -57,26 +57,30 @@ _TAINTS = (
     ("pid-pressure", "NoSchedule"),
     ("unschedulable", "NoSchedule"),
 )
-"""What pods of DaemonSets tolerate.
+"""Taints that pods of DaemonSets tolerate, with the effect of each taint.
 
 ``AddOrUpdateDaemonPodTolerations`` in k8s.io/kubernetes, pkg/controller/daemon/util.
 """
 _LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999), PortRange(12000, 30000))
-"""Where a proxy's outgoing connections may start: never on a port that it is to listen on."""
+"""Ranges from which Linux may take the source ports of a proxy's outgoing connections.
+
+A pod gets the first range without a port on which the proxy listens: see `_local_ports`.
+"""
 
 
 _FINGERPRINTS: dict[Name, tuple[object, str]] = {}
-"""By the pod's name: what its fingerprint was last worked out from, and that fingerprint."""
+"""Cache of `proxy_fingerprint`, by the name of the pod: the inputs, and the fingerprint."""
 _MAX_FINGERPRINTS = 8192
 
 
 class ProxySite(msgspec.Struct, frozen=True):
     """A proxy on a node.
 
-    ``master`` is the real master as the proxy is told it: with a ``uri`` even if it is a Service,
-    ``address`` empty if its name is to be resolved, ``publish`` 0 where that port can't be had.
-    ``peers`` are all of ROS 2: those of the RosProxy, and its proxies on other nodes.
-    ``relay_secret`` is what the proxy and its LAN relay share.
+    ``master`` is the real master for the proxy's settings. The ``uri`` is set even if the master is
+    a Service. If ``address`` is empty, the proxy resolves the host name. If ``publish`` is 0, the
+    proxy does not publish the master. ``peers`` has the ROS 2 peers: the peers that the RosProxy
+    names, and the proxies on other nodes. ``relay_secret`` is the shared secret of the proxy and
+    the LAN relay.
     """
 
     rosproxy: RosProxy
@@ -90,22 +94,22 @@ class ProxySite(msgspec.Struct, frozen=True):
 
     @property
     def own_ports(self) -> PortRange:
-        """The proxy's own ports of the range: with a LAN relay the last one is the LAN relay's."""
+        """The ports of the range for the proxy itself. A LAN relay takes the last port."""
         ports = self.ports
         return PortRange(ports.first, ports.last - 1) if self.rosproxy.spec.multicast else ports
 
     @property
     def lan_relay(self) -> HostPort | None:
-        """Where on the node the proxy's LAN relay listens for it; None without a LAN relay."""
+        """The address at which the LAN relay listens for the proxy; None without a LAN relay."""
         lan = lan_address(self.node, self.advertise_host)
         multicast = self.rosproxy.spec.multicast and lan
         return HostPort(lan, self.ports.last) if multicast else None
 
 
 def lan_address(node: ClusterNode, advertise_host: str) -> str:
-    """A node's own IPv4 address on the LAN; empty if it has none.
+    """The IPv4 address of a node on the LAN; empty if the node has none.
 
-    It is the advertised one, if that is the node's own, else its InternalIP.
+    The advertised host comes first, if this is an address of the node, then the InternalIP.
     """
     ipv4 = [a for a in node.addresses.values() if is_address(a) and ":" not in a]
     internal = node.addresses.get("InternalIP", "")
@@ -118,15 +122,17 @@ def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
 
 
 def policy_of(rosproxy: RosProxy, settings: ClusterSettings) -> tuple[PolicyLayer, ...]:
-    """The layers of a RosProxy's proxies; each further layer can only narrow."""
+    """The policy layers of a RosProxy's proxies: the administrator's, then the RosProxy's."""
     return (*settings.policy, *rosproxy.spec.policy)
 
 
 def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
-    """A proxy's pod.
+    """The pod of a proxy.
 
-    The fingerprint says what the pod is made of, except its image, which can be exchanged, its
-    policy and its peers; then under what its nodes know the proxy, see `keeps_registrations`.
+    The fingerprint has two parts with a hyphen between. The first part is a digest of the pod
+    without the image, the policy and the peers, which the operator changes in a running pod. The
+    second part is a hash of the master, the domain and the advertised host: see
+    `keeps_registrations`.
     """
     rosproxy = site.rosproxy
     container = _container(site, settings)
@@ -136,7 +142,7 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
         ADVERTISE_HOST: site.advertise_host,
     }
     meta = pod_metadata(rosproxy, proxy_id(rosproxy.id, site.node.name), annotations, settings)
-    # A running proxy is told new peers as well, which come and go with the nodes.
+    # The operator also sends new peers to a running proxy. Peers come and go with the nodes.
     live = {*LIVE_VARIABLES, variable("ros2_peer")}
     env = [v for v in container["env"] if v["name"] not in live]
     spec = {**_spec(site, settings), "containers": [{**container, "image": "", "env": env}]}
@@ -144,15 +150,16 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     ros2 = rosproxy.spec.ros2
     graph = f"{site.master.uri}{f' domain {ros2.number}' if ros2 else ''} {site.advertise_host}"
     identity = hashlib.sha256(graph.encode()).hexdigest()[:8]
-    # The fingerprint is worked out without itself, and is on the pod then.
+    # The digest is of the pod without the fingerprint annotation, which is added only now.
     meta["annotations"][FINGERPRINT] = f"{digest(body)}-{identity}"
     return {**body, "spec": {**spec, "containers": [container]}}
 
 
 def proxy_fingerprint(site: ProxySite, settings: ClusterSettings) -> str:
-    """The fingerprint of a proxy's pod, worked out anew only if what it is made of has changed.
+    """The fingerprint of a proxy's pod, from a cache while the inputs are the same.
 
-    With a thousand proxies it would take half the time of a look. Peers are no part of it.
+    Without the cache, the fingerprints of a thousand proxies would take half the time of a look.
+    The peers are no input.
     """
     rosproxy = site.rosproxy
     inputs = (rosproxy.uid, rosproxy.spec, site.node, site.advertise_host, site.ports, site.master)
@@ -167,20 +174,21 @@ def proxy_fingerprint(site: ProxySite, settings: ClusterSettings) -> str:
 
 
 def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
-    """A RosProxy's Service: its one address leads each pod to the proxy on the pod's own node."""
+    """The Service of a RosProxy. The same address leads each pod to the proxy on its own node."""
     annotations: dict[str, str] = {}
     meta = metadata(rosproxy, service_id(rosproxy.id), annotations)
     spec: dict[str, Any] = {
         "type": "ClusterIP",
         "selector": meta["labels"],
         "internalTrafficPolicy": "Local",
-        # A proxy that does not reach its master must still be there to say so.
+        # A proxy that does not reach the master is not ready, but has to tell its nodes so.
         "publishNotReadyAddresses": True,
         "ports": [*_service_ports(rosproxy)],
     }
     body = {"apiVersion": "v1", "kind": "Service", "metadata": meta, "spec": spec}
     annotations[FINGERPRINT] = digest(body)
-    # No part of the fingerprint: a Service that has got another address is not made anew for that.
+    # The address is no part of the fingerprint: the operator does not recreate a Service that got
+    # another address.
     if cluster_ip:
         spec["clusterIP"] = cluster_ip
     return body
@@ -197,20 +205,22 @@ def _service_ports(rosproxy: RosProxy) -> Iterator[Json]:
 
 
 def keeps_registrations(old: str, new: str) -> bool:
-    """Whether a new proxy finds at its master the former one's nodes, by both fingerprints.
+    """Whether a new proxy finds the nodes of the former proxy at the master.
 
-    It does if both have the same master, or domain, and the same advertised host.
+    ``old`` and ``new`` are the fingerprints of the two pods. Both pods need the same master, domain
+    and advertised host, that is the same second part. An old fingerprint may have no second part;
+    then the function returns True.
     """
     return old.partition("-")[2] in ("", new.partition("-")[2])
 
 
 def fingerprint_of(body: Json) -> str:
-    """The fingerprint that is written on an object."""
+    """The fingerprint in the annotations of an object."""
     return str(body["metadata"]["annotations"][FINGERPRINT])
 
 
 def without_cluster_ip(body: Json) -> Json:
-    """A Service that takes any address, for when another Service has its former one now."""
+    """The Service without a fixed address, for when another Service has the former address."""
     spec = {key: value for key, value in body["spec"].items() if key != "clusterIP"}
     return {**body, "spec": spec}
 
@@ -218,7 +228,10 @@ def without_cluster_ip(body: Json) -> Json:
 def metadata(
     rosproxy: RosProxy, id: Name, annotations: dict[str, str], component: str = PROXY
 ) -> dict[str, Any]:
-    """The metadata of an object that belongs to a RosProxy and goes with it."""
+    """The metadata of an object of a RosProxy.
+
+    The garbage collector deletes the object after the RosProxy (``ownerReferences``).
+    """
     owner = {
         "apiVersion": API_VERSION,
         "kind": KIND,
@@ -251,9 +264,10 @@ def pod_metadata(
 def helper_pod(
     site: ProxySite, id: Name, settings: ClusterSettings, container: Json, spec: Json
 ) -> Json:
-    """A pod beside a proxy, with these fields of its container and its spec, and without rights.
+    """A pod beside a proxy, without capabilities and without an account at the API server.
 
-    The container has the name of the component.
+    ``container`` and ``spec`` are the fields that differ between the kinds of pods. The name of the
+    container is also the component label of the pod.
     """
     policy = site.rosproxy.spec.image_pull_policy or settings.image_pull_policy
     own_container = {
@@ -280,13 +294,11 @@ def helper_pod(
 
 
 def _spec(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
-    """The spec of a proxy's pod but for its container.
-
-    The pod is bound to its node through the scheduler, as a DaemonSet's: it checks the ports.
-    """
+    """The spec of a proxy's pod, without the container."""
     spec = site.rosproxy.spec
     aliases = [dict(alias) for alias in spec.host_aliases]
-    # No kubelet has to allow it: k8s.io/kubernetes, pkg/kubelet/sysctl/safe_sysctls.go.
+    # A safe sysctl, which every kubelet allows: k8s.io/kubernetes,
+    # pkg/kubelet/sysctl/safe_sysctls.go.
     sysctls = [{"name": "net.ipv4.ip_local_port_range", "value": _local_ports(site)}]
     return {
         **bound_to(site.node.name, spec, settings),
@@ -297,10 +309,10 @@ def _spec(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
 
 
 def pod_security_context(settings: ClusterSettings) -> dict[str, Any]:
-    """The ``securityContext`` of pods of the proxies' image.
+    """The ``securityContext`` of pods with the proxy's image.
 
-    The programs for the kernel plane belong to the image's group. Container runtimes refuse a
-    runAsGroup without a runAsUser.
+    The process has to be in the image's group, to which the programs for the kernel plane belong.
+    Container runtimes refuse runAsGroup without runAsUser: then the group is a supplemental group.
     """
     user = settings.pod.run_as_user
     in_group = {"runAsUser": user, "runAsGroup": USER} if user else {"supplementalGroups": [USER]}
@@ -312,7 +324,11 @@ def pod_security_context(settings: ClusterSettings) -> dict[str, Any]:
 
 
 def bound_to(node: str, spec: RosProxySpec, settings: ClusterSettings) -> dict[str, Any]:
-    """What the specs of all pods have in common that the operator makes for a node."""
+    """The fields that the specs of all pods of the operator share.
+
+    The affinity binds the pod to the node, as for the pods of a DaemonSet. So the scheduler still
+    checks hostPorts, resources and taints.
+    """
     field = {"key": "metadata.name", "operator": "In", "values": [node]}
     terms = {"nodeSelectorTerms": [{"matchFields": [field]}]}
     tolerations = [
@@ -326,7 +342,8 @@ def bound_to(node: str, spec: RosProxySpec, settings: ClusterSettings) -> dict[s
         "tolerations": [*tolerations, *map(dict, spec.tolerations or ())],
         "restartPolicy": "Always",
         "automountServiceAccountToken": False,
-        # Services called rosproxy-… would otherwise set variables that are the proxy's options.
+        # Otherwise the kubelet sets variables ROSPROXY_… for Services rosproxy-…, and the proxy
+        # reads these variables as options.
         "enableServiceLinks": False,
         **({"imagePullSecrets": secrets} if secrets else {}),
         **({"priorityClassName": priority} if priority else {}),
@@ -344,10 +361,10 @@ def _local_ports(site: ProxySite) -> str:
 
 
 def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
-    """A proxy's container.
+    """The container of a proxy.
 
-    The programs that make rules in the kernel have their capability from their files: Kubernetes
-    calls it escalation.
+    The programs that write kernel rules get NET_ADMIN from a file capability. Kubernetes allows
+    this only with ``allowPrivilegeEscalation``.
     """
     spec = site.rosproxy.spec
     policy = spec.image_pull_policy or settings.image_pull_policy
@@ -371,7 +388,7 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
         "livenessProbe": _probe("/healthz", 10),
         "readinessProbe": _probe("/readyz", 2),
         "lifecycle": {"preStop": {"exec": {"command": ["sleep", str(_LINGERS)]}}},
-        # So the container's status has the last log lines, which `pod_failures` quotes.
+        # The container's status then has the last log lines, which `pod_failures.py` quotes.
         "terminationMessagePolicy": "FallbackToLogsOnError",
         "securityContext": {
             "allowPrivilegeEscalation": forwards,
@@ -382,7 +399,7 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
 
 
 def _told(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:
-    """The settings of a proxy, by their fields, in the order of `environment`."""
+    """The values for the fields of a proxy's settings, in the order of the variables."""
     spec = site.rosproxy.spec
     policy = policy_of(site.rosproxy, settings)
     return {
@@ -395,10 +412,11 @@ def _told(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:
         "admin": HostPort("0.0.0.0", ADMIN_PORT),
         "inside_networks": site.node.pod_networks,
         "cleanup_after": spec.cleanup_after,
-        # The order of former operators.
+        # The order of operators of former releases. With another order, an upgrade of the operator
+        # would change the fingerprints and recreate all proxies.
         **dict.fromkeys(("slave_control", "direction", "udp", "data_plane")),
         **msgspec.structs.asdict(spec.proxy),
-        # The operator decides, the RosProxy may only narrow it.
+        # A RosProxy may only narrow what the operator's option allows.
         "slave_control": WISHES["slave_control"].first(
             (settings.bounds.slave_control, spec.proxy.slave_control)
         ),
@@ -409,7 +427,7 @@ def _told(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:
         "ros2_lan_relay": site.lan_relay,
         "ros2_lan_relay_secret": site.relay_secret if site.lan_relay else None,
         **msgspec.structs.asdict(settings.proxy_bounds),
-        # Without a policy there is nothing to wait for, which takes a second after each restart.
+        # Without a policy the proxy must not wait, because a wait costs a second at each restart.
         "await_policy": AWAITED if policy else None,
         "policy_layers": as_variable(policy),
     }

@@ -1,7 +1,8 @@
-"""Findings about misspelt labels and annotations: at the RosProxy for which they may be meant.
+"""Findings about misspelt labels and annotations of RosProxies, nodes, Services and pods.
 
-A pod gets an Event as well, and the Event alone if its namespace has no RosProxy. The texts stay
-the same from look to look, so that each becomes one Event, and each namespace gets only a few.
+A finding about a pod becomes an Event on the pod. If the namespace has RosProxies, the status of
+the first also shows the finding. The texts stay the same from look to look, so each text becomes a
+single Event.
 """
 
 from collections.abc import Iterable, Iterator
@@ -18,12 +19,12 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.status.findings import finding
 
 MOST_PODS = 10
-"""Reported pods of a namespace: all pods of a Deployment have the same labels."""
+"""Most pods that are reported in a namespace: all pods of a Deployment have the same labels."""
 REASON = "UnknownName"
 
 
 def misspellings(view: View, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
-    """What is wrong with names at a RosProxy, its nodes and the Service of its master."""
+    """Yield the findings about names at a RosProxy, at its nodes and at the master's Service."""
     observed = view.observed
     yield from (finding(rosproxy, REASON, text) for text in rosproxy.misspelt)
     for place in view.places.get(rosproxy.id, ()):
@@ -40,7 +41,7 @@ def _others(rosproxy: RosProxy, subject: str, texts: Iterable[str]) -> Iterator[
 
 
 def misspelt_pod_findings(view: View) -> Iterator[ClusterFinding]:
-    """What is wrong with names at pods. Of several RosProxies of a namespace the first gets it."""
+    """Yield the findings about names at pods, each for the first RosProxy of the namespace."""
     pods = (p for p in view.observed.misspelt_pods if not (p.ended or p.deleting))
     for namespace, group in group_by_key((pod.id.namespace, pod) for pod in pods).items():
         rosproxies = (id for id in view.rosproxies if id.namespace == namespace)

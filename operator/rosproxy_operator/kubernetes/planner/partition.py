@@ -1,9 +1,9 @@
-"""A cluster in parts that have nothing to do with each other, so that each can be planned alone.
+"""Splits a cluster into independent parts, so that the operator plans only the parts that change.
 
-RosProxies of one namespace choose among the same pods, and proxies on one node among the same
-ports: so a part is made of namespaces and of the nodes that they use, with all that is connected by
-these. `plan` plans a part as it does a whole cluster: `partition_snapshot` reduces the snapshot to
-that part, and `merge_state` puts the part's new state into the state of the whole.
+RosProxies of a namespace choose among the same pods, and proxies on a node among the same ports. So
+a part is a set of namespaces and the nodes that these namespaces use. Two namespaces that use the
+same node are in the same part. `partition_snapshot` reduces the snapshot to a part. `plan` plans
+the part like a whole cluster. `merge_state` puts the new state of the part into the whole state.
 """
 
 from collections import defaultdict
@@ -18,7 +18,7 @@ from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Help
 
 
 class Partition(msgspec.Struct, frozen=True):
-    """Namespaces with RosProxies, and the nodes that they use."""
+    """Namespaces, and the nodes that these namespaces use."""
 
     namespaces: frozenset[str] = frozenset()
     nodes: frozenset[str] = frozenset()
@@ -27,9 +27,9 @@ class Partition(msgspec.Struct, frozen=True):
 def partition_of(
     observed: ClusterSnapshot, namespaces: Iterable[str], nodes: Iterable[str] = ()
 ) -> Partition:
-    """What may have to be planned anew if something of these namespaces or nodes has changed.
+    """Return the part to plan after a change in these namespaces or nodes.
 
-    A node that nobody uses concerns nobody.
+    A node that no namespace uses adds nothing.
     """
     nodes_of: dict[str, set[str]] = defaultdict(set)
     users: dict[str, set[str]] = defaultdict(set)
@@ -51,7 +51,7 @@ def partition_of(
 
 
 def partitions(observed: ClusterSnapshot) -> Iterator[Partition]:
-    """All parts."""
+    """Yield all parts of the cluster."""
     pending = {r.id.namespace for r in observed.rosproxies}
     pending |= {name.namespace for name in observed.unusable}
     pending |= {namespace for namespace, _ in _uses(observed)}
@@ -65,7 +65,11 @@ def partitions(observed: ClusterSnapshot) -> Iterator[Partition]:
 
 
 def _uses(observed: ClusterSnapshot) -> Iterator[tuple[str, str]]:
-    """Which namespace uses which node: by pods, by proxies, or by ports that it had on it."""
+    """Yield pairs of a namespace and a node that the namespace uses.
+
+    A namespace uses a node by selected pods, by pods of the operator, or by a range of ports in the
+    status of a RosProxy.
+    """
     for pod in observed.pods:
         if pod.uid in observed.selected:
             yield pod.id.namespace, pod.node
@@ -78,7 +82,7 @@ def _uses(observed: ClusterSnapshot) -> Iterator[tuple[str, str]]:
 
 
 def partition_snapshot(observed: ClusterSnapshot, partition: Partition) -> ClusterSnapshot:
-    """The snapshot of a part alone. What is only looked up by name is left as it is."""
+    """Return the snapshot of a part. Fields that the plan only searches by name stay whole."""
     namespaces = partition.namespaces
     return replace(
         observed,
@@ -109,21 +113,21 @@ _NAMESPACES: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(_BY_ROSPROXY, lambda key: key.of.namespace),
     "unselected": lambda pod: pod.namespace,
 }
-"""By field of the state: the namespace of a key."""
+"""By field of `ClusterState`: a function that returns the namespace of a key."""
 _NODES: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(("lost", "addresses"), str),
     **dict.fromkeys(("taken", "strange"), lambda key: key[0]),
 }
-"""By field of the state: the node of a key."""
+"""By field of `ClusterState`: a function that returns the node of a key."""
 
 
 def partition_state(state: ClusterState, partition: Partition) -> ClusterState:
-    """The state of a part alone."""
+    """Return the state of a part."""
     return _filtered(state, partition, True)
 
 
 def merge_state(state: ClusterState, partition: Partition, new: ClusterState) -> ClusterState:
-    """The state of the whole cluster, with the new state of a part."""
+    """Return the state of the whole cluster, with the new state of a part."""
     outside = _filtered(state, partition, False)
     names = (*_NAMESPACES, *_NODES)
     merged = {name: {**getattr(outside, name), **getattr(new, name)} for name in names}
@@ -131,7 +135,7 @@ def merge_state(state: ClusterState, partition: Partition, new: ClusterState) ->
 
 
 def _filtered(state: ClusterState, partition: Partition, inside: bool) -> ClusterState:
-    """The state of what is inside a part, or of all outside it."""
+    """Return the state of a part, or with ``inside`` False the state without the part."""
     fields: dict[str, Mapping[Any, Any]] = {}
     for owners, part in ((_NAMESPACES, partition.namespaces), (_NODES, partition.nodes)):
         for name, owner in owners.items():

@@ -1,10 +1,14 @@
-"""From what is seen in a cluster to what is to be done there: the way of a RosProxy.
+"""Plans the next actions in a cluster, from a snapshot, the last state, the settings and the time.
 
-`plan` is a function of what is seen, the state before and the time. `bounds` sets aside RosProxies
-that ask for too much. `view` puts in order what is seen: which proxies are wanted where.
-`state.learn` draws conclusions from it, `allocation.allocate` gives each wanted proxy its ports,
-`reconcile` and `network_policy` say what is to be done to Services, proxies and NetworkPolicies,
-`status` and `events` what users are told, `briefing` and `departures` what proxies are.
+`plan` is a pure function with these steps:
+
+1. `bounds` sets aside the RosProxies that ask for too much.
+2. `cluster_view` sorts the snapshot: which proxies are wanted, and where.
+3. `state.learn` updates the state from the view.
+4. `allocation` gives each wanted proxy a range.
+5. `steps` yields actions for Services, NetworkPolicies, proxies, LAN relays and pods.
+6. `status` and `events` write what users read.
+7. `departures` and `briefing` collect what the operator sends to the proxies.
 """
 
 import json
@@ -77,15 +81,15 @@ _STEPS = (
     remove_image_checks,
     remake_unwired,
 )
-"""What is done for each RosProxy, in this order."""
+"""The functions that plan the actions for a RosProxy, in this order."""
 
 
 class ClusterPlan(msgspec.Struct, frozen=True):
-    """What to do, in this order, and what to remember.
+    """The actions to take, in this order, and the next state.
 
-    One action that fails keeps none of the others from being done. ``briefings`` are what proxies
-    are told, by the uid of their pods. ``next_look_in`` is in how many seconds to look again even
-    if nothing happens; None: no need.
+    If an action fails, the operator still takes the next actions. ``briefings`` has what the
+    operator sends each proxy, by the uid of the pod. ``next_look_in`` is the time to the next look
+    in seconds, if no event comes earlier; None: the operator waits for an event.
     """
 
     actions: tuple[Action, ...] = ()
@@ -102,10 +106,10 @@ def plan(
     now: float,
     stamp: str,
 ) -> ClusterPlan:
-    """The next actions, from everything that is seen; none if all is as it ought to be.
+    """Return the next plan. A plan has no actions if everything is as the RosProxies ask.
 
-    ``state`` is that of the plan before, or an empty one. ``now`` is in seconds of a monotonic
-    clock that goes on as long as the state does; ``stamp`` is the time of day in RFC 3339.
+    ``state`` is the state of the last plan, or an empty state. ``now`` is in seconds of a monotonic
+    clock, the same clock as in ``state``. ``stamp`` is the time of day in RFC 3339.
     """
     full_snapshot = observed
     observed = with_pod_defaults(within_bounds(observed, settings), settings.pod)
@@ -150,7 +154,7 @@ def plan(
 def _pod_findings(
     cluster_view: View, state: ClusterState, now: float
 ) -> tuple[ClusterFinding, ...]:
-    """What is wrong with pods, in namespaces with and without a RosProxy."""
+    """Return the findings about pods, in namespaces with and without a RosProxy."""
     return (
         *cluster_view.findings,
         *unselected_findings(cluster_view, state.unselected, now),
@@ -159,7 +163,7 @@ def _pod_findings(
 
 
 def _waits(context: ClusterContext, departed: departures.Departures) -> Iterator[float]:
-    """The seconds until something is due, whatever happens."""
+    """Yield the seconds to each look that is due without an event."""
     yield from (seconds for seconds in ends(context) if seconds > 0)
     yield from context.retries.pauses()
     yield from departures.next_checks(departed, context.now)
@@ -182,10 +186,10 @@ def _status(
 def stand_by(
     observed: ClusterSnapshot, settings: ClusterSettings, state: ClusterState, now: float
 ) -> ClusterState:
-    """What an operator remembers while another operator acts, to take over from it.
+    """Return the state that a standby remembers, so that the standby can take over.
 
-    That is what can't be seen any more once it is needed: which ports participants had, and which
-    addresses pods had. Everything else is learnt from the cluster by the first plan.
+    The state has only what a new leader can't read from the cluster later: the ports that
+    participants had, and the addresses that pods had. The first plan learns everything else.
     """
     departed = departures.find_departures(observed, state, now).state
     observed = with_pod_defaults(within_bounds(observed, settings), settings.pod)
@@ -194,7 +198,7 @@ def stand_by(
 
 
 def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[RosProxyOnNode]:
-    """What a RosProxy has on each node that its status names: also where it had a proxy."""
+    """Yield the state of a RosProxy on each node where the RosProxy has, wants or had a proxy."""
     lan_relays = {h.node: h for h in context.observed.lan_relays if h.owner == rosproxy.uid}
     image_checks = {h.node: h for h in context.observed.image_checks if h.owner == rosproxy.uid}
     node_names = {
@@ -227,7 +231,7 @@ def _problems(
     states: tuple[RosProxyOnNode, ...],
     shared: Iterable[ClusterFinding],
 ) -> tuple[ClusterFinding, ...]:
-    """All that is wrong with a RosProxy."""
+    """Return all findings about a RosProxy."""
     address = context.cluster_ip(rosproxy)
     pods = context.view.selected_pods.get(rosproxy.id, ()) if address else ()
     webhook = context.observed.webhook
@@ -250,9 +254,10 @@ def _problems(
 def _patch(
     context: ClusterContext, rosproxy: RosProxy | InvalidRosProxy, status: Json
 ) -> Iterator[Action]:
-    """Write a status if it has changed; not over and over again if that does not help.
+    """Yield the action that writes a status, if the status has changed.
 
-    Whether it was written before is judged without its times.
+    If the API server does not keep a status, `Retries` delays the next write. For this comparison
+    the times in the conditions don't count.
     """
     if status != rosproxy.status:
         conditions = [{**c, "lastTransitionTime": ""} for c in status.get("conditions", ())]
