@@ -1,8 +1,8 @@
-"""When an action that has had no effect is tried again: soon, then after ever longer pauses.
+"""Delays the retries of an action that has had no effect, with growing pauses.
 
-The planner asks (`Retries.is_due`) before each action whether it is to be done now. What was asked
-for is noted, with the time and with the error if the API server refused it, and goes into the next
-state; a task that is not asked for any more has had its effect and is forgotten.
+The planner asks `Retries.is_due` before each action. `Retries` records each task, with the time and
+the error of the API server, for the next state. If the planner does not ask again, the task has had
+its effect, and `Retries` forgets the task.
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,19 +13,19 @@ from msgspec.structs import replace
 from rosproxy_operator.kubernetes.resources.model import Name
 
 LAG = 3.0
-"""Seconds after which something that was done must be seen in the API server's lists."""
+"""Seconds from an action until the watches of the API server must show the effect."""
 FIRST = 1.0
-"""Seconds until something that failed is tried again, the first time."""
+"""Seconds from the first failure to the next try."""
 LONGEST = 60.0
-"""Seconds between tries at most."""
+"""Longest pause between two tries, in seconds."""
 PROMPT_RECREATIONS = 3
-"""How often a pod that never got well is made anew without delay."""
+"""Creations of a pod that never runs well, before the operator pauses between creations."""
 
 
 class Task(msgspec.Struct, frozen=True):
-    """Something to be done for a RosProxy to the object ``id``.
+    """A change of the object ``id`` for the RosProxy ``of``.
 
-    ``detail`` tells tasks apart that concern objects of one name, or one object in several ways.
+    ``detail`` is the difference between tasks with the same name of the object, such as the uid.
     """
 
     of: Name
@@ -35,10 +35,10 @@ class Task(msgspec.Struct, frozen=True):
 
 
 class RetryRecord(msgspec.Struct, frozen=True):
-    """How often a task was asked for, and when the last time.
+    """The number of tries of a task, and the time ``at`` of the last try.
 
-    ``effect``: it was seen to be done, yet it may have to be done again. ``error`` is what the
-    API server said of it.
+    With ``effect`` the task has had its effect, but may be due again: a created pod may fail.
+    ``error`` is the error of the API server, empty without an error.
     """
 
     count: int
@@ -48,8 +48,8 @@ class RetryRecord(msgspec.Struct, frozen=True):
 
     @property
     def pause(self) -> float:
-        """Seconds after which it may be tried again."""
-        # The exponents are bounded, since 2.0 ** 1024 raises OverflowError.
+        """Seconds from the last try to the next try."""
+        # The exponents have a limit, because 2.0 ** 1024 raises OverflowError.
         if self.effect and not self.error:
             excess = self.count - PROMPT_RECREATIONS
             return min(FIRST * 2.0 ** min(excess, 10), LONGEST) if excess >= 0 else 0.0
@@ -58,7 +58,10 @@ class RetryRecord(msgspec.Struct, frozen=True):
 
 
 class Retries:
-    """The attempts noted in one look. A task that is not asked about is forgotten."""
+    """The records of one look. ``noted`` becomes the ``attempts`` of the next state.
+
+    ``failures`` has the errors of the API server, by RosProxy and object.
+    """
 
     def __init__(
         self,
@@ -76,7 +79,7 @@ class Retries:
         self._recent: set[Task] = set()
 
     def is_due(self, task: Task) -> bool:
-        """Whether a task is to be done now; if so, that is noted."""
+        """Whether to carry out a task now. If so, the try is recorded."""
         record = self._attempts.get(task)
         if record is not None and self._now - record.at < record.pause:
             self.noted[task] = record
@@ -86,7 +89,10 @@ class Retries:
         return True
 
     def is_recent(self, task: Task, seconds: float) -> bool:
-        """Whether a task was carried out less than so many seconds ago; its record is kept then."""
+        """Whether a task was carried out without an error in the last ``seconds``.
+
+        If so, the record stays, and another look follows after this time.
+        """
         record = self._attempts.get(task)
         left = record.at + seconds - self._now if record is not None else 0.0
         if record is None or record.error or left <= 0:
@@ -97,21 +103,21 @@ class Retries:
         return True
 
     def look_again_in(self, seconds: float) -> None:
-        """Note that something else has to come first: look again in that many seconds."""
+        """Request another look after this time, because another change has to come first."""
         self._later.append(seconds)
 
     def note_effect(self, task: Task) -> None:
-        """Note that a task has had its effect, though it may have to be done again."""
+        """Record that a task has had its effect, and keep the count: the task may be due again."""
         if task in self._attempts:
             self.noted[task] = replace(self._attempts[task], effect=True, error="")
 
     def failures(self, of: Name) -> Mapping[Name, str]:
-        """What can't be done for a RosProxy: what the API server said, by the object."""
+        """The errors of the API server for a RosProxy, by object."""
         noted = self.noted.items()
         return {task.id: record.error for task, record in noted if task.of == of and record.error}
 
     def pauses(self) -> Iterator[float]:
-        """In how many seconds there is something to be tried again."""
+        """Yield the seconds until each next try."""
         yield from self._later
         for task, record in self.noted.items():
             if not record.effect and task not in self._recent:

@@ -1,1 +1,1 @@
-"""Users' pods: whom a RosProxy selects, how they are wired, and what they can't have."""
+"""Users' pods: which pods a RosProxy selects, how the webhook wires pods, and faults of pods."""

@@ -1,9 +1,9 @@
-"""How a pod is wired to its proxy at admission, and whether it is.
+"""Wires pods to the proxy at admission, and finds pods that are not wired.
 
-Wired is a pod whose containers have ROS_MASTER_URI, which leads to its RosProxy's Service and so to
-the proxy on its own node, and ROS_IP; for ROS 2 ROS_STATIC_PEERS leads there. `wire` is for the
-webhook, `wiring_finding` (and for ROS 2 `ros2_pods`) for the planner, which finds pods that no
-webhook has seen.
+The containers of a wired pod have ROS_MASTER_URI and ROS_IP, or ROS_STATIC_PEERS for ROS 2. The
+address in these variables is the address of the RosProxy's Service, which leads to the proxy on the
+same node. The webhook uses `wire`. The planner uses `wiring_finding` (and `ros2_pods`) to find pods
+that no webhook has wired.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -39,15 +39,15 @@ from rosproxy_operator.kubernetes.resources.objects import VARIABLE
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 MIRROR = "kubernetes.io/config.mirror"
-"""Annotation of the API server's picture of a static pod: a change of it changes no container."""
+"""Annotation of the mirror pod of a static pod. A change of a mirror pod changes no container."""
 SETTLED = timedelta(minutes=1)
-"""By so much a pod is newer than what ought to have wired it, if that was ready for certain."""
+"""Time after which a new RosProxy or a new operator is sure to wire pods: see `is_late`."""
 UNKNOWN = WebhookState()
 _KINDS = ("initContainers", "containers")
 
 
 class Wiring(msgspec.Struct, frozen=True):
-    """What the webhook makes of a pod: its new ``spec``, None if it stays as it is."""
+    """The answer of the webhook about a pod. ``spec`` is the new spec, None without a change."""
 
     spec: Json | None = None
     annotations: Mapping[str, str] = {}
@@ -55,9 +55,10 @@ class Wiring(msgspec.Struct, frozen=True):
 
 
 class Target(msgspec.Struct, frozen=True):
-    """What a pod is to be told: the master's URI, peers and domain, unless they are empty.
+    """The values for the variables of a pod. The webhook sets no variable for an empty value.
 
-    ``masters`` are hosts and ports of the real master: a ROS_MASTER_URI that names it is replaced.
+    ``masters`` has the hosts and ports of the real master. The webhook replaces a ROS_MASTER_URI of
+    the template that names this master.
     """
 
     uri: str = ""
@@ -67,7 +68,7 @@ class Target(msgspec.Struct, frozen=True):
 
 
 def target_of(rosproxy: RosProxy, cluster_ip: str) -> Target:
-    """What the pods of a RosProxy are told, by the address of its Service."""
+    """Return the values for the pods of a RosProxy. ``cluster_ip`` is the Service's address."""
     ros2 = rosproxy.spec.ros2
     return Target(
         master_uri(cluster_ip) if rosproxy.spec.ros1 else "",
@@ -78,16 +79,19 @@ def target_of(rosproxy: RosProxy, cluster_ip: str) -> Target:
 
 
 def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring:
-    """Wire a pod, as it is at admission, to its proxy.
+    """Return the wiring of a pod at admission, with ``host_aliases`` added to the pod's aliases.
 
-    Every container and init container that does not set them gets ROS_MASTER_URI, and ROS_IP where
-    it sets no ROS_HOSTNAME either. They come first, so that variables of the template can use them
-    (``$(ROS_MASTER_URI)``). A ROS_MASTER_URI that names the RosProxy's own master is what nodes use
-    without a proxy: it is replaced, and kept in an annotation. For ROS 2 it is ROS_STATIC_PEERS,
-    and ROS_DOMAIN_ID if the RosProxy names a domain. An address that this webhook has set before,
-    as in a copy of a wired pod, is set anew. Wiring a wired pod changes nothing.
+    Each container and init container gets these variables, unless the template sets the variable:
 
-    A pod in its node's own network must not be passed here: see `selection.select_rosproxy`.
+    - ROS 1: ROS_MASTER_URI, and ROS_IP if the template sets no ROS_HOSTNAME either.
+    - ROS 2: ROS_STATIC_PEERS, and ROS_DOMAIN_ID if the RosProxy names a domain.
+
+    New variables come first, because Kubernetes expands ``$(ROS_MASTER_URI)`` only in the variables
+    after it. The webhook replaces a ROS_MASTER_URI that names the RosProxy's own master, and keeps
+    the first such value in an annotation. The webhook also replaces an address that the webhook set
+    earlier, as in a copy of a wired pod. A second wiring of the same pod changes nothing.
+
+    The caller must not pass a pod in the host's network: see `selection.select_rosproxy`.
     """
     annotations = texts_at(pod, "metadata", "annotations")
     if MIRROR in annotations:
@@ -122,19 +126,19 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
 def wiring_finding(
     pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState = UNKNOWN
 ) -> ClusterFinding | None:
-    """What is wrong with a selected pod's ROS_MASTER_URI (reason NotWired); None if nothing is.
+    """Return a finding (reason NotWired) if a selected pod does not use its proxy as the master.
 
-    ``cluster_ip`` is that of the RosProxy's Service.
+    ``cluster_ip`` is the address of the RosProxy's Service.
     """
     text = _wrong_master(pod, rosproxy, cluster_ip, webhook)
     return pod_finding(pod, rosproxy, "NotWired", text, fatal=False) if text else None
 
 
 def has_come_unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
-    """Whether a pod has to be created anew to use its proxy, and would be wired then.
+    """Whether a pod does not use its proxy, and the webhook would wire a recreated pod.
 
-    A pod whose template sets another ROS_MASTER_URI than that of its RosProxy's master would not,
-    nor would a pod whose template sets ROS_STATIC_PEERS, nor a pod without the label.
+    The webhook does not wire a pod without the label. The webhook also keeps ROS_STATIC_PEERS of
+    the template, and a ROS_MASTER_URI of the template that does not name the RosProxy's master.
     """
     masters = _masters_of(rosproxy)
     lacks_master = (
@@ -152,12 +156,12 @@ def has_come_unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
 
 
 def has_peers(container: PodContainer) -> bool:
-    """Whether ROS_STATIC_PEERS is set in a container."""
+    """Whether a container has the variable ROS_STATIC_PEERS."""
     return "ROS_STATIC_PEERS" in container.variables
 
 
 def restart_of(pod: Pod) -> str:
-    """The command that creates a pod anew."""
+    """The kubectl command that recreates a pod."""
     if pod.workload:
         return f"kubectl -n {pod.id.namespace} rollout restart {pod.workload}"
     command = f"kubectl -n {pod.id.namespace} delete pod {pod.id.name}"
@@ -165,33 +169,36 @@ def restart_of(pod: Pod) -> str:
 
 
 def again(pod: Pod) -> str:
-    """What to do to create a pod anew. A pod at admission has no uid, and may have no name."""
+    """The fix that recreates a pod. A pod at admission has no uid, and may have no name."""
     return f"run {restart_of(pod)}" if pod.uid or pod.workload else "create the pod again"
 
 
 def edited(change: str, pod: Pod) -> str:
-    """How to make a change in the template of a pod."""
+    """The fix that makes a ``change`` in the template of a pod, with the kubectl command."""
     if pod.workload:
         return f"{change}: kubectl -n {pod.id.namespace} edit {pod.workload}"
     return f"{change}, then {again(pod)}"
 
 
 def _is_of_former(pod: Pod, rosproxy: RosProxy) -> bool:
-    """Whether a pod was wired to a proxy of a former RosProxy of the same name.
+    """Whether a pod was wired for a deleted RosProxy of the same name.
 
-    The ROS nodes of the pod were unregistered when that RosProxy was deleted, and don't register
-    again by themselves.
+    The proxy unregistered the ROS nodes of the pod when that RosProxy was deleted. ROS 1 nodes
+    don't register again by themselves.
     """
     return bool(pod.wired_master_uri) and _is_older(pod, rosproxy)
 
 
 def _is_older(pod: Pod, rosproxy: RosProxy) -> bool:
-    # RFC 3339 in UTC and whole seconds: the order of the texts is that of the times.
+    # The times are RFC 3339 in UTC with whole seconds, so texts sort like times.
     return bool(pod.created) and pod.created < rosproxy.created
 
 
 def is_late(pod: Pod, rosproxy: RosProxy, ready_since: str) -> bool:
-    """Whether a pod is newer than its RosProxy and than a ready operator, by `SETTLED`."""
+    """Whether a pod is newer, by `SETTLED`, than its RosProxy and than the ready webhook.
+
+    ``ready_since`` is in RFC 3339. False if a time is not known.
+    """
     if not (pod.created and rosproxy.created and ready_since):
         return False
     others = (rosproxy.created, ready_since)
@@ -228,7 +235,7 @@ def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: Webhoo
 def missing_variable_text(
     variable: str, pod: Pod, rosproxy: RosProxy, webhook: WebhookState
 ) -> str:
-    """The text about a pod without a variable that names the proxy: the reason and the fix."""
+    """The text about a pod without the variable: the fault, the reason and the fix."""
     text = f"has no variable {variable} with the address of the proxy"
     if INJECT not in pod.labels:
         label = f"{INJECT}={rosproxy.id.name}"
@@ -252,7 +259,10 @@ def missing_variable_text(
 
 
 def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:
-    """Whether a ROS_MASTER_URI leads to a RosProxy's Service, by address or by name."""
+    """Whether a ROS_MASTER_URI leads to a RosProxy's Service, by address or by name.
+
+    The operator can't see a value that is only known at run time, and accepts that value.
+    """
     if uri == VALUE_AT_RUNTIME:
         return True
     master = parse_slave_uri(uri.strip())
@@ -265,7 +275,7 @@ def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:
 
 
 def _masters_of(rosproxy: RosProxy) -> frozenset[HostPort]:
-    """How the pods of a RosProxy may name its real master; hosts in lower case."""
+    """The hosts and ports by which pods may name the real master of a RosProxy, in lower case."""
     master = rosproxy.spec.master
     service = rosproxy.spec.master.service
     if service is None:
@@ -280,16 +290,16 @@ def _masters_of(rosproxy: RosProxy) -> frozenset[HostPort]:
 
 
 def _names_one(uri: str, masters: Collection[HostPort]) -> bool:
-    """Whether a ROS_MASTER_URI names one of these masters, whatever its case."""
+    """Whether a ROS_MASTER_URI names one of these masters, in upper or lower case."""
     plain = uri.strip().lower()
     named = parse_slave_uri(plain)
-    if named is None or plain.removesuffix("/").count("/") != 2:  # a path is another's
+    if named is None or plain.removesuffix("/").count("/") != 2:  # a master's URI has no path
         return False
     return HostPort(named.host.rstrip("."), named.port) in masters
 
 
 def _replaced(spec: Json, target: Target) -> str:
-    """The first ROS_MASTER_URI of a pod's template that is replaced; empty if none is."""
+    """The first ROS_MASTER_URI of a template that the webhook replaces; empty without one."""
     containers = (container for kind in _KINDS for container in submaps(spec, kind))
     own = (v for c in containers for v in submaps(c, "env") if v.get("name") == VARIABLE)
     values = (text_at(variable, "value") for variable in own)
@@ -297,7 +307,7 @@ def _replaced(spec: Json, target: Target) -> str:
 
 
 def _addresses(target: Target) -> list[tuple[str, str, str]]:
-    """The annotation, the variable and the value of each address that a pod is to be told."""
+    """The annotation, the variable and the value of each address for a pod."""
     variables = (
         (MASTER_URI, VARIABLE, target.uri),
         (STATIC_PEERS, "ROS_STATIC_PEERS", target.static_peers),
@@ -329,13 +339,16 @@ def _wired(container: Json, target: Target, annotations: Mapping[str, str]) -> J
 
 
 def _value(container: Json, name: str) -> str:
-    """A variable of a container; of several that count it is the last."""
+    """The value of a variable of a container. The last of equal names counts."""
     env = submaps(container, "env")
     return next((text_at(v, "value") for v in reversed(env) if v.get("name") == name), "")
 
 
 def _merged(own: Iterable[Json], added: Iterable[Json]) -> list[Json]:
-    """Host aliases with others added: one entry per address, as the API server merges them."""
+    """Host aliases of a pod with ``added`` aliases. Each address has a single entry.
+
+    The API server merges by address, too.
+    """
     merged = list(own)
     for alias in added:
         index = next((i for i, a in enumerate(merged) if a.get("ip") == alias.get("ip")), None)

@@ -1,4 +1,4 @@
-"""What is wrong with labelled pods that no operator is needed to see, for the doctor."""
+"""Findings of the doctor about labelled pods. The doctor reads the pods without an operator."""
 
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -16,13 +16,16 @@ from rosproxy_operator.kubernetes.resources.model import Pod, RosProxy
 from rosproxy_operator.kubernetes.resources.names import INJECT
 
 MOST_COMMANDS = 5
-"""Commands in a fix."""
+"""Most commands in a fix."""
 MOST_MISSPELT = 10
-"""Misspelt names of pods that are reported."""
+"""Most findings about misspelt names of pods."""
 
 
 def lonely_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> Iterator[DoctorFinding]:
-    """An error for each namespace that has labelled pods, but no RosProxy."""
+    """Yield an error for each namespace that has labelled pods, but no RosProxy.
+
+    ``with_rosproxy`` has the namespaces with a RosProxy.
+    """
     lonely = (p for p in pods if wants_proxy(p) and p.id.namespace not in with_rosproxy)
     for namespace, group in sorted(group_by_key((p.id.namespace, p) for p in lonely).items()):
         names = listed(sorted(p.id.name for p in group))
@@ -36,7 +39,10 @@ def lonely_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> Itera
 
 
 def misspelt_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> list[DoctorFinding]:
-    """An error for each misspelt name of pods, where no RosProxy has a status that reports it."""
+    """Return an error for each misspelt name of pods, in namespaces without a RosProxy.
+
+    In a namespace with a RosProxy, the status of the RosProxy reports the name.
+    """
     lonely = sorted((p for p in pods if p.id.namespace not in with_rosproxy), key=lambda p: p.id)
     first: dict[tuple[str, str], Pod] = {}
     for pod in lonely:
@@ -47,9 +53,10 @@ def misspelt_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> lis
 
 
 def unreached(pods: Iterable[Pod], rosproxies: Sequence[RosProxy], ready_since: str) -> list[str]:
-    """The pods that no operator has wired, though an operator was ready when they were created.
+    """Return the pods that are not wired, although an operator was ready at their creation.
 
-    ``ready_since`` is the time since when an operator is ready, in RFC 3339; empty if none is.
+    ``ready_since`` is the time in RFC 3339 at which an operator became ready; empty if no operator
+    is ready. Then the result is empty.
     """
     chosen = [(pod, select_rosproxy(pod, rosproxies)) for pod in pods]
     return sorted(

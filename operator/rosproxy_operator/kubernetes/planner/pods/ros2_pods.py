@@ -1,8 +1,8 @@
-"""What keeps a selected pod's ROS 2 nodes from being discovered, as far as the pod itself tells.
+"""Findings about selected pods whose ROS 2 nodes the proxy can't discover.
 
-The webhook has set ROS_STATIC_PEERS to the address of the RosProxy's Service, which leads to the
-proxy on the pod's own node. Where that can't help, the pod gets an Event. The operator does not see
-variables that an image sets: only the name of the image may give the distribution.
+The webhook sets ROS_STATIC_PEERS to the address of the RosProxy's Service, which leads to the proxy
+on the pod's own node. A pod in which this variable has no effect gets an Event. The operator does
+not see variables that the image sets. So only the name of the image may tell the distribution.
 """
 
 import re
@@ -28,16 +28,16 @@ from rosproxy_operator.kubernetes.resources.names import service_id
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 BEFORE_IRON = ("ardent", "bouncy", "crystal", "dashing", "eloquent", "foxy", "galactic", "humble")
-"""Distributions that know no ROS_STATIC_PEERS (rmw_dds_common has it since Iron)."""
+"""Distributions without ROS_STATIC_PEERS (rmw_dds_common reads this variable since Iron)."""
 _OLD = re.compile(rf"(?<![a-z0-9])({'|'.join(BEFORE_IRON)})(?![a-z0-9])")
 _RANGES_WITHOUT_PEERS = ("OFF", "SYSTEM_DEFAULT")
-"""Values of ROS_AUTOMATIC_DISCOVERY_RANGE with which static peers are not used."""
+"""Values of ROS_AUTOMATIC_DISCOVERY_RANGE with which ROS 2 does not use static peers."""
 
 
 def ros2_findings(
     pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState = UNKNOWN
 ) -> Iterator[ClusterFinding]:
-    """What is wrong with a pod's variables; ``address`` is that of the RosProxy's Service."""
+    """Yield the findings about a pod's variables. ``address`` is the RosProxy's Service."""
     if rosproxy.spec.ros2 is None:
         return
     problems = dict.fromkeys(
@@ -52,7 +52,7 @@ def ros2_findings(
 
 
 def _peers_problem(pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState) -> str:
-    """What is wrong with what the webhook has set, or has not."""
+    """The fault of the ROS_STATIC_PEERS that the webhook sets; empty if there is no fault."""
     if pod.static_peers and pod.static_peers != address:
         return (
             f"was wired to {clean(pod.static_peers)[:200]} (ROS_STATIC_PEERS), but the proxy is at "
@@ -66,7 +66,7 @@ def _peers_problem(pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookS
 def _problems(
     container: PodContainer, pod: Pod, rosproxy: RosProxy, address: str
 ) -> Iterator[tuple[str, str]]:
-    """Reason and text of what is wrong with a container."""
+    """Yield the reason and the text of each fault of a container."""
     get = container.variables.get
     rmw = get("RMW_IMPLEMENTATION", "")
     if not is_dds(rmw):
@@ -109,7 +109,7 @@ def _problems(
 
 
 def _names_service(peers: str, rosproxy: RosProxy, address: str) -> bool:
-    """Whether static peers, listed with semicolons, name a RosProxy's Service."""
+    """Whether static peers name a RosProxy's Service. A semicolon separates two peers."""
     service = service_id(rosproxy.id)
     short = f"{service.name}.{service.namespace}"
     hosts = (h.strip().lower().rstrip(".") for h in peers.split(";"))

@@ -1,4 +1,4 @@
-"""Which pods a RosProxy takes."""
+"""Selects the RosProxy of a pod, by the pod's labels."""
 
 from collections.abc import Iterable, Mapping
 
@@ -14,17 +14,17 @@ from rosproxy_operator.kubernetes.resources.names import COMPONENT_LABEL, INJECT
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 LABEL_OFF_VALUES = ("", "false")
-"""Values of the label with which a pod is left alone, whatever a podSelector says."""
+"""Values of the label with which no RosProxy selects the pod, not even by a podSelector."""
 MOST_NAMES = 5
-"""RosProxies that a text names."""
+"""Most RosProxies that a text names."""
 _ANY = "true"
 _PART_OF_LABEL = "app.kubernetes.io/part-of"
 
 
 def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
-    """Whether a label selector fits labels.
+    """Whether a label selector matches labels.
 
-    As ``Requirement.Matches`` in k8s.io/apimachinery, pkg/labels/selector.go, says.
+    The rules are from ``Requirement.Matches`` in k8s.io/apimachinery, pkg/labels/selector.go.
     """
     if any(labels.get(key) != value for key, value in selector.labels.items()):
         return False
@@ -32,15 +32,16 @@ def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
 
 
 def own_values(name: str) -> tuple[str, str]:
-    """The values of the label with which the RosProxy ``name`` is asked for."""
+    """The values of the label that ask for the RosProxy ``name``."""
     return _ANY, name
 
 
 def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFinding | None:
-    """The RosProxy of a pod, of those of any namespace that are not being deleted.
+    """Return the RosProxy that takes a pod, or the reason why a selected pod gets no proxy.
 
-    Of several it is the one that the pod's label names. A finding (reason Ambiguous or HostNetwork)
-    says why it has none though it was selected; None: no RosProxy selects it.
+    If several RosProxies select the pod, the pod's label decides. Without a decision the result is
+    a finding with the reason Ambiguous. For a pod in the host's network the result is a finding
+    with the reason HostNetwork. If no RosProxy selects the pod, the result is None.
     """
     taking = sorted((r for r in rosproxies if selects(r, pod)), key=lambda r: r.id)
     named = [r for r in taking if r.id.name == pod.labels.get(INJECT)]
@@ -64,9 +65,10 @@ def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | Clus
 
 
 def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
-    """Why no RosProxy takes a pod that is labelled, and what to do.
+    """Return why no RosProxy selects a labelled pod, and the fix.
 
-    Empty if the pod is not labelled, or its label says that it is to be left alone.
+    The result is empty if the pod has no label, or a value of `LABEL_OFF_VALUES`. The caller has
+    checked that no RosProxy selects the pod.
     """
     label = pod.labels.get(INJECT, "")
     names = sorted(r.id.name for r in rosproxies if r.id.namespace == pod.id.namespace)
@@ -94,17 +96,20 @@ def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
 
 
 def wants_proxy(pod: Pod) -> bool:
-    """Whether a pod asks for a proxy by its label."""
+    """Whether the label of a pod asks for a proxy."""
     return pod.labels.get(INJECT, "") not in LABEL_OFF_VALUES and not _is_ours(pod.labels)
 
 
 def on_node(rosproxy: RosProxy, node: ClusterNode) -> bool:
-    """Whether the RosProxy's nodeSelector fits a node."""
+    """Whether the RosProxy's nodeSelector matches a node."""
     return matches(Selector(rosproxy.spec.node_selector or {}), node.labels)
 
 
 def selects(rosproxy: RosProxy, pod: Pod) -> bool:
-    """Whether a RosProxy that is not being deleted selects a pod, perhaps along with others."""
+    """Whether a RosProxy selects a pod. Another RosProxy may select the same pod.
+
+    A RosProxy that is being deleted selects no pod.
+    """
     label = pod.labels.get(INJECT)
     selector = rosproxy.spec.pod_selector
     same_namespace = rosproxy.id.namespace == pod.id.namespace
@@ -116,7 +121,10 @@ def selects(rosproxy: RosProxy, pod: Pod) -> bool:
 
 
 def _is_ours(labels: Mapping[str, str]) -> bool:
-    """Whether labels are those of a proxy, or of the operator as its chart labels it."""
+    """Whether a pod belongs to the operator: a proxy, a helper pod or the operator's own pod.
+
+    The operator's own pod has the labels that the chart sets.
+    """
     names = (labels.get(NAME_LABEL), labels.get(_PART_OF_LABEL))
     return is_own(labels) or (labels.get(COMPONENT_LABEL) == "operator" and "rosproxy" in names)
 

@@ -1,7 +1,7 @@
-"""Pods that ask for a proxy by their label, and that no RosProxy selects.
+"""Findings about pods whose label asks for a proxy, and that no RosProxy selects.
 
-The webhook warns at admission, but the controllers of Deployments drop its warnings. So such a pod
-gets an Event, and the RosProxy for which the label may be meant reports the pod.
+The webhook warns at admission, but the controller of a Deployment drops warnings. So the pod gets
+an Event. If the namespace has RosProxies, the status of the first also reports the pod.
 """
 
 from collections.abc import Iterator, Mapping
@@ -12,16 +12,19 @@ from rosproxy_operator.kubernetes.planner.pods.selection import why_not_selected
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Name, Reference
 
 UNSELECTED_FOR_S = 60.0
-"""A pod is reported after this time: its RosProxy may be created after the pod."""
+"""Seconds until a pod is reported: a user may create the RosProxy after the pod."""
 MOST_PODS = 10
-"""Reported pods of a namespace."""
+"""Most pods that are reported in a namespace."""
 
 
 def unselected_findings(
     view: View, since: Mapping[Name, float], now: float
 ) -> Iterator[ClusterFinding]:
-    """Findings about the first few of these pods; ``since`` is when each was first seen so."""
-    # A RosProxy that can't be read has a condition, and may be the one that is meant.
+    """Yield the findings about the first `MOST_PODS` pods of each namespace.
+
+    ``since`` is the time at which the operator first saw each pod without a RosProxy.
+    """
+    # The label may mean an unusable RosProxy. The status of that RosProxy tells the fault already.
     unclear = {id.namespace for id in view.observed.unusable}
     pods = (p for p in view.observed.unselected_pods if p.id.namespace not in unclear)
     due = ((p.id.namespace, p) for p in pods if now - since.get(p.id, now) >= UNSELECTED_FOR_S)
@@ -37,5 +40,5 @@ def unselected_findings(
 
 
 def unselected_waits(since: Mapping[Name, float], now: float) -> Iterator[float]:
-    """The seconds until each pod that is not reported yet is to be reported."""
+    """Yield the seconds until each pod that is not reported yet is reported."""
     return (left for at in since.values() if (left := at + UNSELECTED_FOR_S - now) > 0)
