@@ -1,9 +1,8 @@
-"""What the operator remembers from look to look. Losing it costs time, never correctness.
+"""The state that the operator keeps from look to look. A lost state costs time, not correctness.
 
-Each plan makes the next state out of the one before, in two steps: `learn` draws from what is seen
-(which proxy is unwanted now, which node is gone, which has served where, which ports were refused),
-before anything is decided; `decide` adds the ranges that were given. The other parts are those of
-`departures` (addresses), `retries` (attempts) and `events` (reported), each made once as well.
+Each plan makes the next state from the last state, in two steps. `learn` updates the state from
+the view: unwanted proxies, missing nodes, ranges on which proxies serve, refused ports. `decide`
+adds the ranges of this plan. `departures`, `retries` and `events` fill in the other fields.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -36,22 +35,28 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.status.findings import finding
 
 TRIED_FOR = 60.0
-"""Seconds for which it is told that a proxy got other ports than were tried first."""
+"""Seconds that the status reports that a proxy got other ports than the operator tried first."""
 
 
 class ClusterState(msgspec.Struct, frozen=True):
-    """Times are in seconds of the operator's monotonic clock.
+    """The state. Times are in seconds of the operator's monotonic clock.
 
-    ``begun`` is False until the first look. ``absent`` are proxies since when no pod wants them,
-    ``lost`` nodes since when they are not listed any more. ``served`` is the range on which a
-    proxy was last seen to serve, ``given`` the one that it is to have. ``refused`` is since when a
-    proxy that has served does not get its ports back; ``taken`` are ports by node that were refused
-    at last, and when; ``moved`` are the ranges that had to be left, ``tried`` those that could not
-    be had in the first place. ``attempts`` are actions that have not shown an effect yet,
-    ``reported`` problems that Events were made of. ``addresses`` are, by node, those that pods have
-    or had, and when they were last seen to; ``strange``, by node and address, those that a proxy
-    has named and that no pod was seen with, since when. ``former``: see `former_ports`.
-    ``unselected`` are labelled pods that no RosProxy selects, since when.
+    - ``begun``: False until the first look.
+    - ``absent``: the time since when no pod wants the proxy of a place.
+    - ``lost``: the time since when a node with proxies is missing.
+    - ``served``: the range on which the proxy of a place last served.
+    - ``given``: the range that the operator gave the proxy of a place.
+    - ``refused``: the time since when a proxy that has served does not get its ports back.
+    - ``taken``: by node and port, the time of the last refusal of a port.
+    - ``moved``: ranges that proxies left after they had served.
+    - ``tried``: ranges that proxies left before they had served.
+    - ``attempts``: the records of `Retries`.
+    - ``reported``: the findings that became Events, and when.
+    - ``addresses``: by node, the addresses of pods, and when a look last saw a pod with each.
+    - ``strange``: by node and address, the time since when a proxy reports an address that no pod
+      was seen with.
+    - ``former``: see `former_ports`.
+    - ``unselected``: the time since when no RosProxy selects a labelled pod.
     """
 
     begun: bool = False
@@ -72,10 +77,11 @@ class ClusterState(msgspec.Struct, frozen=True):
 
 
 def learn(view: View, state: ClusterState, now: float) -> ClusterState:
-    """What follows from what is seen.
+    """Return the state after a look at the view.
 
-    A range that its proxy does not get is given up at once if it has never served, else after
-    `RETRY_FOR` seconds, since its ports may only be slow to be let go: they count as taken then.
+    If the scheduler or the kubelet refuses the range of a proxy, the ports count as taken, so that
+    the proxy gets another range. This happens at once if the proxy has never served on the range.
+    Otherwise the operator waits `RETRY_FOR` seconds: a former pod may be slow to free the ports.
     """
     absent = view.proxies.keys() - view.wanted.keys()
     lost = {p.node for p in view.observed.proxies} - view.observed.nodes.keys()
@@ -99,7 +105,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
 
 
 def decide(state: ClusterState, ranges: Mapping[ProxyPlace, PortRange], now: float) -> ClusterState:
-    """The state with the ranges that are given, and with the proxies that had to leave theirs."""
+    """Return the state with the ``ranges`` of this plan, and with the proxies that had to move."""
     moved = new_moves(state.served, ranges, now)
     tried = {place: ports for place, ports in state.given.items() if place not in state.served}
     return replace(
@@ -114,7 +120,7 @@ def decide(state: ClusterState, ranges: Mapping[ProxyPlace, PortRange], now: flo
 def moves(
     view: View, state: ClusterState, ranges: Mapping[ProxyPlace, PortRange]
 ) -> Iterator[ClusterFinding]:
-    """Which proxies have had to leave which ports."""
+    """Yield a finding for each proxy that recently had to leave its ports."""
     for moved, has_served in ((state.moved, True), (state.tried, False)):
         for place, move in sorted(moved.items()):
             if place in ranges and is_moved(move.ports, ranges[place]):
@@ -129,7 +135,10 @@ def moves(
 
 
 def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:
-    """Where each proxy has served; what the status says is believed only once, at the start."""
+    """The range on which each proxy last served.
+
+    Only the first look reads the ranges in the statuses: later, the state is newer than a status.
+    """
     served = dict(state.served)
     if not state.begun:
         for name, rosproxy in view.rosproxies.items():
@@ -141,7 +150,7 @@ def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:
 
 
 def _possible(view: View, ranges: Mapping[ProxyPlace, PortRange]) -> dict[ProxyPlace, PortRange]:
-    """The ranges whose RosProxy and whose node exist."""
+    """The ranges of places whose RosProxy and node exist."""
     rosproxies = view.rosproxies
     nodes = view.observed.nodes
     return {p: ports for p, ports in ranges.items() if p.of in rosproxies and p.node in nodes}
@@ -157,9 +166,9 @@ def _refused(
     since: Mapping[ProxyPlace, float],
     now: float,
 ) -> tuple[dict[ProxyPlace, float], set[tuple[str, int]]]:
-    """Which proxies wait for their ports since when, and the ports by node that no proxy gets.
+    """Return the time since when each proxy waits for its ports, and the refused ports by node.
 
-    A proxy has only to wait while another one that is being deleted still holds its ports.
+    While a proxy that is being deleted still holds the ports, a refusal does not count.
     """
     waiting = {place: at for place, at in since.items() if _is_waiting(view, place)}
     taken: set[tuple[str, int]] = set()
@@ -178,7 +187,8 @@ def _refused(
         other_pods = (p.pod for p in neighbours if place_of(p) != place)
         spec = view.rosproxies[place.of].spec
         pod_ports = host_ports_of((*view.other_pods_by_node.get(proxy.node, ()), *other_pods), spec)
-        # If the pods that hold them are seen, only their ports are avoided, else the whole range.
+        # If the operator sees pods that hold some of the ports, only the ports of pods are avoided.
+        # Otherwise the operator can't know which port is taken, and avoids the whole range.
         conflicts = pod_ports & proxy.pod.every_port
         avoided = pod_ports.intersection(proxy.range.ports()) if conflicts else proxy.range.ports()
         taken |= {(proxy.node, port) for port in avoided}
@@ -186,11 +196,11 @@ def _refused(
 
 
 def _is_waiting(view: View, place: ProxyPlace) -> bool:
-    """Whether the proxy of a place is wanted, but has not got its ports yet."""
+    """Whether the proxy of a place is wanted, but does not have its ports yet."""
     proxy = view.current.get(place)
     return place in view.wanted and (proxy is None or not has_ports(proxy))
 
 
 def host_ports_of(pods: Iterable[Pod], spec: RosProxySpec) -> set[int]:
-    """The hostPorts of pods that a RosProxy can't have."""
+    """The hostPorts of pods that a proxy with this spec can't have."""
     return {port for pod in pods for port in pod.ports_of(spec)}

@@ -1,1 +1,1 @@
-"""What is to be done next: for Services, proxies, LAN relays, NetworkPolicies and unwired pods."""
+"""The steps of a plan: actions for Services, proxies, LAN relays, NetworkPolicies and pods."""

@@ -1,4 +1,4 @@
-"""What the steps of all RosProxies are made from, and what a proxy is to have on a node."""
+"""The input of the steps of a plan, and the site of a proxy: what the proxy needs on a node."""
 
 import msgspec
 from msgspec.structs import replace
@@ -29,20 +29,21 @@ from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
 
 LOST_FOR = 10.0
-"""Seconds for which a node must be missing before its proxies are deleted."""
+"""Seconds that a node must be missing before the operator deletes the node's proxies."""
 TORN_DOWN_WITHIN_S = STOPS_WITHIN + 3.0
-"""Seconds in which a kubelet ends a pod that was deleted by force, and takes its hostPorts back.
+"""Seconds in which a kubelet ends a pod that was deleted by force, and removes its hostPort rules.
 
-If a new pod gets the same ports earlier, the former one's rules still come first. Datagrams that
-go on coming to a port are then led to the former pod's address for good: the CNI plug-in portmap
-deletes conntrack entries when a pod comes, and not when it goes (containernetworking/plugins 1277).
+If a new pod gets the same ports earlier, the rules of the former pod still come first. A steady
+stream of datagrams to a port then goes to the address of the former pod for good. The reason: the
+CNI plug-in portmap deletes conntrack entries when a pod starts, and not when a pod ends
+(containernetworking/plugins 1277).
 """
 
 
 class ClusterContext(msgspec.Struct, frozen=True):
-    """Everything that the steps of all RosProxies are made from.
+    """The input of the steps of all RosProxies.
 
-    ``sites`` are those that have been worked out already: each is asked for several times.
+    ``now`` is in seconds of the operator's monotonic clock. ``sites`` is a cache of `site_of`.
     """
 
     view: View
@@ -55,32 +56,38 @@ class ClusterContext(msgspec.Struct, frozen=True):
 
     @property
     def observed(self) -> ClusterSnapshot:
-        """What is seen."""
+        """The snapshot of the cluster."""
         return self.view.observed
 
     def cluster_ip(self, rosproxy: RosProxy) -> str:
-        """The address of a RosProxy's Service; empty if it has none, or is another RosProxy's."""
+        """The address of a RosProxy's Service; empty without a Service of this RosProxy.
+
+        A Service of a deleted RosProxy of the same name does not count.
+        """
         service = self.observed.services.get(rosproxy.id)
         return service.cluster_ip if service and service.owner == rosproxy.uid else ""
 
     def grace_left(self, place: ProxyPlace) -> float:
-        """The seconds until the grace of a proxy ends that no pod wants any more."""
+        """The seconds until ``spec.grace`` of a proxy ends that no pod wants any more."""
         grace = self.view.rosproxies[place.of].spec.grace
         return grace - (self.now - self.state.absent.get(place, self.now))
 
     def seconds_until_torn_down(self, place: ProxyPlace) -> float:
-        """The seconds until a proxy's former pod holds no UDP ports any more for certain."""
+        """The seconds until a proxy's former pod is sure to hold no UDP ports."""
         since = self.observed.vanished.get(place)
         takes_udp = self.view.rosproxies[place.of].spec.takes_udp
         return 0.0 if since is None or not takes_udp else TORN_DOWN_WITHIN_S - (self.now - since)
 
     def seconds_until_lost(self, node: str) -> float:
-        """The seconds until a node that is missing counts as gone."""
+        """The seconds until a missing node counts as gone."""
         return LOST_FOR - (self.now - self.state.lost.get(node, self.now))
 
 
 def master_of(rosproxy: RosProxy, observed: ClusterSnapshot) -> tuple[MasterSpec | None, str]:
-    """A RosProxy's master as its proxies are told it, else what is wrong; for ROS 2 it is empty."""
+    """Return the master for the proxies of a RosProxy, or None and the fault.
+
+    Without ROS 1 the master is empty.
+    """
     master = rosproxy.spec.master
     if master.service is None:
         return master, ""
@@ -92,7 +99,7 @@ def master_of(rosproxy: RosProxy, observed: ClusterSnapshot) -> tuple[MasterSpec
 
 
 def advertise_host(rosproxy: RosProxy, node: ClusterNode) -> tuple[str, str]:
-    """Under which name or address outside reaches a node, else what is wrong."""
+    """Return the host name or address at which outside reaches a node, or "" and the fault."""
     if node.advertise_host:
         problem = host_problem(node.advertise_host)
         fix = "Give the name or address at which outside reaches the node"
@@ -109,7 +116,10 @@ def advertise_host(rosproxy: RosProxy, node: ClusterNode) -> tuple[str, str]:
 
 
 def site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle:
-    """The proxy that a place is to have where pods want one, or why it can't."""
+    """Return the site of a wanted proxy, or the obstacle to this proxy.
+
+    The place has to be in ``context.view.wanted``.
+    """
     if place not in context.sites:
         context.sites[place] = _site_of(context, place)
     return context.sites[place]
@@ -155,9 +165,10 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
 
 
 def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
-    """The peers of a proxy: those that its RosProxy names, and the proxies on other nodes.
+    """The ROS 2 peers of a proxy, sorted: the peers of the RosProxy, and proxies on other nodes.
 
-    The other proxies are found at the first port of their range.
+    A proxy on another node is a peer at the first port of that proxy's range. A proxy with an IPv6
+    advertised host is no peer, because proxies use only IPv4 for ROS 2.
     """
     rosproxy = context.view.rosproxies[place.of]
     nodes = context.observed.nodes
@@ -174,7 +185,7 @@ def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
 
 
 def peers(context: ClusterContext) -> dict[str, tuple[str, ...]]:
-    """What the proxies for ROS 2 are told of their peers, by the uid of their pod."""
+    """The peers of each proxy for ROS 2, by the uid of the proxy's pod."""
     return {
         proxy.pod.uid: peers_of(context, place)
         for place, proxy in context.view.current.items()

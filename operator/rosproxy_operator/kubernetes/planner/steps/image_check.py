@@ -1,9 +1,9 @@
-"""Whether a node can get the next image of its proxy, and run it, before the proxy takes it.
+"""Checks that a node can pull and run the next image of a proxy, before the proxy gets the image.
 
-A kubelet ends a container before it gets another image (kuberuntime_manager.go, SyncPod). With an
-image that the node can't get, the proxy would be away until the image is set right. So a pod
-with the next image is made on the node first. It prints the version and ends. The proxy takes the
-image only after that pod has succeeded.
+A kubelet ends a container before the kubelet pulls another image (kuberuntime_manager.go, SyncPod).
+With an image that the node can't pull, the proxy would not run until a user corrects the image. So
+the operator first creates a pod with the next image on the node, which prints the version and ends.
+The proxy gets the image only after this pod has succeeded.
 """
 
 from collections.abc import Iterator
@@ -28,16 +28,16 @@ _RESOURCES: Json = {"requests": {"cpu": "1m", "memory": "32Mi"}, "limits": {"mem
 
 
 class ImageState(Enum):
-    """What is known of an image on a node."""
+    """The result of the check of an image on a node."""
 
-    MISSING = "missing"  # nothing: the check is still to be made
+    MISSING = "missing"  # no check of this image exists
     CHECKING = "checking"
     USABLE = "usable"
     UNUSABLE = "unusable"
 
 
 def image_check_pod(site: ProxySite, settings: ClusterSettings) -> Json:
-    """The pod that tries the image of a proxy."""
+    """The pod that checks the image of a proxy."""
     container = {
         "name": IMAGE_CHECK,
         "image": image_of(site.rosproxy, settings),
@@ -49,7 +49,7 @@ def image_check_pod(site: ProxySite, settings: ClusterSettings) -> Json:
 
 
 def image_state(context: ClusterContext, proxy: ProxyPod, site: ProxySite) -> ImageState:
-    """What is known of the next image of a proxy that runs, on the proxy's node."""
+    """The result of the check of a proxy's next image, on the proxy's node."""
     expected = fingerprint_of(image_check_pod(site, context.settings))
     check = next((c for c in _checks(context, site.rosproxy) if c.node == proxy.node), None)
     if check is None or check.fingerprint != expected or check.pod.deleting:
@@ -61,17 +61,17 @@ def image_state(context: ClusterContext, proxy: ProxyPod, site: ProxySite) -> Im
 
 
 def check_image(context: ClusterContext, site: ProxySite) -> Iterator[Action]:
-    """Have the next image tried on a node where the check is missing."""
+    """Yield the action that creates a check of the next image on the node."""
     of = site.rosproxy.id
     id = image_check_id(of, site.node.name)
-    # One with another image has to go first: `remove_image_checks`.
+    # A check of another image has the same name. `remove_image_checks` deletes that check first.
     is_there = any(c.node == site.node.name for c in _checks(context, site.rosproxy))
     if not is_there and context.retries.is_due(Task(of, "create", id)):
         yield CreateHelper(of, image_check_pod(site, context.settings), IMAGE_CHECK)
 
 
 def remove_image_checks(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
-    """Delete the image checks of a RosProxy whose proxies have the image, or want another one."""
+    """Yield the actions that delete image checks that no proxy of the RosProxy needs any more."""
     for check in _checks(context, rosproxy):
         task = Task(check.of, "delete", check.pod.id, check.pod.uid)
         if check.pod.deleting or _is_needed(context, rosproxy, check):

@@ -1,9 +1,9 @@
-"""What is to be done for the LAN relays of a RosProxy: how they are made, and when.
+"""Plans the actions for the LAN relays of a RosProxy.
 
-A LAN relay is a pod in its node's own network: it hears the LAN's multicast there, and the proxy at
-the last port of the proxy's range, which the LAN relay holds. It has to know the proxy's address,
-so it is made once the proxy's pod has one, and anew when that changes. It has no right but that
-network.
+A LAN relay is a pod in the host's network. There the LAN relay receives the multicast of the LAN,
+and listens for the proxy at the last port of the proxy's range. The LAN relay needs the proxy's
+address. So the operator creates the LAN relay once the proxy's pod has an address, and recreates
+the LAN relay when this address changes. The LAN relay has no right but the host's network.
 """
 
 from collections.abc import Iterable, Iterator
@@ -27,15 +27,15 @@ from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status.findings import finding
 
 _RESOURCES: Json = {"requests": {"cpu": "10m", "memory": "32Mi"}, "limits": {"memory": "128Mi"}}
-"""A LAN relay has 30 MiB and one thread."""
+"""A LAN relay uses 30 MiB and a single thread."""
 
 
 def lan_relay_pod(
     site: ProxySite, lan_relay: HostPort, proxy: ProxyPod, settings: ClusterSettings
 ) -> Json:
-    """The pod of the LAN relay of a proxy that listens at ``lan_relay``.
+    """The pod of a LAN relay that listens at ``lan_relay`` for this proxy.
 
-    The relay has the image that the proxy has, which may not be the next one yet.
+    The image is the present image of the proxy, which may not be the image of the site yet.
     """
     ros2 = site.rosproxy.spec.ros2
     target = HostPort(proxy.pod.ip, site.ports.first)
@@ -46,7 +46,8 @@ def lan_relay_pod(
         "image": proxy.image,
         "command": [*LAN_RELAY_COMMAND],
         "env": [{"name": name, "value": value} for name, value in variables.items()],
-        # The scheduler counts it; that of a pod in its node's network is a port of the node.
+        # With the hostPort the scheduler keeps the port free of other pods. In the host's network
+        # the containerPort has to be the same port.
         "ports": [{"containerPort": lan_relay.port, "hostPort": lan_relay.port, "protocol": "UDP"}],
         "resources": _RESOURCES,
     }
@@ -55,10 +56,10 @@ def lan_relay_pod(
 
 
 def reconcile_lan_relays(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
-    """The next actions for the LAN relays of a RosProxy.
+    """Yield the next actions for the LAN relays of a RosProxy.
 
-    The LAN relay of a proxy that is to be made anew stays until the new proxy has an address: the
-    one that goes tells outside by it that its participants have ended.
+    While the operator recreates a proxy, the LAN relay stays until the new proxy has an address.
+    The reason: the former proxy sends dispose messages to outside through the LAN relay.
     """
     places = {*context.view.places.get(rosproxy.id, ())}
     lan_relays_by_node = group_by_key(
@@ -69,7 +70,7 @@ def reconcile_lan_relays(context: ClusterContext, rosproxy: RosProxy) -> Iterato
         lan_relays = lan_relays_by_node.get(node_name, ())
         node = context.observed.nodes.get(node_name)
         if node is None or not node.ready:
-            continue  # the garbage collector takes the pods of nodes that are gone
+            continue  # the garbage collector of the cluster deletes the pods of a gone node
         if place not in places or not rosproxy.spec.multicast:
             yield from _delete_lan_relays(context, lan_relays, "no longer needed")
         else:
@@ -77,7 +78,7 @@ def reconcile_lan_relays(context: ClusterContext, rosproxy: RosProxy) -> Iterato
 
 
 def lan_relay_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
-    """Where a RosProxy's proxy can't have a LAN relay though it ought to."""
+    """Yield a finding for each node on which a proxy can't have its LAN relay."""
     for place in context.view.places.get(rosproxy.id, ()) if rosproxy.spec.multicast else ():
         site = site_of(context, place) if place in context.view.wanted else None
         if isinstance(site, ProxySite) and site.lan_relay is None:
@@ -98,7 +99,7 @@ def _ensure_lan_relay(
     if current is None or not isinstance(site, ProxySite) or site.lan_relay is None or not address:
         return
     if current.fingerprint != proxy_fingerprint(site, context.settings):
-        return
+        return  # the operator will recreate this proxy
     body = lan_relay_pod(site, site.lan_relay, current, context.settings)
     expected = fingerprint_of(body)
     id = lan_relay_id(place.of, place.node)

@@ -1,20 +1,24 @@
-"""The NetworkPolicies of a RosProxy, for its proxies and for its pods.
+"""The NetworkPolicies of a RosProxy: a policy for the proxies, and a policy for the selected pods.
 
-That of the proxies says who may connect to which of their ports (`policy`).
+`policy` says which sources may reach which ports of the proxies:
 
-The port range, and a published master, are for everybody: that is what they are for; for ROS 2, and
-for UDPROS, it is UDP. The master port is for the pods that the RosProxy selects, as are, with
-``direction: Both`` or for ROS 2, the ports that stand in for nodes outside, and those where UDPROS
-of pods goes out; the admin port for the operator and for whom the administrator names. What a proxy
-connects to is not limited. The kubelet's probes need no rule: a pod is always reached from its own
-node (``NetworkPolicySpec`` in k8s.io/api, networking/v1).
+- Any source: ``spec.portWindow`` and a published master. ROS 1 uses TCP, ROS 2 and UDPROS use UDP.
+- The selected pods: the master port and the discovery port of ROS 2. With ``direction: Both`` or
+  for ROS 2 also the ports of stand-ins. UDPROS from pods to outside goes through these ports, too.
+- The sources in ``settings.admin_from``, such as the operator's pod: the admin port. Without this
+  setting any source may reach the admin port.
 
-The policy allows the whole window instead of the ranges of the moment: nothing else listens there,
-and a proxy that gets a range finds it open.
+This policy does not limit to which addresses a proxy connects. The kubelet's probes need no rule,
+because Kubernetes always lets a node reach its own pods (``NetworkPolicySpec`` in k8s.io/api,
+networking/v1).
 
-That of the pods says to what they may connect (`pods_policy`); there is one with ``podEgress:
-Proxy`` alone. The selected pods reach the proxies, one another and any DNS server, and
-nothing else. All their traffic with outside then goes through their proxy, where rules hold.
+The policy opens all of ``spec.portWindow``, not only the present ranges, so the ports of a new
+proxy are open at once. The proxy's own ports are left out. Ports of stand-ins are not left out: the
+window may contain ports from 20000 to 32767.
+
+`pods_policy` says what the selected pods may reach, and exists only with ``podEgress: Proxy``. The
+pods reach only the proxies, each other and DNS servers. So all traffic between these pods and
+outside goes through the proxy, which enforces the rules.
 """
 
 from collections.abc import Iterable, Iterator
@@ -50,7 +54,7 @@ _OFF = "the operator has --no-network-policy"
 
 
 def policy(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
-    """A RosProxy's NetworkPolicy."""
+    """The NetworkPolicy of a RosProxy's proxies."""
     return {
         "apiVersion": "networking.k8s.io/v1",
         "kind": "NetworkPolicy",
@@ -81,7 +85,7 @@ def pods_policy(rosproxy: RosProxy) -> Json:
 
 
 def wanted_policies(rosproxy: RosProxy, settings: ClusterSettings) -> dict[Name, Json]:
-    """The NetworkPolicies that a RosProxy is to have, by their names."""
+    """The NetworkPolicies that a RosProxy needs, by name."""
     if not settings.network_policy:
         return {}
     wanted = {policy_id(rosproxy.id): policy(rosproxy, settings)}
@@ -91,7 +95,10 @@ def wanted_policies(rosproxy: RosProxy, settings: ClusterSettings) -> dict[Name,
 
 
 def reconcile_policies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
-    """Make, mend or remove the NetworkPolicies of a RosProxy."""
+    """Yield the actions that create, correct or delete the NetworkPolicies of a RosProxy.
+
+    If the operator can't list NetworkPolicies, the function yields no action.
+    """
     if context.observed.policies_error:
         return
     wanted = wanted_policies(rosproxy, context.settings)
@@ -109,7 +116,7 @@ def reconcile_policies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[
 def _keep(
     context: ClusterContext, rosproxy: RosProxy, body: Json, current: ProxyPolicy | None
 ) -> Iterator[Action]:
-    """Make a policy that is not there, or mend the one that is."""
+    """Yield the action that creates a missing policy, or corrects the ``current`` policy."""
     name = name_of(body["metadata"])
     ask = context.retries.is_due
     if current is None:
@@ -122,7 +129,10 @@ def _keep(
 
 
 def reconcile_orphaned_policies(context: ClusterContext) -> Iterator[Action]:
-    """Delete the policies of RosProxies that are gone; the garbage collector may come first."""
+    """Yield the actions that delete the policies of RosProxies that are gone.
+
+    The garbage collector of the cluster may delete such a policy first.
+    """
     unusable = {r.uid for r in context.observed.unusable.values()}
     for current in context.observed.policies.values():
         if current.of not in context.view.rosproxies and current.owner not in unusable:
@@ -136,7 +146,10 @@ def _delete(context: ClusterContext, current: ProxyPolicy, why: str) -> Iterator
 
 
 def _spec(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
-    """The spec as the API server gives it back: it is compared with the one that exists."""
+    """The spec of a policy, in the form in which the API server returns the spec.
+
+    `_keep` compares this spec with the existing spec. A difference in form would never end.
+    """
     admin: dict[str, Any] = {"ports": [_port(ADMIN_PORT)]}
     if settings.admin_from is not None:
         admin["from"] = [dict(peer) for peer in settings.admin_from]
@@ -152,7 +165,10 @@ def _spec(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
 
 
 def _public_ports(rosproxy: RosProxy) -> Iterator[Json]:
-    """The ports that are for everybody: never the proxy's own, even if the window has them."""
+    """The ports for any source: the window and a published master, without the proxy's own ports.
+
+    The own ports are the master port, the admin port and the well-known ports of ROS 2.
+    """
     ros2_ports = well_known_ports(rosproxy.spec.ros2.number) if rosproxy.spec.ros2 else ()
     own_ports = (MASTER_PORT, ADMIN_PORT, *ros2_ports)
     for protocol in _protocols(rosproxy):
@@ -164,7 +180,7 @@ def _public_ports(rosproxy: RosProxy) -> Iterator[Json]:
 
 
 def _ranges_without(window: PortRange, excluded: Iterable[int]) -> Iterator[tuple[int, int]]:
-    """The ports of a window but for excluded ones, as ranges of first and last."""
+    """Yield the first and the last port of each range of a window without the excluded ports."""
     first = window.first
     for port in sorted(excluded):
         if first <= port <= window.last:
@@ -196,7 +212,7 @@ def _port(first: int, last: int = 0, protocol: str = "TCP") -> Json:
 
 
 def _pod_selector(rosproxy: RosProxy) -> Json:
-    """The selector of the pods that a RosProxy takes, as in `selection`."""
+    """The selector of the pods that a RosProxy selects, by the rules of `selection.selects`."""
     selector = rosproxy.spec.pod_selector
     if selector is None:
         values = sorted(own_values(rosproxy.id.name))

@@ -1,9 +1,10 @@
-"""What is to be done for one RosProxy: its Service, and its proxy on each node.
+"""Plans the actions for the Service of a RosProxy, and for the proxy on each node.
 
-Each function compares the object that is wanted with the one that exists and yields the next
-action; the rest follows at later looks. Only the fingerprint on an object says whether it is as it
-ought to be. A pod that differs is deleted and made anew under the same name, but for its image,
-which can be exchanged. `retries` keeps actions without effect from being repeated at once.
+Each function compares the wanted object with the existing object, and yields the next action. Later
+looks yield the further actions. The comparison reads only the fingerprint annotation. A pod with
+another fingerprint is deleted, and a later look creates the pod again under the same name. If only
+the image differs, the operator sets the image of the pod. `Retries` delays the repetition of an
+action without an effect.
 """
 
 from collections import Counter
@@ -47,18 +48,18 @@ from rosproxy_operator.kubernetes.resources.names import (
 )
 
 RESTARTS_WITHIN_S = 60.0
-"""Seconds in which a kubelet starts a container again that has got another image."""
+"""Seconds in which a kubelet restarts a container after a change of the image."""
 IN_TURN = 1.0
-"""Seconds after which it is looked again whether the next proxy can be made anew."""
+"""Seconds to the next look while a proxy waits for its turn in a rollout."""
 
 
 def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
-    """The Service of a RosProxy, made if it is not there, made anew if it is not right."""
+    """Yield the action that creates the Service of a RosProxy, or deletes an outdated Service."""
     pods = context.view.selected_pods.get(rosproxy.id, ())
     wired = (master.host for pod in pods if (master := parse_slave_uri(pod.wired_master_uri)))
     static_peers = (pod.static_peers for pod in pods if not pod.wired_master_uri)
     hosts = Counter(host for host in (*wired, *static_peers) if is_address(host))
-    # The address that its pods have been given already, if any.
+    # If the status has no address, the Service gets the address that most wired pods have.
     common = min(hosts, key=lambda host: (-hosts[host], host), default="")
     body = manifests.service(rosproxy, rosproxy.cluster_ip or common)
     service = context.observed.services.get(rosproxy.id)
@@ -74,7 +75,7 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
 
 
 def _delete_service(context: ClusterContext, service: ProxyService, why: str) -> Iterator[Action]:
-    """Delete a Service, unless it is being deleted already."""
+    """Yield the deletion of a Service, unless the Service is being deleted already."""
     name = service_id(service.of)
     if not service.deleting and context.retries.is_due(
         Task(service.of, "delete", name, service.uid)
@@ -83,11 +84,12 @@ def _delete_service(context: ClusterContext, service: ProxyService, why: str) ->
 
 
 def reconcile_proxies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
-    """The next actions for a RosProxy's proxies.
+    """Yield the next actions for the proxies of a RosProxy.
 
-    A change of the image or of the settings rolls out: no more than ``spec.maxUnavailable``
-    proxies are away, or have their next image tried, at a time. The next one waits until those
-    before work again. A proxy that moves to other ports or to another master does not wait.
+    A change of the image or of the settings is a rollout. At the same time, at most
+    ``spec.maxUnavailable`` proxies do not work or have a check of the next image. The next proxy
+    waits until these proxies work again. A proxy that moves to other ports or to another master
+    does not wait.
     """
     places = context.view.places.get(rosproxy.id, ())
     wanted = [place for place in places if _can_be_had(context, place)]
@@ -104,7 +106,7 @@ def reconcile_proxies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
 
 
 def _is_tried(context: ClusterContext, place: ProxyPlace) -> bool:
-    """Whether the next image of a proxy is being tried, or was in vain."""
+    """Whether the check of a proxy's next image is under way or has failed."""
     current = context.view.current.get(place)
     site = site_of(context, place)
     if current is None or not isinstance(site, ProxySite):
@@ -115,22 +117,29 @@ def _is_tried(context: ClusterContext, place: ProxyPlace) -> bool:
 
 
 def _lacks_ports(context: ClusterContext, place: ProxyPlace) -> bool:
-    """Whether a proxy waits for ports: no change of it has caused that, and others are tried."""
+    """Whether a proxy waits for its ports.
+
+    Such a proxy does not count as away in a rollout: no rollout has caused this, and the operator
+    tries other ports.
+    """
     current = context.view.current.get(place)
     return current is not None and current.stuck is PodFailure.PORTS
 
 
 def _can_be_had(context: ClusterContext, place: ProxyPlace) -> bool:
-    """Whether a proxy is wanted, and nothing keeps it from being made."""
+    """Whether a proxy is wanted, and has no obstacle."""
     return place in context.view.wanted and not isinstance(site_of(context, place), Obstacle)
 
 
 def _works(context: ClusterContext, place: ProxyPlace, places: Iterable[ProxyPlace]) -> bool:
-    """Whether a proxy runs what its pod says, and reaches its master if any of ``places`` does."""
+    """Whether a proxy serves, with the image of its pod, and is ready.
+
+    If no proxy of ``places`` is ready, readiness does not count: the master may be down.
+    """
     current = context.view.current.get(place)
     if current is None or not serves(current) or current.stuck is not None:
         return False
-    # A pod says that it is ready until its kubelet has ended the former container.
+    # After a change of the image, a pod stays ready until the kubelet ends the former container.
     if context.retries.is_recent(_setting_image(current, current.image), RESTARTS_WITHIN_S):
         return False
     every = filter(None, map(context.view.current.get, places))
@@ -140,7 +149,10 @@ def _works(context: ClusterContext, place: ProxyPlace, places: Iterable[ProxyPla
 def _reconcile_proxy(
     context: ClusterContext, place: ProxyPlace, may_stop: bool
 ) -> Iterator[Action]:
-    """The next actions for a proxy on a node; ``may_stop``: no other proxy is to come first."""
+    """Yield the next actions for a proxy on a node.
+
+    With ``may_stop`` False, a rollout must not stop this proxy now.
+    """
     node = context.observed.nodes.get(place.node)
     proxies = context.view.proxies.get(place, ())
     if place in context.view.wanted:
@@ -162,7 +174,7 @@ def _reconcile_proxy(
 def _ensure(
     context: ClusterContext, place: ProxyPlace, site: ProxySite, may_stop: bool
 ) -> Iterator[Action]:
-    """The next action for a proxy that is wanted, and can be had as the site says."""
+    """Yield the next action for a wanted proxy without an obstacle."""
     name = proxy_id(place.of, place.node)
     current = context.view.current.get(place)
     misplaced = [p for p in context.view.proxies.get(place, ()) if p.pod.id != name]
@@ -171,7 +183,7 @@ def _ensure(
             yield from _delete_pod(context, proxy, "the proxy of this node has another name")
     elif name in context.view.names:
         _note_creation(context, place)
-        if current is not None:  # else its pod is about to go
+        if current is not None:  # otherwise the pod with this name is deleted first
             yield from _update(context, current, site, may_stop)
     elif (seconds := context.seconds_until_torn_down(place)) > 0:
         context.retries.look_again_in(seconds)
@@ -203,11 +215,15 @@ def _update(
 def _change(
     context: ClusterContext, proxy: ProxyPod, site: ProxySite, may_stop: bool
 ) -> Iterator[Action]:
-    """Make a proxy anew, or exchange its image, if it is its turn."""
+    """Yield the deletion of a proxy that has to be recreated, or the change of the image.
+
+    A proxy that moves to other ports or to another master does not wait for its turn.
+    """
     image = manifests.image_of(site.rosproxy, context.settings)
     fingerprint = manifests.proxy_fingerprint(site, context.settings)
-    # If the next proxy can't find these nodes at the master, this one unregisters them. A range
-    # with the same first port has grown or shrunk at its end: what is left of it is the same.
+    # If the next proxy can't find the nodes at the master, the present proxy unregisters the nodes
+    # (`retire`). A range with the same first port has only grown or shrunk at the end, so the
+    # nodes keep their ports.
     moved = proxy.range.first != site.ports.first
     lost = moved or not manifests.keeps_registrations(proxy.fingerprint, fingerprint)
     if not may_stop and not lost:
@@ -222,16 +238,17 @@ def _change(
 
 
 def _setting_image(proxy: ProxyPod, image: str) -> Task:
-    """The task of exchanging an image; another one once the container was started again."""
+    """The task that sets an image. The task is another one after each restart of the container."""
     return Task(proxy.of, "image", proxy.pod.id, f"{proxy.pod.uid} {proxy.restarts} {image}")
 
 
 def _delete_pod(
     context: ClusterContext, proxy: ProxyPod, why: str, retire: bool = False
 ) -> Iterator[Action]:
-    """Delete a proxy's pod, unless it is being deleted already.
+    """Yield the deletion of a proxy's pod, unless the pod is being deleted already.
 
-    One that is to be retired may be so: the garbage collector is quick.
+    With ``retire`` the proxy first unregisters its nodes. A pod that is being deleted may still do
+    this, because the garbage collector often deletes a pod before the operator acts.
     """
     node = context.observed.nodes.get(proxy.node)
     runs = serves(proxy) and node is not None and node.ready
@@ -241,7 +258,7 @@ def _delete_pod(
 
 
 def _note_creation(context: ClusterContext, place: ProxyPlace) -> None:
-    """Keep count of how often a proxy was made, as long as it is not well."""
+    """Keep the count of creations of a proxy until the proxy serves: see `PROMPT_RECREATIONS`."""
     current = context.view.current.get(place)
     if current is None or not serves(current):
         context.retries.note_effect(_creation(place))
@@ -252,9 +269,13 @@ def _creation(place: ProxyPlace) -> Task:
 
 
 def reconcile_orphans(context: ClusterContext) -> Iterator[Action]:
-    """Delete what belongs to RosProxies that are gone. The API server may come first."""
+    """Yield the deletion of the proxies and Services of RosProxies that are gone.
+
+    The garbage collector of the cluster may delete these objects first.
+    """
     for proxy in context.view.orphans:
-        # Where another RosProxy of this name takes over, it finds their nodes at the master.
+        # A new RosProxy with the same name takes over the nodes at the master, so the orphan must
+        # not unregister the nodes.
         takes_over = proxy.of in context.view.rosproxies
         yield from _delete_pod(context, proxy, "its RosProxy is gone", retire=not takes_over)
     unusable = {r.uid for r in context.observed.unusable.values()}
@@ -264,7 +285,7 @@ def reconcile_orphans(context: ClusterContext) -> Iterator[Action]:
 
 
 def ends(context: ClusterContext) -> Iterator[float]:
-    """In how many seconds each period ends whose end no event tells."""
+    """Yield the seconds to the end of each period of the state. No event tells such an end."""
     ready = {name for name, node in context.observed.nodes.items() if node.ready}
     yield from (context.grace_left(place) for place in context.state.absent if place.node in ready)
     yield from map(context.seconds_until_lost, context.state.lost)
