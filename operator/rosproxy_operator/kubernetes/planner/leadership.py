@@ -5,13 +5,13 @@ The Lease object (coordination.k8s.io/v1) names the holder. The holder renews th
 
 - The holder acts for `DEADLINE` seconds after a successful write, and stops unless the next write
   succeeds. The time counts from before the operator sent the write.
-- An operator that sees the same version of the Lease object for `DURATION` seconds takes the
-  object, or later if the holder wrote a longer duration. The time counts from when the operator
-  first saw the version, which is after the write.
+- An operator takes the Lease object after `DURATION` seconds without a new version, or after the
+  duration in the object if this is longer. The time counts from the operator's first read of the
+  version, which is after the write.
 - A write succeeds only if the Lease object still has the version that was read (resourceVersion).
 
 `DURATION` is longer than `DEADLINE`, so the former leader has stopped before the next leader acts.
-Each operator counts on its own clock. The times in the Lease object are only for people.
+Each operator counts on its own clock. The timestamps in the Lease object are only for people.
 """
 
 import msgspec
@@ -29,8 +29,8 @@ NEVER = float("-inf")
 NOBODY = "nobody"
 """Holder of a Lease object that an operator creates because there is none.
 
-This Lease object has to expire, too, before an operator takes it: a leader may still act, if a user
-has deleted the former Lease object.
+This object has to expire before an operator takes it: if a user has deleted the former Lease
+object, its holder may still act.
 """
 
 
@@ -38,8 +38,8 @@ class LeaseRecord(msgspec.Struct, frozen=True):
     """A Lease object in one ``version``, its resourceVersion.
 
     ``holder`` is empty if the holder has released the Lease object. ``duration`` is in seconds.
-    ``transitions`` is the number of changes of the holder. ``acquired`` is the time when the
-    holder took the Lease object, as the holder wrote this time; empty if not written yet.
+    ``transitions`` is the number of changes of the holder. ``acquired`` is the timestamp that the
+    holder wrote when it took the Lease object, empty before.
     """
 
     version: str
@@ -72,6 +72,7 @@ class Candidate(msgspec.Struct, frozen=True):
 
 def observe(candidate: Candidate, record: LeaseRecord | None, now: float) -> Candidate:
     """Return the candidate after a read of the Lease object; ``now`` is after the answer."""
+    # The time of `seen_since` starts again only with a new version.
     if record == candidate.record and candidate.seen_since is not None:
         return candidate
     is_holder = record is not None and record.holder == candidate.name
@@ -96,6 +97,7 @@ def after_write(candidate: Candidate, record: LeaseRecord, begun: float, now: fl
     """Return the candidate after a write that was sent at ``begun`` and confirmed at ``now``."""
     if record.holder != candidate.name:
         return candidate
+    # A renewal after `leads_until` begins a new term: the operator had stopped acting before.
     terms = candidate.terms if candidate.leads(now) else candidate.terms + 1
     return replace(candidate, leads_until=begun + DEADLINE, terms=terms)
 

@@ -64,7 +64,8 @@ _TAINTS = (
 _LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999), PortRange(12000, 30000))
 """Ranges from which Linux may take the source ports of a proxy's outgoing connections.
 
-A pod gets the first range without a port on which the proxy listens: see `_local_ports`.
+A pod gets the first range without the ports on which the proxy has to listen (`_local_ports`).
+Ports of stand-ins do not count.
 """
 
 
@@ -130,9 +131,8 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     """The pod of a proxy.
 
     The fingerprint has two parts with a hyphen between. The first part is a digest of the pod
-    without the image, the policy and the peers, which the operator changes in a running pod. The
-    second part is a hash of the master, the domain and the advertised host: see
-    `keeps_registrations`.
+    without image, policy and peers, which the operator changes without a new pod. The second part
+    is a hash of master, domain and advertised host: see `keeps_registrations`.
     """
     rosproxy = site.rosproxy
     container = _container(site, settings)
@@ -264,7 +264,7 @@ def pod_metadata(
 def helper_pod(
     site: ProxySite, id: Name, settings: ClusterSettings, container: Json, spec: Json
 ) -> Json:
-    """A pod beside a proxy, without capabilities and without an account at the API server.
+    """A pod beside a proxy, without capabilities and without a token for the API server.
 
     ``container`` and ``spec`` are the fields that differ between the kinds of pods. The name of the
     container is also the component label of the pod.
@@ -351,6 +351,7 @@ def bound_to(node: str, spec: RosProxySpec, settings: ClusterSettings) -> dict[s
 
 
 def _local_ports(site: ProxySite) -> str:
+    """The value of the sysctl: the first range of `_LOCAL_PORTS` that fits, else the first."""
     fixed = (MASTER_PORT, ADMIN_PORT, site.master.publish)
     ros2 = site.rosproxy.spec.ros2
     ros2_ports = sorted(well_known_ports(ros2.number)) if ros2 else ()
@@ -427,7 +428,7 @@ def _told(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:
         "ros2_lan_relay": site.lan_relay,
         "ros2_lan_relay_secret": site.relay_secret if site.lan_relay else None,
         **msgspec.structs.asdict(settings.proxy_bounds),
-        # Without a policy the proxy must not wait, because a wait costs a second at each restart.
+        # Without a policy the proxy does not wait, because a wait costs a second at each restart.
         "await_policy": AWAITED if policy else None,
         "policy_layers": as_variable(policy),
     }

@@ -6,8 +6,8 @@
 2. `cluster_view` sorts the snapshot: which proxies are wanted, and where.
 3. `state.learn` updates the state from the view.
 4. `allocation` gives each wanted proxy a range.
-5. `steps` yields actions for Services, NetworkPolicies, proxies, LAN relays and pods.
-6. `status` and `events` write what users read.
+5. The modules in `steps` yield the actions.
+6. `status` and `events` create statuses and Events for users.
 7. `departures` and `briefing` collect what the operator sends to the proxies.
 """
 
@@ -111,7 +111,7 @@ def plan(
     ``state`` is the state of the last plan, or an empty state. ``now`` is in seconds of a monotonic
     clock, the same clock as in ``state``. ``stamp`` is the time of day in RFC 3339.
     """
-    full_snapshot = observed
+    full_snapshot = observed  # with the RosProxies that `within_bounds` makes unusable
     observed = with_pod_defaults(within_bounds(observed, settings), settings.pod)
     cluster_view = view(observed)
     learned = learn(cluster_view, state, now)
@@ -198,7 +198,7 @@ def stand_by(
 
 
 def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[RosProxyOnNode]:
-    """Yield the state of a RosProxy on each node where the RosProxy has, wants or had a proxy."""
+    """Yield the state of a RosProxy on each node where the RosProxy has, needs or had a proxy."""
     lan_relays = {h.node: h for h in context.observed.lan_relays if h.owner == rosproxy.uid}
     image_checks = {h.node: h for h in context.observed.image_checks if h.owner == rosproxy.uid}
     node_names = {

@@ -25,7 +25,7 @@ PROMPT_RECREATIONS = 3
 class Task(msgspec.Struct, frozen=True):
     """A change of the object ``id`` for the RosProxy ``of``.
 
-    ``detail`` is the difference between tasks with the same name of the object, such as the uid.
+    ``detail`` tells tasks for the same ``id`` apart, for example by the uid of the object.
     """
 
     of: Name
@@ -117,7 +117,7 @@ class Retries:
         return {task.id: record.error for task, record in noted if task.of == of and record.error}
 
     def pauses(self) -> Iterator[float]:
-        """Yield the seconds until each next try."""
+        """Yield the seconds until each next try, except for tasks with ``effect``."""
         yield from self._later
         for task, record in self.noted.items():
             if not record.effect and task not in self._recent:

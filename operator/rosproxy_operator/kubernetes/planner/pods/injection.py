@@ -1,7 +1,7 @@
 """Wires pods to the proxy at admission, and finds pods that are not wired.
 
-The containers of a wired pod have ROS_MASTER_URI and ROS_IP, or ROS_STATIC_PEERS for ROS 2. The
-address in these variables is the address of the RosProxy's Service, which leads to the proxy on the
+The containers of a wired pod have ROS_MASTER_URI and ROS_IP, or ROS_STATIC_PEERS for ROS 2.
+ROS_MASTER_URI and ROS_STATIC_PEERS name the RosProxy's Service, which leads to the proxy on the
 same node. The webhook uses `wire`. The planner uses `wiring_finding` (and `ros2_pods`) to find pods
 that no webhook has wired.
 """

@@ -55,8 +55,8 @@ def misspelt_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> lis
 def unreached(pods: Iterable[Pod], rosproxies: Sequence[RosProxy], ready_since: str) -> list[str]:
     """Return the pods that are not wired, although an operator was ready at their creation.
 
-    ``ready_since`` is the time in RFC 3339 at which an operator became ready; empty if no operator
-    is ready. Then the result is empty.
+    ``ready_since`` is the RFC 3339 time at which an operator became ready; empty without an
+    operator.
     """
     chosen = [(pod, select_rosproxy(pod, rosproxies)) for pod in pods]
     return sorted(

@@ -2,7 +2,8 @@
 
 The webhook sets ROS_STATIC_PEERS to the address of the RosProxy's Service, which leads to the proxy
 on the pod's own node. A pod in which this variable has no effect gets an Event. The operator does
-not see variables that the image sets. So only the name of the image may tell the distribution.
+not see variables that the image sets. Unless the template sets ROS_DISTRO, only the name of the
+image may tell the distribution.
 """
 
 import re
@@ -37,7 +38,7 @@ _RANGES_WITHOUT_PEERS = ("OFF", "SYSTEM_DEFAULT")
 def ros2_findings(
     pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState = UNKNOWN
 ) -> Iterator[ClusterFinding]:
-    """Yield the findings about a pod's variables. ``address`` is the RosProxy's Service."""
+    """Yield findings about a pod. ``address`` is the address of the RosProxy's Service."""
     if rosproxy.spec.ros2 is None:
         return
     problems = dict.fromkeys(

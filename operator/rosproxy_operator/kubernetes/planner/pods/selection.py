@@ -39,9 +39,9 @@ def own_values(name: str) -> tuple[str, str]:
 def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFinding | None:
     """Return the RosProxy that takes a pod, or the reason why a selected pod gets no proxy.
 
-    If several RosProxies select the pod, the pod's label decides. Without a decision the result is
-    a finding with the reason Ambiguous. For a pod in the host's network the result is a finding
-    with the reason HostNetwork. If no RosProxy selects the pod, the result is None.
+    Of several RosProxies that select the pod, the pod's label names one. Otherwise the result is a
+    finding with the reason Ambiguous. For a pod in the host's network the result is a finding with
+    the reason HostNetwork. If no RosProxy selects the pod, the result is None.
     """
     taking = sorted((r for r in rosproxies if selects(r, pod)), key=lambda r: r.id)
     named = [r for r in taking if r.id.name == pod.labels.get(INJECT)]
@@ -106,10 +106,7 @@ def on_node(rosproxy: RosProxy, node: ClusterNode) -> bool:
 
 
 def selects(rosproxy: RosProxy, pod: Pod) -> bool:
-    """Whether a RosProxy selects a pod. Another RosProxy may select the same pod.
-
-    A RosProxy that is being deleted selects no pod.
-    """
+    """Whether a RosProxy that is not being deleted selects a pod, maybe with other RosProxies."""
     label = pod.labels.get(INJECT)
     selector = rosproxy.spec.pod_selector
     same_namespace = rosproxy.id.namespace == pod.id.namespace
@@ -121,10 +118,7 @@ def selects(rosproxy: RosProxy, pod: Pod) -> bool:
 
 
 def _is_ours(labels: Mapping[str, str]) -> bool:
-    """Whether a pod belongs to the operator: a proxy, a helper pod or the operator's own pod.
-
-    The operator's own pod has the labels that the chart sets.
-    """
+    """Whether the labels are of a pod that the operator creates, or of the operator's own pod."""
     names = (labels.get(NAME_LABEL), labels.get(_PART_OF_LABEL))
     return is_own(labels) or (labels.get(COMPONENT_LABEL) == "operator" and "rosproxy" in names)
 

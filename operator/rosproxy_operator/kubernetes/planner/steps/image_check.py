@@ -2,8 +2,8 @@
 
 A kubelet ends a container before the kubelet pulls another image (kuberuntime_manager.go, SyncPod).
 With an image that the node can't pull, the proxy would not run until a user corrects the image. So
-the operator first creates a pod with the next image on the node, which prints the version and ends.
-The proxy gets the image only after this pod has succeeded.
+the operator first creates a pod with the next image on the node. This pod prints the version and
+ends. The proxy gets the image only after the pod has succeeded.
 """
 
 from collections.abc import Iterator

@@ -1,9 +1,9 @@
 """Plans the actions for the LAN relays of a RosProxy.
 
-A LAN relay is a pod in the host's network. There the LAN relay receives the multicast of the LAN,
-and listens for the proxy at the last port of the proxy's range. The LAN relay needs the proxy's
-address. So the operator creates the LAN relay once the proxy's pod has an address, and recreates
-the LAN relay when this address changes. The LAN relay has no right but the host's network.
+A LAN relay is a pod in the host's network, because it has to receive the multicast of the LAN. The
+proxy reaches the LAN relay at the last port of the proxy's range. The operator creates the LAN
+relay once the proxy's pod has an address, and recreates it when this address changes. The LAN relay
+has no right but the host's network.
 """
 
 from collections.abc import Iterable, Iterator

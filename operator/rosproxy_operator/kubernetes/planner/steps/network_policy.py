@@ -13,8 +13,8 @@ because Kubernetes always lets a node reach its own pods (``NetworkPolicySpec`` 
 networking/v1).
 
 The policy opens all of ``spec.portWindow``, not only the present ranges, so the ports of a new
-proxy are open at once. The proxy's own ports are left out. Ports of stand-ins are not left out: the
-window may contain ports from 20000 to 32767.
+proxy are open at once. The proxy's own ports are left out, but not the ports of stand-ins (20000 to
+32767), which the window may contain.
 
 `pods_policy` says what the selected pods may reach, and exists only with ``podEgress: Proxy``. The
 pods reach only the proxies, each other and DNS servers. So all traffic between these pods and
@@ -148,7 +148,8 @@ def _delete(context: ClusterContext, current: ProxyPolicy, why: str) -> Iterator
 def _spec(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
     """The spec of a policy, in the form in which the API server returns the spec.
 
-    `_keep` compares this spec with the existing spec. A difference in form would never end.
+    `_keep` compares this spec with the existing spec. With another form, the operator would correct
+    the policy at each look.
     """
     admin: dict[str, Any] = {"ports": [_port(ADMIN_PORT)]}
     if settings.admin_from is not None:

@@ -69,6 +69,7 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
     elif service.owner != rosproxy.uid:
         yield from _delete_service(context, service, "its former RosProxy is gone")
     elif service.fingerprint != manifests.fingerprint_of(body):
+        # A later look creates the Service again, with the address that the status keeps.
         yield from _delete_service(
             context, service, "replaced, since the RosProxy or the operator has changed"
         )
@@ -117,11 +118,7 @@ def _is_tried(context: ClusterContext, place: ProxyPlace) -> bool:
 
 
 def _lacks_ports(context: ClusterContext, place: ProxyPlace) -> bool:
-    """Whether a proxy waits for its ports.
-
-    Such a proxy does not count as away in a rollout: no rollout has caused this, and the operator
-    tries other ports.
-    """
+    """Whether a proxy waits for its ports. No rollout has caused this, so no rollout waits."""
     current = context.view.current.get(place)
     return current is not None and current.stuck is PodFailure.PORTS
 
@@ -149,10 +146,7 @@ def _works(context: ClusterContext, place: ProxyPlace, places: Iterable[ProxyPla
 def _reconcile_proxy(
     context: ClusterContext, place: ProxyPlace, may_stop: bool
 ) -> Iterator[Action]:
-    """Yield the next actions for a proxy on a node.
-
-    With ``may_stop`` False, a rollout must not stop this proxy now.
-    """
+    """Yield the next actions for a proxy. ``may_stop``: a rollout may stop the proxy now."""
     node = context.observed.nodes.get(place.node)
     proxies = context.view.proxies.get(place, ())
     if place in context.view.wanted:
@@ -186,6 +180,7 @@ def _ensure(
         if current is not None:  # otherwise the pod with this name is deleted first
             yield from _update(context, current, site, may_stop)
     elif (seconds := context.seconds_until_torn_down(place)) > 0:
+        # A pod that was deleted by force may still hold its hostPorts: see `TORN_DOWN_WITHIN_S`.
         context.retries.look_again_in(seconds)
     elif context.retries.is_due(_creation(place)):
         yield CreateProxy(place.of, manifests.proxy_pod(site, context.settings))
