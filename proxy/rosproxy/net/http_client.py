@@ -1,12 +1,14 @@
-"""The client's side of XML-RPC: POST over kept connections.
+"""The HTTP client for XML-RPC: POST over kept connections.
 
-aiohttp's parser (llhttp) reads the responses. Its ClientSession is left out: with cookies,
-redirects, proxies and the like a call takes twice as long, and it closes the connection of a call
-that is given up, which ends roslisp nodes (`rosproxy.net.late_answers`). Nothing is ever inflated:
-ROS does not compress, and a small body could become a huge one.
+aiohttp's parser (llhttp) reads the responses. The client does not use aiohttp's ClientSession. A
+call through ClientSession takes twice as long, because of cookies, redirects and proxies. A
+cancelled call of ClientSession closes the connection, and that ends roslisp nodes
+(`rosproxy.net.late_answers`). The client refuses compressed bodies: ROS does not compress, and a
+small body could become huge.
 
-Bodies that need not be read here, requests and replies alike, go through piece by piece: who can't
-write does not read, so that they take some 100 KiB whatever their length.
+Long bodies that the proxy need not read pass piece by piece, in requests and replies. The proxy
+reads a piece only after the receiver has taken the previous pieces. So a body needs about 100 KiB
+of memory, whatever the length.
 """
 
 import asyncio
@@ -30,34 +32,34 @@ from rosproxy.net.sockets import dial
 from rosproxy.net.time_limits import TimeLimit, TimeLimits
 
 MAX_BODY = 64 * 1024 * 1024
-"""Longest XML-RPC body in bytes, either way, unless told otherwise."""
+"""Default bound of an XML-RPC body in bytes."""
 LONG = 64 * 1024
-"""Bytes from which on a reply that nobody here reads is passed on piece by piece."""
+"""Bytes. A longer reply passes piece by piece if the proxy need not read the reply."""
 PIECE_TIMEOUT = 30.0
-"""Seconds in which the next piece of a long body has to come, or to go."""
+"""Seconds within which the next piece of a long body must arrive, or leave."""
 LONG_TIMEOUT = 600.0
-"""Seconds that a long body may take in all: 64 MiB at 0.9 Mbit/s."""
+"""Seconds for a whole long body: 64 MiB at 0.9 Mbit/s."""
 CONNECT_TIMEOUT = 2.0
-"""Seconds for each address of a peer.
+"""Seconds to connect to each address of a peer.
 
-rosmaster calls all subscribers from three threads (master_api.py, NUM_WORKERS): those that don't
-answer hold up the others.
+Short, because rosmaster calls all subscribers from three threads (master_api.py, NUM_WORKERS). Each
+subscriber that does not answer blocks a thread.
 """
 
 _SENDABLE = re.compile(r"[^\x00-\x20\x7f]+")
 
 
 class LongBody(Protocol):
-    """A request's body that comes piece by piece."""
+    """A request body that arrives piece by piece."""
 
     size: int
 
     def pieces(self) -> AsyncIterator[bytes]:
-        """The pieces, once; what they raise ends the call that carries them."""
+        """The pieces, once. An error between two pieces ends the call that sends the body."""
 
 
 class LongReply:
-    """A reply's body that is passed on piece by piece; `close` it in any case."""
+    """A reply body that passes piece by piece. The receiver must call `close` in any case."""
 
     def __init__(self, size: int, stream: aiohttp.StreamReader, finish: Callable[[], None]) -> None:
         self.size = size
@@ -74,16 +76,16 @@ class LongReply:
             yield piece
 
     def close(self) -> None:
-        """Let the connection go: it is kept if all was read."""
+        """Keep the connection for other calls if the whole body was read, else close it."""
         self._finish()
 
 
 class ClientConnection(HttpProtocol):
-    """A connection to a peer, for one call at a time."""
+    """A connection to a peer, for a single call at a time."""
 
     def __init__(self) -> None:
         loop = asyncio.get_running_loop()
-        # A reply that tells no length ends with its connection, as in HTTP/1.0 (read_until_eof).
+        # A reply without a length ends with the connection, as in HTTP/1.0 (read_until_eof).
         self._responses = HttpResponseParser(
             self,
             loop,
@@ -108,7 +110,7 @@ class ClientConnection(HttpProtocol):
         return self._lasts and is_read and is_open and not self._messages
 
     def data_received(self, data: bytes) -> None:
-        """Take in what has come; also called with nothing, when the parser may go on."""
+        """Parse received bytes. aiohttp passes no bytes when the parser may go on."""
         if self._failure is not None:
             return
         try:
@@ -124,12 +126,12 @@ class ClientConnection(HttpProtocol):
             wake(self._arrival)
 
     def eof_received(self) -> None:
-        """Close the connection, as the peer has closed its side."""
+        """Have asyncio close the connection, because the peer has closed the other side."""
 
     def connection_lost(self, exc: BaseException | None) -> None:
-        """End the call that is under way."""
+        """End the call under way with an error."""
         try:
-            self._responses.feed_eof()  # ends a body that tells no length
+            self._responses.feed_eof()  # ends a body without a length
         except Exception as error:
             if self._content is not None:
                 text = f"the body is not complete: {exc or error}"
@@ -159,12 +161,13 @@ class ClientConnection(HttpProtocol):
 
 
 class HttpClient:
-    """Calls one kind of peer.
+    """Calls peers of a single kind: the master, or nodes.
 
-    ``headers`` are sent with each call. A connection that is not used for ``keepalive`` seconds is
-    closed; there are never more than ``most`` in use, those of long bodies apart, and those in
-    ``late``, which have been given up. No body is longer than ``longest`` bytes. ``source`` is who
-    gives the peers' names (see `resolver`). ``last_address`` is the address reached last.
+    ``headers``: sent with each call. ``keepalive``: seconds until an idle connection is closed; the
+    check may come half that time later. ``most``: connections in use at once, without long bodies
+    and without the cancelled calls in ``late``. ``longest``: bound of a reply body in bytes.
+    ``source``: the source of the peers' names (see `resolver`). ``last_address``: the address of
+    the latest new connection.
     """
 
     def __init__(
@@ -198,11 +201,12 @@ class HttpClient:
         within: float,
         longest: int | None = None,
     ) -> bytes:
-        """A reply's body, within so many seconds; ``host`` is what the peer is called.
+        """Send a request; return the body of the reply, at most ``longest`` bytes.
 
-        It has at most ``longest`` bytes. All calls can be repeated without harm, so a kept
-        connection that turns out to be closed costs one more try. Raises OSError, TimeoutError,
-        aiohttp.ClientError, ValueError.
+        ``within``: seconds for the whole call. ``host``: the text of the ``Host`` header. If a kept
+        connection turns out to be closed, the client sends the request again on a new connection.
+        ROS calls may be repeated without harm. Raises OSError, TimeoutError, aiohttp.ClientError,
+        ValueError.
         """
         head = self._head(path, host, len(body))
         with TimeLimit(self._time_limits, within):
@@ -213,18 +217,19 @@ class HttpClient:
     async def pass_on(
         self, peer: HostPort, path: str, host: str, body: bytes | LongBody, within: float
     ) -> bytes | LongReply:
-        """The same for a reply that nobody here reads: if it is long, it comes piece by piece.
+        """Send a request; return the body of the reply. Beyond LONG bytes the body is a LongReply.
 
-        ``within`` bounds the time from the body's end until the reply begins. A long body goes on
-        a new connection, as its pieces can't be sent twice. Raises what `post` raises, and what the
-        body does.
+        A body without ``Content-Length`` is never a LongReply. ``within``: seconds until a long
+        reply begins, or a short reply ends. For a LongBody the time counts from the end of the
+        body, and connecting has the same time. A LongBody uses a new connection, because the client
+        can't send the pieces twice. Raises the errors of `post` and of the body.
         """
         if isinstance(body, bytes):
             head = self._head(path, host, len(body))
             with TimeLimit(self._time_limits, within):
                 async with self._places:
                     return await self._pass_reply(peer, *await self._ask(peer, head, body))
-        # A long body takes no place among the ``most``, or short calls would have to wait for it.
+        # A long body does not count among ``most``: short calls would wait for the long body.
         head = self._head(path, host, body.size)
         async with asyncio.timeout(within):
             connection = await self._connect(peer)
@@ -239,7 +244,7 @@ class HttpClient:
             raise
 
     def request(self, path: str, host: str, body: bytes) -> bytes:
-        """What `post` sends, for a connection that is not of this client. Raises ValueError."""
+        """The bytes that `post` would send, for a connection of the caller. Raises ValueError."""
         return self._head(path, host, len(body)) + body
 
     async def close(self) -> None:
@@ -254,7 +259,7 @@ class HttpClient:
         await asyncio.sleep(0)  # asyncio closes a transport's socket in the loop's next turn
 
     def leave(self, sock: socket.socket) -> None:
-        """Close a connection that is not of this client once it has its answer."""
+        """Close a connection of the caller after the peer has closed it, or after LATE_TIMEOUT."""
         self.late.wait(partial(_drain, sock), sock.close)
 
     def _head(self, path: str, host: str, size: int) -> bytes:
@@ -264,7 +269,7 @@ class HttpClient:
     async def _ask(
         self, peer: HostPort, head: bytes, body: bytes
     ) -> tuple[ClientConnection, aiohttp.StreamReader, int | None]:
-        """Send a request and wait for a response: its connection, body and length."""
+        """Send a request; return the connection, the body and the length of the response."""
         kept = self._take(peer)
         if kept is not None:
             try:
@@ -282,7 +287,7 @@ class HttpClient:
         try:
             connection.write_message(head, body)
             return await _answer(connection)
-        except asyncio.CancelledError:  # too late, or nobody wants it any more
+        except asyncio.CancelledError:  # timeout, or the caller has gone
             self._used.discard(connection)
             self.late.wait(partial(_drain_answer, connection), connection.close)
             raise
@@ -328,7 +333,7 @@ class HttpClient:
         self._keep(peer, connection)
 
     async def _connect(self, peer: HostPort) -> ClientConnection:
-        """A new connection; never redirected or led elsewhere than to ``peer``."""
+        """A new connection to ``peer``, by the first address that accepts. Raises OSError."""
         if self._closed:
             raise ConnectionAbortedError("the proxy is stopping")
         loop = asyncio.get_running_loop()
@@ -345,7 +350,7 @@ class HttpClient:
         raise failure
 
     def _take(self, peer: HostPort) -> ClientConnection | None:
-        """The connection that was used last, if one is left that can still be used."""
+        """Take the most recent idle connection that can carry a call; None without any."""
         idle = self._idle.get(peer, [])
         while idle:
             _, connection = idle.pop()
@@ -364,7 +369,7 @@ class HttpClient:
             self._sweeper = loop.call_later(self._keepalive, self._sweep)
 
     def _sweep(self) -> None:
-        """Close what was not used for long."""
+        """Close connections that have been idle for ``keepalive`` seconds."""
         loop = asyncio.get_running_loop()
         expiry = loop.time() - self._keepalive
         self._sweeper = None
@@ -388,15 +393,15 @@ def _request_start(path: str, host: str) -> str:
 
 
 class BadResponse(ValueError):
-    """A response in HTTP that is not the one that was asked for: another status, another form."""
+    """An HTTP response with a status other than 200, or with a compressed or too long body."""
 
 
 class CallFailed(Exception):
-    """Another program that was needed could not be asked, or refused; says why."""
+    """Another program could not be called, or refused the call; the message has the reason."""
 
 
 class TooLong(BadResponse):
-    """A body of more bytes than there may be."""
+    """A body with more bytes than the bound."""
 
     def __init__(self, most: int) -> None:
         super().__init__(f"the body is longer than {most} bytes")
@@ -405,9 +410,10 @@ class TooLong(BadResponse):
 async def read_bounded(
     stream: aiohttp.StreamReader, longest: int, hold: Callable[[int], None] | None = None
 ) -> bytes:
-    """All of a body; ``hold`` is told how long each part is before the next is waited for.
+    """The whole body, of at most ``longest`` bytes.
 
-    Raises TooLong, and what ``hold`` raises.
+    Calls ``hold`` with the size of each chunk before reading the next chunk. Raises TooLong, and
+    the errors of ``hold``.
     """
     chunks = list[bytes]()
     size = 0
@@ -423,7 +429,7 @@ async def read_bounded(
 
 
 async def _upload(connection: ClientConnection, head: bytes, body: LongBody) -> None:
-    """Send a long body, as fast as the peer takes it."""
+    """Send a long body as fast as the peer reads. Raises TimeoutError if the peer stalls."""
     connection.write(head)
     async for piece in body.pieces():
         async with asyncio.timeout(PIECE_TIMEOUT):
@@ -432,7 +438,10 @@ async def _upload(connection: ClientConnection, head: bytes, body: LongBody) -> 
 
 
 async def _answer(connection: ClientConnection) -> tuple[aiohttp.StreamReader, int | None]:
-    """The body of a response with status 200, and its length if that is told."""
+    """The body of a response, and the length if the header has ``Content-Length``.
+
+    Skips responses with status 1xx. Raises BadResponse for another status than 200.
+    """
     message, payload = await connection.response()
     while 100 <= message.code < 200:
         message, payload = await connection.response()
@@ -451,19 +460,19 @@ async def _drain_answer(connection: ClientConnection) -> None:
 
 
 async def _drain(sock: socket.socket) -> None:
-    """Take all that comes on a connection until it is ended."""
+    """Read and drop all bytes until the peer closes the connection."""
     while await asyncio.get_running_loop().sock_recv(sock, LONG):
         pass
 
 
 def is_plain(headers: Mapping[str, str]) -> bool:
-    """Whether the body that goes with an HTTP header is not compressed."""
+    """Whether the headers announce a body without compression."""
     encoding = headers.get("Content-Encoding")
     return encoding is None or encoding.strip().lower() in ("identity", "")
 
 
 def _was_closed(error: BaseException) -> bool:
-    """Whether the peer had closed the connection, or reset it."""
+    """Whether an error means that the peer has closed or reset the connection."""
     closed = aiohttp.ServerDisconnectedError, ConnectionResetError, BrokenPipeError
     number = error.errno if isinstance(error, OSError) else None
     return isinstance(error, closed) or number in (errno.ECONNRESET, errno.EPIPE)

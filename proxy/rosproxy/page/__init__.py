@@ -1,6 +1,8 @@
-"""The live page: the graph of nodes and topics, with what is wrong where it is wrong.
+"""The live page: the graph of nodes and topics, with each problem at the broken node or link.
 
-`measures` keeps what was counted, `graph` and `domain_graph` make of it and of what the doctor says
-a document, `changes` tells what is new in one. `feed` asks for as long as somebody looks, `routes`
-serves it with the ``files``, and `visitors` says who may look.
+`feed` asks the proxy, the master and the nodes while a page is open. `judgement` holds the doctor's
+findings, `measures` the counters of nodes and relays. From these, `graph_document` (ROS 1) and
+`domain_graph` (ROS 2) make a document, with the rows and bounds of `page_document`. `changes` finds
+the differences between two documents. `routes` serves documents, changes and the ``files``.
+`visitors` decides which requests may see the page.
 """

@@ -1,12 +1,13 @@
-"""Keeps the document up to date for as long as somebody looks at it, and hands out what is new.
+"""Makes the documents of the live page while a watcher waits for documents.
 
-While there is a watcher, two things go on. The status is read each `TICK` seconds, later where that
-takes long, so that the page never costs more than a share of the proxy's time. And the master and
-the nodes are asked (`rosproxy.doctor.collect.collect_running`), so many questions a second at most.
-When nobody looks, nobody is asked, and what was counted is forgotten.
+A watcher is an open page, or a program that polls. With a watcher, two loops run. The first loop
+reads the status and makes a document each `TICK` seconds. If a document takes long, the pause
+grows, so that documents take at most `SHARE` of the time. The second loop asks the master and the
+nodes in rounds (`rosproxy.doctor.collect.collect_running`), with at most `PER_SECOND` questions a
+second. Without a watcher, both loops end and all counts are dropped.
 
-A watcher waits for another document than the one that it has. One that is slow thereby skips those
-between, and nothing queues up for it.
+Each watcher waits for a newer document than the previous document. So a slow watcher skips
+documents, and no documents queue up.
 """
 
 import asyncio
@@ -29,33 +30,35 @@ from rosproxy.page.page_document import Json
 log = logging.getLogger(__name__)
 
 TICK = 1.0
-"""Seconds between two documents at least."""
+"""Least seconds between two documents."""
 SHARE = 0.1
-"""Share of the time that is spent on making documents at most."""
+"""Largest share of the time for making documents."""
 LOOK_AGAIN = 2.0
-"""Seconds between two rounds of questions at least."""
+"""Least seconds between two rounds of questions."""
 PER_SECOND = 100.0
-"""Questions a second at most, over a round and the pause after it."""
+"""Most questions a second, over a round and the following pause."""
 PER_NODE = 6
-"""Questions to each node in a round at most."""
+"""Most questions to a node in a round."""
 MOST_WATCHERS = 16
-"""Pages that are open at the same time."""
+"""Watchers at the same time."""
 MOST_WATCHERS_EACH = 6
-"""The same from one address. Chromium and Firefox have six connections to a server at most, so that
-a person with many tabs has no more in any case."""
+"""Watchers at the same time from one address.
+
+Chromium and Firefox open at most six connections to a server, so a browser needs no more.
+"""
 LINGER = 10.0
-"""Seconds for which it goes on after the last watcher: pages are loaded again, operators poll."""
+"""Seconds until the loops end after the last watcher. Users reload pages, and operators poll."""
 
 
 class Ended(Exception):
-    """The server stops, and there are no more documents."""
+    """The server stops, so no more documents follow."""
 
 
 class Feed:
-    """The newest document, made by ``make`` while there is somebody who wants it.
+    """Holds the newest document that ``make`` has yielded.
 
-    ``make`` is started anew with the first watcher and cancelled after the last: it yields
-    documents.
+    The feed starts ``make`` for the first watcher, and cancels ``make`` LINGER seconds after the
+    last watcher.
     """
 
     def __init__(self, tasks: Tasks, make: Callable[[], AsyncGenerator[Json]]) -> None:
@@ -72,12 +75,12 @@ class Feed:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is made, since nobody looks."""
+        """Whether no documents are made, because there is no watcher."""
         return self._making is None
 
     @contextlib.contextmanager
     def watching(self, source: str) -> Iterator[None]:
-        """As long as this lasts, documents are made for an address. Raises NoSlot, Ended."""
+        """Make documents for a watcher at an address in this context. Raises NoSlot, Ended."""
         if self._closed:
             raise Ended
         try:
@@ -88,10 +91,7 @@ class Feed:
             self._end_later()
 
     async def after(self, former: Json | None, within: float) -> Json | None:
-        """Another document than the ``former``; None if none comes ``within`` these seconds.
-
-        Raises Ended.
-        """
+        """Wait for a newer document than ``former``; None after ``within`` s. Raises Ended."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within), self._renewed:
                 await self._renewed.wait_for(lambda: self._closed or self._is_update(former))
@@ -100,7 +100,7 @@ class Feed:
         return self._newest if self._is_update(former) else None
 
     async def close(self) -> None:
-        """Let everybody go."""
+        """Cancel ``make``, and raise Ended in all waiting watchers."""
         self._closed = True
         if self._ending:
             self._ending.cancel()
@@ -130,7 +130,8 @@ class Feed:
     async def _keep_making(self) -> None:
         while True:
             try:
-                # Closed here, so that its questions to nodes end at once, and not with the garbage.
+                # aclosing ends the questions to nodes at once. Otherwise the questions would go on
+                # until the garbage collector finds the generator.
                 async with contextlib.aclosing(self._make()) as documents:
                     async for document in documents:
                         await self._publish(document)
@@ -146,7 +147,7 @@ class Feed:
 
 
 class PageWatch:
-    """What was counted and found out of a proxy since somebody began to look at its page."""
+    """Makes the documents of a proxy from the status, the findings and the counts."""
 
     def __init__(
         self,
@@ -159,13 +160,13 @@ class PageWatch:
         self._admin = admin
         self._measures = Measures()
         self._judged: JudgedFacts | None = None
-        # Taken once: were the clock set meanwhile, the times of all links would change.
+        # Read only once: if the clock is set later, the times of the links stay as they are.
         self._epoch = time.time() - time.monotonic()
-        # A document is made in a thread, and counters may not change while that reads them.
+        # A thread reads the counters to make a document. Meanwhile the counters must not change.
         self._counting = asyncio.Lock()
 
     async def documents(self) -> AsyncGenerator[Json]:
-        """A document each tick, without an end."""
+        """Yield a document each TICK, without an end."""
         asking = asyncio.create_task(_again_and_again(self._ask))
         try:
             while True:
@@ -183,13 +184,13 @@ class PageWatch:
         async with self._counting:
             if judged:
                 self._measures.read_relays(relayed(status, judged.facts.system), now)
-            # In a thread, so that calls of nodes are not kept waiting by a large graph.
+            # In a thread, because the document of a large graph would hold up calls of nodes.
             return await asyncio.to_thread(
                 graph_document, status, judged, self._measures, own_findings, now, self._epoch
             )
 
     async def _ask(self) -> float:
-        """One round of questions; the seconds until the next."""
+        """Ask all nodes; return the seconds until the next round."""
         began = time.monotonic()
         status = self._status()
         facts = await collect_running(status, self._admin, partial(topics_to_ask_about, status))
@@ -203,7 +204,7 @@ class PageWatch:
 
 
 async def _again_and_again(ask: Callable[[], Awaitable[float]]) -> None:
-    """Ask without an end, whatever becomes of it."""
+    """Repeat ``ask`` without an end, also after an error. ``ask`` returns the pause in seconds."""
     pause = LOOK_AGAIN
     while True:
         try:

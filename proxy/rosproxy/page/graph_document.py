@@ -1,8 +1,8 @@
-"""The document of one proxy: from its status, what the doctor has found out, and what was counted.
+"""Makes the document of a proxy from the status, the doctor's findings and the counts.
 
-A link has the first cause of what is wrong: a node at either end that is wrong, then what the
-doctor says of the pair, then that nothing arrives. Links between two nodes outside don't concern
-the proxy and are left out.
+A broken link shows only the first of these causes: a fault of a node at either end, the doctor's
+finding on the pair, a connection on which nothing arrives. The document has no links between two
+nodes outside, because these links do not concern the proxy.
 """
 
 from collections.abc import Iterator, Sequence
@@ -41,12 +41,12 @@ from rosproxy.telemetry.text import quoted
 
 MASTER = "master"
 PROXY = "rosproxy"
-"""Keys of what is no node: names of those begin with a slash."""
+"""Keys of master and proxy. No node has such a key: names of nodes begin with a slash."""
 _STATES = {Severity.ERROR: BROKEN, Severity.WARNING: WARNING}
 
 
 def relayed(status: ProxyStatus, graph: SystemState) -> dict[Key, int]:
-    """The bytes that the proxy has relayed of each link of a topic."""
+    """The bytes that the proxy has relayed for each link of a topic."""
     sizes: dict[Key, int] = {}
     for endpoint in status.nodes:
         for connection in endpoint.connections:
@@ -65,10 +65,10 @@ def graph_document(
     now: float,
     epoch: float,
 ) -> Json:
-    """The document; ``own_findings`` are the proxy's about its own setting-up.
+    """The document of a proxy. ``own_findings``: the findings of the proxy about its own setup.
 
-    ``now`` is in monotonic seconds, as the counters' times, and ``epoch`` when those began, in
-    seconds since the epoch.
+    ``now``: monotonic seconds, as the times of the counters. ``epoch``: the Unix time in seconds at
+    which the monotonic clock was 0.
     """
     judged = without_ended(judged or JudgedFacts(DoctorFacts(status=status)), status)
     present = tuple(endpoint for endpoint in status.nodes if not endpoint.has_ended)
@@ -124,12 +124,14 @@ class _Ros1Graph:
             MASTER: PageNode(ROBOT, "master", "master", state, text, "", shown_name(master.uri))
         }
         nodes |= {name: self._inside_node(name, e) for name, e in self._inside.items()}
-        # Who is connected though the master does not know it, or has not been asked yet.
+        # Callers of relayed connections. The master may not know a caller, or the first round of
+        # questions may not have ended.
         nodes |= {
             c.caller_id: PageNode(ROBOT, address=shown_name(c.peer))
             for endpoint in self._status.nodes
             for c in endpoint.connections
-            # Whoever connects names himself; what is no node on this page has no slash.
+            # A caller chooses the caller_id. Without the test for a slash, a caller could replace
+            # MASTER or PROXY.
             if c.caller_id not in self._inside and c.caller_id.startswith("/")
         }
         return nodes | {
@@ -199,13 +201,20 @@ class _Ros1Links:
                     yield self._alone(topic, name)
 
     def _alone(self, topic: str, name: str) -> PageLink:
-        """A topic of a node with nobody on the other side; perhaps it is hidden from there."""
+        """The link of a topic without a node at the other end.
+
+        If the policy hides the topic, the text has the reason.
+        """
         reason = self._hidden.get((topic, name))
         text = "" if reason is None else shown_text(f"hidden from outside by the policy: {reason}")
         return PageLink("topic", shown_name(topic), name, text=text, quiet=topic in QUIET)
 
     def _pairs(self) -> set[Key]:
-        """Publishers and subscribers of which one is inside; of /tf there may be very many."""
+        """The links (topic, publisher, subscriber) with an inside node, and all relayed links.
+
+        Topics with more links than the bound allows are only counted, in ``left_out``: /tf may
+        have very many.
+        """
         pairs = {*self._relayed}
         for topic in sorted(self._graph.topics, key=lambda topic: (topic in QUIET, topic)):
             publishers = self._graph.publishers.get(topic, ())
@@ -218,7 +227,10 @@ class _Ros1Links:
         return pairs
 
     def _has_topic(self, name: str, endpoint: EndpointStatus, topic: str) -> bool:
-        """Whether a node has a topic, as far as is known where several share an address."""
+        """Whether a node publishes or subscribes to a topic of the endpoint.
+
+        If several nodes share the address, the graph of the master decides.
+        """
         return len(endpoint.nodes) == 1 or name in self._graph.sides(topic)
 
     def _topic(self, key: Key) -> PageLink:
@@ -248,7 +260,7 @@ class _Ros1Links:
         )
 
     def _problem(self, key: Key) -> DoctorFinding | None:
-        """What is wrong with a link, the first cause first."""
+        """The first cause why a link is broken; None without a cause."""
         for name in key[1:]:
             finding = self._judged.nodes.get(name)
             if finding and finding.severity is Severity.ERROR:
@@ -264,7 +276,7 @@ class _Ros1Links:
     def _stalled(self, key: Key) -> DoctorFinding:
         topic, publisher, subscriber = key
         text = (
-            f"connected, but nothing of what {publisher} publishes arrives at {subscriber}: "
+            f"connected, but no message of {publisher} arrives at {subscriber}: "
             "packets are dropped on the way"
         )
         _, port = self._way(key)
@@ -278,7 +290,7 @@ class _Ros1Links:
         return error("pair", f"{topic} from {publisher} to {subscriber}", text, fix)
 
     def _way(self, key: Key) -> tuple[str, int | None]:
-        """How a link is carried, and by which port of the proxy."""
+        """How a link is carried (empty if unknown), and the port of the proxy, if any."""
         topic, publisher, subscriber = key
         if (topic, subscriber) in self._udpros:
             return "UDPROS", self._udpros[topic, subscriber]
@@ -299,7 +311,7 @@ class _Ros1Links:
     def _way_of(
         self, holder: EndpointStatus | StandInStatus, port: int, is_relayed: bool
     ) -> tuple[str, int | None]:
-        """The same for what goes by a port of the range, or by one that stands for outside."""
+        """The same as `_way`, for a link through the ports of an endpoint or stand-in."""
         plane = holder.data_plane
         if plane and plane.plane == "kernel" and plane.port and not is_relayed:
             return "kernel", plane.port
@@ -345,6 +357,9 @@ class _Ros1Links:
 
 
 def _owner(endpoint: EndpointStatus, holders: Sequence[str]) -> str:
-    """Which node of an address has something, as the master tells; else the first."""
+    """The first node of an endpoint that is among ``holders``, the nodes that the master lists.
+
+    If none is, the first node of the endpoint; empty if the endpoint has no node.
+    """
     matches = [name for name in endpoint.nodes if name in holders]
     return next(iter([*matches, *endpoint.nodes]), "")

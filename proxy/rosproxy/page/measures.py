@@ -1,13 +1,14 @@
-"""What was counted of each link, and what follows from it.
+"""The counters of each link, and the rates, times and stalls that follow from the counters.
 
-That are rates, the age of the last message, and whether a connection that seems well carries
-nothing. There are three counters: the publisher's and the subscriber's own of messages and bytes,
-which they are asked for now and then (``getBusStats``), and the proxy's of bytes, where it relays.
-What the subscriber has counted has arrived. The proxy's counter stops only once buffers are full;
-the publisher's tells what was to be sent.
+A link has up to three counters:
 
-The proxy's counter is read each second, the nodes' as seldom as a thousand of them need. So what
-the proxy relays counts, as long as nothing shows that it does not arrive.
+- The subscriber counts messages and bytes that have arrived (``getBusStats``).
+- The publisher counts messages and bytes to send (``getBusStats``).
+- The proxy counts bytes that a relay has passed on. If nothing arrives, this counter goes on until
+  the buffers are full.
+
+The proxy reads the relays each second. A round of questions to a thousand nodes takes a minute. So
+the relay decides whether messages flow, unless the counts of the nodes show a stall.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,22 +19,24 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 
 STALLED = 5.0
-"""Seconds in which a subscriber has got nothing that was sent to it, until that is told."""
+"""Seconds without a message at the subscriber after which a link counts as stalled."""
 MISSED = 2
-"""Messages that must have been sent meanwhile: one may be under way."""
+"""Messages that the publisher must have sent meanwhile. A single message may be under way."""
 LATE_ROUNDS = 2
-"""Rounds of questions after which the counts of a node that answers no more are not shown."""
+"""Rounds of questions without a new count after which a link no longer flows."""
 FLOWS = 3.0
-"""Seconds after a message in which one is said to come just now."""
+"""Seconds after a message in which a link flows."""
 Key = tuple[str, str, str]
 """Topic, publisher, subscriber."""
 
 
 @dataclass(slots=True)
 class Counter:
-    """Something that only grows: its ``value`` ``at`` a time, ``rate``, and when it last grew.
+    """A counter of messages or bytes, at the latest two reads.
 
-    ``every``: seconds between the last two times.
+    ``value``: the count at the latest read. ``at``: the time of this read. ``grew``: the latest
+    read with a larger count than before. ``every``: seconds between the latest two reads. ``rate``:
+    growth a second between these reads. Times are monotonic seconds.
     """
 
     value: int
@@ -43,7 +46,7 @@ class Counter:
     every: float = 0.0
 
     def read(self, value: int, at: float) -> None:
-        """Take in another value; a smaller one is that of a new connection."""
+        """Record a later value. A smaller value belongs to a new connection and has no rate."""
         if at <= self.at:
             return
         self.rate = (value - self.value) / (at - self.at) if value >= self.value else None
@@ -56,16 +59,18 @@ class Counter:
 
 @dataclass(slots=True)
 class Link:
-    """The counters of a link, by ``messages``, ``bytes`` and side, and ``relayed`` bytes.
+    """The counters of a link by name.
 
-    ``mark``: what the publisher had sent, and when, as the subscriber last got something.
+    ``given`` and ``given bytes``: the publisher's counts. ``taken`` and ``taken bytes``: the
+    subscriber's counts. ``relayed``: bytes of the relay. ``mark``: the publisher's count, and the
+    time, when the subscriber's count last grew.
     """
 
     counters: dict[str, Counter] = field(default_factory=dict)
     mark: tuple[int, float] | None = None
 
     def read(self, name: str, value: int, at: float) -> None:
-        """Take in what was counted."""
+        """Record a value of a counter."""
         counter = self.counters.get(name)
         if counter is None:
             self.counters[name] = Counter(value, at)
@@ -74,16 +79,16 @@ class Link:
 
     @property
     def hz(self) -> float | None:
-        """Messages per second that arrive or, where that is not told, that are sent."""
+        """Messages a second by the subscriber's count, else by the publisher's count."""
         return self._first("rate", "taken", "given")
 
     @property
     def rate(self) -> float | None:
-        """Bytes per second: those of the proxy, else those that a node has counted."""
+        """Bytes a second by the relay, else by the subscriber, else by the publisher."""
         return self._first("rate", "relayed", "taken bytes", "given bytes")
 
     def last(self, now: float) -> float | None:
-        """When something was last seen to have come; None: that is not known."""
+        """The time of the last message, in monotonic seconds; None if unknown."""
         names = ("taken",) if self.is_stalled(now) else ("taken", "relayed")
         counters = [self.counters[name] for name in names if name in self.counters]
         if not counters:
@@ -91,7 +96,10 @@ class Link:
         return max((c.grew for c in counters if c.grew is not None), default=None)
 
     def flows(self, now: float) -> bool:
-        """Whether messages come just now, or came so often when they were counted last."""
+        """Whether messages flow at ``now``.
+
+        If only nodes count, messages flow if the last read showed at least one message per FLOWS.
+        """
         last = self.last(now)
         if last is None or self.is_stalled(now):
             return False
@@ -103,18 +111,18 @@ class Link:
         return counter.grew == counter.at and (counter.rate or 0.0) * FLOWS >= 1.0
 
     def note_progress(self) -> None:
-        """Remember how far the publisher was whenever the subscriber got something."""
+        """Set ``mark`` if the subscriber's count has grown, for `is_stalled`."""
         sent = self.counters.get("given")
         arrived = self.counters.get("taken")
         if sent is None or arrived is None:
             self.mark = None
-        # Anew also when the publisher counts from the beginning: that is another connection.
+        # A smaller count of the publisher belongs to a new connection, and needs a new mark.
         elif self.mark is None or (arrived.grew or 0.0) > self.mark[1] or sent.value < self.mark[0]:
-            # The two nodes are asked one after the other: nothing is late before the later answer.
+            # The nodes answer at different times. The time of a stall starts at the later answer.
             self.mark = sent.value, max(sent.at, arrived.at)
 
     def is_stalled(self, now: float) -> bool:
-        """Whether messages are sent, and none arrives."""
+        """Whether no message arrived for STALLED seconds, although the publisher sent MISSED."""
         if self.mark is None:
             return False
         sent, since = self.mark
@@ -128,24 +136,24 @@ class Link:
 
 
 class Measures:
-    """The counters of all links, for as long as anybody looks."""
+    """The counters of all links while there is a watcher."""
 
     def __init__(self) -> None:
         self._links: dict[Key, Link] = {}
 
     def get(self, key: Key) -> Link:
-        """What is known of a link."""
+        """The counters of a link, perhaps empty. Do not change the result."""
         return self._links.get(key, _EMPTY_LINK)
 
     def read_relays(self, relayed: Mapping[Key, int], now: float) -> None:
-        """Take in the bytes that the proxy has relayed, by those links that it relays now."""
+        """Record the bytes that the proxy has relayed, by link. Other links lose ``relayed``."""
         for key in self._links.keys() - relayed.keys():
             self._links[key].counters.pop("relayed", None)
         for key, size in relayed.items():
             self._links.setdefault(key, Link()).read("relayed", size, now)
 
     def read_nodes(self, facts: DoctorFacts, pairs: Iterable[Key]) -> None:
-        """Take in what nodes have counted of these links; what is known of others is dropped."""
+        """Record the counts of nodes for the links ``pairs``, and drop all other links."""
         former = self._links
         uris = dict[str, Mapping[tuple[str, HostPort], str]]()
         self._links = {}
@@ -177,7 +185,10 @@ def _read(link: Link, side: str, report: SlaveReport, connection: tuple[str, str
 
 
 def _publishers(report: SlaveReport) -> Mapping[tuple[str, HostPort], str]:
-    """The URIs that a subscriber knows publishers by, which roscpp has without their paths."""
+    """The URIs that a subscriber reports for publishers, by topic and slave API.
+
+    roscpp reports URIs without a path, so these URIs can differ from the URIs at the master.
+    """
     uris: dict[tuple[str, HostPort], str] = {}
     for direction, topic, peer in report.counts:
         slave = parse_slave_uri(peer) if direction == "i" else None

@@ -1,7 +1,8 @@
-"""What the live page shows: nodes, the links between them, and findings, as one JSON document.
+"""The JSON document of the live page: nodes, links between nodes, and findings.
 
-Both versions of ROS and both operators make such a document; the page knows no other. Texts are
-what nodes call themselves and things, shortened, and harmless only as text.
+Proxies make this document for ROS 1 and ROS 2, and both operators make the same document for
+several proxies. Nodes choose the names in the document. `shown_name` and `shown_text` shorten these
+names, but do not escape HTML: show these names only as text.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,7 +19,7 @@ from rosproxy.telemetry.text import brief
 ROBOT = "robot"
 HOST = "host"
 CONTAINER = "container"
-"""The lanes: outside, the machine of the proxy, and inside."""
+"""The lanes of the graph: outside, the machine of the proxy, inside."""
 OK = "ok"
 UNKNOWN = "unknown"
 WARNING = "warning"
@@ -27,17 +28,17 @@ BROKEN = "broken"
 MOST_NODES = 1500
 MOST_LINKS = 3000
 MOST_FINDINGS = 50
-"""How many are shown; the rest is counted."""
+"""Bounds of the document. ``left_out`` counts further nodes and links, but no findings."""
 MOST_NODE_BYTES = 1024 * 1024
 MOST_LINK_BYTES = 4 * MOST_NODE_BYTES
-"""Bytes of all nodes that are shown, and of all links, as JSON in ASCII. The document is made each
-second. With names of 50 characters, and nothing wrong, all of them have 2 MB."""
+"""Bounds of all nodes and of all links in bytes, as JSON in ASCII. A document is made each second.
+With names of 50 characters and no faults, MOST_NODES and MOST_LINKS have 2 MB."""
 LONGEST = 300
-"""Characters of a name."""
+"""Most characters of a name."""
 LONGEST_TEXT = 1000
-"""Characters of what is wrong, and of its fix."""
+"""Most characters of a problem or a fix."""
 QUIET = frozenset({"/rosout", "/rosout_agg", "/tf", "/tf_static", "/parameter_events"})
-"""Topics that nearly every node has: hidden until they are asked for."""
+"""Topics that nearly every node has. The page hides these topics by default."""
 _QUIET_SERVICES = ("/get_loggers", "/set_logger_level")
 Json = dict[str, Any]
 Row = TypeVar("Row", bound=msgspec.Struct)
@@ -46,9 +47,9 @@ Row = TypeVar("Row", bound=msgspec.Struct)
 class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
     """A node, participant, master or proxy in its lane.
 
-    ``label`` is shown where the key is no name. ``ports`` are those that stand for it outside,
-    ``rate`` what is forwarded for it where that is not known of each link, in bytes per second.
-    ``proxy``: whose it is, where there are several.
+    ``label``: the text to show if the key is not a name. ``text`` and ``fix``: the problem and what
+    to do. ``ports``: the ports of the proxy for this node. ``rate``: forwarded bytes a second, if
+    the rates of the links are not known. ``proxy``: the proxy of the node, on an operator's page.
     """
 
     lane: str
@@ -64,13 +65,13 @@ class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A topic from a publisher to a subscriber, or a service or parameter and who has it.
+    """A topic from a publisher to a subscriber, or a service or parameter of a node.
 
-    ``target`` is empty where there is none. ``carried``: kernel, splice, copy, UDPROS, or direct
-    where it does not pass the proxy; empty if that is not known. ``port``: the proxy's. ``rate`` is
-    in bytes and ``hz`` in messages per second, ``since`` when something came last that does not
-    come just now, in seconds since the epoch; None: not known. ``proxy``: the key of the proxy with
-    the ``port``, where there are several.
+    ``target``: empty if only one end is known. ``carried``: kernel, splice, copy or UDPROS; direct
+    if the link does not pass the proxy; empty if unknown. ``port``: the port of the proxy.
+    ``rate``: bytes a second. ``hz``: messages a second. ``since``: the Unix time in seconds of the
+    last message, if nothing flows. None means unknown. ``proxy``: the key of the proxy with the
+    ``port``, on an operator's page.
     """
 
     kind: str
@@ -91,7 +92,7 @@ class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def key(self) -> str:
-        """What tells it from all others."""
+        """The key of the link in the document."""
         return f"{self.kind} {self.name} {self.source} {self.target}"
 
 
@@ -102,7 +103,10 @@ def document(
     findings: Iterable[DoctorFinding],
     left_out: int = 0,
 ) -> Json:
-    """All of it within bounds; ``left_out``: how many links are not even among these."""
+    """The document, within the bounds, with warnings and errors among ``findings``.
+
+    ``left_out``: the number of links that the caller has left out of ``links``.
+    """
     nodes = {shown_name(key): node for key, node in nodes.items()}
     by_key = {link.key: link for link in map(_shown_link, links)}
     worst = [f for f in findings if f.severity >= Severity.WARNING]
@@ -123,7 +127,11 @@ def within_bounds(
     most_nodes: int = MOST_NODES,
     most_links: int = MOST_LINKS,
 ) -> tuple[dict[str, PageNode], dict[str, PageLink]]:
-    """As many nodes and links as are shown: first what is broken, then what is not quiet."""
+    """The nodes and links within the bounds.
+
+    Broken nodes and links come first, with the nodes at both ends of a broken link. Then come links
+    that are not quiet. A link without the node at either end is left out.
+    """
     order = sorted(links, key=lambda key: (links[key].state != BROKEN, links[key].quiet, key))
     broken = [links[key] for key in order if links[key].state == BROKEN]
     important = {end for link in broken for end in (link.source, link.target)}
@@ -141,7 +149,7 @@ def within_bounds(
 
 
 def _fitting(rows: Iterable[tuple[str, Row]], room: int) -> Iterator[tuple[str, Row]]:
-    """The first rows with their keys, as many as have ``room`` bytes together."""
+    """The first rows and keys that need at most ``room`` bytes together."""
     for keyed in rows:
         room -= len(encode(keyed))
         if room < 0:
@@ -150,12 +158,12 @@ def _fitting(rows: Iterable[tuple[str, Row]], room: int) -> Iterator[tuple[str, 
 
 
 def _shown_link(link: PageLink) -> PageLink:
-    """A link with its ends as the nodes are called in the document."""
+    """A link with the keys that its nodes have in the document."""
     return replace(link, source=shown_name(link.source), target=shown_name(link.target))
 
 
 class PageFinding(msgspec.Struct, frozen=True):
-    """A finding, with its severity in words."""
+    """A finding, with the severity as a word."""
 
     severity: str = ""
     subject: str = ""
@@ -164,14 +172,14 @@ class PageFinding(msgspec.Struct, frozen=True):
 
 
 class PageProxy(msgspec.Struct, frozen=True):
-    """What of a proxy's own is needed to show it among several."""
+    """The values of a proxy that an operator needs to merge documents."""
 
     host: str = ""
     master: str = ""
 
 
 class Document(msgspec.Struct, frozen=True):
-    """A document as its reader has it."""
+    """A document that an operator has read from a proxy."""
 
     nodes: dict[str, PageNode]
     links: dict[str, PageLink]
@@ -181,22 +189,22 @@ class Document(msgspec.Struct, frozen=True):
 
 
 def is_quiet_service(name: str) -> bool:
-    """Whether every node has such a service."""
+    """Whether every node has a service of this name, such as ``/NODE/get_loggers``."""
     return name.endswith(_QUIET_SERVICES)
 
 
 def rounded(value: float) -> float:
-    """A measure as it is shown: a change in the third digit alone is not sent."""
+    """A value with two significant digits. Smaller changes would send the row again."""
     return float(f"{value:.2g}")
 
 
 def shown_name(name: str) -> str:
-    """A name as it is shown."""
+    """A name for the document: shortened, with control characters escaped."""
     return brief(name, LONGEST)
 
 
 def shown_text(text: str) -> str:
-    """What is wrong, or a fix, as it is shown."""
+    """A problem or fix for the document: shortened, with control characters escaped."""
     return brief(text, LONGEST_TEXT)
 
 

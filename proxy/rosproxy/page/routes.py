@@ -1,8 +1,10 @@
-"""The page over HTTP: its files, the document, and its changes as server-sent events.
+"""Serves the live page over HTTP: files, the document, and changes as server-sent events.
 
-It only tells. Its files are the same for everybody; what is told of nodes is for those that
-`Visitors` lets in. The page may load nothing from anywhere else and run no script but its own (its
-Content-Security-Policy), so that a name that a node has given itself does nothing there.
+The page can change nothing at the proxy. Every caller may read the scripts and the style sheet. The
+document and the changes are only for requests that `Visitors` allows.
+
+Nodes choose their names, so a name may contain a script. The Content-Security-Policy of the page
+allows only files of the proxy, so a browser does not run such a script.
 """
 
 import asyncio
@@ -28,16 +30,19 @@ from rosproxy.page.visitors import SESSION, Visitors, cookie_name
 
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 HEARTBEAT = 15.0
-"""Seconds after which something is sent, so that whoever has gone is noticed on either side."""
+"""Seconds without a change after which the proxy sends the time.
+
+If sending fails, the browser has gone. If no event arrives, the page opens a new connection.
+"""
 FIRST = 10.0
-"""Seconds in which the first document must be there."""
+"""Seconds within which the first document must be ready."""
 MOST_OF_FORM = 4096
-"""Longest form in bytes."""
+"""Most bytes of the login form."""
 FORM_TIMEOUT = 10.0
-"""Seconds in which it must have arrived."""
+"""Seconds within which the login form must arrive."""
 _HEADERS = {
     "Content-Security-Policy": (
-        # data: is for the empty icon in the pages' heads, which keeps browsers from asking for one.
+        # data: is for the empty icon in the pages' heads. Otherwise browsers request /favicon.ico.
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
         "img-src 'self' data:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     ),
@@ -54,11 +59,11 @@ _FILES = {
     "/findings.js": ("findings.js", "text/javascript"),
     "/page.css": ("page.css", "text/css"),
 }
-_WRONG = '<p role="alert">That is not the token.</p>'
+_WRONG = '<p role="alert">Wrong token. Enter the token of --admin-token.</p>'
 
 
 class Page:
-    """The routes of the page, over a feed of documents."""
+    """The routes of the page. ``feed`` makes the documents."""
 
     def __init__(self, feed: Feed, visitors: Visitors) -> None:
         self.feed = feed
@@ -68,7 +73,7 @@ class Page:
 
     @property
     def routes(self) -> Mapping[tuple[str, str], Handler]:
-        """What is served, by method and path."""
+        """The handlers by method and path."""
         handlers: dict[tuple[str, str], Handler] = {
             ("GET", "/"): self._show,
             ("POST", "/login"): self._log_in,
@@ -100,7 +105,9 @@ class Page:
                 body = await read_bounded(request.content, MOST_OF_FORM)
             fields = parse_qs(body.decode("utf-8", "surrogateescape"), max_num_fields=4)
         except (TimeoutError, TooLong, ValueError):
-            return web.Response(status=400, text="rosproxy: unreadable form\n", headers=_HEADERS)
+            return web.Response(
+                status=400, text="rosproxy: unreadable form. Open / again\n", headers=_HEADERS
+            )
         if self.visitors.knows_token(fields.get("token", [""])[0]):
             return self._let_in(request)
         return self._turn_away(_WRONG)
@@ -118,7 +125,7 @@ class Page:
         return response
 
     async def _send_document(self, request: web.BaseRequest) -> web.StreamResponse:
-        """The whole document, for programs."""
+        """Reply with the whole document, for programs."""
         if not self.visitors.may_look(request):
             return _refusal()
         try:
@@ -131,10 +138,10 @@ class Page:
             return _not_now(error)
 
     async def _stream(self, request: web.BaseRequest) -> web.StreamResponse:
-        """The document and then, as long as the browser is there, what changes in it."""
+        """Send the document, and then the changes until the browser closes the connection."""
         if not self.visitors.may_look(request):
             return _refusal()
-        # It has no body, and the stream has no end.
+        # A reply to HEAD has no body, so the stream would never end.
         if request.method == "HEAD":
             return web.Response(headers=_HEADERS)
         response = web.StreamResponse(headers={**_HEADERS, "Cache-Control": "no-store"})
@@ -152,24 +159,27 @@ class Page:
         return response
 
     async def _send(self, response: web.StreamResponse) -> None:
-        """Raises Ended, and ConnectionError once the browser has gone."""
+        """Send events without an end. Raises Ended, and ConnectionError if the browser closes."""
         await response.write(_clock_event())
         former: Json | None = None
         while True:
             newest = await self.feed.after(former, HEARTBEAT)
-            # Of a comment, which is shorter, a browser tells the page nothing.
+            # Not a comment, which would be shorter: browsers do not pass comments to the page.
             event = _clock_event() if newest is None else self._event(former, newest)
             await write_pieces(response, event)
             former = newest or former
 
     def _encode(self, document: Json) -> bytes:
-        """A document as JSON, encoded once for all who ask for it."""
+        """A document as JSON, encoded only once for all programs."""
         if self._whole is None or self._whole[0] is not document:
             self._whole = document, json.dumps(document, separators=(",", ":")).encode()
         return self._whole[1]
 
     def _event(self, former: Json | None, newest: Json) -> bytes:
-        """An event. Most watchers have seen the same, so that it is encoded once."""
+        """The event that turns ``former`` into ``newest``.
+
+        Encoded only once for all watchers with the same ``former``, as most have.
+        """
         cached = self._encoded
         if cached is None or cached[0] is not former or cached[1] is not newest:
             update = newest if former is None else changes(former, newest)
@@ -180,7 +190,7 @@ class Page:
 
 
 def _clock_event() -> bytes:
-    """The page tells how old something is, and the browser's clock may be another."""
+    """The event with the proxy's time. The browser's clock may differ, and the page shows ages."""
     return f"event: clock\ndata: {time.time():.3f}\n\n".encode()
 
 
@@ -195,7 +205,7 @@ async def _send_file(request: web.BaseRequest) -> web.StreamResponse:
 
 @cache
 def _read(name: str) -> tuple[bytes, str]:
-    """A file of the page, and what tells it from others of that name."""
+    """The content of a file of the page, and the ETag, which is a hash of the content."""
     body = files("rosproxy.page").joinpath("files", name).read_bytes()
     return body, f'"{hashlib.sha256(body).hexdigest()[:32]}"'
 
@@ -207,14 +217,14 @@ def _html(name: str, status: int = 200, remark: str = "") -> web.Response:
 
 
 def _refusal() -> web.Response:
-    text = "rosproxy: this needs 'Authorization: Bearer TOKEN', or the cookie of the page at /\n"
+    text = "rosproxy: no token or cookie. Send 'Authorization: Bearer TOKEN', or log in at /\n"
     return web.Response(status=403, text=text, headers=_HEADERS)
 
 
 def _not_now(reason: object = "") -> web.Response:
-    return unavailable(reason or "nothing is known yet; try again", _HEADERS)
+    return unavailable(reason or "no document is ready yet. Try again", _HEADERS)
 
 
 def _source(request: web.BaseRequest) -> str:
-    """The address that a request comes from."""
+    """The IP address from which a request comes."""
     return plain_address(request.remote or "")

@@ -1,12 +1,15 @@
-"""Who may look at the page: whoever may read the status and, where there is a token, knows it.
+"""Decides which requests may see the live page.
 
-A browser can't send the token with each request, and a cookie that holds it would go to every other
-port of the host. So it is given once, in a form, for a cookie that lets look and nothing else. And
-``rosproxy status --open`` gets a key by ``POST /page-key``, which is good for one cookie within a
-minute, so that no token stands in an address. All of them are random, and kept here as hashes.
+Without a token, every caller may see the page, as ``/status``. With a token, callers on loopback
+and callers with the token may. A web page of a stranger may not (`rosproxy.admin.host_rule`).
 
-Without a token the page is for whoever reaches the endpoint, as ``/status`` is; but not for pages
-of strangers (`rosproxy.admin.host_rule`).
+A browser can't send the token with each request. A cookie with the token would be a risk, because
+browsers send a cookie to all ports of the host. So the user enters the token once, in a form, and
+the browser gets a session cookie. With this cookie, the browser can only see the page.
+
+``rosproxy status --open`` gets a key by ``POST /page-key``, so the address in the browser contains
+no token. The key gives the browser a cookie, works once, and expires after a minute. Cookies and
+keys are random, and the proxy stores only hashes.
 """
 
 import hashlib
@@ -22,15 +25,15 @@ from rosproxy.admin.requests import EmptyBody, read_body
 from rosproxy.net.addresses import is_loopback
 
 SESSION = 12 * 3600.0
-"""Seconds for which a cookie is good."""
+"""Seconds until a cookie expires."""
 KEY = 60.0
-"""Seconds in which a key must be used."""
+"""Seconds until a key expires."""
 MOST = 64
-"""Cookies, and keys, that are good at the same time; the oldest goes first."""
+"""Most valid cookies, and most valid keys. A further cookie or key replaces the oldest."""
 
 
 class ExpiringTokens:
-    """Random texts that are good for some seconds, of which only hashes are kept."""
+    """Issues random texts that are valid for ``seconds``, and keeps only hashes."""
 
     def __init__(self, seconds: float, now: Callable[[], float]) -> None:
         self._seconds = seconds
@@ -38,7 +41,7 @@ class ExpiringTokens:
         self._until: dict[str, float] = {}
 
     def issue(self) -> str:
-        """Make one."""
+        """Issue a text; the oldest text expires if there are MOST."""
         self._forget()
         while len(self._until) >= MOST:
             del self._until[next(iter(self._until))]
@@ -47,15 +50,15 @@ class ExpiringTokens:
         return text
 
     def is_good(self, text: str) -> bool:
-        """Whether it was issued here and is not too old.
+        """Whether a text was issued here and has not expired.
 
-        Hashes are compared, so that the time it takes tells nothing of the text.
+        The comparison uses hashes, so the time of the comparison reveals nothing about a text.
         """
         self._forget()
         return _hash(text) in self._until
 
     def use_up(self, text: str) -> bool:
-        """The same, and it is good no more."""
+        """The same as `is_good`; the text then expires."""
         self._forget()
         return self._until.pop(_hash(text), None) is not None
 
@@ -65,10 +68,11 @@ class ExpiringTokens:
 
 
 class Visitors:
-    """Decides who may look. ``token_hash``: the SHA-256 of the token, in hex digits.
+    """Decides which requests may see the page.
 
-    ``local``: without one only callers on loopback may. ``own_names`` are those that the endpoint
-    is known by, in lower case.
+    ``token_hash``: the SHA-256 of the token in hex digits, None without a token. ``local``: only
+    callers on loopback may see the page, as on an operator's endpoint. ``own_names``: the names of
+    the endpoint, in lower case.
     """
 
     def __init__(
@@ -85,7 +89,7 @@ class Visitors:
         self._keys = ExpiringTokens(KEY, now)
 
     def may_look(self, request: web.BaseRequest) -> bool:
-        """Whether a request is of somebody who may."""
+        """Whether a request may see the page."""
         if self._sessions.is_good(request.cookies.get(cookie_name(request), "")):
             return True
         scheme, _, token = request.headers.get("Authorization", "").partition(" ")
@@ -98,46 +102,47 @@ class Visitors:
 
     @property
     def refusal(self) -> str:
-        """What to tell somebody who may not look where there is no token."""
+        """The text of the reply to a refused request at an endpoint without a token."""
         if self._local:
             return (
-                "rosproxy: the page is for this machine's own loopback (http://localhost:PORT/)\n"
+                "rosproxy: only callers on loopback may see the page. "
+                "Open http://localhost:PORT/ on this machine\n"
             )
         return (
-            "rosproxy: by this name the page is shown only with the token (--admin-token); without "
-            "one ask for it by the address of this host, or as localhost\n"
+            "rosproxy: without a token the page does not open by this name. Open the page by the "
+            "address of this host or as localhost, or set --admin-token\n"
         )
 
     @property
     def needs_token(self) -> bool:
-        """Whether there is a token to be known."""
+        """Whether the endpoint has a token."""
         return self._token_hash is not None
 
     def knows_token(self, token: str) -> bool:
-        """Whether this is the token."""
+        """Whether a text is the token. The comparison takes the same time for all texts."""
         return self._token_hash is not None and hmac.compare_digest(_hash(token), self._token_hash)
 
     def new_session(self) -> str:
-        """What a cookie is to hold."""
+        """The value of a new session cookie."""
         return self._sessions.issue()
 
     def uses_key(self, key: str) -> bool:
-        """Whether this is a key; it is none afterwards."""
+        """Whether a text is a valid key. The key then expires."""
         return self._keys.use_up(key)
 
     async def issue_key(self, body: Any) -> dict[str, Any]:
-        """``POST /page-key``: a key with which a browser gets in. Raises BodyError."""
+        """``POST /page-key``: return a new key for a browser. Raises BodyError."""
         read_body(body, EmptyBody)
         return {"key": self._keys.issue()}
 
 
 def cookie_name(request: web.BaseRequest) -> str:
-    """Cookies are for all ports of a host: the name tells which one is meant."""
+    """The name of the cookie, with the port: browsers send a cookie to all ports of a host."""
     _, _, port = request.headers.get("Host", "").rpartition(":")
-    # The header is the caller's: only digits of it may get into a cookie's name.
+    # The caller chooses the Host header, so only digits may get into the name.
     return f"rosproxy-{port}" if port.isascii() and port.isdecimal() else "rosproxy"
 
 
 def _hash(text: str) -> str:
-    # aiohttp keeps bytes that are no UTF-8 as surrogates.
+    # aiohttp decodes bytes that are not UTF-8 to surrogates.
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()

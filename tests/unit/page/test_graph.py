@@ -186,7 +186,7 @@ def test_a_link_that_carries_nothing_is_broken_and_names_the_command() -> None:
     measures, facts = counted((60.0, 10, 10), (62.0, 30, 30), (98.0, 300, 30))
     link = made(judge(facts), measures=measures)["links"][LINK]
     assert (link["state"], link["since"]) == ("broken", 962)
-    assert "nothing of what /talker publishes arrives at /listener" in link["text"]
+    assert "no message of /talker arrives at /listener" in link["text"]
     assert link["fix"].startswith("on the machine of /listener: nc -vz robot-host 45000")
 
 

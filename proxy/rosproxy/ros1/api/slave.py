@@ -1,8 +1,9 @@
-"""The slave API of inside nodes, as outside and the master reach it through a lease.
+"""The slave API of inside nodes, which outside and the master reach through leases.
 
-The port at which a call arrives says which node is meant. The call is forwarded to it, with the
-addresses in it imported and those in its reply exported (`rosproxy.ros1.rewriting.slave_api`). What
-the calls tell is noted: the TCPROS port that a node names, and that a node refuses.
+The port of a connection decides which endpoint a call is for. The proxy imports the addresses in
+the call, forwards the call to the endpoint, and exports the addresses in the reply
+(`rosproxy.ros1.rewriting.slave_api`). The proxy also records the TCPROS port that a node names in a
+reply, and whether the node answers.
 """
 
 import asyncio
@@ -40,7 +41,7 @@ NOT_THE_MASTER = "only the master's host may call this method (slave control: ma
 
 
 class SlaveApi:
-    """Serves the ports of nodes inside: XML-RPC itself, topics and services by ``tcpros``."""
+    """Serves the ports of nodes inside: XML-RPC here, topics and services by ``tcpros``."""
 
     def __init__(
         self,
@@ -61,12 +62,12 @@ class SlaveApi:
         self.server = XmlRpcServer(context, self, greeting, context.lease_call, self)
 
     async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
-        """Serve a connection to one of an endpoint's ports. Raises TimeoutError, OSError."""
+        """Serve a connection to a port of an endpoint. Raises TimeoutError, OSError."""
         target = self._nodes.target(endpoint)
         await self.server.dispatch(conn, peer, partial(self._tcpros.serve, target, peer))
 
     def end_calls(self, port: int) -> None:
-        """Let the XML-RPC connections of a port end, which refuses from now on."""
+        """End the XML-RPC connections of a closed port, busy connections after the current call."""
         self.server.close_port(port)
 
     async def __call__(self, call: IncomingCall) -> bytes | LongReply:
@@ -74,7 +75,7 @@ class SlaveApi:
         endpoint = self._endpoint(call)
         method = passing.method_of(call.body)
         if method is not None and not await self._may_call(method, call.source):
-            return self._refuse(method, NOT_THE_MASTER)  # before it is read
+            return self._refuse(method, NOT_THE_MASTER)  # before parsing
         try:
             parsed = xmlrpc.parse_call(call.body, self._context.lease_call)
         except xmlrpc.XmlRpcError:
@@ -88,11 +89,11 @@ class SlaveApi:
                 raise Unreachable("the caller has closed the connection")
             results.append(await self._multicall_result(endpoint, inner, call))
             call.charge(len(results[-1]))
-            await asyncio.sleep(0)  # what is refused or absorbed waits for nothing else
+            await asyncio.sleep(0)  # refused and absorbed calls wait for no node
         return multicall.results_reply(results)
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
-        """How to watch a long call while it passes; None if it has to be read."""
+        """The watch for a long call that may pass unread; None if the proxy must read the call."""
         return passing.CallWatch() if slave_api.passes_unread(method) else None
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
@@ -111,7 +112,10 @@ class SlaveApi:
         return await count_reply(self._context.metrics, "slave", method, reply)
 
     def _endpoint(self, call: IncomingCall) -> Endpoint:
-        """The endpoint that a call is for. Raises Unreachable."""
+        """The endpoint that a call is for.
+
+        Raises Unreachable if the call comes from this proxy, or if the node has gone.
+        """
         endpoint = self._context.registry.by_port.get(call.local.port)
         if call.comes_from(self._context.instance):
             raise Unreachable("the address of a node leads back to the proxy itself")
@@ -120,10 +124,10 @@ class SlaveApi:
         return endpoint
 
     def _matches_path(self, endpoint: Endpoint, path: str) -> bool:
-        """Whether a request's path names this endpoint, or no node at all, as roscpp's.
+        """Whether the path of a request names this endpoint, or no node, as roscpp's paths do.
 
-        A port may serve another node by now; the master's ``shutdown`` for a former one must not
-        end it.
+        The port may serve another node by now. A ``shutdown`` of the master for the former node
+        must not end the present node.
         """
         inside_path = parse_inside_path(path)
         return inside_path is None or inside_path.slave == endpoint.slave
@@ -131,11 +135,13 @@ class SlaveApi:
     async def _multicall_result(
         self, endpoint: Endpoint, inner: xmlrpc.Call | None, call: IncomingCall
     ) -> bytes:
-        """One result of a multicall, which is taken apart here: nodes get single calls only."""
+        """The result of a call in a multicall; the node gets a single call.
+
+        Several client libraries lack system.multicall (docs/architecture.md, Client libraries).
+        """
         if inner is None:
             text = f"an element of {multicall.MULTICALL} is not a method call"
             return multicall.fault_value(xmlrpc.INVALID_REQUEST, f"rosproxy: {text}")
-        # Several client libraries lack system.multicall (docs/architecture.md, Client libraries).
         body = multicall.single_call(inner)
         reply = await self._reply_to_call(
             endpoint, xmlrpc.parse_call(body, self._context.lease_call), body, call
@@ -149,7 +155,11 @@ class SlaveApi:
     async def _reply_to_call(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
     ) -> bytes | LongReply:
-        """The reply to a single call with the document ``body``, which came as or in ``call``."""
+        """The reply to a single call.
+
+        ``body`` is the document of the single call. ``call`` is the call that has arrived: the
+        single call, or a multicall around the single call.
+        """
         caller_id = parsed.string(0) or ""
         reason = await self._why_not(endpoint, parsed.method, caller_id, call.source)
         if reason is None and parsed.method == "paramUpdate":
@@ -168,7 +178,7 @@ class SlaveApi:
         return await count_reply(self._context.metrics, "slave", parsed.method, reply)
 
     def _refuse(self, method: str, reason: str) -> bytes:
-        """The reply to a call that its caller may not make."""
+        """Count a refused call; return the reply with the reason."""
         self._context.metrics.count("slave", method, "refused")
         return xmlrpc.dump_reply([-1, f"rosproxy: {reason}", 0])
 
@@ -198,8 +208,8 @@ class SlaveApi:
         else:
             body = self._stand_ins.with_address(body, parsed)
         reply = await self._ask(endpoint, slave_api.rewrite_call(body, parsed, view))
-        # The node's own answer is all that tells where its topics are. Whoever connects next, and
-        # the kernel plane, are led to the port that is noted here.
+        # Only this reply names the TCPROS port of the node. The relay and the kernel plane lead the
+        # next connections to the port that the proxy records here.
         port = endpoint.port
         topic_port = slave_api.topic_port(parsed, reply)
         if topic_port is not None:
@@ -212,7 +222,10 @@ class SlaveApi:
     def _with_hidden(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes
     ) -> tuple[bytes, xmlrpc.Call]:
-        """A publisherUpdate with what the node is to hear of; as it came if that is the same."""
+        """A publisherUpdate with all publishers for the node, and the parsed call.
+
+        Hidden publishers are added (`publishers_for`). Unchanged if the publishers are the same.
+        """
         topic = parsed.string(1) or ""
         announced = slave_api.announced_publishers(parsed)
         publishers = self._policy.publishers_for(endpoint, topic, announced)
@@ -222,7 +235,7 @@ class SlaveApi:
         return body, xmlrpc.parse_call(body)
 
     async def _is_absorbed(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
-        """Whether a node is spared a needless ``shutdown`` or outdated ``publisherUpdate``."""
+        """Whether to keep back a call: a needless ``shutdown`` or outdated ``publisherUpdate``."""
         if parsed.method == "shutdown":
             caller_id = parsed.string(0) or ""
             reason = parsed.string(1) or ""
@@ -242,15 +255,15 @@ class SlaveApi:
         )
 
     async def _note_health(self, endpoint: Endpoint, answer: Awaitable[_Answer]) -> _Answer:
-        """An answer of a node; what it tells of the node's health is noted. Raises Unreachable."""
+        """Await the answer of a node, and record whether the node answers. Raises Unreachable."""
         health = endpoint.health
         try:
             reply = await answer
         except Unreachable as error:
-            if error.probe is ProbeResult.ANSWERED:  # an HTTP status: it lives
+            if error.probe is ProbeResult.ANSWERED:  # an HTTP status, so the node lives
                 health.note(error.probe, self._context.now())
             if error.refused and health.note(error.probe, self._context.now()):
-                # Refused twice, the node has ended: its port refuses as well at once.
+                # With this refusal the node counts as ended, so the port refuses at once, too.
                 log.info("%s has ended: %s", endpoint.label, error)
                 self._leases.close(endpoint)
             raise
@@ -260,18 +273,19 @@ class SlaveApi:
     async def _why_not(
         self, endpoint: Endpoint, method: str, caller_id: str, source: str
     ) -> str | None:
-        """Why a caller may not call a method of a node; None if he may."""
+        """The reason why a caller may not call a method of a node; None if allowed."""
         if not await self._may_call(method, source):
             return NOT_THE_MASTER
         denial = await self._policy.check_slave_call(method, endpoint, source, caller_id)
         return denial.reason if denial else None
 
     async def _not_subscribed(self, endpoint: Endpoint, parameter: str | None) -> str | None:
-        """Why a node is not told of a parameter; None if it may have subscribed to it.
+        """The reason to refuse a ``paramUpdate``; None if the node may have subscribed.
 
-        rosmaster never forgets the subscriptions of nodes that have ended, and some libraries leave
-        them behind (rosrust, to every parameter), so it calls who has the port by now. rosnodejs
-        never answers that, and rosmaster tells it of no publishers meanwhile.
+        rosmaster keeps parameter subscriptions of nodes that have ended. Some libraries do not
+        unsubscribe (rosrust subscribes to every parameter). So rosmaster calls the present node at
+        the port. rosnodejs never answers such a call, and meanwhile rosmaster sends this node no
+        ``publisherUpdate``.
         """
         await self._context.wait_for_registration(endpoint)
         if parameter is None or endpoint.may_hear_of(parameter):
@@ -279,7 +293,7 @@ class SlaveApi:
         return f"{endpoint.label} has not subscribed to parameter {parameter}"
 
     async def _may_call(self, method: str, source: str) -> bool:
-        """Whether ``--slave-control`` lets a source call a method."""
+        """Whether ``--slave-control`` allows a source to call a method."""
         anybody = self._context.settings.slave_control == "any"
         if anybody or method not in slave_api.MASTER_ONLY:
             return True
