@@ -1,8 +1,8 @@
-"""Calls of the control plane through the proxy, next to the same calls without it.
+"""Measures XML-RPC calls through the proxy, and the same calls without the proxy.
 
-Each measurement is one kept connection, as rospy keeps one to its master. There are two proxies,
-with uvloop where that is installed and with Python's own event loop, each with a rospy node.
-HAProxy forwards the same HTTP unread.
+Each measurement uses a single kept connection, as rospy does for calls to the master. There are two
+proxies, each with a rospy node: with uvloop if installed, and with Python's own event loop. If
+installed, HAProxy forwards the same HTTP without reading the calls.
 """
 
 from __future__ import annotations
@@ -29,16 +29,19 @@ QUICK_SECONDS = 0.1
 WARM_UP_CALLS = 20
 TOPICS = 100
 PARAMETERS = 1000
-"""That roslaunch sets, all in one multicall."""
+"""Parameters that roslaunch sets in a single multicall."""
 LAUNCH = f"{PARAMETERS} setParam in one multicall"
 NODES = 100
-"""That start at once; each publishes ten topics."""
+"""Nodes that start at the same time. Each node publishes ten topics."""
 FIRST_SLAVE = 50000
 ENDING_TOPICS = 10
-"""That a node publishes, and as many that it subscribes to: rospy ends both in one multicall."""
+"""Topics that the ending node publishes, and topics that the node subscribes to.
+
+rospy unregisters all of these in a single multicall.
+"""
 STRING = "std_msgs/String"
 LOOPS = {"uvloop": 0, "asyncio": 1}
-"""What the ports of the proxy on an event loop are counted from."""
+"""The event loops, with a number for the ports of the proxy on each loop."""
 HAPROXY_PORT = 47000
 _HAPROXY = """
 global
@@ -69,7 +72,10 @@ Where = tuple[str, int]
 
 @dataclass(frozen=True)
 class Way:
-    """Whom inside and outside call, and as whom: ``name`` at ``uri``."""
+    """A way for calls; ``path`` is the column in the book.
+
+    Inside calls ``master``, as the node ``name`` with the slave URI ``uri``. Outside calls ``node``.
+    """
 
     path: str
     master: Where
@@ -79,7 +85,7 @@ class Way:
 
 
 class Line:
-    """A kept connection; ``times`` are the seconds that the calls on it took."""
+    """A kept connection. ``times``: the durations of the timed calls in seconds."""
 
     def __init__(self, address: Where) -> None:
         self.times: list[float] = []
@@ -91,19 +97,19 @@ class Line:
         self._http.close()
 
     def call(self, method: str, *params: Any, timed: bool = True) -> Any:
-        """The value of a call; writing and reading XML is not part of the time."""
+        """Make a call and return the value. The time does not include writing and reading XML."""
         body = dumps(params, method).encode()
         started = perf_counter()
         self._http.request("POST", "/", body, {"Content-Type": "text/xml"})
         reply = self._http.getresponse().read()
         if timed:
             self.times.append(perf_counter() - started)
-        assert self._http.sock is self._sock, "the connection was not kept"
+        assert self._http.sock is self._sock, "the peer did not keep the connection"
         return loads(reply)[0][0]
 
 
 def run(book: Book, rounds: int, quick: bool) -> None:
-    """Add rates and medians of all calls; the ways take turns in each round."""
+    """Add rates and medians of all calls to the book. The ways take turns in each round."""
     seconds = QUICK_SECONDS if quick else CALL_SECONDS
     with world() as machines, machines.master(), ExitStack() as stack:
         loops = [name for name in LOOPS if name == "asyncio" or find_spec(name)]
@@ -125,13 +131,13 @@ def run(book: Book, rounds: int, quick: bool) -> None:
 
 
 Step = Callable[[Way, Line, int], None]
-"""The n-th call of a measurement, and those that it needs and that are not timed."""
+"""Makes the n-th timed call of a measurement, and the untimed calls before the timed call."""
 
 
 def compare(
     book: Book, machines: World, ways: list[Way], method: str, step: Step, seconds: float
 ) -> None:
-    """One round of one call on all ways, the direct one first."""
+    """Measure a call on all ways in a round. The first way is DIRECT."""
     direct = 0.0
     for way in ways:
         times = timed(machines, way, method, step, seconds)
@@ -144,7 +150,7 @@ def compare(
 
 
 def timed(machines: World, way: Way, method: str, step: Step, seconds: float) -> list[float]:
-    """The seconds that each of many calls took, without the first ones."""
+    """The seconds of each call, without the calls of the warm-up."""
     from_outside = method == "requestTopic"
     with machines.entered("outside" if from_outside else "inside"):
         line = Line(way.node if from_outside else way.master)
@@ -173,7 +179,7 @@ def request_topic(way: Way, line: Line, _: int) -> None:
 
 
 def end_node(way: Way, line: Line, _: int) -> None:
-    """A node's end, as rospy does it (rospy/impl/registration.py), after registering anew."""
+    """Register a node, then end the node as rospy does (rospy/impl/registration.py)."""
     topics = [f"/bench_ending{way.name}/{number}" for number in range(ENDING_TOPICS)]
     made = [["registerPublisher", topic, STRING] for topic in topics]
     made += [["registerSubscriber", f"{topic}/sub", STRING] for topic in topics]
@@ -194,7 +200,7 @@ def get_parameter(way: Way, line: Line, _: int) -> None:
 
 
 def launch(way: Way, line: Line, number: int) -> None:
-    """All parameters of a launch file, as roslaunch sets them (roslaunch/launch.py)."""
+    """Set all parameters of a launch file, as roslaunch does (roslaunch/launch.py)."""
     names = [f"/bench_launched{way.name}/{index}" for index in range(PARAMETERS)]
     calls = [{"methodName": "setParam", "params": [way.name, name, number]} for name in names]
     replies = line.call("system.multicall", calls)
@@ -202,7 +208,7 @@ def launch(way: Way, line: Line, number: int) -> None:
 
 
 def started_at_once(machines: World, way: Way) -> float:
-    """Seconds until all of many nodes that start at the same moment have registered."""
+    """Seconds until NODES nodes that start at the same time have registered."""
     master = "http://{}:{}/".format(*way.master)
     name = f"crowd_{way.name[1:]}"
     numbers = map(str, (FIRST_SLAVE, NODES, NODES))
@@ -230,7 +236,7 @@ CALLS: dict[str, Step] = {
 
 @contextmanager
 def haproxy(machines: World, node: Where) -> Iterator[Way]:
-    """HAProxy in HTTP mode, before the master and before a node."""
+    """Run HAProxy in HTTP mode before the master and before a node."""
     file = machines.folder / "haproxy-http.conf"
     values = {"gateway": GATEWAY, "host": HOST, "port": HAPROXY_PORT}
     targets = {"master": f"{OUTSIDE}:{MASTER_PORT}", "node": "{}:{}".format(*node)}
@@ -243,7 +249,7 @@ def haproxy(machines: World, node: Where) -> Iterator[Way]:
 
 @contextmanager
 def proxy(machines: World, loop: str) -> Iterator[Way]:
-    """A proxy on an event loop, and a rospy node behind it."""
+    """Run a proxy on an event loop, with a rospy node behind the proxy."""
     shift = 1000 * LOOPS[loop]
     name = f"/bench_{loop}"
     port = MASTER_PORT + shift
@@ -265,7 +271,10 @@ def proxy(machines: World, loop: str) -> Iterator[Way]:
 
 
 def environment(machines: World, loop: str) -> dict[str, str]:
-    """That of a proxy on an event loop: it takes uvloop if that can be imported."""
+    """The environment that makes a proxy use an event loop.
+
+    A proxy uses uvloop if the import works. So for asyncio, a file makes the import fail.
+    """
     env = machines.environment("host")
     if loop == "uvloop":
         return env

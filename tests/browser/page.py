@@ -1,4 +1,4 @@
-"""The live page as somebody sees it who looks at its table, or at the lines of its graph."""
+"""Reads the live page in a browser as a user sees the tables and the graph, and serves pages."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.ros.topology import Place, run_command
 
 UNKNOWN = "\N{EN DASH}"
 MANY_PORT = 21312
-"""The port of the page with fake nodes."""
+"""The port of the page with made-up nodes."""
 URL = f"http://127.0.0.1:{ADMIN_PORT}/"
 ROWS = """
 return [...document.querySelectorAll("#rows tr")].map((row) => ({
@@ -32,33 +32,33 @@ return [...document.querySelectorAll("#node-rows tr")].map((row) =>
   [...row.cells].map((cell) => cell.textContent));
 """
 LINE = """
-const row = [...document.querySelectorAll("#boxes .line")].find((one) =>
-  one.dataset.from === arguments[0] && one.dataset.to === arguments[1]);
+const row = [...document.querySelectorAll("#boxes .line")].find((line) =>
+  line.dataset.from === arguments[0] && line.dataset.to === arguments[1]);
 if (!row) return null;
 const ways = [...document.querySelectorAll("#lines g")];
-const way = ways.find((one) => one.dataset.id === row.dataset.id);
+const way = ways.find((group) => group.dataset.id === row.dataset.id);
 return { colour: getComputedStyle(way).color,
-  label: [...row.children].map((one) => one.textContent).filter(Boolean).join("\\n") };
+  label: [...row.children].map((child) => child.textContent).filter(Boolean).join("\\n") };
 """
 CHOOSE = """
-const row = [...document.querySelectorAll("#boxes .line")].find((one) =>
-  one.dataset.from === arguments[0] && one.dataset.to === arguments[1]);
+const row = [...document.querySelectorAll("#boxes .line")].find((line) =>
+  line.dataset.from === arguments[0] && line.dataset.to === arguments[1]);
 if (row && !row.hasAttribute("aria-current")) row.click();
 return document.querySelector("#details").textContent;
 """
 PLACES = """
-return Object.fromEntries([...document.querySelectorAll("#boxes .box")].map((one) =>
-  [one.title.split("\\n")[0], one.getBoundingClientRect().left]));
+return Object.fromEntries([...document.querySelectorAll("#boxes .box")].map((box) =>
+  [box.title.split("\\n")[0], box.getBoundingClientRect().left]));
 """
 BOX = """
-const box = [...document.querySelectorAll("#boxes .box:not(.line)")].find((one) =>
-  one.title.split("\\n")[0] === arguments[0]);
+const box = [...document.querySelectorAll("#boxes .box:not(.line)")].find((node) =>
+  node.title.split("\\n")[0] === arguments[0]);
 return box ? getComputedStyle(box).borderTopColor : "";
 """
 DETAILS = "return document.querySelector('#details').textContent"
 FOCUS_GROUP = """
 const groups = [...document.querySelectorAll("#boxes .group")];
-groups.find((one) => one.title.startsWith(arguments[0])).focus();
+groups.find((group) => group.title.startsWith(arguments[0])).focus();
 """
 TROUBLE = "return document.querySelector('#findings').innerText"
 TITLE = "return document.title"
@@ -73,7 +73,7 @@ table ip cut {{
 
 
 class ThisMachine(Place):
-    """The machine of the tests, in no namespace of its own."""
+    """The machine of the tests, without a network namespace."""
 
     def command(self, argv: Sequence[str]) -> list[str]:
         return [*argv]
@@ -87,13 +87,13 @@ THIS_MACHINE = ThisMachine("tests", "", "")
 
 
 def rows(browser: Browser) -> list[Json]:
-    """All rows of the table."""
+    """The rows of the table of links."""
     table: list[Json] = browser.run(ROWS)
     return table
 
 
 def row(browser: Browser, name: str, **wanted: str) -> Json:
-    """The row of a topic, once it says what is wanted; raises AssertionError."""
+    """Wait for a row of a topic with the ``wanted`` cells. Raises AssertionError after 90 s."""
     seen: list[Json] = []
 
     def fits() -> bool:
@@ -103,12 +103,12 @@ def row(browser: Browser, name: str, **wanted: str) -> Json:
     try:
         wait_until(f"the row of {name} has {wanted}", fits, 90)
     except AssertionError as error:
-        raise AssertionError(f"{error}; it has {seen}") from None
+        raise AssertionError(f"{error}; the rows are {seen}") from None
     return next(topic_row for topic_row in seen if wanted.items() <= topic_row.items())
 
 
 def line(browser: Browser, source: str, target: str) -> Json:
-    """A line of the graph, between two boxes."""
+    """A line of the graph between two boxes: the colour and the label."""
     edge: Json | None = browser.run(LINE, source, target)
     assert edge, f"no line from {source} to {target}"
     return {**edge, "colour": edge["colour"].replace(" ", "")}
@@ -120,23 +120,23 @@ def box_colour(browser: Browser, name: str) -> str:
 
 
 def node_rows(browser: Browser, name: str) -> list[list[str]]:
-    """The rows of a node: state, name, where, address, ports, MB/s, and what is wrong."""
+    """The rows of a node: state, name, where, address, ports, MB/s, and the problem."""
     table: list[list[str]] = browser.run(NODES)
     return [cells for cells in table if cells[1] == name]
 
 
 def trouble(browser: Browser) -> str:
-    """All that the page says is wrong."""
+    """The text of all findings on the page."""
     return str(browser.run(TROUBLE))
 
 
 def title(browser: Browser) -> str:
-    """The page's title."""
+    """The title of the page."""
     return str(browser.run(TITLE))
 
 
 def colour(browser: Browser, name: str) -> str:
-    """A colour of the style sheet, as the canvas names it."""
+    """The computed colour of a class of the style sheet, such as ``ok`` or ``broken``."""
     script = """
     const span = document.createElement("span");
     span.className = arguments[0];
@@ -149,7 +149,7 @@ def colour(browser: Browser, name: str) -> str:
 
 
 def port_of(lab: Lab, name: str) -> int:
-    """The port that stands for a node outside."""
+    """The port at which outside reaches a node inside."""
     port = urlsplit(lab.node_uri(name) or "").port
     assert port
     return port
@@ -157,7 +157,7 @@ def port_of(lab: Lab, name: str) -> int:
 
 @contextmanager
 def cut(lab: Lab, port: int) -> Iterator[None]:
-    """The host drops all packets of a published port, in both directions."""
+    """Have the host drop all packets of a published port, in both directions."""
     enter = ("ip", "netns", "exec", lab.place("host").namespace)
     run_command(*enter, "nft", "-f", "-", text=CUT.format(port=port))
     try:
@@ -168,7 +168,10 @@ def cut(lab: Lab, port: int) -> Iterator[None]:
 
 @contextmanager
 def serving(browser: Browser, place: Place, log: Path, port: int, *words: str) -> Iterator[Process]:
-    """A module serves a page at a port of a machine, where the browser is and looks at it."""
+    """Run a module that serves a page at a port of the browser's machine, and open the page.
+
+    ``words``: the name of the module, and the arguments after the port.
+    """
     paths = os.pathsep.join(path for path in sys.path if path)
     environment = clean_environment(PYTHONPATH=paths, PYTHONUNBUFFERED="1")
     command = [sys.executable, "-m", words[0], str(port), *words[1:]]
@@ -177,7 +180,7 @@ def serving(browser: Browser, place: Place, log: Path, port: int, *words: str) -
         server.wait_for("^serving", timeout=60)
         browser.open(f"http://127.0.0.1:{port}/")
         yield server
-        # Away from it first: a page that loses its server says so in the console.
+        # Leave the page before the server ends: a lost connection is an error in the console.
         browser.open("about:blank")
     finally:
         server.kill()
@@ -187,14 +190,14 @@ def serving(browser: Browser, place: Place, log: Path, port: int, *words: str) -
 def made_up(
     browser: Browser, folder: Path, nodes: int, module: str = "many", place: Place = THIS_MACHINE
 ) -> Iterator[Process]:
-    """The browser shows so many nodes that are made up, at a place; what serves them."""
+    """Show a page with made-up nodes in the browser, and yield the server of the page."""
     words = f"tests.browser.{module}", str(nodes)
     with serving(browser, place, folder / "made-up.log", MANY_PORT, *words) as server:
         yield server
 
 
 def play(lab: Lab) -> dict[str, Any]:
-    """Some nodes as a robot has them, on all machines; the names of those that matter."""
+    """Start nodes of a usual robot on all machines. Return ``port``: the port of the planner."""
     start = lab.node
     start("roscpp", "c1", "pub", name="recognizer", topic="/objects", rate=10)
     start("roscpp", "c1", "sub", name="viewer", topic="/camera/image")

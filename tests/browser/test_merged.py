@@ -1,6 +1,7 @@
-"""The page of all proxies of an operator in Chromium, over two that run.
+"""Tests the live page of an operator in Chromium, with two running proxies.
 
-Each stands before a network of its own, with one master outside: c1 is behind px, c2 behind px2.
+Each proxy has a separate inside network, and both use the same master outside. c1 is behind px, c2
+behind px2.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ TOKEN = "0123456789abcdef"
 ADMIN = ("--admin-bind", f"0.0.0.0:{ADMIN_PORT}", "--admin-token", TOKEN)
 OPERATOR_PORT = 11313
 PORTS_OF_FIRST = re.compile(r"460[0-2]\d")
-"""As the host publishes them."""
+"""Ports of the first proxy, as the host publishes these ports."""
 
 
 class Second:
@@ -63,13 +64,13 @@ class Second:
         return process
 
     def start_again(self) -> None:
-        """Start it; it has been killed."""
+        """Start the proxy after a kill."""
         self.process = self._start()
 
 
 @pytest.fixture
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
-    """A master outside and the proxy on px."""
+    """A lab with a master outside and the proxy on px."""
     remove_leftovers()
     compiled_node()
     topology = Topology(PLAN)
@@ -98,7 +99,7 @@ def second(lab: Lab) -> Iterator[Second]:
 
 @pytest.fixture
 def machine(lab: Lab) -> Place:
-    """The machine of operator and browser: the host, which is on both networks."""
+    """The machine of operator and browser: the host, which is on the networks of both proxies."""
     return lab.place("host")
 
 
@@ -106,7 +107,7 @@ def machine(lab: Lab) -> Place:
 def operator(
     lab: Lab, second: Second, machine: Place, browser: Browser, tmp_path: Path
 ) -> Iterator[Process]:
-    """It shows both proxies, as `one` and `two`, to the browser."""
+    """The operator, with the page open in the browser. The proxies are named `one` and `two`."""
     addresses = {"one": lab.place("px").address, "two": lab.place("px2").address}
     words = ["tests.browser.merged", TOKEN]
     words += [f"{name}={address}:{ADMIN_PORT}" for name, address in addresses.items()]
@@ -116,7 +117,7 @@ def operator(
 
 
 def hearers(browser: Browser) -> list[str]:
-    """Who hears /chatter, by the rows of its links."""
+    """The subscribers of /chatter, by the rows of the links."""
     return sorted(link["To"] for link in rows(browser) if link["Name"] == "/chatter")
 
 
@@ -128,7 +129,9 @@ def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: B
     for listener in ("/listener", "/hearer"):
         shown = row(browser, "/chatter", State="ok", From="/talker", To=listener)
         assert PORTS_OF_FIRST.fullmatch(shown["Port"]), shown
-    wait_until("each link is there once", lambda: hearers(browser) == ["/hearer", "/listener"])
+    wait_until(
+        "the page shows each link once", lambda: hearers(browser) == ["/hearer", "/listener"]
+    )
     for name, where in (
         ("/talker", "container, inside of one"),
         ("/hearer", "container, inside of two"),
@@ -142,7 +145,7 @@ def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: B
     assert line(browser, "/talker", "/hearer")["colour"] == ok
 
     second.process.kill()
-    wait_until("it is told", lambda: "BROKEN: two\n" in trouble(browser))
+    wait_until("the page shows proxy two as broken", lambda: "BROKEN: two\n" in trouble(browser))
     (broken,) = node_rows(browser, "two (proxy)")
     admin = f"{lab.place('px2').address}:{ADMIN_PORT}"
     assert broken[0] == "BROKEN"
@@ -159,6 +162,6 @@ def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: B
     assert box_colour(browser, "two") == ok
     row(browser, "/chatter", State="ok", From="/talker", To="/hearer")
     wait_until(
-        "who is behind it is back",
+        "/hearer is back behind proxy two",
         lambda: [c[2] for c in node_rows(browser, "/hearer")] == ["container, inside of two"],
     )

@@ -36,14 +36,14 @@ HOSTILE = "/<img src=x onerror=document.title='mine'>"
 
 
 def talk(lab: Lab, library: str = "roscpp") -> None:
-    """A publisher inside with a subscriber outside, that get along."""
+    """Start a publisher inside and a subscriber outside; wait for three messages."""
     lab.node(library, "c1", "pub", name="talker", topic="/chatter", rate=10)
     heard = lab.node(library, "out", "sub", name="listener", topic="/chatter")
     heard.wait_for_count("^got ", 3)
 
 
 def chosen_line(browser: Browser) -> str:
-    """What the page tells of that line once it is chosen."""
+    """Choose the line from /talker to /listener, and return the details on the page."""
     return str(browser.run(CHOOSE, "/talker", "/listener"))
 
 
@@ -57,7 +57,7 @@ def test_a_link_that_breaks_turns_red_with_the_command_and_green_when_mended(
     assert (well["Carried by"], well["Port"]) == ("splice", str(port))
     assert line(browser, "/talker", "/listener")["colour"] == colour(browser, "ok")
     wait_until(
-        "the line tells what flows",
+        "the line shows the rates",
         lambda: re.fullmatch(
             r"/chatter\n[\d.]+ Hz, [\d.<]+ MB/s, splice",
             line(browser, "/talker", "/listener")["label"],
@@ -65,12 +65,14 @@ def test_a_link_that_breaks_turns_red_with_the_command_and_green_when_mended(
         60,
     )
     wait_until(
-        "what was chosen tells it, too",
+        "the details show the last message, too",
         lambda: "last message just now, carried by splice" in chosen_line(browser),
         60,
     )
     places = browser.run(PLACES)
-    assert places["/listener"] < places["rosproxy"] < places["/talker"], "each in its lane"
+    assert places["/listener"] < places["rosproxy"] < places["/talker"], (
+        "the boxes are not in the lanes"
+    )
     used = browser.run("return document.querySelector('#summary').textContent")
     assert re.search(r"ports \d+-\d+: [1-9]\d* used, \d+ free", used)
     with cut(lab, port):
@@ -118,7 +120,7 @@ def test_hertz_and_bytes_are_those_of_the_nodes(lab: Lab, browser: Browser) -> N
             if topic_row["To"] and topic_row["Hz"] not in no_rate
         }
 
-    wait_until("the page tells both rates", lambda: told() >= {"/chatter", "/back"}, 90)
+    wait_until("the page shows both rates", lambda: told() >= {"/chatter", "/back"}, 90)
     back = row(browser, "/back", State="ok", To="/taker")
     assert back["Carried by"] == "direct"
     assert back["MB/s"] not in (UNKNOWN, "0")
@@ -156,9 +158,9 @@ def test_nodes_of_a_container_are_a_group(lab: Lab, browser: Browser) -> None:
 
 
 def test_names_are_text_whatever_they_are(lab: Lab, browser: Browser) -> None:
-    """The master refuses odd names; who connects to a node may call himself anything."""
+    """The master refuses odd names, but a caller of a node may choose any caller_id."""
     talker = lab.node("roscpp", "c1", "pub", name="talker", topic="/chatter", rate=10)
-    talker.wait_for("^sent ")  # registered it is before, for /rosout
+    talker.wait_for("^sent ")  # a registration alone may be the one for /rosout
     header = {"callerid": HOSTILE, "topic": "/chatter", "md5sum": "*", "type": "*"}
     with lab.place("out").entered():
         stranger = socket.create_connection((OUT_HOST, port_of(lab, "talker")))
@@ -188,39 +190,43 @@ def test_light_dark_and_a_phone(lab: Lab, browser: Browser) -> None:
     wait_until("nothing is wider than a phone", lambda: browser.run(narrow))
     with cut(lab, port_of(lab, "talker")):
         row(browser, "/chatter", State="BROKEN", To="/listener")
-        assert browser.run(narrow), "nor with a long command"
+        assert browser.run(narrow), "a long command is wider than a phone"
 
 
 def test_the_keyboard_alone_gets_everywhere(lab: Lab, browser: Browser) -> None:
     talk(lab)
     browser.open(URL)
     row(browser, "/chatter", State="ok", To="/listener")
-    focus = "const one = document.activeElement; return one.id || one.className.split(' ')[0]"
+    focus = "const item = document.activeElement; return item.id || item.className.split(' ')[0]"
     visited: list[str] = []
     while visited.count("scroll") < 2 and len(visited) < 50:
         browser.press("\ue004")
         visited.append(browser.run(focus))
-    # What was wrong in the test before may still stand there.
+    # A finding of the previous test may still be on the page.
     visited = [name for name in visited if name not in ("cause", "copy")]
     boxes = visited.count("box")
-    assert boxes > 3, "two nodes, their line and the proxy"
+    assert boxes > 3, "fewer boxes than two nodes, a line and the proxy"
     before = ["skip", "wrong", "past", "filter", "quiet", "unfold", "graph"]
-    assert visited == [*before, *["box"] * boxes, "scroll", "scroll"], "with both tables"
+    assert visited == [*before, *["box"] * boxes, "scroll", "scroll"], (
+        "the order of the focus is wrong"
+    )
 
 
 def test_a_thousand_nodes(lab: Lab, browser: Browser, tmp_path: Path) -> None:
-    """They are made up; what is not shown of them is said, and only changes are sent."""
+    """The nodes are made up. The page shows MOST_ROWS links, and the number of further links."""
     with made_up(browser, tmp_path, 1000, place=lab.place("px")):
-        wait_until("there are rows", lambda: len(rows(browser)) == MOST_ROWS, 60)
+        wait_until("the page shows rows", lambda: len(rows(browser)) == MOST_ROWS, 60)
         told = browser.run("return document.querySelector('#more').textContent")
         assert told == "600 more: narrow it down by a name."
         before = [page_row["MB/s"] for page_row in rows(browser)]
         wait_until(
-            "rates follow", lambda: before != [page_row["MB/s"] for page_row in rows(browser)], 60
+            "the page updates the rates",
+            lambda: before != [page_row["MB/s"] for page_row in rows(browser)],
+            60,
         )
         browser.run("document.querySelector('#filter').focus()")
         browser.press("node499/")
-        wait_until("two are left", lambda: len(rows(browser)) == 2, 60)
+        wait_until("the page shows only two rows", lambda: len(rows(browser)) == 2, 60)
 
 
 @pytest.mark.parametrize("width", [1200, 360])
@@ -254,4 +260,7 @@ def test_nodes_with_their_addresses_and_ports(lab: Lab, browser: Browser) -> Non
     assert "/rosout" not in nodes
     browser.run("document.querySelector('#filter').focus()")
     browser.press("talk")
-    wait_until("one is left", lambda: [cells[1] for cells in browser.run(NODES)] == ["/talker"])
+    wait_until(
+        "the page shows only /talker",
+        lambda: [cells[1] for cells in browser.run(NODES)] == ["/talker"],
+    )

@@ -1,4 +1,4 @@
-"""The state of the live page during updates: focus, chosen line, announcements, connection.
+"""Tests the live page during updates: focus, chosen line, announcements, connection.
 
 The nodes are made up (`tests.browser.many`).
 """
@@ -20,41 +20,41 @@ from tests.ros.topology import Place
 
 CONNECTION = "return document.querySelector('#connection').textContent"
 FOCUS = """
-const one = document.activeElement;
-return [one.title, one.getAttribute("aria-expanded")];
+const box = document.activeElement;
+return [box.title, box.getAttribute("aria-expanded")];
 """
 BREAK = """
 const { state } = window.rosproxyPage;
-const link = [...state.links].find(([, one]) => one.name === arguments[0])[1];
+const link = [...state.links].find(([, row]) => row.name === arguments[0])[1];
 Object.assign(link, { state: "broken", text: `${link.name} is cut`, fix: arguments[1] });
 """
 FINDINGS = """
-return [...document.querySelectorAll("#findings li")].map((one) => [
-  one.querySelector(".what")?.textContent, one.querySelector(".fix")?.textContent,
-  one.seen || false]);
+return [...document.querySelectorAll("#findings li")].map((item) => [
+  item.querySelector(".what")?.textContent, item.querySelector(".fix")?.textContent,
+  item.seen || false]);
 """
 FIXES = ("mend the first", "restart the second")
-MARK = "document.querySelectorAll(arguments[0]).forEach((one) => { one.seen = true; });"
-SEEN = "return [...document.querySelectorAll(arguments[0])].every((one) => one.seen);"
+MARK = "document.querySelectorAll(arguments[0]).forEach((item) => { item.seen = true; });"
+SEEN = "return [...document.querySelectorAll(arguments[0])].every((item) => item.seen);"
 
 
 @pytest.fixture
 def machine() -> Place:
-    """Where page and browser are: no test here needs ROS."""
+    """The machine of page and browser. No test here needs ROS."""
     return THIS_MACHINE
 
 
 @pytest.fixture
 def server(browser: Browser, tmp_path: Path) -> Iterator[Process]:
-    """The page of some nodes, in namespaces of two or three."""
+    """The server of a page with 100 nodes, in namespaces of two or three nodes."""
     with made_up(browser, tmp_path, 100) as server:
-        wait_until("there are rows", lambda: len(rows(browser)) == 100)
+        wait_until("the page shows rows", lambda: len(rows(browser)) == 100)
         yield server
 
 
 @contextmanager
 def stopped(server: Process) -> Iterator[None]:
-    """It does nothing, and its connections stand."""
+    """Suspend the server. The connections of the server stay open."""
     os.kill(server.pid, signal.SIGSTOP)
     try:
         yield
@@ -79,12 +79,19 @@ def test_a_namespace_keeps_the_focus(browser: Browser) -> None:
 
 @pytest.mark.usefixtures("server")
 def test_what_is_chosen_is_told_where_the_rest_is_hidden(browser: Browser) -> None:
-    """Alone of its namespace it has a box of its own; and what is marked in the text stays so."""
+    """The filter leaves a single node of the namespace, so this node has a separate box.
+
+    Updates do not replace the elements of the details.
+    """
     browser.run("document.querySelector('#filter').focus()")
     browser.press("node3/")
-    wait_until("two are left", lambda: len(rows(browser)) == 2)
+    wait_until("the page shows only two rows", lambda: len(rows(browser)) == 2)
     told = "/group3/node3/topic0"
-    wait_until("it is drawn", lambda: told in browser.run(CHOOSE, "/group3/node3", "/outside3"), 20)
+    wait_until(
+        "the details show the line",
+        lambda: told in browser.run(CHOOSE, "/group3/node3", "/outside3"),
+        20,
+    )
     browser.run(MARK, "#details *")
     before = browser.run(DETAILS)
     wait_until("rates follow", lambda: browser.run(DETAILS) != before)
@@ -95,17 +102,22 @@ def test_what_is_chosen_is_told_where_the_rest_is_hidden(browser: Browser) -> No
 def test_what_is_chosen_and_goes_is_chosen_no_more(browser: Browser) -> None:
     browser.run("document.querySelector('#filter').focus()")
     browser.press("node3/")
-    wait_until("it is drawn", lambda: browser.run(CHOOSE, "/group3/node3", "/outside3"), 20)
+    wait_until(
+        "the details show the line", lambda: browser.run(CHOOSE, "/group3/node3", "/outside3"), 20
+    )
     browser.press("x")
-    wait_until("it is gone", lambda: not browser.run(DETAILS))
+    wait_until("the details are empty", lambda: not browser.run(DETAILS))
     browser.press("\ue003")
-    wait_until("it is back", lambda: len(rows(browser)) == 2)
+    wait_until("the page shows both rows again", lambda: len(rows(browser)) == 2)
     assert not browser.run(DETAILS)
 
 
 def test_a_finding_that_is_there_is_not_said_again(browser: Browser, server: Process) -> None:
     def told(*numbers: int) -> bool:
-        """Break the links; what was on its way to the browser may have mended them again."""
+        """Break the links on the page, and return whether the page shows the findings.
+
+        An update under way may have repaired the links, so each check breaks the links again.
+        """
         findings = []
         for number in numbers:
             node = f"/group{number}/node{number}"
@@ -114,32 +126,38 @@ def test_a_finding_that_is_there_is_not_said_again(browser: Browser, server: Pro
             findings.append([what, FIXES[number]])
         return [[what, fix] for what, fix, _ in browser.run(FINDINGS)] == findings
 
-    with stopped(server):  # it would send the links anew, as they are there
-        wait_until("the first is told", lambda: told(0))
+    with stopped(server):  # the server would send the links without faults
+        wait_until("the page shows the first finding", lambda: told(0))
         browser.run(MARK, "#findings li")
-        wait_until("both are told", lambda: told(0, 1))
+        wait_until("the page shows both findings", lambda: told(0, 1))
         assert [seen for _, _, seen in browser.run(FINDINGS)] == [True, False]
 
 
 @pytest.mark.usefixtures("server")
 def test_a_page_in_the_background_follows(browser: Browser) -> None:
-    """It gets no frames, and what it is to draw does not queue up for the next one."""
+    """A page in the background gets no frames. Drawing must not wait for the next frame."""
     browser.run("window.requestAnimationFrame = () => 0")
     before = rates(browser)
     wait_until("rates follow", lambda: rates(browser) != before)
 
 
 def test_a_connection_that_is_silent_is_made_anew(browser: Browser, server: Process) -> None:
-    """Cut off without an end: to the browser it seems open."""
+    """A cut connection has no end, so for the browser the connection seems open."""
 
     def minute_later() -> str:
-        """What was on its way to the browser may have come after that minute."""
+        """Set the clock a minute ahead, and return the state of the connection.
+
+        An event under way may arrive after that, so each check sets the clock ahead again.
+        """
         browser.run("const now = Date.now; Date.now = () => now() + 60000")
         return str(browser.run(CONNECTION))
 
     assert browser.run(CONNECTION) == "Live"
     with stopped(server):
-        wait_until("it says so", lambda: minute_later().startswith("Not connected"))
-    wait_until("it is back", lambda: browser.run(CONNECTION) == "Live")
+        wait_until(
+            "the page shows that the connection is lost",
+            lambda: minute_later().startswith("Not connected"),
+        )
+    wait_until("the page is connected again", lambda: browser.run(CONNECTION) == "Live")
     before = rates(browser)
     wait_until("rates follow", lambda: rates(browser) != before)

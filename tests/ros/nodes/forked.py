@@ -16,7 +16,7 @@ import runpy
 import signal
 import sys
 
-import actionlib  # noqa: F401 - as the others, for whoever is forked
+import actionlib  # noqa: F401 - this and further imports are for the forks
 import rosnode  # noqa: F401
 import rosparam  # noqa: F401
 import rospy.names
@@ -28,7 +28,7 @@ from rosgraph.names import get_ros_namespace
 
 
 def main() -> None:
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # a parent leaves nothing to be waited for
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps the parents of the programs
     for line in sys.stdin:
         request = json.loads(line)
         reader, writer = os.pipe()
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def become(request: dict[str, object], writer: int) -> None:
-    """Makes this process equal to a program started with these arguments."""
+    """Make this process equal to a program with the arguments and environment of the request."""
     os.setsid()
     log = os.open(request["log"], os.O_WRONLY | os.O_TRUNC)
     for number in (1, 2):
@@ -66,7 +66,7 @@ def become(request: dict[str, object], writer: int) -> None:
 
 
 def keep(child: int, ended: str) -> None:
-    """Waits for a program's end and writes the exit status."""
+    """Wait for the end of a program, write the exit status to a file, and exit."""
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     with open(f"{ended}.new", "w") as file:
         file.write(str(code))
