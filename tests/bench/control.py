@@ -74,7 +74,7 @@ Where = tuple[str, int]
 class Way:
     """A way for calls; ``path`` is the column in the book.
 
-    Inside calls ``master``, as the node ``name`` with the slave URI ``uri``. Outside calls ``node``.
+    Inside calls ``master`` as the node ``name`` with the slave URI ``uri``. Outside calls ``node``.
     """
 
     path: str

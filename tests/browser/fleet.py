@@ -1,10 +1,11 @@
-"""A live page of an operator with three proxies and any number of nodes, which are made up.
+"""Serves a live page of an operator with three proxies and any number of made-up nodes.
 
 python -m tests.browser.fleet PORT NODES
 
-A third of the nodes is of ROS 1, the others are of two domains of ROS 2, each behind a proxy of its
-own. Containers have up to five nodes. A fifth of the outside nodes of ROS 1 is on the host. One
-link in twelve is broken. What makes and serves the document is the operator's own code.
+A third of the nodes uses ROS 1. The other nodes use two domains of ROS 2. Each third has a separate
+proxy. Containers have up to five nodes. A fifth of the outside nodes of ROS 1 is on the host. A
+twelfth of the links is broken. The code of the operator makes the document, and the code of the
+proxy serves the document.
 """
 
 from __future__ import annotations
@@ -37,18 +38,18 @@ from rosproxy.page.visitors import Visitors
 from rosproxy_operator.common.merged_page import merged
 
 PROXIES = {"ros1": "", "domain-0": "0", "domain-7": "7"}
-"""The domains of the proxies; the first one has ROS 1."""
+"""The domain of each proxy. The first proxy is for ROS 1."""
 EACH = 5
 """Nodes of a container, and of a machine outside."""
 PARTS = ("arm", "base", "camera", "lidar", "planner", "teleop", "battery", "gripper")
 ENDED = 3
-"""Nodes in the first container that have ended."""
+"""Nodes in the first container of ROS 1 that have ended."""
 SINCE = time.time() - 300
-"""When the idle links carried something last, in seconds since the epoch."""
+"""The Unix time in seconds of the last message on idle links."""
 
 
 def documents(nodes: int) -> dict[str, Document | str]:
-    """What the proxies tell of so many nodes in all."""
+    """The documents of the proxies, with ``nodes`` nodes in all."""
     return {
         name: _document(number, domain, [*range(number, nodes, len(PROXIES))])
         for number, (name, domain) in enumerate(PROXIES.items())
@@ -68,7 +69,7 @@ def _document(proxy: int, domain: str, numbers: list[int]) -> Document:
 
 
 def _key(domain: str, number: int) -> str:
-    """A node's name, or the domain and the GUID prefix of a participant."""
+    """The key of a node: a name, or the domain and the GUID prefix of a participant."""
     if domain:
         return f"{domain} 01.0f.{number:08x}"
     return f"/{PARTS[number % len(PARTS)]}/driver_of_the_unit_{number}"
@@ -96,7 +97,10 @@ def _node(proxy: int, domain: str, index: int, is_inside: bool) -> PageNode:
 
 
 def _links(domain: str, inside: list[str], outside: list[str]) -> Iterator[PageLink]:
-    """Two links of each node inside: one outwards, and one in either direction."""
+    """Two links of each node inside to nodes outside, and links between some nodes inside.
+
+    The first link leads outwards. The second link leads inwards for two thirds of the nodes.
+    """
     for i, node in enumerate(inside):
         if not outside:
             return

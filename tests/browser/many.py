@@ -1,10 +1,10 @@
-"""A live page of a proxy with any number of nodes, which are made up: what they send grows.
+"""Serves a live page of a proxy with any number of made-up nodes that send messages.
 
 python -m tests.browser.many PORT NODES
 
-Half of the nodes are inside; each publishes two topics, one for each of two nodes outside. The rate
-of each topic differs every second. What serves it is the proxy's own page; ``/cost`` tells in
-seconds what each document took.
+Half of the nodes are inside. Each node inside publishes two topics, for two nodes outside. The rate
+of each topic changes every second. The code of the proxy serves the page. ``/cost`` returns the
+duration of each document in seconds.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FIRST_PORT = 11000
 
 
 def status_of(nodes: int, second: int) -> ProxyStatus:
-    """The status of a proxy with so many nodes, half of them inside, after so many seconds."""
+    """The status of a proxy after ``second`` seconds. Half of the ``nodes`` are inside."""
     inside = max(nodes // 2, 1)
     return ProxyStatus(
         version="0",
@@ -51,7 +51,7 @@ def status_of(nodes: int, second: int) -> ProxyStatus:
 
 
 def _endpoint(number: int, inside: int, second: int) -> EndpointStatus:
-    """A node that publishes two topics; its neighbours outside hear one each."""
+    """A node that publishes two topics. Each topic has a subscriber outside."""
     topics = tuple(f"/group{number % 20}/node{number}/topic{k}" for k in range(2))
     hearers = (f"/outside{number}", f"/outside{(number + 1) % inside}")
     sent = 1000 * (50 * second + second * (7 * number + 3) % 40)
@@ -73,7 +73,7 @@ def _endpoint(number: int, inside: int, second: int) -> EndpointStatus:
 
 
 class MadeUpProxy:
-    """Makes its documents as `PageWatch` does, and notes how long each takes, in seconds."""
+    """Makes documents as `PageWatch` does. ``took``: the seconds for each document."""
 
     def __init__(self, nodes: int) -> None:
         self._nodes = nodes

@@ -1,9 +1,9 @@
-"""The page of an operator over some proxies, as the operators serve it, without an engine.
+"""Serves the live page of an operator for some proxies, without an engine.
 
 python -m tests.browser.merged PORT TOKEN NAME=ADDRESS...
 
-An operator learns of its engine which proxies there are; here they are given. Their documents are
-asked for, merged and served by the operator's own code.
+The engine tells a real operator the proxies. Here the arguments name the proxies. The operator's
+code asks for the documents, merges the documents, and serves the page.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ async def serve(port: int, token: str, proxies: dict[str, HostPort]) -> None:
 
 
 def read_proxies(words: list[str]) -> dict[str, HostPort]:
-    """The admin endpoints of proxies, by their names."""
+    """The admin endpoints of the proxies by name."""
     proxies = {}
     for word in words:
         name, _, address = word.partition("=")

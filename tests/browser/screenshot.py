@@ -1,4 +1,4 @@
-"""Paint the live page with real nodes and one broken link: ``make screenshot``.
+"""Make a picture of the live page with real nodes and a broken link: ``make screenshot``.
 
 python -m tests.browser.screenshot FILE
 """
@@ -21,7 +21,7 @@ HIGH = 760
 
 
 def paint(lab: Lab, folder: Path) -> bytes:
-    """The page once all is known of the links that are well, and of the one that is not."""
+    """The picture of the page when the good links show messages and a link is broken."""
     port = play(lab)["port"]
     browser = Browser(lab.place("px"), folder)
     try:

@@ -1,4 +1,4 @@
-"""What is wrong and what happened on the live page, of nodes and links that are made up."""
+"""Tests “What is wrong” and “What happened” on the live page, with made-up nodes and links."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CLEANUP = "run rosnode cleanup (answer y)"
 
 @pytest.fixture
 def machine() -> Place:
-    """Where page and browser are: no test here needs ROS."""
+    """The machine of page and browser. No test here needs ROS."""
     return THIS_MACHINE
 
 
@@ -92,12 +92,12 @@ def test_a_finding_is_shown_in_graph_and_table_and_leaves(browser: Browser, tmp_
         browser.run("document.querySelector('#findings .cause').click()")
         assert len(texts(browser, MARKED_BOXES)) == 3
         assert len(texts(browser, "#node-rows tr[aria-current]")) == 3
-        assert not texts(browser, MARKED_ROWS), "no link has this problem"
+        assert not texts(browser, MARKED_ROWS), "a link is marked without this problem"
         browser.run("document.querySelector('#findings .copy').focus()")
         browser.press("\ue007")  # a script alone may not copy
         assert texts(browser, "#findings .copy")[0] == "Copied"
         browser.run(MEND)
-        wait_until("it is over", lambda: len(texts(browser, "#events li")) == 1)
+        wait_until("the finding is over", lambda: len(texts(browser, "#events li")) == 1)
         (event,) = texts(browser, "#events li")
         assert "over after" in event
         assert first[0].removeprefix("BROKEN: ") in event

@@ -1,6 +1,6 @@
-"""The graph of the live page with 5 to 1,000 nodes, which are made up: what an engineer sees of it.
+"""Tests the graph of the live page on the screen, with 5 to 1,000 made-up nodes.
 
-The pages are those of an operator with three proxies (`tests.browser.fleet`). No test here needs
+The pages are pages of an operator with three proxies (`tests.browser.fleet`). No test here needs
 ROS: page and browser run on this machine.
 """
 
@@ -20,18 +20,18 @@ from tests.ros.topology import Place
 
 SIZES = (5, 30, 100, 1000)
 MOST_UNFOLDED = 100
-"""Nodes whose unfolded picture is measured; of more, this takes minutes."""
+"""Most nodes for a check of the unfolded graph. With more nodes, this takes minutes."""
 GEOMETRY = Path(__file__).with_name("geometry.js").read_text()
 NODES = 'return document.querySelectorAll("#boxes .box.node, #boxes .box.participant").length'
 ROWS = "return document.querySelectorAll('#rows tr').length"
-TEXTS = "return [...document.querySelectorAll(arguments[0])].map((one) => one.textContent)"
+TEXTS = "return [...document.querySelectorAll(arguments[0])].map((item) => item.textContent)"
 MARKED_ROWS = "#rows tr[aria-current] td:nth-child(2)"
 MARKED_BOXES = ".box:not(.line)[aria-current]"
 MARKED_FINDINGS = "#findings li[aria-current] .what"
 MARKED_LINES = ".box.line[aria-current]"
 SHOWN = """
-return { boxes: [...document.querySelectorAll("#boxes .box")].map((one) => one.title),
-  marked: [...document.querySelectorAll(".box[aria-current]")].map((one) => one.title),
+return { boxes: [...document.querySelectorAll("#boxes .box")].map((box) => box.title),
+  marked: [...document.querySelectorAll(".box[aria-current]")].map((box) => box.title),
   filter: document.querySelector("#filter").value };
 """
 FOLDS = """
@@ -49,7 +49,7 @@ return import("/picture.js").then(({ boxesOf }) => {
 """
 PICTURE = """
 return import("/picture.js").then(({ boxesOf }) => {
-  const nodes = new Map(arguments[0].map((one, index) => [`/n${index}`, one]));
+  const nodes = new Map(arguments[0].map((node, index) => [`/n${index}`, node]));
   const chosen = { unfoldAll: false, turned: new Map(arguments[1]), depths: {} };
   const { lanes } = boxesOf(nodes, new Set(nodes.keys()), chosen);
   return lanes.map((lane) => lane.map(({ level, label, note }) =>
@@ -60,15 +60,15 @@ return import("/picture.js").then(({ boxesOf }) => {
 
 @pytest.fixture
 def machine() -> Place:
-    """Where page and browser are."""
+    """The machine of page and browser."""
     return THIS_MACHINE
 
 
 @contextmanager
 def fleet(browser: Browser, folder: Path, nodes: int) -> Iterator[None]:
-    """The browser shows so many nodes of three proxies."""
+    """Show a page with ``nodes`` nodes of three proxies in the browser."""
     with made_up(browser, folder, nodes, "fleet"):
-        wait_until("there are rows", lambda: browser.run(ROWS) > 0)
+        wait_until("the page shows rows", lambda: browser.run(ROWS) > 0)
         yield
 
 
@@ -76,7 +76,7 @@ def click(browser: Browser, selector: str, text: str) -> None:
     """Click the first element with a text."""
     script = """
     const all = [...document.querySelectorAll(arguments[0])];
-    all.find((one) => one.textContent.includes(arguments[1])).click();
+    all.find((item) => item.textContent.includes(arguments[1])).click();
     """
     browser.run(script, selector, text)
 
@@ -100,7 +100,7 @@ def test_the_picture_reads(browser: Browser, tmp_path: Path, nodes: int) -> None
 
 
 def geometry(browser: Browser) -> list[str]:
-    """What is wrong with the picture; raises AssertionError if there is none."""
+    """The faults of the graph on the screen. Raises AssertionError without boxes or lines."""
     answer: dict[str, Any] = browser.run(GEOMETRY)
     assert answer["boxes"]
     assert answer["lines"]
@@ -126,7 +126,7 @@ def test_what_is_chosen_is_marked_in_graph_and_table(browser: Browser, tmp_path:
         marked = len(texts(browser, MARKED_ROWS))
         assert marked == len(texts(browser, MARKED_LINES)) == 2
         click(browser, "#boxes .proxy", "domain-7")
-        assert len(texts(browser, MARKED_ROWS)) == 10, "all that the proxy carries"
+        assert len(texts(browser, MARKED_ROWS)) == 10, "not all links of the proxy are marked"
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_the_filter_finds_hosts_proxies_and_domains(
     with fleet(browser, tmp_path, 30):
         browser.run("document.querySelector('#filter').focus()")
         browser.press(wanted)
-        wait_until("the others are gone", lambda: browser.run(ROWS) == count)
+        wait_until("the page shows only the wanted rows", lambda: browser.run(ROWS) == count)
 
 
 def test_an_address_shows_the_same_again(browser: Browser, tmp_path: Path) -> None:
@@ -153,17 +153,17 @@ def test_an_address_shows_the_same_again(browser: Browser, tmp_path: Path) -> No
         address = browser.run("return location.href")
         browser.open("about:blank")
         browser.open(address)
-        wait_until("it is the same", lambda: browser.run(SHOWN) == shown)
+        wait_until("the page shows the same state", lambda: browser.run(SHOWN) == shown)
 
 
 def places(browser: Browser, folder: Path, nodes: list[dict[str, str]], *turned: str) -> Any:
-    """The boxes inside, of nodes that are all inside; groups that a click has turned are open."""
+    """The boxes of the lane inside for made-up ``nodes``. The groups ``turned`` are unfolded."""
     with made_up(browser, folder, 10):
         return browser.run(PICTURE, nodes, [[key, True] for key in turned])[2]
 
 
 def inside(*addresses: str, **more: str) -> list[dict[str, str]]:
-    """Nodes with these addresses."""
+    """Nodes inside with these addresses. ``more``: further fields of each node."""
     return [{"lane": "container", "address": address, **more} for address in addresses]
 
 
@@ -200,7 +200,7 @@ def test_of_very_many_containers_some_are_shown(browser: Browser, tmp_path: Path
     nodes[250]["state"] = "broken"
     shown = places(browser, tmp_path, nodes)
     assert len(shown) == 24
-    assert "/n250, 172.18.1.50" in shown, "which is broken"
+    assert "/n250, 172.18.1.50" in shown, "the broken node is not shown"
     assert shown[-1] == "277 more containers, 277 nodes"
 
 

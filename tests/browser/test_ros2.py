@@ -1,4 +1,4 @@
-"""ROS 2 on the live page in Chromium: real rclpy (Fast DDS) and Cyclone DDS on both sides."""
+"""Tests ROS 2 on the live page in Chromium: real rclpy (Fast DDS) and Cyclone DDS."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ table ip firewall {{
 
 @pytest.fixture(scope="module")
 def topology(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Topology]:
-    """The machines."""
+    """The machines and networks of the tests."""
     remove_leftovers()
     with built(PLAN, tmp_path_factory.mktemp("machines")) as topology:
         yield topology
@@ -49,7 +49,7 @@ def topology(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Topology]:
 
 @pytest.fixture
 def lab(topology: Topology, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
-    """A proxy for ROS 2 that has just started."""
+    """A lab with a new proxy for ROS 2."""
     lab = Lab(topology, tmp_path_factory.mktemp("lab"))
     with lab.used():
         lab.start_proxy()
@@ -57,7 +57,7 @@ def lab(topology: Topology, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 
 
 def label(lab: Lab, role: str, topic: str) -> str:
-    """The label of the participant on a machine that has a topic, once the proxy knows it."""
+    """Wait for the participant on a machine that has a topic, and return the label."""
     labels: list[str] = []
 
     def is_there() -> bool:
@@ -78,7 +78,10 @@ def label(lab: Lab, role: str, topic: str) -> str:
 
 @contextmanager
 def firewall(lab: Lab) -> Iterator[None]:
-    """The host drops what comes to the range, but for the port where outside announces itself."""
+    """Have the host drop datagrams to all ports of the range but the first.
+
+    Outside participants send their announcements to the first port.
+    """
     enter = ("ip", "netns", "exec", lab.place("host").namespace)
     rules = FIREWALL.format(first=PORTS.first + 1, last=PORTS.last)
     run_command(*enter, "nft", "-f", "-", text=rules)
@@ -107,7 +110,7 @@ def test_participants_and_their_topics(lab: Lab, browser: Browser) -> None:
     for ends in ((talker, listener), (scanner, reader)):
         drawn = line(browser, *ends)
         assert drawn["colour"] == ok
-        assert re.match(r"/(chatter|scan)\n", drawn["label"]), "it is the only one of the two"
+        assert re.match(r"/(chatter|scan)\n", drawn["label"]), "the line shows several links"
     nodes = {cells[1].removesuffix(" (participant)"): cells for cells in browser.run(NODES)}
     for name, where, vendor in (
         (talker, "container, inside", "Fast DDS"),
@@ -119,7 +122,7 @@ def test_participants_and_their_topics(lab: Lab, browser: Browser) -> None:
         assert vendor in nodes[name][3]
     assert inwards["Port"] in nodes[reader][4].split(", ")
     places = browser.run(PLACES)
-    assert places[listener] < places["rosproxy"] < places[talker], "each in its lane"
+    assert places[listener] < places["rosproxy"] < places[talker], "the boxes are not in the lanes"
     assert trouble(browser) == "Nothing wrong was found."
     quiet = {"ros_discovery_info", "/rosout", "/parameter_events"}
     assert not quiet & {shown["Name"] for shown in rows(browser)}
@@ -148,7 +151,9 @@ def test_qos_that_does_not_match_is_red_at_its_pair_and_green_when_mended(
     assert red["label"] == f"BROKEN: /scan\n{fix}"
     assert fix in browser.run(CHOOSE, scanner, reader)
     told = trouble(browser)
-    assert told.startswith(f"BROKEN: /scan from {scanner} to {reader}\n"), "and nothing twice"
+    assert told.startswith(f"BROKEN: /scan from {scanner} to {reader}\n"), (
+        "the page shows another finding first"
+    )
     assert told.count(fix) == 1
     assert title(browser) == "(1 broken) rosproxy"
 
@@ -174,7 +179,9 @@ def test_a_service_of_another_type_is_broken_between_its_ends(lab: Lab, browser:
     assert node_rows(browser, f"{broken['To']} (participant)")[0][2] == "robot, outside"
     client.stop()
     wait_until("nothing is broken", lambda: title(browser) == "rosproxy")
-    assert service not in {shown["Name"] for shown in rows(browser)}, "as every node has it"
+    assert service not in {shown["Name"] for shown in rows(browser)}, (
+        "the page shows a quiet service"
+    )
 
 
 def test_a_firewall_before_the_range_is_a_warning_until_it_is_gone(
@@ -186,7 +193,7 @@ def test_a_firewall_before_the_range_is_a_warning_until_it_is_gone(
     with firewall(lab):
         lab.node("jazzy", "out", "pub", topic="/scan")
         lab.wait_for_participants(1, 1)
-        wait_until("it is told", lambda: trouble(browser).startswith("warning: "))
+        wait_until("the page shows the warning", lambda: trouble(browser).startswith("warning: "))
         (outsider,) = lab.domain().outside
         text = f"at {outsider.address} (Fast DDS, outside): no datagram from this"
         fix = "publish the range for UDP, and let firewalls accept UDP"

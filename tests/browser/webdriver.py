@@ -1,7 +1,6 @@
 """A browser on a machine of the lab, driven over WebDriver (https://www.w3.org/TR/webdriver2/).
 
-Half a dozen calls of JSON over HTTP are all that is needed, for which a client library would bring
-a dozen packages.
+The tests need half a dozen calls of JSON over HTTP. A client library would need a dozen packages.
 """
 
 from __future__ import annotations
@@ -44,14 +43,14 @@ class Browser:
         self._session = f"/session/{session['sessionId']}"
 
     def close(self) -> None:
-        """End the browser, then its driver."""
+        """End the browser, then chromedriver."""
         try:
             self._call("DELETE", self._session)
         finally:
             self._driver.kill()
 
     def open(self, url: str) -> None:
-        """Go to a page, and wait until it is loaded."""
+        """Open a page, and wait until the page is loaded."""
         self._post("/url", url=url)
 
     def run(self, script: str, *arguments: Any) -> Any:
@@ -59,12 +58,12 @@ class Browser:
         return self._post("/execute/sync", script=script, args=list(arguments))
 
     def resize(self, width: int, height: int) -> None:
-        """Give what is seen of the page this size in CSS pixels."""
+        """Set the size of the viewport in CSS pixels."""
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.devtools("Emulation.setDeviceMetricsOverride", **metrics)
 
     def prefer(self, scheme: str) -> None:
-        """Prefer light or dark."""
+        """Set the preferred colour scheme, ``light`` or ``dark``."""
         feature = {"name": "prefers-color-scheme", "value": scheme}
         self.devtools("Emulation.setEmulatedMedia", features=[feature])
 
@@ -73,7 +72,7 @@ class Browser:
         return self._post("/goog/cdp/execute", cmd=command, params=parameters)
 
     def press(self, keys: str) -> None:
-        """Press keys, where the focus is."""
+        """Press keys for the element with the focus."""
         actions = [{"type": kind, "value": key} for key in keys for kind in ("keyDown", "keyUp")]
         source = {"type": "key", "id": "keyboard", "actions": actions}
         self._post("/actions", actions=[source])
@@ -83,7 +82,7 @@ class Browser:
         return base64.b64decode(self._call("GET", f"{self._session}/screenshot"))
 
     def console(self) -> list[str]:
-        """What the console has printed since it was asked last: errors, refused content."""
+        """The messages of the console since the previous call: errors, refused content."""
         return [str(row["message"]) for row in self._post("/se/log", type="browser")]
 
     def _post(self, path: str, **body: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What is new in a document: only that is sent to those who have the former one."""
+"""The difference between two documents. The proxy sends only this difference to open pages."""
 
 from typing import Any
 
@@ -7,10 +7,10 @@ _TABLES = ("nodes", "links")
 
 
 def changes(before: Json, after: Json) -> Json:
-    """What turns ``before`` into ``after``; empty if they are equal.
+    """The update that turns ``before`` into ``after``; empty if both are equal.
 
-    Of nodes and links those that are new or differ, and None for those that are gone; of the rest
-    all that differs.
+    The update has the new and changed nodes and links, and None for removed nodes and links. Of the
+    other fields, the update has each changed field.
     """
     update: Json = {}
     for table in _TABLES:
@@ -28,7 +28,7 @@ def changes(before: Json, after: Json) -> Json:
 
 
 def changed(before: Json, update: Json) -> Json:
-    """The document with these changes."""
+    """The document ``before`` with the changes of ``update``."""
     after = {**before, **update}
     for table in _TABLES:
         rows = {**before[table], **update.get(table, {})}

@@ -1,7 +1,7 @@
-"""ROS 2 in the document of a proxy: participants, and what is announced on both sides.
+"""ROS 2 in the document of a proxy: participants, topics and services of both sides.
 
-User data is not read, so that neither messages nor their rate are known of a topic: the bytes are
-those of a participant's ports.
+The proxy does not read user data, so a topic has no messages and no rate. The bytes are those of
+the ports of a participant.
 """
 
 from collections.abc import Iterator
@@ -42,9 +42,9 @@ _QUIET_ENDINGS = (
 )
 """Services that every node of ROS 2 has."""
 _QUIET_TOPICS = QUIET | {"ros_discovery_info"}
-"""By the last, participants of ROS 2 tell each other which nodes they have."""
+"""On ros_discovery_info, participants announce the ROS 2 nodes that each participant has."""
 Key = tuple[str, str, str, str]
-"""A link: its kind and name, and the GUID prefixes of its source and its target."""
+"""A link: kind, name, GUID prefix of the source, GUID prefix of the target."""
 
 
 def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
@@ -64,7 +64,7 @@ def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
 
 
 def findings(status: ProxyStatus) -> list[DoctorFinding]:
-    """What the doctor says of the domains, but for what is shown at participants and links."""
+    """The doctor's findings on the domains that no participant and no link shows."""
     shown = {p.guid_prefix for domain in status.domains for p in (*domain.inside, *domain.outside)}
     at_links = {
         (problem.subject, problem.text)
@@ -83,9 +83,9 @@ def _key(domain: DomainStatus, guid_prefix: str) -> str:
 
 
 def _user_data_ports(participant: ParticipantStatus) -> list[LocatorStatus]:
-    """The ports at which user data for a participant arrives, where the proxy passes that on.
+    """The ports of the proxy at which user data for a participant arrives.
 
-    Cyclone DDS has one port for all that comes: then it is that of discovery.
+    Cyclone DDS has the same port for discovery and user data. Then this port counts.
     """
     data = [lease for lease in participant.leases if lease.kind == TrafficKind.USER_DATA.value]
     return data or [*participant.leases]
@@ -116,8 +116,8 @@ def _node(
 def _distinguishing(guid_prefix: str) -> str:
     """The part of a GUID prefix in which participants of a machine differ.
 
-    The first four bytes are the vendor's and, of Fast DDS, the machine's. Then it has the process,
-    and in the last four the participant of that, which are 0 for the only one.
+    The first four bytes have the vendor and, with Fast DDS, the machine. The next four bytes have
+    the process. The last four bytes have the participant in the process, and are 0 for the first.
     """
     return guid_prefix[len("01.0f.aa.bb.") :].removesuffix(".00.00.00.00")
 
@@ -129,7 +129,7 @@ def _state(problem: DomainProblem | None) -> str:
 
 
 def _mismatches(domain: DomainStatus) -> dict[Key, DomainProblem]:
-    """What does not match, by the link that shows it."""
+    """The mismatches of QoS or type, by the link that shows the mismatch."""
     participants = {p.guid_prefix: p for p in (*domain.inside, *domain.outside)}
     nobody = ParticipantStatus()
     mismatches: dict[Key, DomainProblem] = {}
@@ -139,7 +139,7 @@ def _mismatches(domain: DomainStatus) -> dict[Key, DomainProblem]:
         if pair.kind == "topic":
             ends = (writer, reader)
             has_link = pair.name in {*writer.publishes} & {*reader.subscribes}
-        else:  # of a service both write and read
+        else:  # both ends of a service write and read
             ends = (reader, writer) if pair.name in reader.services else (writer, reader)
             has_link = pair.name in ends[0].services and ends[1] is not nobody
         if has_link:
@@ -171,7 +171,7 @@ def _links(domain: DomainStatus, problems: dict[str, DomainProblem]) -> Iterator
                 ),
                 problems.get(participant.guid_prefix),
             )
-    # Whose clients are well has no link to them: only the server is shown.
+    # A service has a link to a client only if client and server do not match.
     for (kind, name, server, client), problem in mismatches.items():
         if kind == "service":
             ends = _key(domain, server), _key(domain, client)
@@ -193,7 +193,7 @@ def _crossing(
 
 
 def _worst(*problems: DomainProblem | None) -> DomainProblem | None:
-    """The first that is grave, else the first of all."""
+    """The first grave problem, else the first problem; None without a problem."""
     present = [problem for problem in problems if problem]
     return next((problem for problem in present if problem.grave), next(iter(present), None))
 
@@ -205,7 +205,7 @@ def _topic_link(
     problem: DomainProblem | None,
     is_passed: bool,
 ) -> PageLink:
-    """A topic between two participants; ``is_passed``: the proxy passes its data on."""
+    """A topic between two participants. ``is_passed``: the user data passes the proxy."""
     writer, reader = ends
     port = next(iter(_user_data_ports(reader)), None) if is_passed else None
     carried = (port.plane if port else "") if is_passed else "direct"
@@ -222,6 +222,6 @@ def _topic_link(
 
 
 def _marked(link: PageLink, problem: DomainProblem | None) -> PageLink:
-    """The link with what is wrong."""
+    """The link with the state, text and fix of a problem, if any."""
     text, fix = (problem.text, problem.fix) if problem else ("", "")
     return replace(link, state=_state(problem), text=shown_text(text), fix=shown_text(fix))

@@ -1,7 +1,7 @@
-"""What the doctor finds out about a proxy that runs, for its page: again and again, on everything.
+"""The doctor's findings on a running proxy for the live page, after each round of questions.
 
-A round of questions takes a while in which nodes start and end. So the proxy is heard before and
-after it, and what holds by both is said.
+Nodes start and end during a round. So the doctor judges with the status from before the round and
+with the status from after the round, and the page shows only findings of both.
 """
 
 from collections.abc import Collection, Mapping
@@ -19,10 +19,11 @@ from rosproxy.page.page_document import MOST_LINKS, QUIET
 
 
 class JudgedFacts(msgspec.Struct, frozen=True):
-    """The ``facts`` with the doctor's findings: on nodes, on pairs, and on the rest.
+    """The ``facts`` with the doctor's findings on nodes, on pairs, and on the rest.
 
-    ``unconnected_pairs`` are all pairs that are not connected; of them ``pairs`` has those that
-    were so before.
+    ``unconnected_pairs``: all pairs that are not connected. ``pairs``: a finding for each pair,
+    also for a connected pair, but not for a pair that is in ``unconnected_pairs`` for the first
+    time.
     """
 
     facts: DoctorFacts
@@ -33,7 +34,10 @@ class JudgedFacts(msgspec.Struct, frozen=True):
 
 
 def topics_to_ask_about(status: ProxyStatus, graph: SystemState) -> tuple[str, ...]:
-    """The topics that nodes are asked about: those of nodes inside, as many as can be shown."""
+    """The topics about which to ask nodes: topics of nodes inside, up to MOST_LINKS links.
+
+    Without the topics that nearly every node has (QUIET).
+    """
     inside = inside_nodes(status)
     topics = []
     remaining = MOST_LINKS
@@ -50,10 +54,10 @@ def topics_to_ask_about(status: ProxyStatus, graph: SystemState) -> tuple[str, .
 def judge(
     facts: DoctorFacts, previous: JudgedFacts | None = None, later: ProxyStatus | None = None
 ) -> JudgedFacts:
-    """Have the doctor judge what was found out; ``previous`` is its judgement before this one.
+    """Have the doctor judge ``facts``. ``previous``: the judgement of the round before.
 
-    ``later`` is what the proxy says of itself after all were asked. A pair is said to be apart once
-    it is found so twice: nodes that start need a moment to meet.
+    ``later``: the status of the proxy after the round. A pair counts as unconnected only after two
+    rounds in a row: nodes that start need a moment to connect.
     """
     nodes: dict[str, DoctorFinding] = {}
     rest = []
@@ -75,9 +79,9 @@ def judge(
 
 
 def _lasting(facts: DoctorFacts, later: ProxyStatus | None) -> list[DoctorFinding]:
-    """What is wrong by what the proxy said before and by what it says after.
+    """The findings that hold with the status before the round and with the status ``later``.
 
-    Of a node that registers or leaves meanwhile the one knows, and the other does not.
+    A node that registers or ends during the round is in only one status, and has no finding.
     """
     before = _wrong(facts)
     if later is None:
@@ -92,9 +96,9 @@ def _wrong(facts: DoctorFacts) -> list[DoctorFinding]:
 
 
 def without_ended(judged: JudgedFacts, status: ProxyStatus) -> JudgedFacts:
-    """The judgement without nodes whose container is gone, as a newer ``status`` knows.
+    """The judgement without nodes that have ended by a newer ``status``.
 
-    A node of the same name that is registered elsewhere stays.
+    A node with the same name stays if the master has another URI for the name.
     """
     ended_endpoints = [endpoint for endpoint in status.nodes if endpoint.has_ended]
     ended_uris = {endpoint.advertised_uri for endpoint in ended_endpoints}
@@ -128,6 +132,6 @@ def _without_names(table: Mapping[str, list[str]], names: Collection[str]) -> di
 
 
 def inside_nodes(status: ProxyStatus) -> dict[str, EndpointStatus]:
-    """The nodes inside, by their names; without those whose container is gone."""
+    """The endpoints of nodes inside by name, without endpoints that have ended."""
     present = [endpoint for endpoint in status.nodes if not endpoint.has_ended]
     return {name: endpoint for endpoint in present for name in endpoint.nodes}

@@ -1,17 +1,17 @@
-"""The master port: inside nodes call it as their master.
+"""The master port, which nodes inside call as their master.
 
 A request that registers or names an address takes these steps (`MasterApi`):
 
 1. Read: parse the calls (`rosproxy.ros1.rewriting.master_calls`).
-2. Check: ask the policy. The proxy itself answers what a rule denies, and finds what is hidden.
+2. Check: ask the policy. The proxy answers calls that a rule denies, and look-ups of hidden names.
 3. Admit: give the node an endpoint, and ask the policy about the registration.
 4. Export the addresses (`rosproxy.ros1.rewriting.master_api`).
 5. Call the master.
 6. Record in the registry what the master has accepted, and tell subscribers of hidden publishers.
 7. Filter the reply by the policy, and import the addresses.
 
-A ``system.multicall`` takes the same steps, for each of its calls. All other requests pass as they
-are; long ones, parameters above all, unread.
+A ``system.multicall`` takes the same steps for each call. All other requests pass unchanged. The
+proxy does not read long requests of this kind, which usually set parameters.
 """
 
 import asyncio
@@ -70,14 +70,14 @@ class MasterApi:
         self._refuse_loop(call)
         metrics = self._context.metrics
         upstream = self._context.upstream
-        # So rospy and roscpp write calls for parameters, unless they set a list or a struct.
+        # rospy and roscpp use only scalars in calls for parameters, except to set a list or struct.
         method = fast.method_of_scalars(call.body) if self._context.policy.idle else None
         if method and _passes(method):
             return await count_reply(metrics, "master", method, upstream.pass_to_master(call.body))
-        # getUri is answered with the address by which the node itself calls the proxy.
+        # The reply to getUri has the address by which the node calls the proxy.
         caller = Caller(call.source, call.local.host, master=call.host_header or str(call.local))
         reads_params = self._context.policy.reads_parameters(call.source)
-        # roslaunch sets all its parameters by one multicall (launch.py, _load_parameters).
+        # roslaunch sets all parameters by a single multicall (launch.py, _load_parameters).
         if not reads_params and await _is_long_and_passes(call.body):
             return await count_reply(
                 metrics, "master", MULTICALL, upstream.pass_to_master(call.body)
@@ -90,9 +90,9 @@ class MasterApi:
         return await count_reply(metrics, "master", request.method, self._answer(request, call))
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
-        """How to watch a long call while it passes; None if it has to be read."""
-        # A call for one parameter is checked by its head (`pass_on`). A multicall holds many, and
-        # the reply to getParamNames has to be filtered.
+        """The watch for a long call that may pass unread; None if the proxy must read the call."""
+        # To check a call for a single parameter, `pass_on` needs only the head of the call. A
+        # multicall may name many parameters, and the proxy must filter a reply to getParamNames.
         is_checked = method in (MULTICALL, "getParamNames")
         if is_checked and self._context.policy.reads_parameters(None):
             return None
@@ -121,12 +121,13 @@ class MasterApi:
             raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, text)
 
     async def _answer(self, request: Request, incoming: IncomingCall) -> bytes | LongReply:
-        """The reply to a request that was read; a request without changes passes untouched."""
+        """The reply to a parsed request. A request without changes passes as the original bytes."""
         policy = self._context.policy
         upstream = self._context.upstream
         if not request.plain:
-            # A node that a former process of the proxy knew would get another port before that, and
-            # rosmaster would shut it down for its new URI (registrations.py, _register_node_api).
+            # Without the recovery, a node of a former process of the proxy would get another port.
+            # rosmaster would shut the node down for the new URI (registrations.py,
+            # _register_node_api).
             await self._recovery.ensure()
         elif policy.idle:
             return await upstream.pass_to_master(request.body)
@@ -141,9 +142,9 @@ class MasterApi:
                 return exported.local_reply()
             reply = await self._call_master(exported, exported.body)
             self._record(reply.registry_changes(self._context.now()), request.caller)
-            await self._memory.write()  # the registry learns a service's port only now
+            await self._memory.write()  # `_record` has just learnt a service's port
             await self._stand_ins.listen_for(reply.uris(), request.caller)
-            if policy.rules.version != version:  # what was allowed may be denied by now
+            if policy.rules.version != version:  # new rules may deny the request
                 policy.must_enforce = True
             return master_api.import_reply(reply, self._context.addressing, policy.filter_result)
 
@@ -154,17 +155,16 @@ class MasterApi:
         answers: Sequence[LocalAnswer | None],
         incoming: IncomingCall,
     ) -> AsyncIterator[Sequence[CallOutcome]]:
-        """The outcomes of a request's calls, some of which have an answer. Raises Unreachable.
+        """The outcomes of a request's calls, in order. ``answers``: the answers of the policy.
 
-        Within the context the endpoints that the calls register are *pending*: their leases do not
-        end while the calls are on their way. If the caller goes away meanwhile, the master is told
-        nothing.
+        In the context, the endpoints that the calls register are *pending*, so their leases do not
+        end. Raises Unreachable if the caller closes the connection before the call of the master.
         """
         self._context.refresh_networks()
         outcomes = list[CallOutcome]()
         pending = list[Endpoint]()
         try:
-            # One after the other: they may register the same new node.
+            # In order, because two calls may register the same new node.
             for call, answer in zip(request.calls, answers, strict=True):
                 if incoming.gone:
                     raise Unreachable("the caller has closed the connection")
@@ -172,14 +172,14 @@ class MasterApi:
                 if call and answer is None:
                     outcome = await self._outcome(call, request, pending)
                 outcomes.append(outcome)
-                await asyncio.sleep(0)  # with many rules one call may take milliseconds
+                await asyncio.sleep(0)  # with many rules, a call may take milliseconds
             yield outcomes
         finally:
             for endpoint in pending:
                 endpoint.pending -= 1
 
     async def _outcome(self, call: Call, request: Request, pending: list[Endpoint]) -> CallOutcome:
-        """What becomes of a call; the endpoint that it registers is pending from now on."""
+        """The outcome of a call. Makes the endpoint that the call registers pending."""
         caller = request.caller
         policy = self._context.policy
         if method_spec(call.method).unregisters:
@@ -189,7 +189,7 @@ class MasterApi:
         if isinstance(admission, LocalAnswer) or admission is Passing.NO_REGISTRATION:
             return admission
         if isinstance(admission, Endpoint):
-            # Held before anything is awaited: nothing else keeps the lease from ending meanwhile.
+            # Pending before the first await. Otherwise the lease could end meanwhile.
             admission.pending += 1
             pending.append(admission)
             await self._adopter.take_over(admission, caller_id_of(call))
@@ -197,7 +197,7 @@ class MasterApi:
         return denial.answer if denial else admission
 
     async def _admit(self, call: Call, request: Request) -> CallOutcome:
-        """What becomes of one call; what is too long, or one too many, is refused."""
+        """Admit a call, or refuse a name that is too long or exceeds the bound of an endpoint."""
         caller = request.caller
         may_be_long = len(request.body) > LONGEST_NAME
         if may_be_long and (text := too_long_to_register(call)):
@@ -208,25 +208,25 @@ class MasterApi:
         return admission
 
     def _refuse(self, reason: str, call: Call, caller: Caller, text: str) -> LocalAnswer:
-        """Refuse a call that is over a bound, and report the refusal."""
+        """Report a call over a bound, and return the refusal."""
         description = f"{call.method} of {caller.caller_id}: {text}"
         self._context.refusals.note(reason, caller.address, description)
         return refusal(f"rosproxy: {text}")
 
     async def _call_master(self, exported: ExportedRequest, body: bytes) -> MasterReply:
         """The master's reply to a request. Raises XmlRpcError, Unreachable."""
-        # Before the master knows the node: were the proxy killed in between, the next process
-        # would find a registration with this lease, and not know where its node is.
+        # Written before the call: if the proxy is killed after the call, the next process finds a
+        # registration with this lease, and needs the address of the node.
         await self._memory.write()
         limits = exported.request.reply_limits
         answer = await self._context.upstream.post_to_master(body, limits)
         return master_calls.read_reply(exported, answer)
 
     def _record(self, changes: Iterable[RegistryChange], caller: Caller) -> None:
-        """Record what the master has accepted, and what the policy keeps from the master.
+        """Record what the master has accepted, and what the policy hides from the master.
 
-        The registry takes a service's port only from the node's own address: any node may register
-        a service in another node's name, and the port would be open to outside.
+        The registry takes the port of a service only from a caller at the address of the node. Any
+        node may register a service by the name of another node, and outside would reach the port.
         """
         registry = self._context.registry
         for change in changes:
@@ -234,7 +234,7 @@ class MasterApi:
             endpoint = change.endpoint
             if endpoint is None:
                 registry.unregister(registration.kind, registration.name, registration.caller_id)
-            elif registry.by_port.get(endpoint.port) is endpoint:  # not forgotten since
+            elif registry.by_port.get(endpoint.port) is endpoint:  # not removed since
                 registration = self._context.policy.settle(endpoint, registration)
                 if caller.address == endpoint.location.address:
                     registry.register(endpoint, registration)
@@ -245,10 +245,10 @@ class MasterApi:
 
 @dataclass(slots=True, eq=False)
 class PublishedMaster:
-    """The master itself for outside (``--publish-master``), where it runs inside.
+    """Forwards calls of outside to a master that runs inside (``--publish-master``).
 
-    What the master holds are outside addresses already; only its own URI is replaced, by the one at
-    which it is published: ``address``.
+    The registrations at the master already have outside addresses. The proxy replaces only the URI
+    of the master by ``address``, the published address.
     """
 
     _context: Context
@@ -267,7 +267,7 @@ class PublishedMaster:
         return master_api.rename_master(request, reply, self._address)
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
-        """How to watch a long call while it passes; None if it has to be read."""
+        """The watch for a long call that may pass unread; None if the proxy must read the call."""
         return _watch(method, size, self._context.master_call)
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
@@ -280,13 +280,13 @@ def _passes(method: str) -> bool:
 
 
 def _watch(method: str, size: int, limits: Limits) -> passing.CallWatch | None:
-    if method == MULTICALL:  # a shorter one may hold calls with addresses, so it is read
+    if method == MULTICALL:  # the proxy reads a shorter multicall, which may have addresses
         return passing.MulticallWatch(_passes) if size > limits.size else None
     return passing.CallWatch() if _passes(method) else None
 
 
 async def _is_long_and_passes(body: bytes) -> bool:
-    """Whether a body is a long multicall of which nothing has to be read."""
+    """Whether a body is a long multicall that the proxy need not read."""
     if len(body) <= passing.SHORT or passing.method_of(body) != MULTICALL:
         return False
     watch = passing.MulticallWatch(_passes)
@@ -297,6 +297,6 @@ async def _is_long_and_passes(body: bytes) -> bool:
             watch.see(piece)
             await asyncio.sleep(0)
         watch.end()
-    except xmlrpc.XmlRpcError:  # it is read then, which tells the error
+    except xmlrpc.XmlRpcError:  # the proxy then reads the call and reports the error
         return False
     return True
