@@ -1,9 +1,9 @@
-"""The server's side of XML-RPC: requests on kept connections, one after the other.
+"""The HTTP server for XML-RPC: answers the requests of a kept connection in order.
 
-aiohttp's parser (llhttp) reads the requests. aiohttp's `web.Server` is left out: it makes a task, a
-request, a response and a writer for each request, and a call takes a third longer with them.
+aiohttp's parser (llhttp) reads the requests. The server does not use aiohttp's `web.Server`, which
+makes a task, a request, a response and a writer for each request. A call would take a third longer.
 
-A reply has a Content-Length and no chunks: ROS's clients expect that (xmlrpcpp, XmlRpcClient.cpp).
+A reply has a Content-Length and no chunks, as ROS clients expect (xmlrpcpp, XmlRpcClient.cpp).
 """
 
 import asyncio
@@ -25,17 +25,17 @@ from rosproxy.net.sockets import reset_on_close
 log = logging.getLogger(__name__)
 
 IDLE_TIMEOUT_S = 75.0
-"""Seconds in which the next request must arrive."""
+"""Seconds within which the next request must arrive."""
 REST_TIMEOUT_S = 10.0
-"""Seconds in which the rest of a body must arrive after the reply was sent.
+"""Seconds within which the rest of a body must arrive after the reply.
 
-A client that still writes gets no reply from a connection that is closed meanwhile.
+If the server closed the connection while the client still writes, the client would lose the reply.
 """
 MAX_LINE_BYTES = 4096
 MAX_HEADERS = 64
-"""Header lines of a request: ROS's clients send five."""
+"""Most header lines of a request. ROS clients send five."""
 MAX_QUEUED = 8
-"""Requests of a connection that wait while the one before is answered."""
+"""Most requests of a connection that wait for the reply to an earlier request."""
 
 
 class BadBody(ValueError):
@@ -71,12 +71,12 @@ class HttpReply:
 def text_reply(
     text: str, status: int = 200, reason: str = "", lines: str = "", lasts: bool = True
 ) -> HttpReply:
-    """A reply for people."""
+    """A reply with plain text."""
     return HttpReply(text.encode(), status, reason, "text/plain; charset=utf-8", lines, lasts)
 
 
 class HttpRequest:
-    """A request whose header has come; ``content`` brings the body."""
+    """A request whose header has arrived. ``content`` is the stream of the body."""
 
     __slots__ = ("_message", "connection", "content", "headers", "method")
 
@@ -91,18 +91,18 @@ class HttpRequest:
 
     @property
     def path(self) -> str:
-        """The path, with what follows a question mark."""
+        """The path and the query."""
         url = self._message.url
         return str(url.relative() if url.absolute else url)
 
     @property
     def content_length(self) -> int | None:
-        """Bytes of the body, if the header tells them."""
+        """The length of the body in bytes; None without ``Content-Length``."""
         length = self.headers.get("Content-Length")
         return None if length is None else int(length)
 
     def invite(self) -> None:
-        """Ask for the body, if the client waits to be asked."""
+        """Send ``100 Continue`` if the client waits for that before sending the body."""
         waits = self.headers.get("Expect", "").lower() == "100-continue"
         if waits and self._message.version >= HttpVersion11:
             self.connection.write(b"HTTP/1.1 100 Continue\r\n\r\n")
@@ -112,7 +112,7 @@ class HttpRequest:
         await self.write(self._head(HttpReply(b""), size))
 
     async def write(self, data: bytes) -> None:
-        """Send on, as fast as the client takes it. Raises ConnectionError."""
+        """Send data, and wait until the client reads. Raises ConnectionError."""
         self.connection.write(data)
         await self.connection.drain()
 
@@ -123,7 +123,7 @@ class HttpRequest:
         await self.connection.drain()
 
     def reset(self) -> None:
-        """Reset the connection: what a caller finds whose peer is gone. ROS's clients try again."""
+        """Reset the connection, as if the peer had gone. ROS clients then try again."""
         self.connection.reset()
 
     def _head(self, reply: HttpReply, size: int) -> bytes:
@@ -135,8 +135,8 @@ class HttpRequest:
 class HttpConnection(HttpProtocol):
     """A connection of a client.
 
-    ``busy``: a request is being answered. ``source`` is where the client is, ``local`` where it has
-    reached this machine.
+    ``busy``: whether a request is being answered. ``source``: the address and port of the client.
+    ``local``: the address and port of this machine.
     """
 
     def __init__(self, server: "HttpServer") -> None:
@@ -164,9 +164,9 @@ class HttpConnection(HttpProtocol):
         self._is_closing = False
         """No further request is served."""
         self._has_last = False
-        """Nothing that comes is read any more; the last request has come."""
+        """The last request has arrived, and the server reads no further bytes."""
         self._fault = ""
-        """What after the last request is not HTTP."""
+        """Why the bytes after the last request are not HTTP."""
         self._idle_since = loop.time()
         self._idle_timer: asyncio.TimerHandle | None = None
         self.task: asyncio.Task[None] | None = None
@@ -184,7 +184,7 @@ class HttpConnection(HttpProtocol):
         self.task = self._loop.create_task(self._serve())
 
     def data_received(self, data: bytes) -> None:
-        """Take in what has come; also called with nothing, when the parser may go on."""
+        """Parse received bytes. aiohttp passes no bytes when the parser may go on."""
         if self._is_closing or self._has_last:
             return
         messages: Sequence[tuple[RawRequestMessage, StreamReader]] = ()
@@ -195,17 +195,17 @@ class HttpConnection(HttpProtocol):
             self._has_last = True
         else:
             self._requests.extend(messages)
-            self._has_last = is_upgrade  # to a protocol that is not spoken here
+            self._has_last = is_upgrade  # the server has no other protocol
         if messages or self._has_last:
             wake(self._arrival)
         if len(self._requests) >= MAX_QUEUED and not self._buffer_paused:
             self._pause_reading_for_buffer()
 
     def eof_received(self) -> None:
-        """Close the connection, as the client has closed its side; what is under way ends first."""
+        """Have asyncio close the connection, because the client has closed the other side."""
 
     def connection_lost(self, exc: BaseException | None) -> None:
-        """Forget the connection; the request that is being answered is answered to its end."""
+        """Forget the connection. A call under way runs to the end."""
         super().connection_lost(exc)
         self.close()
         if self._idle_timer is not None:
@@ -220,11 +220,11 @@ class HttpConnection(HttpProtocol):
 
     @property
     def lasts(self) -> bool:
-        """Whether another request is served after the one that is answered now."""
+        """Whether the server serves another request after the current request."""
         return not self._is_closing and bool(self._requests or not self._has_last)
 
     def close(self) -> None:
-        """Serve no further request, and end the connection after the one that is answered now."""
+        """Serve no further request, and end the connection after the current request."""
         self._is_closing = True
         wake(self._arrival)
 
@@ -257,7 +257,7 @@ class HttpConnection(HttpProtocol):
             self.force_close()
 
     async def _next(self) -> HttpRequest | None:
-        """The next request; None if none is to be served any more."""
+        """The next request; None if the server serves no further request."""
         while not (self._requests or self._has_last or self._is_closing):
             self._arrival = self._loop.create_future()
             await self._arrival
@@ -284,7 +284,7 @@ class HttpConnection(HttpProtocol):
             self._idle_since = self._loop.time()
 
     async def _skip_rest(self, content: StreamReader) -> None:
-        """Read the rest of a body to no end; if it takes long, no further request is served."""
+        """Read and drop the rest of a body. After REST_TIMEOUT_S, serve no further request."""
         try:
             async with asyncio.timeout(REST_TIMEOUT_S):
                 while not content.at_eof():
@@ -304,7 +304,7 @@ class HttpConnection(HttpProtocol):
 
 
 class HttpServer:
-    """Serves connections; a subclass says how (`answer`)."""
+    """Serves connections. A subclass implements `answer`."""
 
     def __init__(self) -> None:
         self._connections: set[HttpConnection] = set()
@@ -318,7 +318,7 @@ class HttpServer:
         raise NotImplementedError
 
     def connection_made(self, connection: HttpConnection) -> None:
-        """Take a connection in."""
+        """Add a connection."""
         self._connections.add(connection)
 
     def connection_lost(self, connection: HttpConnection) -> None:
@@ -326,7 +326,7 @@ class HttpServer:
         self._connections.discard(connection)
 
     async def shutdown(self, within: float) -> None:
-        """Close all connections; requests that are being answered get ``within`` seconds."""
+        """Close all connections. Requests under way have ``within`` seconds to end."""
         connections = list(self._connections)
         for connection in connections:
             connection.close()
@@ -341,7 +341,7 @@ class HttpServer:
 
 
 def _host_port(sockname: object) -> HostPort:
-    """An address as sockets give it."""
+    """The address and port in a socket address; empty and 0 if unknown."""
     match sockname:
         case [str(host), int(port), *_]:
             return HostPort(plain_address(host), port)
@@ -349,9 +349,12 @@ def _host_port(sockname: object) -> HostPort:
 
 
 def _head(version: HttpVersion, lasts: bool, reply: HttpReply, size: int) -> bytes:
-    """A reply's header; that the connection lasts is said where HTTP's version doesn't imply it."""
+    """The header of a reply.
+
+    ``Connection`` is present only if ``lasts`` differs from the default of the HTTP version.
+    """
     start = _head_start(version, lasts, reply.status, reply.reason, reply.content_type)
-    # roscpp finds the length only with a blank after the colon (XmlRpcClient.cpp, readHeader).
+    # roscpp finds the length only with a space after the colon (XmlRpcClient.cpp, readHeader).
     return f"{start}{reply.lines}Content-Length: {size}\r\n\r\n".encode()
 
 

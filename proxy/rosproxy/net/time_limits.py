@@ -1,6 +1,6 @@
-"""Time limits of calls, as `asyncio.timeout` has them, with one timer for many calls.
+"""Time limits of calls, as with `asyncio.timeout`, but with a shared timer for many calls.
 
-uvloop spends a turn of the event loop on each timer that is cancelled: a twentieth of a call.
+uvloop spends a turn of the event loop on each cancelled timer: a twentieth of the time of a call.
 """
 
 import asyncio
@@ -8,7 +8,7 @@ import math
 
 
 class TimeLimits:
-    """The limits in force, and the timer for the first one that may run out."""
+    """The limits in force, and the timer for the limit that may run out first."""
 
     def __init__(self) -> None:
         self.running = set[TimeLimit]()
@@ -16,7 +16,7 @@ class TimeLimits:
         self._timer: asyncio.TimerHandle | None = None
 
     def look_at(self, when: float, loop: asyncio.AbstractEventLoop) -> None:
-        """Look at a time whether a limit has run out, instead of later."""
+        """Set the timer to look at ``when`` whether a limit has run out, instead of later."""
         if self._timer is not None:
             self._timer.cancel()
         self.next_look = when
@@ -33,9 +33,9 @@ class TimeLimits:
 
 
 class TimeLimit:
-    """Raises TimeoutError if what runs in the context takes longer than so many seconds.
+    """Raises TimeoutError if the code in the context takes longer than ``seconds``.
 
-    The timer stays when the context ends: most often a later limit needs it.
+    The timer stays when the context ends, because usually a later limit needs the timer.
     """
 
     __slots__ = ("_cancels", "_has_run_out", "_limits", "_seconds", "_task", "end")
@@ -59,14 +59,14 @@ class TimeLimit:
             self._limits.look_at(self.end, loop)
 
     def run_out(self) -> None:
-        """End what runs."""
+        """Cancel the code in the context."""
         self._has_run_out = True
         self._task.cancel()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: object
     ) -> None:
-        """Raise TimeoutError if the limit, and nothing else, has cancelled the task."""
+        """Raise TimeoutError if only the limit has cancelled the task."""
         self._limits.running.discard(self)
         is_cause = self._has_run_out and self._task.uncancel() <= self._cancels
         if is_cause and kind is asyncio.CancelledError:

@@ -1,7 +1,7 @@
-"""The links of the hub router to routers outside: which link is up, and why another is not.
+"""The links of the hub router to routers outside: which links are up, and why a link is down.
 
-The hub dials each peer again and again by itself, and tells which sessions it has, but not why a
-peer has none. So the proxy tries to connect to such a peer.
+The hub dials each peer again and again. The hub reports the sessions, but not why there is no
+session with a peer. So the proxy tries to connect to such a peer.
 """
 
 from collections.abc import Collection, Iterable
@@ -25,9 +25,9 @@ class LinkFault(Enum):
 
 @dataclass
 class Link:
-    """A link to a peer. ``addresses`` are those of the peer's name.
+    """A link to a peer. ``addresses``: the addresses of the peer's host name.
 
-    ``fault`` is None if the link is up. ``since`` is the time at which it went up or down.
+    ``fault``: None if the link is up. ``since``: the time at which the link went up or down.
     """
 
     peer: HostPort

@@ -1,13 +1,13 @@
-"""The configurations of the proxy's routers: one for each container, and the hub.
+"""The configurations of the proxy's routers: a router for each container, and the hub.
 
-A router never passes data between two of its own peers: zenoh expects peers of a router to reach
-each other directly. rmw_zenoh makes each node a peer that listens on loopback, so nodes of one
+A router never passes data between two peers of this router: zenoh expects such peers to reach each
+other directly. rmw_zenoh makes each node a peer that listens on loopback. So nodes of the same
 container reach each other, and nodes of two containers do not. With a router for each container,
 two containers are peers of two routers, and routers pass data on to each other. The hub is linked
 to all these routers, and to routers outside.
 
-The values are those of rmw_zenohd (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_ROUTER_CONFIG.json5),
-except for the addresses, the bound of sessions, and the delay for scouting, which is off.
+The values come from rmw_zenohd (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_ROUTER_CONFIG.json5).
+Exceptions are the addresses, the bound of sessions, and the delay for scouting, which is off.
 """
 
 import json
@@ -19,7 +19,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.zenoh.protocol.report import MOST_SESSIONS
 
 RouterConfig = Mapping[str, str]
-"""Values as JSON, by their keys in zenoh's configuration."""
+"""Values as JSON, by the keys of zenoh's configuration."""
 _LOOPBACK = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 _COMMON: dict[str, Any] = {
     "mode": "router",
@@ -52,7 +52,7 @@ def router_configs(
     ``listen`` is the port of the hub for outside, ``peers`` are routers that the hub dials.
     """
     containers = [HostPort(bind, port) for port in ports.ports()]
-    # The hub dials the other routers. So without ``listen`` it has no port that others can reach.
+    # The hub dials the other routers, so without ``listen`` the hub has no port.
     dialed = [HostPort(_LOOPBACK.get(bind, bind), port) for port in ports.ports()]
     hub_ports = [] if listen is None else [HostPort(bind, listen)]
     routers = [_config([container], []) for container in containers]

@@ -1,4 +1,4 @@
-"""rmw_zenoh in a running proxy: the routers, their links, and what is wrong with them."""
+"""rmw_zenoh in a running proxy: the routers, the links, and the faults of both."""
 
 import asyncio
 import logging
@@ -29,13 +29,13 @@ from rosproxy.zenoh.status import ZenohState
 log = logging.getLogger(__name__)
 
 LINK_INTERVAL_S = 5.0
-"""Time between looks at the addresses of peers, and between tries of links that are not up."""
+"""Seconds between look-ups of the peers' addresses, and between tries of links that are down."""
 FAULT_INTERVAL_S = 1.0
 _OPTION = "--ros zenoh"
 
 
 class Zenoh:
-    """The part for rmw_zenoh. `start` it in a running event loop, `stop` it in the same."""
+    """The part of the proxy for rmw_zenoh. Call `start` and `stop` in the same event loop."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
@@ -49,7 +49,7 @@ class Zenoh:
         self.state = ZenohState(settings, self.keeper, runtime.now)
 
     async def start(self) -> None:
-        """Start the routers and begin. Raises SettingError."""
+        """Start the routers, and look for faults from now on. Raises SettingError."""
         _check_package()
         _check_ports(self._settings)
         try:
@@ -67,7 +67,7 @@ class Zenoh:
 
     @property
     def greeting(self) -> str:
-        """How nodes use it, for the log."""
+        """How nodes reach the routers, for the log."""
         settings = self._settings
         outside = [f"peers {listed(map(str, settings.zenoh_peer))}"] if settings.zenoh_peer else []
         if settings.zenoh_listen is not None:
@@ -76,29 +76,29 @@ class Zenoh:
         return ", ".join([ports, *outside])
 
     actions: Mapping[str, Action] = {}
-    """No post of an operator concerns rmw_zenoh."""
+    """No action of an operator concerns rmw_zenoh."""
     retired = False
-    """The routers register nothing."""
+    """The routers have no registrations, so an operator retires nothing."""
 
     async def settle(self) -> None:
-        """No port of it is probed."""
+        """Return at once: no port for rmw_zenoh is probed."""
 
     async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
-        """None: it has no ports of the range."""
+        """No results: rmw_zenoh has no ports of the range."""
         return ()
 
     async def try_ports(self) -> tuple[PortProbe, ...]:
-        """Instead of a start: take its ports, and let go. Raises SettingError."""
+        """Bind the ports and close them again, without a start. Raises SettingError."""
         _check_package()
         _check_ports(self._settings)
         return ()
 
     async def apply_policy(self) -> EnforcementCounts:
-        """No policy holds for it; `Settings` refuses rules."""
+        """No counts: rmw_zenoh has no policy, and `Settings` refuses rules."""
         return EnforcementCounts()
 
     def unready(self) -> str | None:
-        """Why nodes can't use it now; None if they can."""
+        """Why nodes can't use the routers now; None if the routers run."""
         failure = self.keeper.failure
         return f"{findings.ROUTERS}: do not run: {failure}" if failure else None
 
@@ -116,13 +116,13 @@ class Zenoh:
         await asyncio.gather(*(self._look_at(link) for link in self.state.links))
 
     async def _look_at(self, link: Link) -> None:
-        """Find the addresses of a peer, and why the link to it is not up."""
-        # A name server that is away takes no address away.
+        """Look up the addresses of a peer, and record why the link to the peer is down."""
+        # If the name server does not answer, the former addresses stay.
         link.addresses = tuple(await resolve(link.peer.host)) or link.addresses
         fault = None
         if not self.state.is_up(link):
             fault = await try_link(link.addresses, link.peer.port)
-        if self.keeper.failure:  # no router dials
+        if self.keeper.failure:  # no router dials the peer
             return
         # The link may have come up during the try, which takes some seconds.
         fault = None if self.state.is_up(link) else fault
@@ -131,9 +131,9 @@ class Zenoh:
             log.info("zenoh link %s: %s", state, link.peer)
 
     async def _look_for_faults(self) -> None:
-        """Report each fault once in the log, and as a problem for as long as the fault lasts."""
+        """Log each fault once, and report the fault as a problem while the fault lasts."""
         current = {fault.subject: fault for fault in findings.faults(self.state.status())}
-        if self.keeper.failure:  # of all else nothing is known
+        if self.keeper.failure:  # former faults stay, because nothing else is known
             current = self._faults | current
         for subject in self._faults.keys() | current.keys():
             fault = current.get(subject)

@@ -1,8 +1,8 @@
-"""The checks of the policy: before the master or a node is called, and of what comes back.
+"""The checks of the policy: before a call of the master or a node, and of the reply.
 
-Each ``check_…`` returns a `Denial`, or None for what is allowed, and reports what a rule denies. A
-source that is the address of a node inside is not outside: nodes in several inside networks reach
-each other through the proxy's ports.
+Each ``check_…`` returns a `Denial`, or None if allowed, and reports the denial. A source with the
+address of a node inside is not outside: nodes in several inside networks reach each other through
+the ports of the proxy.
 """
 
 import asyncio
@@ -51,18 +51,18 @@ RULE_KINDS = {
     Kind.SERVICE: RuleKind.SERVE,
     Kind.PARAM: RuleKind.GET_PARAM,
 }
-"""The rules for a registration, by its kind."""
+"""The kind of rules for each kind of registration."""
 _OFFERED = {"topic": Kind.PUBLISHER, "service": Kind.SERVICE}
-"""What a node inside has registered if outside asks for a topic or service of the node."""
+"""The registration of a node inside, if outside asks for a topic or service of the node."""
 _USED = {"topic": RuleKind.SUBSCRIBE, "service": RuleKind.CALL}
-"""The rules for a topic or service of outside."""
+"""The kind of rules for a topic or service of outside."""
 
 
 class Ros1Policy:
-    """The policy in force, ``rules``, as it applies to calls, connections and registrations.
+    """Applies the policy in force, ``rules``, to calls, connections and registrations.
 
-    ``must_enforce``: something happened by a policy that is no longer in force, so the policy has
-    to be enforced again (`PolicyEnforcer`).
+    ``must_enforce``: a former policy has allowed something meanwhile, so `PolicyEnforcer` must
+    enforce the policy again.
     """
 
     def __init__(
@@ -83,26 +83,26 @@ class Ros1Policy:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to check: no rule, and nothing that a former rule has hidden."""
+        """Whether there is nothing to check: no rule, and no hidden registration."""
         return self.rules.empty and not self._registry.hides
 
     # Calls at the master port
 
     def reads_parameters(self, source: str | None) -> bool:
-        """Whether calls for parameters from an address have to be read; None: from any."""
+        """Whether the proxy must read calls for parameters from an address (None: any address)."""
         return self.rules.may_deny(PARAMETERS, (), source)
 
     def reads_reply(self, request: Request) -> bool:
-        """Whether the reply to a request may have to say otherwise than the master does."""
+        """Whether the proxy may have to change the master's reply to a request."""
         if request.tells_graph and self._registry.hides:
             return True
         lists_params = any(call and call.method == "getParamNames" for call in request.calls)
         return lists_params and self._filters_params(request.caller)
 
     async def check_request(self, request: Request) -> Sequence[LocalAnswer | None]:
-        """The answers to the calls of a request that the master does not get; None: it gets it.
+        """The proxy's answer to each call of a request; None if the call goes to the master.
 
-        A registration is checked once the node has an endpoint (`check_registration`). Raises
+        `check_registration` checks registrations later, when the node has an endpoint. Raises
         Unreachable.
         """
         answers: list[LocalAnswer | None] = [None] * len(request.calls)
@@ -112,11 +112,11 @@ class Ros1Policy:
         for index, call in enumerate(request.calls):
             if call:
                 answers[index] = await self._answer(call, request.caller, params)
-            await asyncio.sleep(0)  # with many rules one call may take milliseconds
+            await asyncio.sleep(0)  # with many rules, a call may take milliseconds
         return answers
 
     def check_unread(self, method: str, head: bytes, source: str) -> Denial | None:
-        """Check a long call, of which only the head was read."""
+        """Check a long call by the head of the call."""
         caller_id, name = passing.first_strings(head, 2)
         use = param_use(method, caller_id or "", name)
         if use is None:
@@ -127,9 +127,9 @@ class Ros1Policy:
     def check_registration(
         self, call: Call, admission: Endpoint | Passing, caller: Caller, now: float
     ) -> Denial | None:
-        """Check a call that registers, once its node is admitted; what is denied is hidden."""
+        """Check a call that registers, after admission. A denied registration becomes hidden."""
         affected = None if self.idle else registration_of(call, now, caller.address)
-        if affected is None or affected.kind is Kind.PARAM:  # parameters were checked before
+        if affected is None or affected.kind is Kind.PARAM:  # already checked
             return None
         endpoint = admission if isinstance(admission, Endpoint) else None
         address = endpoint.address if endpoint else caller.address
@@ -137,7 +137,7 @@ class Ros1Policy:
         verdict = self.rules.ask(kind, affected.name, [affected.caller_id], address)
         if verdict.allowed:
             return None
-        if endpoint is None:  # the URI is that of another node, which the proxy can't hide
+        if endpoint is None:  # the URI of another node, which the proxy can't hide
             return denied(verdict.reason)
         hidden = replace(affected, hidden=True)
         answer = self._hidden.answer_registration(hidden, endpoint, caller)
@@ -154,10 +154,11 @@ class Ros1Policy:
         return self._hidden.answer_unregistration(current) if current and current.hidden else None
 
     def settle(self, endpoint: Endpoint, registration: Registration) -> Registration:
-        """The registration as the registry has to have it.
+        """The registration for the registry.
 
-        A registration that the master has stays shown until the enforcer takes it back: the policy
-        has just changed. The enforcer also takes the fast port of a node that hides anything.
+        If the policy has just changed, the master may still have a denied registration. Then
+        the registration stays shown until the enforcer takes it back from the master. The enforcer
+        also takes the fast port of a node with hidden registrations.
         """
         if not registration.hidden:
             return registration
@@ -168,7 +169,7 @@ class Ros1Policy:
         return replace(registration, hidden=not is_shown)
 
     def filter_result(self, result: CallResult, caller: Caller) -> Sequence[Edit]:
-        """The edits by which a result leaves out what is denied and has what is hidden; or none."""
+        """The edits that remove denied names from a result and add hidden names."""
         value = result.value
         if self.idle or value is None or not result.accepted:
             return ()
@@ -197,7 +198,7 @@ class Ros1Policy:
     # What is registered
 
     def verdict(self, endpoint: Endpoint, registration: Registration) -> Verdict:
-        """Whether the master may have a registration; nothing is reported."""
+        """Whether the master may have a registration. Reports no denial."""
         kind = RULE_KINDS[registration.kind]
         name = registration.name
         verdict = self.rules.judge(kind, name, [registration.caller_id], endpoint.address)
@@ -207,7 +208,7 @@ class Ros1Policy:
         return verdict
 
     def report_registration(self, endpoint: Endpoint, registration: Registration) -> Verdict:
-        """The same, and a denial is reported."""
+        """The same as `verdict`; reports a denial."""
         verdict = self.verdict(endpoint, registration)
         subject = f"{registration.name} of {registration.caller_id}"
         return self.rules.report(verdict, RULE_KINDS[registration.kind], subject, endpoint.address)
@@ -241,8 +242,9 @@ class Ros1Policy:
     def check_outside_request(self, call: Call, endpoint: Endpoint, source: str) -> Denial | None:
         """Check a requestTopic from outside.
 
-        An offer of UDPROS holds a header of its own, whose topic roscpp serves (topic_manager.cpp,
-        requestTopic): the offer is denied if a rule may deny anything of the node.
+        An offer of UDPROS has a separate header, and roscpp serves the topic of this header
+        (topic_manager.cpp, requestTopic). So the proxy denies UDPROS if a rule may deny a topic of
+        the node.
         """
         topic = call.string(1) or ""
         caller_id = call.string(0) or ""
@@ -259,7 +261,7 @@ class Ros1Policy:
     ) -> Denial | None:
         """Check a call from outside at a node.
 
-        What only the master calls, in its name and from its address, is allowed.
+        The master may make MASTER_ONLY calls: with the caller_id MASTER, from the master's host.
         """
         kind = RuleKind.SLAVE
         verdict = self.rules.judge(kind, method, [caller_id], endpoint.address)
@@ -271,7 +273,7 @@ class Ros1Policy:
         return self._denial(verdict, kind, f"{method} at {endpoint.label}", source)
 
     def may_bypass(self, endpoint: Endpoint) -> bool:
-        """Whether a node's topics may go where no header is read: forwarded by the kernel."""
+        """Whether the kernel may forward a node's topics, so that the proxy reads no header."""
         return not self.rules.may_deny(OUTWARDS, endpoint.caller_ids, endpoint.address)
 
     # What a node inside asks of outside
@@ -279,8 +281,8 @@ class Ros1Policy:
     def check_inside(self, kind: str, name: str, source: str, caller_id: str) -> Denial | None:
         """Check whether a node inside may have a "topic" or "service" of outside.
 
-        A client gives any name. Unless a node of that name is known at the address of the client,
-        what one of the nodes there may not have is denied.
+        A client may give any name. If the proxy knows no node of this name at the address, the
+        rules for all nodes at the address apply, too.
         """
         if self.rules.empty:
             return None
@@ -301,13 +303,14 @@ class Ros1Policy:
         return no_publisher(topic, with_fix(denial.reason)) if denial else None
 
     def inside_may_bypass(self) -> bool:
-        """Whether nodes inside may have topics of outside where no header is read."""
+        """Whether nodes inside may get topics of outside without the proxy reading a header."""
         return not self.rules.may_deny((RuleKind.SUBSCRIBE,), (), None)
 
     def inside_may_keep(self, relay: Relay) -> bool:
-        """Whether a node inside may still have what a relay brings it from outside.
+        """Whether a node inside may keep a relayed connection to outside.
 
-        Of a service's connection only the address is known: it may be denied as well.
+        Of a connection to a service the proxy knows only the address, not the service. If a rule
+        may deny a service to the caller, the connection ends, too.
         """
         if parse_service_uri(relay.name):
             return not self.rules.may_deny({RuleKind.CALL}, [relay.caller_id], relay.peer)
@@ -327,8 +330,8 @@ class Ros1Policy:
         name = second_parameter_name(call)
         await self._services.find(name)
         provider = self._registry.services.get(name)
-        # Rules for `call` are about services of outside (docs/reference/policy.md). Once a node's
-        # registrations are taken back, the master may have the service of another.
+        # Rules for `call` concern services of outside (docs/reference/policy.md). After the proxy
+        # has unregistered a dead node, another node may have the service.
         if provider and not provider[0].health.cleaned:
             is_hidden = provider[1].hidden
             return self._hidden.find_service(name, provider[0], caller) if is_hidden else None
@@ -339,15 +342,15 @@ class Ros1Policy:
     async def _check_parameters(
         self, call: Call, caller: Caller, params: "_ParamNames"
     ) -> Denial | None:
-        """Check what a call does with parameters. Raises Unreachable."""
+        """Check how a call uses parameters. Raises Unreachable."""
         use = param_use_of(call)
         if use is None:
             return None
         caller_id = call.string(0) or ""
         verdict = self._verdict_on_use(use, caller_id, caller.address)
-        # A subscriber of a namespace is also sent what is set below it later (rosmaster's
-        # paramserver.py, compute_param_updates), so the names that exist now don't settle it. Nor
-        # do they for a call that sets a whole namespace.
+        # The rules for existing names decide about a namespace, except in two cases. rosmaster also
+        # sends a subscriber parameters that are set below the namespace later (paramserver.py,
+        # compute_param_updates). And a setParam of a whole namespace may make new names.
         may_settle = use.below and call.method != "subscribeParam" and not sets_namespace(call)
         exact = self._verdict_on_names(use.kind, use.names, caller_id, caller.address)
         if may_settle and exact.allowed and not verdict.allowed:
@@ -373,11 +376,11 @@ class Ros1Policy:
         return strictest([judge(kind, name, [caller_id], source) for name in names])
 
     def _filters_params(self, caller: Caller) -> bool:
-        """Whether there may be parameters that a caller may not read."""
+        """Whether a rule may deny a parameter to a caller."""
         return self.rules.may_deny({RuleKind.GET_PARAM}, [caller.caller_id], caller.address)
 
     def _without_denied_params(self, names: Value, caller: Caller) -> list[Edit]:
-        """The edits by which a list of parameters leaves out those that a caller may not read."""
+        """The edits that remove from a list all parameters that a caller may not read."""
         if not self._filters_params(caller):
             return []
         kind = RuleKind.GET_PARAM
@@ -390,17 +393,17 @@ class Ros1Policy:
         ]
 
     def _denial(self, verdict: Verdict, kind: RuleKind, subject: str, source: str) -> Denial | None:
-        """Report a verdict; the denial if it is one."""
+        """Report a verdict; return the denial, or None if allowed."""
         is_allowed = self.rules.report(verdict, kind, subject, source).allowed
         return None if is_allowed else denied(verdict.reason)
 
     def _is_inside(self, source: str) -> bool:
-        """Whether a node that has answered lives at an address."""
+        """Whether an address belongs to a node inside that has answered."""
         return any(e.address == source and e.trusted for e in self._registry)
 
 
 class _ParamNames:
-    """The names of all parameters, for one request: the master is asked once if at all."""
+    """The names of all parameters for a request. Asks the master once, only if needed."""
 
     def __init__(self, upstream: MasterClient) -> None:
         self._upstream = upstream
@@ -419,11 +422,11 @@ class _ParamNames:
 
 
 def topic_names(topic: str, caller_id: str) -> tuple[str, ...]:
-    """The names to which a node may resolve a topic as a client has written it."""
+    """The names to which a node may resolve a topic name of a client."""
     return tuple(dict.fromkeys((topic, resolve_name(topic, ""), resolve_name(topic, caller_id))))
 
 
 def _offers_tcpros_alone(call: Call) -> bool:
-    """Whether a requestTopic offers no other protocol than TCPROS."""
+    """Whether a requestTopic offers only TCPROS."""
     offers = call.params[2].items if len(call.params) > 2 else []
     return all(offer.items and offer.items[0].string() == "TCPROS" for offer in offers)

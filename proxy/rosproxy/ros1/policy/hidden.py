@@ -1,10 +1,10 @@
-"""Hidden registrations: how nodes inside find each other where the master is told nothing.
+"""Hidden registrations: how nodes inside find each other without the master.
 
-For nodes inside the proxy answers in the master's place:
+The proxy answers calls of nodes inside instead of the master:
 
-- A subscriber hears of hidden publishers besides the publishers that the master names.
-- A hidden subscriber hears of all publishers inside, and of none outside.
-- lookupService finds a hidden service, lookupNode a node of which the master knows nothing.
+- A subscriber gets hidden publishers, besides the publishers that the master names.
+- A hidden subscriber gets all publishers inside, and no publisher outside.
+- lookupService finds a hidden service. lookupNode finds a node with only hidden registrations.
 - The graph has the hidden names, too.
 
 `Registry` has the table of hidden registrations. Texts and values of the answers:
@@ -31,7 +31,7 @@ _TABLES = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 
 @dataclass(slots=True, eq=False)
 class HiddenAnswers:
-    """Answers nodes inside as the master would, if it knew of the hidden registrations."""
+    """Answers nodes inside as a master with the hidden registrations would."""
 
     _registry: Registry
     _addressing: Addressing
@@ -39,7 +39,7 @@ class HiddenAnswers:
     def answer_registration(
         self, registration: Registration, endpoint: Endpoint, caller: Caller
     ) -> LocalAnswer:
-        """The answer to a registration that is hidden from now on."""
+        """The answer to a new hidden registration."""
         name = registration.name
         change = RegistryChange(registration, endpoint)
         if registration.kind is Kind.SERVICE:
@@ -69,7 +69,7 @@ class HiddenAnswers:
         return LocalAnswer(1, f"rosrpc URI: [{imported}]", imported)
 
     def find_node(self, call: Call, caller: Caller) -> LocalAnswer | None:
-        """The answer to lookupNode; None for a node of which the master may know."""
+        """The answer to lookupNode; None if the master may know the node."""
         caller_id = second_parameter_name(call)
         endpoint = self._registry.by_caller.get(caller_id)
         if endpoint is None or endpoint.health.cleaned:
@@ -92,7 +92,7 @@ class HiddenAnswers:
         return [*dict.fromkeys([*at_master, *map(self._addressing.advertised_uri, extra)])]
 
     def complete_graph(self, call: Call, listing: Any) -> Any:
-        """The graph that the master tells, with the hidden names; unchanged if it is malformed.
+        """The master's graph with the hidden names; unchanged if malformed.
 
         Shapes, all lists of strings: master_api.py, getPublishedTopics, getTopicTypes and
         getSystemState.
@@ -118,7 +118,7 @@ class HiddenAnswers:
         ]
 
     def _with_nodes(self, table: Any, kind: Kind) -> Any:
-        """A table of names with their nodes, and the hidden ones among them."""
+        """A table of names with their nodes, including hidden registrations."""
         if not isinstance(table, list):
             return table
         rows = {row[0]: [*row[1]] for row in table if _is_row(row)}
@@ -130,7 +130,7 @@ class HiddenAnswers:
         return [[name, nodes] for name, nodes in rows.items()]
 
     def _types(self, kinds: Sequence[Kind]) -> dict[str, str]:
-        """The types of hidden topics, as far as a node has given one."""
+        """The types of hidden topics, as far as a node has given a type."""
         types: dict[str, str] = {}
         for _, registration in self._registry.hidden_registrations():
             if registration.kind in kinds and types.get(registration.name, "*") == "*":
@@ -143,7 +143,7 @@ class HiddenAnswers:
 
 
 def _living(endpoints: Iterable[Endpoint]) -> list[Endpoint]:
-    """The endpoints whose registrations stand, each once, in the order of their ports."""
+    """The endpoints that are not cleaned, without duplicates, in the order of ports."""
     by_id = {id(endpoint): endpoint for endpoint in endpoints if not endpoint.health.cleaned}
     return sorted(by_id.values(), key=lambda endpoint: endpoint.port)
 

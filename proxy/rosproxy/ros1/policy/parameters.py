@@ -1,4 +1,4 @@
-"""Parameters: what a call does with them, and so which rules and names the policy looks at."""
+"""How a call uses parameters, and so which rules and names the policy checks."""
 
 import msgspec
 
@@ -10,11 +10,15 @@ _EVERYTHING = "/"
 _READS = {"getParam": 1, "hasParam": 1, "searchParam": 1, "subscribeParam": 2}
 _WRITES = {"setParam": 1, "deleteParam": 1}
 _WHOLE = frozenset({"getParam", "subscribeParam", "setParam", "deleteParam"})
-"""The methods that are about a whole namespace, if the name is one."""
+"""The methods that apply to a whole namespace if the name is a namespace."""
 
 
 class ParamUse(msgspec.Struct, frozen=True):
-    """What a call does with parameters: the names that it may mean, and whether all below them."""
+    """How a call uses parameters.
+
+    ``kind``: the rules for the call. ``names``: the names that the call may mean. ``below``:
+    whether the call also means all names below ``names``.
+    """
 
     kind: RuleKind
     names: tuple[str, ...]
@@ -22,7 +26,7 @@ class ParamUse(msgspec.Struct, frozen=True):
 
 
 def param_use(method: str, caller_id: str, name: str | None) -> ParamUse | None:
-    """What a call does with parameters; None if nothing. No ``name``: the name is not known."""
+    """How a call uses parameters; None without parameters. ``name``: None if unknown."""
     if method not in _READS and method not in _WRITES:
         return None
     kind = RuleKind.SET_PARAM if method in _WRITES else RuleKind.GET_PARAM
@@ -34,7 +38,7 @@ def param_use(method: str, caller_id: str, name: str | None) -> ParamUse | None:
 
 
 def param_use_of(call: Call) -> ParamUse | None:
-    """What a call that was read does with parameters; None if nothing."""
+    """How a parsed call uses parameters; None without parameters."""
     place = _READS.get(call.method) or _WRITES.get(call.method)
     return param_use(call.method, call.string(0) or "", call.string(place)) if place else None
 
@@ -45,7 +49,7 @@ def sets_namespace(call: Call) -> bool:
 
 
 def _searched_names(caller_id: str, name: str) -> tuple[str, ...]:
-    """The names that searchParam looks at: in all namespaces of the caller, from its own up."""
+    """The names that searchParam tries: below the caller_id, then below each parent namespace."""
     if name.startswith(("/", "~")):
         return (resolve_name(name, caller_id),)
     segments = [segment for segment in caller_id.split("/") if segment]

@@ -1,9 +1,9 @@
-"""Hidden services after a restart of the proxy: the proxy asks the nodes inside for them.
+"""Finds hidden services after a restart of the proxy, by questions to nodes inside.
 
-The slave API tells the topics of a node, but not its services, and the master never knew the hidden
-ones. So when a node inside looks up an unknown service that the policy would hide, the proxy asks
-the nodes that the last recovery found again. The question is the header of a service client that
-only probes (http://wiki.ros.org/ROS/Connection%20Header).
+The slave API reports the topics of a node, but not the services, and the master never knew the
+hidden services. When a node inside looks up an unknown service that the policy would hide, the
+proxy asks the nodes that the last recovery found again. The question is the header of a service
+client that only probes (http://wiki.ros.org/ROS/Connection%20Header).
 """
 
 import asyncio
@@ -20,10 +20,10 @@ from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.registry import Registry
 
 ASK_AGAIN_S = 5.0
-"""Seconds without a second question for the same service: roscpp looks up a service that it waits
-for fifty times a second."""
+"""Seconds without a second question for the same service. roscpp looks up an awaited service fifty
+times a second."""
 MOST_REMEMBERED = 1000
-"""Services that the proxy remembers for that."""
+"""Services for which the proxy remembers the time of the question."""
 
 
 @dataclass(slots=True, eq=False)
@@ -51,7 +51,7 @@ class ServiceFinder:
         await asyncio.gather(*(self._ask(endpoint, name) for endpoint in endpoints))
 
     def _may_have(self, endpoint: Endpoint, name: str) -> bool:
-        """Whether a node may have a service that is hidden and that it registered before."""
+        """Whether a node may have registered a hidden service before the restart."""
         if not (endpoint.restored and endpoint.answers and endpoint.node_ports):
             return False
         verdict = self._rules.judge(RuleKind.SERVE, name, endpoint.caller_ids, endpoint.address)

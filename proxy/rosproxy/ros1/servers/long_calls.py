@@ -1,4 +1,4 @@
-"""Calls with too many bytes or elements to read, which the proxy need not read."""
+"""Long calls, with too many bytes or elements to read, which the proxy need not read."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -42,8 +42,8 @@ class LongCall:
         for piece in cut(self._head):  # other tasks run between two pieces
             self._watch.see(piece)
             await asyncio.sleep(0)
-        # Always one piece behind. rosmaster and nodes read a body to the end before they parse
-        # the body, so without the last piece they do not act on a refused call.
+        # Each piece waits for the next piece. rosmaster and nodes read the whole body before
+        # parsing. So a refused call without the last piece has no effect.
         previous = self._head
         while not self._rest.at_eof():
             try:
@@ -59,10 +59,10 @@ class LongCall:
 
 
 class LongCalls(Protocol):
-    """What a service does with long calls that it need not read."""
+    """How a service handles long calls that the proxy need not read."""
 
     def watch(self, method: str, size: int) -> CallWatch | None:
-        """The watch for a call of a method while it passes; None if the call has to be read."""
+        """The watch for a long call that may pass unread; None if the proxy must read the call."""
 
     async def pass_on(self, call: "IncomingCall", long_call: LongCall) -> bytes | LongReply:
         """The reply to a call; ``call`` names the caller. Raises XmlRpcError, Unreachable."""

@@ -1,7 +1,7 @@
-"""What the router process tells the proxy: a line of JSON for each look at the routers.
+"""The reports of the router process to the proxy: a line of JSON for each look at the routers.
 
-A router describes itself in zenoh's admin space at ``@/ZID/router``; the report keeps the sessions
-of this description. The router process bounds a report, and the proxy bounds the line.
+A router describes itself in zenoh's admin space at ``@/ZID/router``. A report has the sessions of
+this description. The router process bounds a report, and the proxy bounds the line.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from rosproxy.net.addresses import HostPort, parse_authority, plain_address
 LONGEST_REPORT = 16 * 1024 * 1024
 """Bytes of a line. All sessions that routers accept, and all tokens, take some 10 MB."""
 MOST_SESSIONS = 1000
-"""Sessions that a router accepts: its setting ``transport/unicast/max_sessions``."""
+"""Most sessions of a router: the setting ``transport/unicast/max_sessions``."""
 
 
 class Link(msgspec.Struct, frozen=True):
@@ -32,7 +32,7 @@ class RouterSession(msgspec.Struct, frozen=True):
 
 
 class RouterReport(msgspec.Struct, frozen=True):
-    """A router: its zenoh ID and its sessions."""
+    """A router: the zenoh ID and the sessions."""
 
     zid: str
     sessions: tuple[RouterSession, ...] = ()
@@ -42,7 +42,7 @@ class Report(msgspec.Struct, frozen=True):
     """A report: the routers in the order of their configurations, and the liveliness tokens.
 
     ``tokens`` is None if nothing has changed since the last report. ``tokens_left_out`` counts
-    tokens above the bound. If ``error`` is set, the routers do not run, and it says why.
+    tokens above the bound. ``error``: why the routers do not run; empty if the routers run.
     """
 
     routers: tuple[RouterReport, ...] = ()
