@@ -2,9 +2,9 @@
 
     python -m tests.bench.crowd MASTER_URI ADDRESS PORT COUNT [AT_ONCE [NAME]]
 
-Each has a slave API of its own, on ports from PORT on, and publishes ten topics. AT_ONCE nodes
-register at the same time, each on a connection of its own. It prints how long their registration
-took, and serves until it is killed.
+The nodes have slave APIs on COUNT ports, beginning with PORT. Each node publishes ten topics.
+AT_ONCE nodes register at the same time, each node on a separate connection. The program prints the
+seconds until all nodes are registered, and serves the slave APIs for an hour.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STRING = "std_msgs/String"
 
 
 class Slave(asyncio.Protocol):
-    """One connection to the slave API of a node."""
+    """A connection to the slave API of a node."""
 
     def __init__(self, name: str, number: int) -> None:
         self._name = name
@@ -63,7 +63,7 @@ def topics(name: str, number: int) -> list[str]:
 
 
 def register(master: str, uri: str, name: str, number: int) -> None:
-    """What one node calls when it starts, on a kept connection."""
+    """Register the topics of a node on a kept connection, as a node does at the start."""
     http = HTTPConnection(urlsplit(master).netloc, timeout=60)
     for topic in topics(name, number):
         body = dumps((f"/{name}_{number}", topic, STRING, uri), "registerPublisher").encode()

@@ -1,7 +1,7 @@
 """The Docker operator on a host with a growing number of labelled containers.
 
-Engine, proxies and masters are real. The labelled containers do nothing, so the costs are only
-those of the operator and the engine. Ten containers share a network and a master, and so a proxy.
+Engine, proxies and masters are real. The labelled containers do nothing, so only the operator and
+the engine cost time. Ten containers share a network and a master, and so a proxy.
 The second half of the containers starts at once, as with ``docker compose up``.
 """
 
@@ -129,7 +129,7 @@ def _rest(operator: Process, quiet: float = 6.0) -> None:
 
 @contextmanager
 def _masters(count: int) -> Iterator[None]:
-    """Run masters on this host, one for each network."""
+    """Run masters on this host, a master for each network."""
     masters = []
     try:
         for number in range(count):

@@ -18,7 +18,7 @@ from tests.ros2.lab import Lab as Ros2Lab
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Shows with a failure what the proxy and the nodes of that test have printed."""
+    """Add the output of the proxy and the nodes to the report of a failed test."""
     result = yield
     lab = getattr(item, "funcargs", {}).get("lab")
     if result.failed and isinstance(lab, Lab | Ros2Lab):
@@ -28,7 +28,7 @@ def pytest_runtest_makereport(
 
 @pytest.fixture(scope="session")
 def lab_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
-    """One master and one proxy for all tests."""
+    """A lab with a master and a proxy for all tests."""
     remove_leftovers()
     compiled_node()
     topology = Topology(SHARED)
@@ -46,7 +46,7 @@ def lab_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 
 @pytest.fixture
 def lab(lab_of_all: Lab) -> Iterator[Lab]:
-    """The lab, with no node of another test."""
+    """The lab without nodes of other tests."""
     lab_of_all.ensure_running()
     yield lab_of_all
     lab_of_all.stop_nodes()
@@ -55,13 +55,13 @@ def lab(lab_of_all: Lab) -> Iterator[Lab]:
 
 @pytest.fixture
 def machine(lab: Lab) -> Place:
-    """The machine of the browser: the proxy's."""
+    """The machine of the browser, which is also the machine of the proxy."""
     return lab.place("px")
 
 
 @pytest.fixture
 def browser(machine: Place, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """A browser on a machine of the lab; at the end its console must be clean."""
+    """A browser on a machine of the lab. At the end, the console must have no messages."""
     browser = Browser(machine, tmp_path_factory.mktemp("browser"))
     try:
         yield browser

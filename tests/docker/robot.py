@@ -96,7 +96,7 @@ class _Transport(xmlrpc.client.Transport):
 
 @contextmanager
 def robot_outside(image: str) -> Iterator[Robot]:
-    """A robot whose nodes use its address."""
+    """A robot. The nodes of the robot announce the address."""
     settings = ("--env", f"ROS_MASTER_URI={MASTER_URI}", "--env", f"ROS_IP={ROBOT_ADDRESS}")
     with machine(image, "addressed", ADDRESSED, *settings) as own_machine:
         yield _robot(own_machine, own_machine.address)
@@ -106,14 +106,14 @@ def robot_outside(image: str) -> Iterator[Robot]:
 def named_robot(
     image: str, name: str = "robot", number: int = NAMED, namespace: str = ""
 ) -> Iterator[Robot]:
-    """A usual robot, whose nodes use its host name."""
+    """A usual robot. The nodes of the robot announce the host name."""
     with machine(image, name, number, *_names(name, number), namespace=namespace) as own_machine:
         yield _robot(own_machine, name, hidden=bool(namespace))
 
 
 @contextmanager
 def laptop(image: str, robot: Robot) -> Iterator[Machine]:
-    """A second machine outside, beside the robot. Inside, its name does not resolve."""
+    """A second machine outside, beside the robot. Inside, the name does not resolve."""
     own = addresses(LAPTOP)[1]
     settings = ("--env", f"ROS_MASTER_URI={robot.master_uri}", "--env", f"ROS_IP={own}",
                 "--add-host", f"{robot.name}:{robot.address}")  # fmt: skip

@@ -1,4 +1,4 @@
-"""Nodes of ROS 2: in labelled containers, and on a machine that shares a LAN with this host."""
+"""Nodes of ROS 2, in labelled containers and on a machine in a LAN with this host."""
 
 import itertools
 import re
@@ -17,15 +17,15 @@ from tests.docker.nodes import Log
 
 NUMBER = 91
 HERE, THERE = addresses(NUMBER)
-"""This host's address on the LAN, and the other machine's."""
+"""The addresses of this host and of the other machine on the LAN."""
 OPTIONS = ("--ports", "32", "--advertise-host", HERE)
-"""A controller's, so that outside is found on that LAN."""
+"""Options of the controller, so that the proxy finds outside on this LAN."""
 _PROGRAMS = {"jazzy": "node.py", "kilted": "node.py", "cyclone": "participant.py"}
 _numbers = itertools.count(1)
 
 
 def command(vendor: str, kind: str, topic: str, *options: str) -> tuple[str, ...]:
-    """The program that stands for a node, of an implementation of DDS."""
+    """The command of a node with an implementation of DDS."""
     program = (f"/opt/{vendor}/bin/python", f"/nodes/{_PROGRAMS[vendor]}")
     return (*program, kind, "--topic", topic, *options)
 
@@ -62,7 +62,7 @@ class OutsideNode:
 def machine_on_lan(
     image: str, name: str = "lan", number: int = NUMBER, namespace: str = ""
 ) -> Iterator[Outside]:
-    """A machine that sends multicast into its cable."""
+    """A machine that sends multicast to the LAN."""
     with machine(image, name, number, namespace=namespace) as lan_machine:
         process = str(inspect(lan_machine.container)["State"]["Pid"])
         run("nsenter", "--target", process, "--net",
@@ -106,7 +106,7 @@ def ports(proxy: Proxy) -> dict[str, list[tuple[int, str]]]:
 
 
 def wait_for_line(log: Log, pattern: str, count: int = 3, seconds: float = 60) -> None:
-    """Wait until that many lines match."""
+    """Wait until ``count`` lines match."""
     wait_until(
         lambda: len(re.findall(pattern, log.read(), re.MULTILINE)) >= count, seconds,
         lambda: f"{count} of {pattern!r} in:\n{log.read()[-3000:]}",
@@ -143,7 +143,7 @@ def runs(proxy: Proxy) -> list[tuple[str, str]]:
 
 
 class Flow:
-    """A talker and a listener on either side; ``heard`` is what each listener hears."""
+    """A talker and a listener on each side. ``heard``: the messages of each listener."""
 
     def __init__(
         self,
@@ -172,7 +172,7 @@ class Flow:
             log.wait_for(text, count=10, since=since, seconds=seconds)
 
     def gaps(self, since: float) -> str:
-        """The longest times without messages since then, and how many were lost."""
+        """The longest times without messages since ``since``, and the number of lost messages."""
         now = time.time()
         out, back = (log.longest_gap(text, since, now) for log, text in self.heard)
         lost = sum(log.lost(text, since) for log, text in self.heard)

@@ -1,6 +1,6 @@
-"""An engine that is ended and restarted, without its userland proxy.
+"""An engine without userland proxy ends and starts again.
 
-The engine is private, so that other containers are not touched.
+The engine is private, so the test does not touch other containers.
 """
 
 import signal
@@ -58,7 +58,7 @@ def controller(
 def listeners(
     engine: PrivateEngine, robot: Robot, controller: Process, ros_image: str
 ) -> Iterator[dict[str, Log]]:
-    """The robot's output for two nodes inside, one in each language."""
+    """The output of the listeners on the robot, for a rospy node and a roscpp node inside."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DOCKER_HOST", engine.url)
         inside = Inside(ros_image, robot.master_uri)
@@ -81,8 +81,8 @@ def test_everything_comes_back_with_the_engine(
     controller: Process,
     listeners: dict[str, Log],
 ) -> None:
-    """The engine ends the containers, at the latest after its return, and restarts them, perhaps
-    with other addresses.
+    """The engine ends the containers, at the latest after the restart of the engine. Then the
+    engine starts the containers again, perhaps with other addresses.
     """
     for listener in listeners.values():
         listener.wait_for("inside")

@@ -30,14 +30,14 @@ _numbers = itertools.count(1)
 
 @dataclass(frozen=True)
 class Node:
-    """A session with the defaults of rmw_zenoh, its log, and the container that it is in."""
+    """A session with the defaults of rmw_zenoh. ``container``: None for a node on the robot."""
 
     name: str
     log: Log
     container: Container | None = None
 
     def wait_for(self, text: str, count: int = 5, seconds: float = 60) -> None:
-        """Wait until it has printed so many more lines that begin with a text."""
+        """Wait until the node has printed ``count`` more lines that begin with ``text``."""
         before = self.count(text)
         wait_until(lambda: self.count(text) >= before + count, seconds, self.log.read)
 
@@ -55,7 +55,7 @@ class Sides:
         self.peers = (ENABLE, f"rosproxy.peers={robot.address}")
 
     def outside(self, kind: str, topic: str = "chatter") -> Node:
-        """A node on the robot."""
+        """Start a node on the robot."""
         name = f"outside_{next(_numbers)}"
         words = " ".join((*NODE, kind, name, topic))
         file = f"/tmp/{name}.log"
@@ -64,7 +64,7 @@ class Sides:
         return Node(name, Log(lambda: path.read_text() if path.exists() else ""))
 
     def inside(self, kind: str, topic: str = "chatter", **more: Any) -> Node:
-        """A node in a labelled container, in which nothing else is set."""
+        """Start a node in a container with only the labels."""
         name = unique(kind)
         more.setdefault("labels", self.peers)
         network = more.pop("network", self.network)
@@ -91,7 +91,7 @@ def controller(
 
 @pytest.fixture(scope="module")
 def robot(zenoh_image: str) -> Iterator[Machine]:
-    """A machine outside with a router, which has a route to this host and to nothing else."""
+    """A machine outside with a router. The machine has a route only to this host."""
     with machine(zenoh_image, "zenoh", NUMBER) as robot:
         robot.start("rmw_zenohd")
         yield robot
@@ -196,7 +196,7 @@ def test_a_router_given_by_address_just_works(sides: Sides, controller: Controll
 
 
 def test_a_router_in_a_container_is_dialed(sides: Sides, controller: Controller) -> None:
-    """Its own neighbours use it, others the proxy."""
+    """Nodes in the network namespace of the router use the router, other nodes the proxy."""
     router = sides.made.run(sides.network, "rmw_zenohd", labels=sides.peers, name=unique("router"))
     neighbour = sides.inside("sub", network=f"container:{router.name}", labels=(ENABLE,))
     talker = sides.inside("pub", labels=(ENABLE,))
@@ -222,7 +222,7 @@ def test_the_last_container_goes_and_nothing_is_left(sides: Sides, controller: C
 
 
 def test_neighbours_do_not_reach_loopback(sides: Sides) -> None:
-    """The redirect lets packets of 127.0.0.0/8 leave the container, and none of others in."""
+    """The redirect lets packets to 127.0.0.0/8 leave the container, but none come in."""
     talker = sides.inside("pub")
     assert talker.container is not None
     server = "from socket import *; s = create_server(('127.0.0.1', 8000)); s.accept()"

@@ -140,7 +140,7 @@ async def test_a_client_that_leaves_inside_its_header_is_survived(proxy, node):
 
 
 async def test_a_header_whose_sender_has_left_is_not_handed_on(proxy, node):
-    """Of a subscriber's connections, rospy's publisher keeps the one with the last header."""
+    """A rospy publisher keeps only the connection of a subscriber that sent the last header."""
     await node.publish(proxy.master)
     for _ in range(20):
         async with connect(proxy.lease(node)) as wire:
@@ -288,7 +288,7 @@ async def test_a_registration_never_gets_a_port_outside_the_range(make_proxy, ma
         assert phrase in text
     assert text in caplog.text
     assert proxy.metric("range_exhausted_total") == 1
-    # Other nodes go on, and in a multicall each call has its own answer.
+    # Other nodes go on, and each call of a multicall has a separate answer.
     calls = [
         {"methodName": "getPid", "params": ["/n2"]},
         {"methodName": "registerSubscriber", "params": ["/n2", "/t", "*", nodes[2].uri]},
@@ -414,9 +414,7 @@ async def test_parallel_registrations_of_one_new_node_share_a_port(proxy, master
 async def test_a_node_gets_a_header_of_a_subscriber_that_has_gone_meanwhile(
     proxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ):
-    """rospy's publisher accepts no connection while reporting a connection that ended before its
-    header.
-    """
+    """A rospy publisher accepts no connection while reporting a connection without a header."""
     await node.publish(proxy.master)
     has_ended = iter([False, True])  # after its header; after the connection to the node
     monkeypatch.setattr("rosproxy.net.sockets.has_ended", lambda _: next(has_ended))

@@ -41,7 +41,7 @@ async def answers(uri: str) -> bool:
 
 
 def all_were_told(nodes: list[FakeNode], publisher: str) -> bool:
-    """Whether this publisher is the only one in the last update of /update at all nodes."""
+    """Whether the last publisherUpdate of /update at all nodes has only this publisher."""
     return all(node.updates("/update")[-1:] == [[publisher]] for node in nodes)
 
 

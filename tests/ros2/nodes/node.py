@@ -30,14 +30,14 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
-# An action that takes only a millisecond ends before the feedback's publisher and the client's
-# subscription have discovered each other. Volatile feedback is then lost, without a proxy as well.
+# An action of a millisecond ends before the feedback's publisher and the client's subscription have
+# discovered each other. Volatile feedback is then lost, also without a proxy.
 FEEDBACK_PAUSE = 0.2
-# A server drops a response whose client's reader it does not know after a tenth of a second
-# (rmw_fastrtps, `check_for_subscription`), though the client knows the server already. So on a busy
-# machine a first goal's result may be lost without a proxy as well; clients ask again.
+# A server drops a response if the server has not discovered the client's reader after a tenth of a
+# second (rmw_fastrtps, `check_for_subscription`). The client may already know the server. So on a
+# busy machine the result of the first goal may be lost, also without a proxy. Clients ask again.
 ORDER = 8
-"""Of the action's goals: the sequence has one number more, and feedback begins with three."""
+"""Order of the goals. The sequence has ORDER + 1 numbers, the first feedback has three."""
 GOAL_PATIENCE = 15.0
 
 
@@ -152,10 +152,10 @@ def act(node: Node, options: argparse.Namespace) -> None:
 
 
 def pursue(node: Node, options: argparse.Namespace) -> None:
-    """Pursue goals until all feedback of one has come.
+    """Send goals until a goal has all feedback.
 
-    The server does not wait for the client's reader of feedback, which it may meet after the first
-    goal (rcl_action, rcl_action_server_is_available).
+    The server may discover the client's reader of feedback after the first goal (rcl_action,
+    rcl_action_server_is_available).
     """
     client = node.kept = ActionClient(node, Fibonacci, options.topic)
     asked = -GOAL_PATIENCE
@@ -256,7 +256,7 @@ def read_options() -> argparse.Namespace:
     parser.add_argument("--liveliness", choices=LivelinessPolicy.__members__)
     parser.add_argument("--lease", type=float, default=0, help="of liveliness, in seconds")
     parser.add_argument("--in-turn", action="store_true", help="call after the last reply")
-    parser.add_argument("--of", default="", help="the node whose parameters are asked for")
+    parser.add_argument("--of", default="", help="the node to ask for parameters")
     parser.add_argument("--contexts", type=int, default=1)
     return parser.parse_args(sys.argv[1:])
 

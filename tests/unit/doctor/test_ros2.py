@@ -71,7 +71,7 @@ def test_who_hears_nobody_is_told_where_to_look() -> None:
 
 
 def test_a_peer_without_a_known_participant_gets_a_finding() -> None:
-    """With multicast, Cyclone DDS does not listen on the usual ports, so announcements miss it."""
+    """With multicast, Cyclone DDS does not listen on the usual ports and misses announcements."""
     peers = ("10.0.0.9", "fd00::9", "10.0.0.7", "10.0.0.6:11400")
     told = diagnose_domain(
         DomainStatus(peers=peers, discovery="10.0.0.1:11400", inside=(INSIDE,), outside=(OUTSIDE,))

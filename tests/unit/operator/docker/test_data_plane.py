@@ -179,7 +179,7 @@ def test_the_kernel_plane_makes_both_anew() -> None:
 
 @pytest.mark.parametrize("plane", ["auto", "splice", "copy"])
 def test_leaving_the_kernel_plane_leaves_no_rules_behind(plane: DataPlane) -> None:
-    """A killed proxy leaves its rules, and its successor cannot remove these."""
+    """A killed proxy leaves rules in the sandbox that the next proxy cannot remove."""
     plan = look(asking("a", plane), existing_pair=own("kernel"))
     assert made(plan.actions) == ([False], [plane])
 

@@ -138,7 +138,7 @@ async def test_it_is_told_anew_at_each_look_and_to_each_run_of_the_proxy(tasks: 
 
 
 async def test_a_proxy_for_rmw_zenoh_is_not_told_who_may_use_it(tasks: Tasks) -> None:
-    """It would answer that it does not know the call."""
+    """Such a proxy does not know the call."""
     proxies = Proxies()
     proxies.known_status = ProxyStatus()
     sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)

@@ -1,4 +1,4 @@
-"""Containers of rmw_zenoh: one proxy for all, a port and a redirect for each network namespace."""
+"""Containers of rmw_zenoh: a common proxy, and a port and redirect for each network namespace."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -100,7 +100,7 @@ def look(
 
 
 def the_proxy(peers: tuple[str, ...] = (), ports: PortRange = PORTS) -> dict[str, Any]:
-    """The proxy as it is to be, with an address on the network of the containers."""
+    """A proxy that needs no change, with an address on the network of the containers."""
     box = CreateSandbox(sandbox_name(ZENOH), ZENOH, ports)
     box_print = sandbox_fingerprint(box, SETTINGS)
     made = Create(proxy_name(ZENOH), ZENOH, ports, box.name, peers=peers)
@@ -116,13 +116,13 @@ def the_proxy(peers: tuple[str, ...] = (), ports: PortRange = PORTS) -> dict[str
 
 
 def redirects(state: HostState, settings: PlanSettings = SETTINGS) -> list[Action]:
-    """What is to be done for redirects alone."""
+    """The planned actions for redirects."""
     groups = look(state, settings).groups
     return [action for group in groups if group.subject for action in group.actions]
 
 
 def made_for(state: HostState) -> dict[str, CreateRedirect]:
-    """The redirects that are set, by the container."""
+    """The planned redirects by container."""
     made = [action for action in redirects(state) if isinstance(action, CreateRedirect)]
     return {action.target.removeprefix("id-"): action for action in made}
 
@@ -242,7 +242,7 @@ def test_a_router_given_by_address_just_works(override: str) -> None:
     ],
 )
 def test_what_the_variable_names(override: str, peers: set[str], text: str) -> None:
-    """A container on the same network is dialed by its name, and its neighbours go on using it."""
+    """The proxy dials a container on the same network by name, without a redirect for that."""
     router = replace(node("router", address="172.18.0.8"), labels={})
     (member,), told = read(node(override=override), router)
     assert member.peers == peers
@@ -273,7 +273,7 @@ def test_a_router_that_is_not_allowed_is_not_dialed(named: Any) -> None:
 
 
 def test_a_container_that_is_a_router_is_dialed_and_left_as_it_is() -> None:
-    """So are the containers in its network namespace."""
+    """The same holds for containers in the network namespace of the router."""
     override = f'listen/endpoints=["tcp/[::]:7500"];{ROBOT}'
     router = node("router", override=override, router=True)
     sharing = node("driver", mode="container:id-router")
@@ -329,7 +329,7 @@ def test_the_proxy_publishes_nothing_and_is_told_its_routers() -> None:
     peers = ("192.0.2.7:7447", "robot:7447")
     box = sandbox_config(CreateSandbox("n", ZENOH, PORTS), SETTINGS)
     assert box["HostConfig"]["PortBindings"] == {}
-    # Its own connections take no port of its routers.
+    # Connections of the proxy use no port of the routers.
     assert box["HostConfig"]["Sysctls"] == {"net.ipv4.ip_local_port_range": "7704 11000"}
     made = Create("n", ZENOH, PORTS, "box", peers=peers)
     config = container_config(made, replace(SETTINGS, data_plane="kernel"), SECRET, "")
@@ -417,7 +417,7 @@ def test_containers_that_share_a_network_look_for_the_routers_of_both() -> None:
 
 
 def test_a_container_keeps_its_port() -> None:
-    """Also through a restart, and where others come that sort before it."""
+    """The port stays after a restart, and with a new container that sorts first."""
     made = made_for(observed(node("b"), node("c"), **the_proxy()))
     records = tuple(map(record, made.values()))
     later = replace(node("c"), started_at="2026-01-01T11:00:00Z")

@@ -44,7 +44,7 @@ ROBOT = Name("ros", "robot")
 def rosproxy(name: str = "robot", uid: str = "", **changes: Any) -> RosProxy:
     """A RosProxy in namespace ros with four ports per node.
 
-    ``changes`` are for the RosProxy, its spec or its `ProxySpec`.
+    ``changes``: fields of the RosProxy, the spec or the `ProxySpec`.
     """
     defaults: dict[str, Any] = {
         "master": MasterSpec("http://robot:11311"), "ports": 4, "window": PortRange(11400, 11499),
@@ -95,7 +95,7 @@ def proxy(
     settings: ClusterSettings = SETTINGS,
     **changes: Any,
 ) -> ProxyPod:
-    """A proxy's pod, by default running. ``changes`` are for its `Pod`."""
+    """The pod of a proxy, by default running. ``changes``: fields of the `Pod`."""
     of = of or rosproxy()
     on = on or node()
     body: dict[str, Any] = copy.deepcopy(
@@ -120,7 +120,7 @@ def service(of: RosProxy | None = None, ip: str = "10.96.1.1", **changes: Any) -
 def observed(
     *resources: RosProxy | ClusterNode | Pod | ProxyPod | ProxyService, **more: Any
 ) -> ClusterSnapshot:
-    """A cluster with these objects; with node one unless other nodes are given."""
+    """A cluster with these objects. Without a ClusterNode, the cluster has the node ``one``."""
     nodes = [r for r in resources if isinstance(r, ClusterNode)] or [node()]
     services = [r for r in resources if isinstance(r, ProxyService)]
     return ClusterSnapshot(

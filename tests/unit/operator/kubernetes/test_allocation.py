@@ -134,7 +134,7 @@ def test_ports_that_no_pod_may_have_are_named() -> None:
 
 
 def changed(**changes: Any) -> tuple[str, ClusterPlan]:
-    """The range that a running proxy gets when its RosProxy changes."""
+    """The range of a running proxy after a change of the RosProxy."""
     of = rosproxy(**changes)
     plan = look(scene(proxy(), of=of))
     return str(plan.state.given[ROBOT_ON_ONE]), plan

@@ -171,7 +171,7 @@ async def test_it_settles(server: ApiServer, running: Running) -> None:
 
 
 async def test_an_operator_without_the_lead_only_looks(server: ApiServer, running: Running) -> None:
-    """It acts at once when it leads, and stops when it leads no more."""
+    """The operator acts at once with the lead, and stops without the lead."""
 
     def written() -> list[str]:
         return [method for method, _, _ in server.requests if method != "GET"]

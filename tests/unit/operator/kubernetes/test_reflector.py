@@ -148,7 +148,7 @@ async def test_what_happens_is_seen(server: ApiServer, seen: Seen) -> None:
 
 
 async def test_a_proxy_that_vanishes_while_it_runs_is_noted(server: ApiServer, seen: Seen) -> None:
-    """Deleted by force: its kubelet ends it, and frees its hostPorts, some seconds later."""
+    """After a forced deletion, the kubelet ends the pod and frees the hostPorts seconds later."""
     running = {"containerStatuses": [{"name": "proxy", "state": {"running": {"startedAt": "1"}}}]}
     ended = {"containerStatuses": [{"name": "proxy", "state": {"terminated": {"exitCode": 0}}}]}
     put_all(server)
@@ -195,7 +195,7 @@ async def test_a_watch_that_is_lost_goes_on(server: ApiServer, seen: Seen) -> No
 
 
 async def test_after_a_lost_watch_no_event_comes_twice(server: ApiServer, seen: Seen) -> None:
-    """Otherwise a pod would lose its address for a moment, and would count as gone."""
+    """With an old event, the pod would lose the address for a moment and count as gone."""
     put_all(server)
     await begun(server, seen)
     server.put("pods", pod_obj("second", INJECT), NAMESPACE)

@@ -148,12 +148,12 @@ FORWARDED = [
     # forwarded connections by peer; subscribers that the publisher names; silent subscribers
     ({}, [], ["/a", "/b", "/c"]),
     ({LAPTOP: 2}, [], ["/c"]),
-    ({LAPTOP: 3}, [], ["/c"]),  # one too many: an old connection that the kernel still tracks
+    ({LAPTOP: 3}, [], ["/c"]),  # the kernel still tracks an old connection
     ({LAPTOP: 2, ROBOT: 1}, [], []),
     ({ROBOT: 1}, [], ["/a", "/b"]),
-    ({LAPTOP: 1, ROBOT: 1}, [], ["/a", "/b"]),  # which of the two is not known
+    ({LAPTOP: 1, ROBOT: 1}, [], ["/a", "/b"]),  # not known which subscriber is connected
     ({LAPTOP: 1, ROBOT: 1}, ["/a"], ["/b"]),
-    ({LAPTOP: 1, ROBOT: 1}, ["/a", "/b"], ["/a", "/b"]),  # one subscriber has vanished
+    ({LAPTOP: 1, ROBOT: 1}, ["/a", "/b"], ["/a", "/b"]),  # a subscriber has vanished
     ({ELSEWHERE: 3}, [], []),  # the peers' addresses are hidden
     ({ELSEWHERE: 2}, ["/a", "/c"], ["/b"]),
     ({ELSEWHERE: 2}, [], ["/a", "/b", "/c"]),

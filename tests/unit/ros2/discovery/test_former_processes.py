@@ -1,4 +1,4 @@
-"""A crashed process sends no dispose message. The next process at its port ends its participant."""
+"""A crashed process sends no dispose message. The next process at the port ends the participant."""
 
 import pytest
 
@@ -27,7 +27,7 @@ SECOND_OF_NEXT = FAST_DDS + bytes([7, 7, 2, 2, 2, 2, 1, 0, 0, 0])
 
 
 def ended(sent: list[Outgoing], host: str) -> list[bytes]:
-    """The participants whose dispose messages go to a host."""
+    """The participants of the dispose messages to a host."""
     disposed = (
         source_prefix(out.datagram)
         for out in sent
