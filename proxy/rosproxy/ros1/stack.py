@@ -65,7 +65,7 @@ RETRY_BLOCKED = 30.0
 
 
 class Ros1:
-    """The part for ROS 1. `start` and `stop` it in the same running event loop."""
+    """The part of the proxy for ROS 1. Call `start` and `stop` in the same event loop."""
 
     def __init__(self, runtime: Runtime) -> None:
         self.settings = settings = runtime.settings
@@ -137,7 +137,7 @@ class Ros1:
         settings = self.settings
         context = self.context
         self.reserve_range()
-        # Before any port listens: the kernel has to see connections from their beginning.
+        # Before any port listens, because the kernel has to see connections from the beginning.
         await self.plane.start()
         master = self._make_master_api()
         context.tasks.spawn(self._callers.await_operator(), "waiting for an operator")
@@ -198,7 +198,7 @@ class Ros1:
         return self.context.retired
 
     async def settle(self) -> None:
-        """Wait until the master has answered: `probe` makes it call the ports under test."""
+        """Wait until the master has answered, because `probe` has the master call the ports."""
         await self.master_monitor.answered.wait()
 
     async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
@@ -206,7 +206,7 @@ class Ros1:
         return await probe_range(self.context, self.leases, or_fast)
 
     async def try_ports(self) -> tuple[PortProbe, ...]:
-        """Without a start: reserve the range, try it, and release it. Raises SettingError."""
+        """Reserve, try and release the range, without a start. Raises SettingError."""
         try:
             self.reserve_range()
             return await self.probe(or_fast=True)
@@ -223,7 +223,7 @@ class Ros1:
         return self._state.add_to(status)
 
     def unready(self) -> str | None:
-        """Why nodes cannot use the proxy now; None if they can."""
+        """Why nodes cannot use the proxy now; None if nodes can."""
         if self.retired:
             return "the proxy is retired and accepts no registrations"
         if self.master_monitor.up:
@@ -277,7 +277,8 @@ class Ros1:
             needed = len(ports) + SPARE_FILES
             text = f"{ports} needs {needed} open files, and this process may have {files}"
             raise SettingError(RANGE_OPTION, f"{text}. Raise the limit (ulimit -Hn)")
-        # Kept connections, one for each node, get half of the rest at most; clients get all else.
+        # Kept connections, up to one for each node, get at most half of the rest. Clients get all
+        # other files.
         spare = max(files, 0) - len(ports) - SPARE_FILES
         self.prober.kept_connections.most = max(0, min(len(ports), spare // 2))
         self.context.gate.bound(spare - self.prober.kept_connections.most)

@@ -1,8 +1,8 @@
-"""Keeps the router process alive: starts it, takes its reports, and starts it again after its end.
+"""Keeps the router process alive: starts the process, reads reports, restarts the process.
 
 Nodes of rmw_zenoh dial a router again 1, 3, 7 and 11 seconds after the connection has ended. So if
-the routers are back within a second, the first of these tries succeeds. A process without reports
-counts as hung, and the proxy kills it.
+the routers are back within a second, the first of these tries succeeds. The proxy kills a process
+without reports, which counts as hung.
 """
 
 import asyncio
@@ -44,7 +44,7 @@ class RoutersFailed(Exception):
 class RouterKeeper:
     """The router process of a proxy.
 
-    ``failure`` says why no routers run; it is empty while they do. ``restarts`` counts the
+    ``failure``: why no routers run; empty while the routers run. ``restarts``: the number of
     processes that have ended.
     """
 
@@ -80,7 +80,7 @@ class RouterKeeper:
             await asyncio.sleep(max(began + LEAST_START_INTERVAL_S - loop.time(), 0.0))
 
     async def _run_once(self) -> str:
-        """Run a process to its end; returns the reason of the end."""
+        """Run a process to the end; return the reason of the end."""
         try:
             process = await asyncio.create_subprocess_exec(
                 *self.program, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=LONGEST_REPORT

@@ -44,7 +44,7 @@ def too_long_to_connect(fields: Mapping[str, str]) -> str | None:
 
 
 def _too_long(texts: Iterable[tuple[str, str, int]]) -> str | None:
-    """The first text that is longer than its bound, from (label, text, bound); None if none is."""
+    """Describe the first text over the bound, from (label, text, bound); None if all texts fit."""
     for label, text, most in texts:
         if len(text) > most:
             return f"{label} has {len(text)} characters, at most {most} are accepted"

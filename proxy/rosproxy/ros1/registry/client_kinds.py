@@ -1,9 +1,9 @@
-"""Which nodes may use the proxy as their master: nodes inside, or the selected nodes.
+"""Which nodes may use the proxy as the master: nodes inside, or the selected nodes.
 
 ROS 1 has no identity but the address from which a call comes. Without an operator, every address in
 the inside networks may use the proxy. An operator names the selected addresses (``POST
 /containers``). From then on only these addresses may use the proxy, in any network. Until the first
-such report after a start, the inside networks count. So a proxy that starts without its operator
+such report after a start, the inside networks count. So a proxy that starts without an operator
 serves the same nodes as before.
 """
 
@@ -34,7 +34,7 @@ def client_kind(
 
 
 def refusal(address: str, kind: ClientKind, networks: Sequence[Network]) -> str:
-    """Why an address may not use the proxy as its master, and what to do, in one line."""
+    """Why an address may not use the proxy as the master, and what to do, in a line."""
     if kind is ClientKind.UNSELECTED:
         return (
             f"rosproxy: {address} is not selected to use this proxy as its master. "

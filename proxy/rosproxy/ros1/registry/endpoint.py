@@ -1,4 +1,4 @@
-"""An endpoint: a node behind the proxy, its location, its registrations, and its port."""
+"""An endpoint: a node behind the proxy, with location, registrations and port."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -16,15 +16,15 @@ MOST_CHARACTERS = 2_000_000
 """The highest number of characters of all registered names and types of an endpoint. 10,000 topics
 of a large system have 1,000,000."""
 LONGEST_REGISTRATION = 8192
-"""Characters of a registration: three names and a URI; the topic name includes its namespace."""
+"""Most characters of a registration: three names and a URI. The topic name has the namespace."""
 MOST_SERVICE_PORTS = 16
 """Remembered TCPROS ports of services for an endpoint. rospy and roscpp have a single port for all
 topics and services. After a restart the proxy does not try ports beyond this number."""
 MOST_FORMER_CALLERS = 64
 """Remembered names that are no longer registered at an endpoint."""
 MOST_NAMED = 3
-"""Node names of an endpoint in a message. Most endpoints have one name, and several if another node
-has used the same port again."""
+"""Most node names of an endpoint in a message. Most endpoints have a single name. An endpoint has
+several names if another node has used the same port again."""
 STATES = ("ok", "new", "failing", "refused", "silent", "cleaned", "ended", "unverified")
 
 
@@ -76,15 +76,15 @@ class Registration:
 
 @dataclass(slots=True, eq=False)
 class Endpoint:
-    """An inside slave URI, and the port at which outside reaches it.
+    """An inside slave URI, and the port at which outside reaches the node.
 
     An endpoint is plain state. `Registry` keeps the indexes, ``callers`` (the number of
     registrations by node name) and ``characters`` (the length of all registrations).
 
-    - ``uri``: the slave URI as the node gave it. ``node`` is its host and port.
+    - ``uri``: the slave URI from the node. ``node``: the host and port of this URI.
     - ``port``: the lease, where the proxy listens.
     - ``topic_ports``: the TCPROS ports that the node itself named, by topic. rospy and roscpp have
-      a single port for all topics, other client libraries one for each.
+      a single port for all topics, other client libraries a port for each topic.
     - ``trusted``: False while only the data of the master mention the endpoint.
     - ``source``: the address from which the first registration came. After a recovery, the address
       of the node.
@@ -110,7 +110,7 @@ class Endpoint:
     service_ports: dict[int, None] = field(default_factory=dict)
     """TCPROS ports at which the node has registered services, oldest first."""
     former_callers: dict[str, None] = field(default_factory=dict)
-    """Names that are no longer registered at this endpoint, oldest first; `Registry` fills it."""
+    """Names that are no longer registered at this endpoint, oldest first. `Registry` adds names."""
     connections: int = 0
     """Open connections from outside that the proxy relays."""
     pending: int = 0
@@ -121,7 +121,7 @@ class Endpoint:
     source: str = ""
     health: Health = field(default_factory=Health)
     admissions: dict[tuple[HostPort, str], None] = field(default_factory=dict)
-    """Hosts and ports that mean this endpoint, with their sources, oldest first; by `Registry`."""
+    """Hosts and ports of this endpoint with the source of each, oldest first; by `Registry`."""
     former_uris: set[str] = field(default_factory=set)
     unsettled: bool = False
     settles_at: float = 0.0
@@ -132,7 +132,7 @@ class Endpoint:
     """Whether a former process of the proxy had the endpoint, and perhaps further data."""
 
     def mark_alive(self, pid: int | None, topic_ports: Mapping[str, int], now: float) -> None:
-        """Record what the node has said about itself: it is served, and its registrations hold."""
+        """Record an answer of the node. The proxy serves the node, and the registrations hold."""
         self.trusted = True
         self.topic_ports = dict(topic_ports)
         self.health.note(ProbeResult.ANSWERED, now)
@@ -140,7 +140,7 @@ class Endpoint:
         self.health.cleaned = False
 
     def note_unused(self, now: float) -> float:
-        """Record that the lease is unused now; return for how many seconds it has been unused."""
+        """Record that the lease is unused now; return the seconds since the lease is unused."""
         if self.idle_since is None:
             self.idle_since = now
         return now - self.idle_since
@@ -167,14 +167,14 @@ class Endpoint:
         self.unsettled = True
 
     def confirm(self) -> None:
-        """Record that the node registered from its own address: the proxy trusts what it says."""
+        """Record a registration from the node's own address, so that the proxy trusts the node."""
         self.location = replace(self.location, confirmed=True)
         self.trusted = True
 
     def note_topic_port(self, topic: str, port: int | None) -> None:
         """Record the TCPROS port that the node names for a topic; None removes the topic.
 
-        Only registered topics are recorded. roscpp names its port for any topic, so a caller could
+        Only registered topics are recorded. roscpp names a port for any topic, so a caller could
         make the proxy record names without end.
         """
         if port is not None and self.publishes(topic):
@@ -183,7 +183,7 @@ class Endpoint:
             self.topic_ports.pop(topic, None)
 
     def note_service_port(self, port: int) -> bool:
-        """Record a TCPROS port at which the node has a service; return whether it was unknown."""
+        """Record a TCPROS port at which the node has a service; return whether the port is new."""
         if port in self.service_ports:
             return False
         self.service_ports[port] = None
@@ -198,7 +198,7 @@ class Endpoint:
 
     @property
     def state(self) -> str:
-        """The state of the node in one word: one of STATES."""
+        """The state of the node, from STATES."""
         return self.health.state if self.trusted else "unverified"
 
     @property
@@ -218,7 +218,7 @@ class Endpoint:
 
     @property
     def never_found(self) -> bool:
-        """Whether the node has registered, but has never answered here: it may be elsewhere."""
+        """Whether the node has registered, but never answered here, and may be elsewhere."""
         health = self.health
         return self.trusted and health.answered_at is None and health.failures > 0
 
@@ -226,8 +226,8 @@ class Endpoint:
     def expendable(self) -> bool:
         """Whether the port may go to a live node, because this endpoint's node does not answer.
 
-        A node that has never answered gets a single probe. A node that only the master mentions has
-        to confirm its registrations with its first answer.
+        A node that has never answered gets a single probe. If only the master mentions a node, the
+        first answer of the node must confirm the registrations.
         """
         if self.pending or self.connected:
             return False
@@ -253,12 +253,12 @@ class Endpoint:
 
     @property
     def slave(self) -> HostPort:
-        """The address and port of the slave API; they identify the endpoint."""
+        """The address and port of the slave API, which identify the endpoint."""
         return HostPort(self.location.address, self.node.port)
 
     @property
     def caller_ids(self) -> list[str]:
-        """The names of the nodes registered here, usually one."""
+        """The names of the nodes registered here, usually a single name."""
         return sorted(self.callers)
 
     @property
@@ -290,7 +290,7 @@ class Endpoint:
         return any((Kind.PUBLISHER, topic, name) in self.registrations for name in self.callers)
 
     def may_hear_of(self, parameter: str) -> bool:
-        """Whether the node may be subscribed to a parameter or to a namespace around it.
+        """Whether the node may be subscribed to a parameter or to a namespace around the parameter.
 
         After a recovery the answer is yes, because the master lists no parameter subscriptions.
         """
@@ -318,7 +318,7 @@ class Endpoint:
 
     @property
     def reason_full(self) -> str | None:
-        """Why the endpoint accepts no more registrations; None if it does."""
+        """Why the endpoint accepts no more registrations; None if there is room."""
         for count, most, label in (
             (len(self.registrations), MOST_REGISTRATIONS, "registrations"),
             (self.characters, MOST_CHARACTERS, "characters of registered names"),
@@ -335,4 +335,4 @@ class Endpoint:
 
 
 EndpointRegistration = tuple[Endpoint, Registration]
-"""An endpoint, and one of its registrations."""
+"""An endpoint, and a registration of the endpoint."""

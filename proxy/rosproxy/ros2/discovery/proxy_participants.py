@@ -1,9 +1,9 @@
-"""The proxy's own participants in a domain: their datagrams, and the datagrams to them.
+"""The proxy's own participants in a domain: datagrams from and to these participants.
 
 The *discovery participant* learns the readers and writers of all participants, on both sides. With
 the *port store*, participants inside keep their ports for the next process of the proxy. Neither
-has a reader or writer for a topic. Each side discovers these participants directly; the proxy does
-not announce them on behalf of the other side.
+has a reader or writer for a topic. Each side discovers these participants directly. The proxy does
+not pass on an announcement of these participants between the sides.
 """
 
 from dataclasses import dataclass
@@ -71,7 +71,7 @@ class ProxyParticipants:
     def question_to_outside(self, outsider: OutsideParticipant) -> list[Outgoing]:
         """The question by which a participant outside proves an address.
 
-        Empty if the participant has answered, or if its credit is too small.
+        Empty if the participant has answered, or has too little credit.
         """
         if self.proofs.has_answered(outsider.address, outsider.prefix):
             return []
@@ -94,7 +94,7 @@ class ProxyParticipants:
         return sent_to(metatraffic, [self.proofs.question(address, prefix, reached_at)])
 
     def question_to_announced(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
-        """The question to a participant inside, at the metatraffic locator in its announcement."""
+        """The question to a participant inside, at the metatraffic locator of an announcement."""
         spdp = message.of_participant
         metatraffic = first_metatraffic(spdp, message.datagram, source) if spdp else None
         return self.question_to_inside(source, message.prefix, metatraffic)
@@ -186,7 +186,7 @@ class ProxyParticipants:
         self.former_ports.forget_participant(prefix)
 
     def _ask(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> list[bytes]:
-        """Pass a message at a port to the discovery participant. Return its requests."""
+        """Pass a message at a port to the discovery participant. Return the requests."""
         passed, questions = self.fragments.rewritten(
             port, message, self.discovery_participant.prefix, rewrite
         )

@@ -1,17 +1,17 @@
 """The proof that a datagram comes from the LAN relay, or from the proxy of this relay.
 
-Both programs know one secret. A source address proves nothing: behind Docker's port proxy, and
+Both programs know the same secret. A source address proves nothing: behind Docker's port proxy, and
 where Kubernetes masquerades, each client has the address of the relay.
 
     magic 4, time stamp 8 (milliseconds of Unix time, big-endian), proof 16, then the content
 
 The proof is a keyed BLAKE2b (RFC 7693) of the time stamp and the content. The direction is the
-*person* parameter of the hash, so that the proof of one direction is wrong in the other.
+*person* parameter of the hash, so a proof for one direction is wrong in the opposite direction.
 
 A proof is valid for `WINDOW_S` seconds before and after the receiver's clock. Neither program keeps
 state, so each program may restart at any time. Within the window, an attacker may repeat a
-datagram. The repeated datagram says what its participant has just said to the whole LAN. At worst,
-a participant that has ended lives for one lease duration more, or the proxy forgets a live
+datagram. The repeated datagram tells only what a participant has just told the whole LAN. At worst,
+a participant that has ended lives for another lease duration, or the proxy forgets a live
 participant until the next announcement, seconds later. The relay runs on the proxy's machine, so
 both programs have the same clock, also if the clock jumps.
 """
@@ -28,7 +28,7 @@ MAGIC = b"RPX1"
 WINDOW_S = 30.0
 """Seconds by which the time stamp may differ from the receiver's clock."""
 LONGEST_CONTENT = 8192 + 16
-"""Bytes of a content that the receiver reads: the longest announcement, and its address."""
+"""Bytes of a content that the receiver reads: the longest announcement, and an address."""
 _PROOF_SIZE = 16
 _STAMP = struct.Struct(">Q")
 _CONTENT_AT = len(MAGIC) + _STAMP.size + _PROOF_SIZE
@@ -55,7 +55,7 @@ class RelayProof:
         self._unix_time = unix_time
 
     def sealed(self, direction: Direction, content: bytes) -> bytes:
-        """Return the datagram with a content and its proof."""
+        """Return the datagram with a content and the proof."""
         stamp = _STAMP.pack(int(self._unix_time() * 1000))
         return MAGIC + stamp + self._proof(direction, stamp, content) + content
 

@@ -1,6 +1,6 @@
-"""The sockets of a domain: received datagrams go to `Domain`, and its datagrams are sent.
+"""The sockets of a domain: pass received datagrams to `Domain`, and send the resulting datagrams.
 
-User data passes at once. Discovery takes long to read, and waits for its turn
+User data passes at once. Discovery takes long to read, and waits in a queue
 (`DiscoveryScheduler`).
 
     the groups       at the domain's multicast port, on all inside networks
@@ -56,9 +56,9 @@ log = logging.getLogger(__name__)
 EXPIRY_INTERVAL = 0.5
 """Seconds between calls of `DomainServer.expire`."""
 ADMISSION_TIMEOUT = 5.0
-"""Seconds after which a participant that has waited is queued again, if it is not served yet."""
+"""Seconds after which a waiting participant is queued again, unless already served."""
 PER_TURN = 16
-"""Datagrams that a socket passes on before the other sockets have their turn."""
+"""Datagrams that a socket passes on before other sockets follow."""
 QUEUED_FOR_PASSED = 8
 """Datagrams that a socket may queue in place of a datagram that passes. Queueing is that much
 faster. Otherwise the kernel would drop datagrams, without fairness to the sources."""
@@ -66,7 +66,7 @@ faster. Otherwise the kernel would drop datagrams, without fairness to the sourc
 Take = Callable[[bytes, str, float], list[Outgoing]]
 """Handles a datagram with its source and the time, and returns the datagrams to send."""
 MustRead = Callable[[bytes, str], bool]
-"""Whether a datagram from a source is discovery that has to wait for its turn."""
+"""Whether a datagram from a source is discovery that has to wait in the queue."""
 
 
 class DomainServer:
@@ -93,7 +93,7 @@ class DomainServer:
         self._told_changes = 0
         pool = PortPool(settings.ports.listen)
         # A new prefix for each process: participants announce themselves at once only to an
-        # unknown discovery participant, and repeat all announcements for it.
+        # unknown discovery participant, and repeat all announcements for this participant.
         self.domain = Domain(settings, pool, os.urandom(PREFIX), os.urandom(32), now(), time.time())
         self._selected = SelectedAddresses(now() + awaited)
         self._loop = asyncio.get_running_loop()
@@ -106,7 +106,7 @@ class DomainServer:
         self._scheduler = DiscoveryScheduler()
         self._next_part: asyncio.Handle | None = None
         self._admitting: dict[bytes, float] = {}
-        """Participants whose wait for former ports is over, and since when each is queued."""
+        """Participants that no longer wait for former ports, with the time of queueing."""
         self._out = {f: _sending_socket(f) for f in (socket.AF_INET, socket.AF_INET6)}
         self.lost = 0
         """Datagrams that the kernel refused to send."""
@@ -152,8 +152,8 @@ class DomainServer:
     def join(self, addresses: Iterable[str]) -> None:
         """Join the groups on the inside networks of these addresses, and leave all others.
 
-        The addresses are those of the proxy. If the proxy leaves a network and returns, it has to
-        join again. The discovery participant announces itself on each new network.
+        These are addresses of the proxy. If the proxy leaves a network and returns, the proxy has
+        to join again. The discovery participant announces itself on each new network.
         """
         for address in self._groups.join(addresses):
             self._announce_on(address)
@@ -247,7 +247,7 @@ class DomainServer:
         if self._next_part:
             self._next_part.cancel()
         # Only for the discovery participant: the port store has to stay known, because
-        # participants keep their ports with it.
+        # participants use the port store to keep ports.
         dispose_message = self.domain.proxy_participants.discovery_participant.dispose_message()
         for address in self._groups.joined:
             self._multicast(address, dispose_message)
@@ -268,7 +268,7 @@ class DomainServer:
     def _admit_waiting(self) -> None:
         """Queue the participants that may get ports now. After a start there are many at once."""
         now = self._now()
-        # The longest queue loses its last items without notice (`FairQueue`).
+        # The longest queue loses the last items without notice (`FairQueue`).
         admitting = {p: t for p, t in self._admitting.items() if now - t < ADMISSION_TIMEOUT}
         self._admitting = admitting
         former_ports = self.domain.former_ports
@@ -307,7 +307,7 @@ class DomainServer:
                 settings.proxy_address_for(address)
             )
             count = counts.get(address, 0)
-            # Participants of a machine bind the well-known ports one after the other (9.6.2.3). So
+            # Participants of a machine bind the well-known ports in order (9.6.2.3). So
             # unknown participants are at the next ports.
             targets = settings.well_known(
                 address, count + NEXT_PORTS if count else PARTICIPANTS_TRIED
@@ -363,8 +363,8 @@ class DomainServer:
     def _is_let_in(self, datagram: bytes, source: str, now: float) -> bool:
         """Whether the proxy handles discovery from an inside address now.
 
-        If the address is not selected, hold its announcements, because the operator may select it
-        soon.
+        If the address is not selected, hold announcements from there, because the operator may
+        select the address soon.
         """
         if not self._is_inside(source):
             return False
@@ -388,7 +388,7 @@ class DomainServer:
         """Receive the datagrams at a socket: queue discovery, and pass all others at once.
 
         A turn ends after `PER_TURN` datagrams, or after half the bytes of the longest datagram.
-        Then other sockets have their turn. A queued datagram counts less (`QUEUED_FOR_PASSED`).
+        Then other sockets follow. A queued datagram counts less (`QUEUED_FOR_PASSED`).
         """
         spent_bytes = spent = 0.0
         with contextlib.suppress(BlockingIOError):
@@ -422,13 +422,13 @@ class DomainServer:
         return (take, source, stream) if stream else None
 
     def _replaces(self, key: Hashable, take: Take, datagram: bytes, source: str) -> bool:
-        """Replace the waiting datagram with a key by a later one. Return False if there is none."""
+        """Replace the waiting datagram with a key by a later datagram. Return False without any."""
         if key is None:
             return False
         return self._scheduler.replace(key, partial(self._carry_out, take, datagram, source))
 
     def _read_in_turn(self, take: Take, datagram: bytes, source: str, key: Hashable) -> None:
-        """Queue a datagram of discovery, or handle it at once if none waits."""
+        """Queue a datagram of discovery, or handle the datagram at once if no datagram waits."""
         heard_at = self.domain.source_of(datagram, source)
         standing = self.domain.standing(heard_at)
         read = partial(self._carry_out, take, datagram, source)
@@ -437,7 +437,7 @@ class DomainServer:
             self.domain.refused("rate", heard_at, text)
 
     def _carry_out(self, take: Take, datagram: bytes, source: str) -> list[Outgoing]:
-        """Handle a datagram. Send and return the datagrams that follow from it."""
+        """Handle a datagram. Send and return the resulting datagrams."""
         outgoing = take(datagram, source, self._now())
         self._tell_changes()
         self._open_and_send(outgoing)
@@ -453,7 +453,7 @@ class DomainServer:
         self._send(out for out in outgoing if not (closed and self._names_any(closed, out)))
 
     def _send_and_go_on(self, outgoing: Iterable[Outgoing]) -> None:
-        """Send the first datagrams that follow from a change, and the others in later rounds."""
+        """Send the first datagrams that follow from a change, and the rest in later rounds."""
         self._open_and_send(outgoing)
         if self.domain.is_busy and self._next_part is None:
             self._next_part = self._loop.call_soon(self._go_on)
@@ -463,7 +463,7 @@ class DomainServer:
         self._send_and_go_on(self.domain.go_on(self._now()))
 
     def _names_any(self, ports: Iterable[int], out: Outgoing) -> bool:
-        """Whether a datagram has a locator with one of these ports of the proxy."""
+        """Whether a datagram has a locator with any of these ports of the proxy."""
         near = self.domain.settings.proxy_address_for(out.target.host)
         locators = (pack_locator(HostPort(near, p), order) for p in ports for order in "<>")
         return any(locator in out.datagram for locator in locators)

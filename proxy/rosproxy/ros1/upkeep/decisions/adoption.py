@@ -1,9 +1,9 @@
 """Adoption of nodes that registered at the real master directly: which nodes, where, which calls.
 
-A container may start while the name of its master still leads to the real master. Its nodes then
-register with their own URIs, which outside cannot reach. Such nodes are *direct*. To adopt a direct
-node, the proxy takes back all registrations of the node, and makes them again with URIs that
-outside can reach.
+A container may start while the name of the master still leads to the real master. Nodes of this
+container then register with URIs that outside cannot reach. Such nodes are *direct*. To adopt a
+direct node, the proxy takes back all registrations of the node. Then the proxy registers the same
+names with URIs that outside can reach.
 
 Both client libraries keep the connection to the real master open. So later calls of such a node may
 bypass the proxy as well. The master then drops the registrations that the name had before, and
@@ -25,14 +25,14 @@ from rosproxy.ros1.rewriting.addressing import Addressing
 from rosproxy.ros1.upkeep.decisions.registration import is_known_as
 
 Container = tuple[str, Collection[str]]
-"""The IP address of a container on an inside network, and its host names in lower case."""
+"""The IP address of a container on an inside network, and the host names in lower case."""
 
 _NEW_URI = re.compile(r"\[(/[^\]\s]*)\] Reason: new node registered")
 """rosmaster/registrations.py, shutdown_node_task."""
 
 
 class DirectNode(msgspec.Struct, frozen=True):
-    """A node that is registered with its own URI, and the slave addresses where it may be."""
+    """A node that is registered with the node's own URI, and the slave addresses to try."""
 
     caller_id: str
     uri: str
@@ -41,7 +41,7 @@ class DirectNode(msgspec.Struct, frozen=True):
 
     @property
     def topics(self) -> set[str]:
-        """The topics of the node, without /rosout if there are others."""
+        """The topics of the node, without /rosout unless /rosout is the only topic."""
         names = {r.name for r in self.registrations if r.kind in TOPIC_KINDS}
         return names - {ROSOUT} or names
 
@@ -94,7 +94,7 @@ def locate(
 
 
 def renamed_node(caller_id: str, reason: str) -> str | None:
-    """The name whose URI has changed, if that is the reason of a ``shutdown`` call."""
+    """The name with a changed URI, if that is the reason of a ``shutdown`` call; else None."""
     match = _NEW_URI.match(reason)
     return match[1] if match and caller_id == "/master" else None
 
@@ -112,7 +112,7 @@ def has_name_still(endpoint: Endpoint, uri: str | None, advertised: str) -> bool
 
 
 def _score(node: DirectNode, info: NodeInfo) -> int:
-    """The direct node's topics that the answering node has, minus the topics that it lacks."""
+    """The number of topics that the answering node has, minus the number of missing topics."""
     counts = Counter(info.has(topic) for topic in node.topics)
     return counts[True] - counts[False]
 

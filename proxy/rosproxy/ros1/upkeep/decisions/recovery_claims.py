@@ -4,7 +4,7 @@ The advertised URIs at the master tell the ports. The parameter of the proxy
 (`rosproxy.ros1.registry.remembered_leases`) tells where the nodes of these ports are; URIs of
 former versions have the node in the path instead. Any program can write both to the master, so the
 data are only claims. If several claims name the same port or the same node, `choose_claims` keeps
-the claim that its node confirms best. Before the proxy serves a node, the node has to confirm its
+the claim that a node confirms best. Before the proxy serves a node, the node has to confirm the
 claim (`confirmed_by`).
 """
 
@@ -84,14 +84,14 @@ def find_claims(
 
 
 def contested_claims(candidates: Sequence[Claim]) -> list[Claim]:
-    """The claims that share their port or their inside address with another claim."""
+    """The claims that share the port or the inside address with another claim."""
     ports = Counter(c.port for c in candidates)
     slaves = Counter(c.slave for c in candidates)
     return [claim for claim in candidates if ports[claim.port] > 1 or slaves[claim.slave] > 1]
 
 
 def choose_claims(candidates: Sequence[Claim]) -> list[Claim]:
-    """One claim for each port and inside address: the claim that its node confirms best."""
+    """A single claim for each port and inside address: the claim that the node confirms best."""
 
     def merit(claim: Claim) -> tuple[int, int]:
         count = len(claim.registrations)
@@ -110,11 +110,10 @@ def choose_claims(candidates: Sequence[Claim]) -> list[Claim]:
 
 
 def confirmed_by(registrations: Iterable[Registration], info: NodeInfo) -> bool | None:
-    """Whether the topics that a node names confirm its registrations.
+    """Whether the topics that a node names confirm the registrations.
 
     A forged URI may lead to a program that is not the node of that name. Then there is no answer
-    here, or the topics of another node. None: no topic is registered, or the node does not tell its
-    topics.
+    here, or the topics of another node. None: no topic is registered, or the node names no topics.
     """
     topics = {r.name for r in registrations if r.kind in TOPIC_KINDS}
     answers = [info.has(topic) for topic in (topics - {ROSOUT} or topics)]
@@ -131,9 +130,9 @@ def has_own_topic(registrations: Iterable[Registration]) -> bool:
 def by_name(registrations: Iterable[Registration]) -> dict[str, list[Registration]]:
     """Registrations by node name.
 
-    Several names at one slave URI usually mean several processes, one after the other. A port is
-    used again, and the master keeps the registrations of the earlier process until a program takes
-    them back.
+    Several names at the same slave URI usually mean several processes in a row. The later process
+    uses the port again, and the master keeps the registrations of the earlier process until a
+    program ends these registrations.
     """
     registrations_by_name: dict[str, list[Registration]] = {}
     for registration in registrations:
@@ -152,7 +151,7 @@ def unconfirmed_registrations(
 def topics_and_services_to_ask(
     registrations: Iterable[Registration],
 ) -> tuple[list[str], list[Registration]]:
-    """The topics and services by which a node can confirm its registrations.
+    """The topics and services by which a node can confirm the registrations.
 
     At most `MOST_ASKED` of each, with /rosout as the last topic.
     """

@@ -4,10 +4,10 @@ The master takes a registration back only if the call has exactly the strings of
 With other strings, a stale entry stays. When the URI of a name changes, the master calls
 ``shutdown`` at the former URI (rosmaster/registrations.py, _register_node_api). So if the master
 has a name by a former URI of the same node, the proxy first takes back all registrations of the
-name, and then makes them again.
+name, and then registers the name again.
 
 The other functions compare three views of a node: the registry, the master, and what the node
-itself says (`NodeInfo`). A node tells its topics, but not its services and parameters.
+itself says (`NodeInfo`). A node names topics, but no services and parameters.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -49,7 +49,7 @@ def to_register(registrations: Iterable[EndpointRegistration]) -> list[EndpointR
 
 
 def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[EndpointRegistration]:
-    """One publisher of each topic that the nodes of some endpoints publish.
+    """A single publisher of each topic that the nodes of some endpoints publish.
 
     When the proxy registers this publisher, the master sends all subscribers of the topic the list
     of publishers.
@@ -65,7 +65,7 @@ def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[EndpointRegis
 def is_known_as(endpoint: Endpoint, uri: str) -> bool:
     """Whether a URI at the master is a former URI of this endpoint, or the node's own URI.
 
-    A loopback address does not count, because every node may give one.
+    A loopback address does not count, because every node may give a loopback address.
     """
     is_own = parse_slave_uri(uri) == endpoint.node and not is_loopback(endpoint.node.host)
     return is_own or uri in endpoint.former_uris
@@ -77,7 +77,7 @@ def free_calls(
     """The calls that end all registrations of some names.
 
     ``uris`` has the slave URI of each name, ``services`` the URI of each service. Subscribers go
-    first, so that the master does not tell them that publishers have gone.
+    first, so that the master does not tell subscribers that publishers have gone.
     """
     ordered = sorted(_usable(registrations, services), key=lambda r: r.kind is not Kind.SUBSCRIBER)
     return [unregister_call(r, uris[r.caller_id], services.get(r.name, "")) for r in ordered]
@@ -94,7 +94,7 @@ def restore_calls(
 def release_calls(uris: Mapping[str, str], caller: str) -> list[MethodCall]:
     """The calls that end the parameter subscription of every node, and ask which names are left.
 
-    The master does not list such a subscription. But it keeps the name of the node as known.
+    The master does not list such a subscription, but keeps the name of the node as known.
     """
     ask: list[MethodCall] = [("lookupNode", [caller, name]) for name in uris]
     params = [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in uris]
@@ -142,7 +142,7 @@ def left_over_registrations(
 
 
 def vanished_topics(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
-    """The topics registered before a time that the node says it does not have.
+    """The topics registered before a time that the node says not to have.
 
     A node that registers at the real master directly also unregisters there. The master ignores
     such a call, because the master has another URI for the node.
@@ -157,7 +157,7 @@ def valid_registrations(
     """The registrations of an endpoint that hold for a node that has come back.
 
     A topic holds unless the node says that it does not have the topic. Services and parameters
-    cannot be asked for. They hold if the ``same_process`` answers, and has not lost all topics.
+    cannot be asked for. Both hold if the ``same_process`` answers, and has not lost all topics.
     """
     registrations = list(endpoint.registrations.values())
     topics = [r for r in registrations if r.kind in TOPIC_KINDS]
@@ -170,8 +170,8 @@ def valid_registrations(
 def unregistered_topics(endpoint: Endpoint, info: NodeInfo) -> list[Registration]:
     """The topics that a node has and the master does not know, with their types.
 
-    rospy gives up a registration if it finds no master. If several node names share the slave API,
-    the list is empty.
+    rospy gives up a registration without a master. If several node names share the slave API, the
+    list is empty.
     """
     names = endpoint.caller_ids
     if len(names) != 1:

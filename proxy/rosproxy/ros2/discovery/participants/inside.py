@@ -32,7 +32,7 @@ from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 @dataclass(slots=True)
 class InsideParticipants(ParticipantTable[InsideParticipant]):
-    """The participants inside, with their port mappings and the verdicts of the policy."""
+    """The participants inside, with port mappings and the verdicts of the policy."""
 
     settings: DomainSettings
     mappings: PortMappings
@@ -41,7 +41,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     verdicts: Verdicts
 
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> InsideParticipant | None:
-        """The participant in an announcement, added if necessary; None if the proxy refuses it.
+        """The participant in an announcement, added if necessary; None if refused.
 
         A participant on several networks is served at the first. Raises RtpsError.
         """
@@ -72,7 +72,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         return participant
 
     def gives_place(self, prefix: bytes, source: str) -> InsideParticipant | None:
-        """The participant that ends in favour of a new one; None if no participant has to end.
+        """The participant that ends in favour of a new participant; None if none has to end.
 
         Then there is room for the new participant, or the new participant gets no place.
         """
@@ -89,7 +89,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         return surplus(self._answering(True), MOST_INSIDE, str)
 
     def _why_no_place(self, prefix: bytes, source: str) -> str:
-        """Why a new participant at an address gets no place; empty if it gets a place."""
+        """Why a new participant at an address gets no place; empty if there is a place."""
         if self.count_by_address[source] >= MOST_PER_ADDRESS:
             return f"the address already has {MOST_PER_ADDRESS} participants"
         has_answered = self.proofs.has_answered(source, prefix)
