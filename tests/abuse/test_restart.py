@@ -122,13 +122,13 @@ def participants(abused: Abused, side: str) -> dict[str, dict[str, Any]]:
 
 
 def ports(abused: Abused, participant: Participant) -> list[int]:
-    """The ports of a participant inside; none if the proxy does not serve it."""
+    """The ports of a participant inside; empty if the proxy does not serve the participant."""
     found = participants(abused, "inside").get(f"{participant.prefix.hex()} {participant.address}")
     return [lease["port"] for lease in found["leases"]] if found else []
 
 
 async def serve_and_restart(abused: Abused, good: Reader, robot: Participant) -> list[int]:
-    """Serve a pair until its ports are kept, then kill the proxy. Return the ports."""
+    """Serve a pair until both keep the ports, then restart the proxy. Return the ports."""
     good.meta.settimeout(0.1)
     meta, user = served(good, robot, b"before")
     good.meta.setblocking(False)

@@ -30,11 +30,11 @@ REGISTRATION_GRACE = 0.5
 MANY_VALUES = 100
 """A document with more values is large. Registrations have six."""
 MOST_PASSING = 256
-"""Calls and replies that pass unread at the same time. Each takes a thread of the master."""
+"""Most calls and replies that pass unread at once. Each call takes a thread of the master."""
 MOST_CLIENTS = 4096
 """The highest number of addresses whose `ClientKind` is remembered."""
 PASSING_SHARE = 64
-"""The share of `MOST_PASSING` for one source."""
+"""Most calls and replies of a single source among `MOST_PASSING`."""
 
 
 class Context:
@@ -119,7 +119,7 @@ class Context:
 
     @property
     def selected(self) -> frozenset[str] | None:
-        """The addresses that may use the proxy as their master; None: no operator has named any."""
+        """The addresses that may use the proxy as the master; None: no operator has named any."""
         return self._selected
 
     @selected.setter
@@ -129,7 +129,7 @@ class Context:
         self._client_networks = None
 
     def client_kind(self, address: str) -> ClientKind:
-        """Whether an address may use the proxy as its master, as far as known now."""
+        """The kind of an address: whether the address may use the proxy as the master."""
         kind = self._client_kinds.get(address)
         if kind is None:
             if len(self._client_kinds) >= MOST_CLIENTS:
@@ -139,7 +139,7 @@ class Context:
         return kind
 
     def client_networks(self) -> Sequence[Network]:
-        """The networks that may use the proxy as their master, without overlaps."""
+        """The networks that may use the proxy as the master, without overlaps."""
         if self._client_networks is None:
             networks = self.addressing.networks
             if self.selected is not None:
@@ -161,7 +161,7 @@ class Context:
             await asyncio.sleep(0.002)
 
     def refresh_networks(self) -> None:
-        """Read the networks of the proxy's interfaces again, if they have changed."""
+        """Read the networks of the proxy's interfaces again after a change."""
         if self._network_changes.noticed(self.now()):
             self.read_networks()
 
@@ -170,7 +170,7 @@ class Context:
         self._proxy_addresses.clear()
         self._client_kinds.clear()
         self._client_networks = None
-        # With --direction both the network of the default route leads outside, so it is not inside.
+        # With --direction both, the network of the default route leads outside and is not inside.
         configured = self.settings.inside_networks
         both = self.stand_ins.is_bidirectional
         self.addressing.networks = configured or interface_networks(without_uplink=both)

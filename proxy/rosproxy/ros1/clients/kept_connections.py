@@ -1,10 +1,10 @@
 """Kept connections to nodes, by which the proxy asks again and again whether a node answers.
 
 A call with a new connection takes the proxy half a millisecond. With a thousand nodes and a call
-every five seconds, this is a tenth of a processor. Over a kept connection, a question is one
-``send`` and an answer one ``recv``. An answer wakes no task: the next look collects the answers
-(`KeptConnections.collect`). An answer with the same body as the last answer has the same pid, and
-the proxy does not parse it.
+every five seconds, this is a tenth of a processor. Over a kept connection, a question is a single
+``send`` and an answer a single ``recv``. An answer wakes no task: the next look collects the
+answers (`KeptConnections.collect`). An answer with the same body as the last answer has the same
+pid, and the proxy does not parse it.
 
 The kernel tells which connections the nodes have ended (EPOLLRDHUP), also after a crash of the
 process. So the next look knows the end of a node.
@@ -27,7 +27,7 @@ from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.registry.node_health import ProbeResult
 
 LONGEST_ANSWER = 4096
-"""Bytes of an answer with its header. Answers of rospy have 400 bytes."""
+"""Most bytes of an answer with header. Answers of rospy have 400 bytes."""
 
 _OK = b"HTTP/1.1 200 "
 _LENGTH = re.compile(rb"\r\nContent-Length:\s*(\d{1,4})\s*(?:\r\n|\Z)", re.IGNORECASE)

@@ -1,7 +1,7 @@
 """Enforce a changed policy: hide and show registrations, and cut connections.
 
-- The proxy takes back denied registrations at the master and hides them. Nodes inside that use
-  these registrations stay connected.
+- The proxy takes back denied registrations at the master, and hides these registrations. Nodes
+  inside that use a hidden registration stay connected.
 - The proxy registers what the policy allows again.
 - The proxy cuts connections to denied topics and services: connections from outside, and
   connections from inside through stand-ins.
@@ -9,8 +9,8 @@
   check what the kernel forwards. If a rule concerns nodes outside, all stand-ins lose their fast
   ports.
 
-All the rest stays as it is. So the proxy may enforce a policy at any time, and repeats this until
-all steps have worked.
+All other connections and registrations stay. So the proxy may enforce a policy at any time, and
+repeats this until all steps have worked.
 """
 
 import asyncio
@@ -81,7 +81,7 @@ class PolicyEnforcer:
         return enforced
 
     def _cut_relays(self) -> int:
-        """End the connections that the policy denies to outside or to a node inside; their number.
+        """End the connections that the policy denies; return the number of these connections.
 
         The name of an unregistered topic or service is unknown, so the policy may deny such a
         connection as well.
@@ -106,7 +106,7 @@ class PolicyEnforcer:
         """Take fast ports from nodes that the policy may deny in part; the cut connections."""
         policy = self._context.policy
         count = 0 if policy.inside_may_bypass() else self._stand_ins.close_fast_ports()
-        # Nodes inside have lost connections, and may need their publishers once more.
+        # Nodes inside have lost connections, and may need the publishers once more.
         if count:
             self._leases.watch(self._context.registry)
         for endpoint in self._context.registry:

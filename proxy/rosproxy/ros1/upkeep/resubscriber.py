@@ -1,19 +1,19 @@
-"""Reconnect subscribers that receive nothing although their publisher is there.
+"""Reconnect subscribers that receive nothing although a publisher is there.
 
 After an outage of the proxy or of a port, subscribers may have given up (see
 `decisions.resubscription`). The same fix works for roscpp and rospy: a ``publisherUpdate`` without
-the publisher, then one with the publisher. The proxy sends the first itself (`_withdraw`), only to
-subscribers without a connection, because the update ends existing connections. For the second, the
-proxy registers one publisher of each topic again. The master then tells all subscribers of the
-topic.
+the publisher, then a ``publisherUpdate`` with the publisher. The proxy sends the first update
+(`_withdraw`), only to subscribers without a connection, because the update ends existing
+connections. For the second update, the proxy registers a publisher of each topic again. The master
+then sends the update to all subscribers of the topic.
 
 Subscribers inside can lose publishers outside in the same way. The proxy registers such a
-subscriber again, and sends it the publishers from the reply. With ``--direction both`` the proxy
-first withdraws the publishers to which the subscriber has no relay.
+subscriber again, and sends the subscriber the publishers from the reply. With ``--direction both``
+the proxy first withdraws the publishers to which the subscriber has no relay.
 
 `announce` does this for endpoints that a new process of the proxy has found at the master, `remind`
-for a node that answers again. Both schedule further looks (`look`), because subscribers act on
-their own for up to three minutes.
+for a node that answers again. Both schedule further looks (`look`), because subscribers try by
+themselves for up to three minutes.
 """
 
 import asyncio
@@ -43,8 +43,8 @@ LOOK_DELAYS = (4.0, 10.0, 25.0, 75.0, 165.0)
 """Seconds from an outage to each look at the affected endpoints.
 
 Before the first look, a proxy that is replaced by force has ended, and roscpp's first retries are
-over. Before the last two looks, rospy gives up a connection whose other end has vanished: TCP
-keep-alive probes begin after 60 seconds. Then a reset answers, or no answer comes for 90 seconds.
+over. Before the last two looks, rospy gives up a connection to a vanished peer: TCP keep-alive
+probes begin after 60 seconds. Then a reset answers, or no answer comes for 90 seconds.
 """
 RESUBSCRIBE_TICK = 1.0
 """Seconds between two checks which looks are due."""
@@ -92,9 +92,8 @@ class Resubscriber:
     async def remind(self, endpoint: Endpoint) -> None:
         """Repair connections after the port of a node refused. Raises Unreachable, MasterError.
 
-        A subscriber whose requestTopic was refused does not ask again by itself. When a publisher
-        registers, the master sends the subscriber its publishers once more. Existing connections
-        stay.
+        After a refused requestTopic, a subscriber does not ask again. When a publisher registers,
+        the master sends the subscriber all publishers once more. Existing connections stay.
         """
         self.watch([endpoint])
         kinds = (Kind.PUBLISHER, Kind.SUBSCRIBER)
@@ -127,9 +126,9 @@ class Resubscriber:
     async def _withdraw(self, endpoints: Sequence[Endpoint], ask: bool = True) -> set[str]:
         """Tell subscribers without a connection that these publishers have gone; return the topics.
 
-        The subscribers connect again when they hear that the publishers are back. With ``ask``, the
-        proxy asks the publishers for their connections, and spares subscribers with UDPROS. Raises
-        Unreachable, MasterError.
+        The subscribers connect again when the master announces the publishers again. With ``ask``,
+        the proxy asks the publishers for their connections, and spares subscribers with UDPROS.
+        Raises Unreachable, MasterError.
         """
         state = await self._context.upstream.read_registrations()
         subscriptions = decisions.subscriptions(state, endpoints, self._context.addressing)
@@ -142,7 +141,7 @@ class Resubscriber:
         outside_publishers = self._outside_publishers(graph, endpoints)
         for endpoint, _, uris in outside_publishers:
             await self._stand_ins.listen_for(uris, self._context.caller_at(endpoint))
-        # The plane reads the connections of the kernel every few seconds. Read them now.
+        # The plane reads the kernel's connections only every few seconds, so read these now.
         if self._context.stand_ins.by_port or any(
             s.endpoint.fast_port or s.endpoint.fast_peers for s in unrelayed
         ):
@@ -174,7 +173,7 @@ class Resubscriber:
         return [s for s in unrelayed if is_relayed(s)]
 
     async def _read_buses(self, subs: Iterable[TopicSubscription]) -> dict[Endpoint, list[BusRow]]:
-        """What the publishers name as their connections."""
+        """The connections of the publishers, by ``getBusInfo``."""
 
         async def read(endpoint: Endpoint) -> list[BusRow]:
             upstream = self._context.upstream
@@ -194,7 +193,7 @@ class Resubscriber:
     async def _resolve_hosts(
         self, graph: Graph, unrelayed: Iterable[TopicSubscription]
     ) -> dict[str, list[str]]:
-        """The hosts' addresses of subscribers whose publisher has connections in the kernel."""
+        """The addresses of subscribers' hosts, if the publisher has connections in the kernel."""
 
         async def resolve_host(uri: str) -> list[str]:
             endpoint = self._context.addressing.endpoint_of(uri)

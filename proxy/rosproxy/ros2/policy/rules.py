@@ -1,8 +1,8 @@
 """Which rule of the policy applies to a reader or writer of DDS (`rosproxy.access.rules`).
 
 The rules name topics and services as seen from inside. A service has two topics in DDS, for
-requests and for replies, and each has readers and writers. So the kind of rule follows from the
-topic's name, and from the direction of its data.
+requests and for replies. Each topic has readers and writers. So the kind of rule follows from the
+name of the topic, and from the direction of the data.
 """
 
 from rosproxy.access.rules import RuleKind
@@ -10,7 +10,8 @@ from rosproxy.ros2.protocol.ros_names import is_of_requests, is_of_service, ros_
 from rosproxy.ros2.registry.participants import EndpointKind
 
 GRAPH_TOPIC = "ros_discovery_info"
-"""The topic on which participants publish their nodes. Without it, `ros2 node list` is empty."""
+"""The topic on which participants publish their nodes. Without GRAPH_TOPIC, `ros2 node list` is
+empty."""
 
 
 def rule_about(kind: EndpointKind, dds_topic: str, is_inside: bool) -> tuple[RuleKind, str] | None:

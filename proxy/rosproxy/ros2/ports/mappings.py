@@ -22,14 +22,14 @@ from rosproxy.ros2.rewriting.discovery import Announcement
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 PART_FOR_PROVEN = 4
-"""If no more free ports are left than one part in so many of the range, only participants that have
-answered get ports."""
+"""If at most 1/PART_FOR_PROVEN of the range is free, only participants that have answered get
+ports."""
 PART_FOR_OTHERS = 8
-"""One part in so many of the range is not available to a single address. So a container that takes
-all available ports leaves some to others."""
+"""A single address can't get the last 1/PART_FOR_OTHERS of the range. So a container that takes all
+available ports leaves some ports to other containers."""
 
 Holder = tuple[InsideParticipant, PortMapping]
-"""A participant and one of its port mappings."""
+"""A participant and a port mapping of the participant."""
 
 
 @dataclass(slots=True)

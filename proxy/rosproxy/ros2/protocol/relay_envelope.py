@@ -1,7 +1,7 @@
 """The envelope that the LAN relay puts around an announcement: the source address.
 
 The envelope is 16 bytes before the datagram: an IPv6 address, or an IPv4-mapped IPv6 address. The
-proxy sends to a participant outside only at the source address of its announcement. This address is
+proxy sends to a participant outside only at the source address of an announcement. This address is
 lost when the LAN relay passes the datagram on.
 
 In the other direction, the proxy tells the relay which addresses are proven: `LIST_MAGIC`, and 16
@@ -22,7 +22,7 @@ _SIZE = 16
 
 
 def wrapped(source: str, datagram: bytes) -> bytes:
-    """A datagram after its source address. Raises ValueError if ``source`` is not an address."""
+    """The source address, then a datagram. Raises ValueError if ``source`` is not an address."""
     return _packed(source) + datagram
 
 
@@ -34,7 +34,7 @@ def unwrapped(data: bytes) -> tuple[str, bytes]:
 
 
 def address_lists(addresses: Iterable[str]) -> Iterator[bytes]:
-    """Yield lists of addresses, each for one datagram.
+    """Yield lists of addresses, a list for each datagram.
 
     Raises ValueError if an item is not an address.
     """

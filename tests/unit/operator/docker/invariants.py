@@ -184,7 +184,7 @@ class Invariants:
         return wanted
 
     def check_routers(self, wanted: dict[tuple[int, Key], set[str]]) -> None:
-        """Each network namespace has a port of the proxy of its own."""
+        """Each network namespace has a separate port of the proxy."""
         runs = [(box, own) for box, own in self.own("running", role=ROLE_PROXY) if own.key == ZENOH]
         for proxy, own in runs:
             box = self.engine.home(proxy)
@@ -198,7 +198,7 @@ class Invariants:
             assert len({target.port for target in leads}) == len(leads) == len(wanted)
 
     def check_redirects(self, live: list[Member]) -> None:
-        """Only containers with an address in ROS_MASTER_URI have a redirect, to their proxy."""
+        """Only containers with an address in ROS_MASTER_URI have a redirect, to the right proxy."""
         boxes = {box.id: box for box in self.engine.boxes}
         routers = self.routers_wanted(live)
         self.check_routers(routers)
@@ -274,7 +274,7 @@ class Invariants:
     def check_lan_relay(
         self, lan_relay: Box, hears: OwnLabels, sandbox: Box, near: HostPort
     ) -> None:
-        """The LAN relay runs, and knows the address of its proxy."""
+        """The LAN relay runs, and knows the address of the proxy."""
         assert lan_relay.state in ("running", "restarting")
         assert self.is_named(lan_relay, lan_relay_name(hears.key))
         if self.engine.image:

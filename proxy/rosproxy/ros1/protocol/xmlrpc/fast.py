@@ -97,7 +97,7 @@ class _NotPlain(Exception):
 
 
 def call(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, list[Value]] | None:
-    """The method and parameters of a ``methodCall``; None if it does not have the plain form."""
+    """The method and parameters of a ``methodCall``; None without the plain form."""
     head = _CALL.match(body)
     if head is None or not _is_plain(body, limits):
         return None
@@ -106,13 +106,13 @@ def call(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, list[Value]] | N
 
 
 def method_of_scalars(body: bytes) -> str | None:
-    """The method of a plain call all of whose parameters are texts and numbers, else None."""
+    """The method of a plain call with only texts and numbers as parameters, else None."""
     match = _SCALARS_CALL.match(body)
     return match[1].decode() if match else None
 
 
 def methods_of_multicall(body: bytes) -> set[str] | None:
-    """The methods in a plain multicall all of whose parameters are scalars or lists of such.
+    """The methods in a plain multicall with only scalars and lists of scalars as parameters.
 
     None for any other document.
     """

@@ -1,6 +1,6 @@
-"""``system.multicall``: many calls in one, ``[{methodName: string, params: array}, …]``.
+"""``system.multicall``: many calls in a single call, ``[{methodName: string, params: array}, …]``.
 
-Each success comes back as a one-element array, each failure as a bare fault struct
+The result of a success is an array with a single element, the result of a failure a fault struct
 (https://mirrors.talideon.com/articles/multicall.html).
 """
 
@@ -20,8 +20,8 @@ from rosproxy.ros1.protocol.xmlrpc.values import Edit
 
 MULTICALL = "system.multicall"
 MOST_CALLS = 1000
-"""The highest number of calls in a multicall. The proxy admits these calls, or sends them to a
-node, one after the other. Only roslaunch and the proxy itself (a hundred at once) send multicalls.
+"""The highest number of calls in a multicall. The proxy admits these calls in order, or sends the
+calls to a node in order. Only roslaunch and the proxy itself (a hundred at once) send multicalls.
 The multicalls of roslaunch set parameters; from 64 KiB on they pass without a count (`passing`)."""
 
 
@@ -69,7 +69,7 @@ def fault_value(code: int, message: str) -> bytes:
 
 
 def results_reply(results: Iterable[bytes]) -> bytes:
-    """The ``methodResponse`` of a multicall from its results, each a raw value."""
+    """The ``methodResponse`` of a multicall with these results, which are raw values."""
     params = b"<params><param>%b</param></params>" % _array(results)
     return b"<?xml version='1.0'?><methodResponse>%b</methodResponse>" % params
 

@@ -4,14 +4,14 @@ The proxy reads the method from the head of the document, in the form of ROS's c
 reads a document with another head as a whole, within `limits`. While the rest of the document
 passes, the proxy only watches for a second method name. The master or a node must not find a method
 that the proxy has not judged. The proxy holds the last piece back until the whole document has been
-watched. So no program acts on a refused document, because rosmaster and nodes read a body to the
-end before they parse it.
+watched. So no program acts on a refused document, because rosmaster and nodes parse a body only
+after the whole body has arrived.
 
 roslaunch sets parameters by ``system.multicall``. expat parses such a call piece by piece, and the
 call passes if each inner call may pass. The document has to follow the grammar strictly. Python's
-Unmarshaller (xmlrpc/client.py) has a stack and no grammar, so it could find another method in a
-document with another structure. A regular expression accepts the usual document in a twentieth of
-the time (`fast.methods_of_multicall`).
+Unmarshaller (xmlrpc/client.py) has a stack and no grammar, so the Unmarshaller could find another
+method in a document with another structure. A regular expression accepts the usual document in a
+twentieth of the time (`fast.methods_of_multicall`).
 """
 
 import re
@@ -35,7 +35,8 @@ DEPTH = 64
 """The highest number of nested elements in a multicall, as in `Limits`."""
 LONGEST_MARKUP = 64 * 1024
 """Bytes of a tag, comment or processing instruction in a multicall. expat buffers such markup until
-it is complete. Before version 2.6, expat starts again at the beginning with each new piece."""
+the markup is complete. Before version 2.6, expat starts again at the beginning with each new
+piece."""
 LONGEST_NAMES = 4096
 """Characters of all names of elements and attributes in a multicall, each name counted once. The
 parser keeps the names until the end of the document. XML-RPC has 20 names."""
@@ -63,12 +64,12 @@ _STRING_PARAM = re.compile(
 # UTF-16, which expat recognizes by itself. A search for bytes finds no name in UTF-16.
 _FORBIDDEN = re.compile(rb"[<:]methodName[\s/>]|<!DOCTYPE|<!ENTITY|\0")
 _HINTS = (b"methodName", b"<!DOCTYPE", b"<!ENTITY", b"\0")
-"""Each forbidden text has one of these. A search for these first takes a hundredth of the time."""
+"""Each forbidden text contains a hint. A search for hints first takes a hundredth of the time."""
 _NESTING = re.compile(rb"<(/?)(?:array|struct)>")
 _LONGEST = len(b"<methodName>")
 """Bytes of the longest text in the search."""
 NESTED = 20
-"""The highest number of nested arrays and structs. XmlRpc++ uses its stack for each."""
+"""The highest number of nested arrays and structs. XmlRpc++ recurses for each level."""
 
 _LEVELS = (
     {"methodCall"},
@@ -93,13 +94,13 @@ _PARAMS = ["name:params", "value", "array"]
 
 
 def method_of(head: bytes) -> str | None:
-    """The method of a call, from the head of its document; None if the head does not tell it."""
+    """The method of a call, from the head of the document; None if the head has no method."""
     match = _HEAD.match(head, 0, HEAD)
     return match[2].decode() if match else None
 
 
 def first_strings(head: bytes, count: int) -> list[str | None]:
-    """The first ``count`` parameters of a call, from the head of its document.
+    """The first ``count`` parameters of a call, from the head of the document.
 
     From the first parameter on that is no plain string, or not in the head, all elements are None.
     """
@@ -118,13 +119,13 @@ def first_strings(head: bytes, count: int) -> list[str | None]:
 
 
 def status_of(head: bytes) -> int | None:
-    """The ROS status of a reply, from its head; None if the head does not tell it."""
+    """The ROS status of a reply, from the head; None if the head has no status."""
     match = _STATUS.match(head, 0, HEAD)
     return int(match[2]) if match else None
 
 
 class CallWatch:
-    """Watches a passing document, from its head on."""
+    """Watches a passing document, from the head on."""
 
     def __init__(self) -> None:
         self._tail: bytes | None = None
@@ -157,7 +158,7 @@ class CallWatch:
         """End the watch after the last piece. Raises XmlRpcError if the document is incomplete."""
 
     def passes(self, _body: bytes) -> bool:
-        """Whether a whole document passes at a glance; it is watched otherwise."""
+        """Whether a whole document may pass without a watch."""
         return False
 
 

@@ -33,7 +33,7 @@ class Edit(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class Value:
-    """A ``<value>``: its kind, its place in the document, and its content.
+    """A ``<value>``: the kind, the place in the document, and the content.
 
     ``outer`` spans the whole element, ``inner`` the text of a scalar; both are byte offsets.
     ``members`` are the names of a struct's members, in the order of ``items``. ``encoding`` is the

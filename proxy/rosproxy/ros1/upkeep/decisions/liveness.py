@@ -96,11 +96,11 @@ def lease_lasts(endpoint: Endpoint, linger: float) -> float:
 
 
 def dead_endpoints(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint]:
-    """The endpoints at addresses that are gone whose node does not answer.
+    """The endpoints at addresses that have gone, if the node does not answer.
 
     If a node answers, the address is in use again, or the report was late. A silent node stays if
     the node has registered at or after ``since``, or is registering. The reason: a restarted
-    container has its old address, and a node that is starting may need some time to answer.
+    container has the old address, and a starting node may need some time to answer.
     """
 
     def is_spared(endpoint: Endpoint) -> bool:
@@ -117,7 +117,7 @@ def dead_endpoints(answers: Mapping[Endpoint, ProbeResult], since: float) -> lis
 def movable(
     endpoints: Iterable[Endpoint], moved: Mapping[str, str], networks: Sequence[Network]
 ) -> dict[Endpoint, str]:
-    """The endpoints whose address has changed, with the new address if this is inside."""
+    """The endpoints with a changed address, each with the new address, if inside."""
     moves = {e: moved.get(e.location.address, "") for e in endpoints}
     return {
         e: new for e, new in moves.items() if new != e.location.address and is_inside(new, networks)

@@ -1,7 +1,7 @@
-"""Which participant gives its place to a new participant, so that no source takes all places.
+"""Which participant ends in favour of a new participant, so that no source takes all places.
 
-There are two kinds of places, for proven participants and for all others, whose sources may be
-forged. A participant takes no place of the other kind. Proven places are shared out fairly among
+There are places for proven participants, and places for unproven participants with perhaps forged
+sources. A participant takes no place of the other kind. Proven places are shared out fairly among
 *owners*. The owner of an address is the address itself, or its subnet.
 """
 
@@ -18,7 +18,7 @@ def oldest_unproven(unproven: Sequence[AnyParticipant], most: int) -> AnyPartici
     """The unproven participant that ends in favour of a new participant; None if there is room.
 
     There is room for ``most`` participants. The oldest ends, because this participant has had the
-    longest time to prove its address. ``unproven`` are in order of arrival.
+    longest time to prove an address. ``unproven`` are in order of arrival.
     """
     return unproven[0] if len(unproven) >= most else None
 
