@@ -128,7 +128,7 @@ def ports(abused: Abused, participant: Participant) -> list[int]:
 
 
 async def serve_and_restart(abused: Abused, good: Reader, robot: Participant) -> list[int]:
-    """Serve a pair until both keep the ports, then restart the proxy. Return the ports."""
+    """Serve a pair until the ports are kept, then restart the proxy. Return the ports."""
     good.meta.settimeout(0.1)
     meta, user = served(good, robot, b"before")
     good.meta.setblocking(False)
