@@ -11,10 +11,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOTS = ("proxy", "operator", "examples", "scripts", "tests", "charts", "docs")
-NOT_YET_REWRITTEN = frozenset(
-    Path(__file__).with_name("not_yet_rewritten.txt").read_text().splitlines()
-)
-"""Files with sentences from before the rules. The list only shrinks."""
 RIDDLES = re.compile(
     r"\b(?:somebody|nobody|anybody|everybody|whoever|whom)\b"
     r"|\b(?:of|to|by|for|from|that|and|where|if) who\b|, who\b"
@@ -72,15 +68,8 @@ def riddles(path: Path) -> list[str]:
 def test_texts_name_what_they_speak_of() -> None:
     own = Path(__file__).resolve()  # it has examples of riddles
     files = [path for path in (*python_files(), *pages()) if path != own]
-    told = {str(path.relative_to(ROOT)): riddles(path) for path in files}
-    new = [
-        riddle for name, found in told.items() if name not in NOT_YET_REWRITTEN for riddle in found
-    ]
     # Name the node, the container, the caller or the reader instead.
-    assert not new
-    rewritten = {name for name in NOT_YET_REWRITTEN if not told.get(name)}
-    # These have none any more: take them out of not_yet_rewritten.txt.
-    assert not rewritten
+    assert not [riddle for path in files for riddle in riddles(path)]
 
 
 @pytest.mark.parametrize(
