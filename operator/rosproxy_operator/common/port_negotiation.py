@@ -173,11 +173,11 @@ def negotiate(
 
     ``blocked`` are single ports that are not free, ``ranges`` whole ranges. Raises PortsExhausted.
     """
-    gaps = list(_gaps(window, blocked, ranges))
-    for gap in gaps:
+    free = list(gaps(window, blocked, ranges))
+    for gap in free:
         if len(gap) >= count:
             return PortRange(gap.first, gap.first + count - 1)
-    raise PortsExhausted(count, window, [len(gap) for gap in gaps])
+    raise PortsExhausted(count, window, [len(gap) for gap in free])
 
 
 def is_free(ports: PortRange, blocked: Collection[int], ranges: Iterable[PortRange] = ()) -> bool:
@@ -195,10 +195,10 @@ def within(inner: PortRange, outer: PortRange) -> bool:
     return outer.first <= inner.first and inner.last <= outer.last
 
 
-def _gaps(
+def gaps(
     window: PortRange, blocked: Collection[int], ranges: Iterable[PortRange]
 ) -> Iterator[PortRange]:
-    """Yield the free stretches of a window, in order."""
+    """Yield the stretches of a window without blocked ports and other ranges, in order."""
     intervals = [(port, port) for port in blocked] + [(ports.first, ports.last) for ports in ranges]
     first = window.first
     for start, end in sorted(intervals):

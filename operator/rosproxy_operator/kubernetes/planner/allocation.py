@@ -4,7 +4,8 @@ A proxy keeps its present or former range as long as the RosProxy allows the ran
 free. The state and the status of the RosProxy name former ranges. On each node, proxies that have
 ports come first, then proxies that had ports, then new proxies. A hostPort is taken if any pod of
 the node has the port, also a foreign pod. `state` says which ports were refused recently, and which
-proxies had to leave a range.
+proxies had to leave a range. A new range has ports of stand-ins only if no other range is free,
+because the NetworkPolicy opens a range to all sources.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -17,6 +18,7 @@ from rosproxy_operator.common.port_negotiation import (
     PortsExhausted,
     RangeWish,
     fill,
+    gaps,
     is_free,
     keep,
     overlap,
@@ -31,6 +33,7 @@ from rosproxy_operator.kubernetes.planner.cluster_view import (
     place_of,
     serves,
 )
+from rosproxy_operator.kubernetes.planner.stand_ins import STAND_INS, stand_in_protocols
 from rosproxy_operator.kubernetes.planner.state import ClusterState, host_ports_of
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPod
 from rosproxy_operator.kubernetes.resources.model import (
@@ -135,7 +138,7 @@ class _Node(msgspec.Struct):
             kernel,
             held=allowed[0] if is_held else None,
             former=tuple(FormerRange(r, taken) for r in allowed),
-            avoided=[*filter(None, others)],
+            avoided=[*filter(None, others), *_avoided_stand_ins(spec)],
         )
 
     def _past(self, place: ProxyPlace) -> Iterator[PortRange]:
@@ -232,3 +235,13 @@ class _Node(msgspec.Struct):
         # The proxy itself listens on these ports, and a hostPort has the container port's number.
         ros2_ports = well_known_ports(spec.ros2.number) if spec.ros2 else frozenset[int]()
         return {MASTER_PORT, ADMIN_PORT, spec.master.publish, *ros2_ports}
+
+
+def _avoided_stand_ins(spec: RosProxySpec) -> list[PortRange]:
+    """Return the ports of stand-ins that a new range avoids, if possible.
+
+    If all ranges of the window have such ports, no range is better, and the list is empty.
+    """
+    others = gaps(spec.window, (), [STAND_INS])
+    has_choice = any(len(ports) >= spec.ports for ports in others)
+    return [STAND_INS] if has_choice and stand_in_protocols(spec) else []

@@ -11,7 +11,7 @@ from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, PodFailure
-from rosproxy_operator.kubernetes.resources.model import MasterSpec, ProxyPlace
+from rosproxy_operator.kubernetes.resources.model import MasterSpec, ProxyPlace, Ros2Spec
 from tests.unit.operator.kubernetes.objects import (
     RANGE,
     ROBOT,
@@ -109,6 +109,34 @@ def test_former_ports_of_another_rosproxy_are_left_alone_if_there_are_others(
 ) -> None:
     arm = rosproxy("arm", former_ranges={"one": RANGE})
     assert created(look(two(B, arm=arm, robot=rosproxy(**changes)))) == str(ports)
+
+
+@pytest.mark.parametrize(
+    ("changes", "window", "others", "ports"),
+    [
+        ({}, (20_000, 40_000), [], "20000-20003"),
+        ({"direction": "both"}, (19_999, 40_000), [], "32768-32771"),
+        ({"ros2": Ros2Spec()}, (19_999, 40_000), [], "32768-32771"),
+        # without other free ports
+        ({"direction": "both"}, (20_000, 20_019), [], "20000-20003"),
+        ({"direction": "both"}, (19_996, 20_019), [pod("web", ports=[19_998])], "19999-20002"),
+    ],
+)
+def test_a_new_range_avoids_ports_of_stand_ins_if_possible(
+    changes: dict, window: tuple[int, int], others: list, ports: str
+) -> None:
+    of = rosproxy(window=PortRange(*window), **changes)
+    settings = replace(
+        SETTINGS, node_ports=PortRange(50_000, 50_001), ephemeral=PortRange(50_002, 50_003)
+    )
+    assert created(look(scene(*others, of=of), settings=settings)) == ports
+
+
+def test_a_running_proxy_keeps_a_range_with_ports_of_stand_ins() -> None:
+    of = rosproxy(window=PortRange(11400, 29_999), direction="both")
+    ports = PortRange(20_000, 20_003)
+    plan = look(scene(proxy(of, ports=ports), of=of))
+    assert (done(plan), plan.state.given[ROBOT_ON_ONE]) == ([], ports)
 
 
 def test_without_free_ports_the_finding_names_the_holders_and_the_fix() -> None:

@@ -14,7 +14,14 @@ from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy, wanted_policies
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPolicy
-from rosproxy_operator.kubernetes.resources.model import Json, MasterSpec, Name, RosProxy, Selector
+from rosproxy_operator.kubernetes.resources.model import (
+    Json,
+    MasterSpec,
+    Name,
+    Ros2Spec,
+    RosProxy,
+    Selector,
+)
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
     SETTINGS,
@@ -22,6 +29,8 @@ from tests.unit.operator.kubernetes.objects import (
     done,
     node,
     observed,
+    pod,
+    proxy,
     rosproxy,
     service,
     site,
@@ -192,6 +201,52 @@ def test_the_ports_that_stand_in_for_outside_are_for_selected_pods() -> None:
     ]
     assert pods["ports"] == [{"protocol": "TCP", "port": 11311}, *stand_ins]
     assert not [port for port in stand_ins if port in everybody["ports"]]
+
+
+NEAR_STAND_INS = PortRange(19_990, 20_009)
+
+
+@pytest.mark.parametrize(
+    ("changes", "ranges", "ports"),
+    [
+        ({}, [], [("TCP", 19_990, 20_009)]),
+        ({"direction": "both"}, [], [("TCP", 19_990, 19_999)]),
+        ({"ros1": False, "ros2": Ros2Spec()}, [], [("UDP", 19_990, 19_999)]),
+        # ROS 1 has no stand-ins here
+        ({"ros2": Ros2Spec()}, [], [("TCP", 19_990, 20_009), ("UDP", 19_990, 19_999)]),
+        ({"direction": "both"}, [PortRange(20_002, 20_005)],
+         [("TCP", 19_990, 19_999), ("TCP", 20_002, 20_005)]),
+        ({"direction": "both"}, [PortRange(19_998, 20_001)], [("TCP", 19_990, 20_001)]),
+    ],
+)  # fmt: skip
+def test_a_window_opens_ports_of_stand_ins_only_for_present_ranges(
+    changes: dict[str, Any], ranges: list[PortRange], ports: list[tuple[str, int, int]]
+) -> None:
+    made = policy(rosproxy(window=NEAR_STAND_INS, **changes), ON, ranges)
+    first, *_ = made["spec"]["ingress"]
+    assert [(p["protocol"], p["port"], p["endPort"]) for p in first["ports"]] == ports
+
+
+def test_a_window_of_stand_ins_alone_opens_nothing_until_a_proxy_has_a_range() -> None:
+    """A rule without ports would open all ports of the proxies."""
+    of = rosproxy(window=PortRange(20_000, 20_019), direction="both")
+    assert ["from" in rule for rule in policy(of, ON)["spec"]["ingress"]] == [True, True]
+    created, *_ = done(look(observed(of, service(of), pod())))
+    assert isinstance(created, CreatePolicy)
+    public_ports = created.body["spec"]["ingress"][0]["ports"]
+    assert public_ports == [{"protocol": "TCP", "port": 20_000, "endPort": 20_003}]
+
+
+def test_a_running_proxy_keeps_an_open_range_of_stand_ins() -> None:
+    of = rosproxy(window=NEAR_STAND_INS, direction="both")
+    ports = PortRange(20_002, 20_005)
+    seen = observed(of, service(of), pod(), proxy(of, ports=ports, settings=ON))
+    created, *others = done(look(seen))
+    assert isinstance(created, CreatePolicy)
+    assert others == []
+    assert created.body["spec"] == policy(of, ON, [ports])["spec"]
+    unwanted = done(look(replace(seen, pods=())))
+    assert unwanted == [created]
 
 
 def test_the_window_is_open_for_datagrams_where_they_are_asked_for() -> None:

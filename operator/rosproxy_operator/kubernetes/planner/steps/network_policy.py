@@ -13,19 +13,19 @@ because Kubernetes always lets a node reach its own pods (``NetworkPolicySpec`` 
 networking/v1).
 
 The policy opens all of ``spec.portWindow``, not only the present ranges, so the ports of a new
-proxy are open at once. The proxy's own ports are left out, but not the ports of stand-ins (20000 to
-32767), which the window may contain.
+proxy are open at once. The proxy's own ports are left out. If the proxies have stand-ins, the ports
+of stand-ins (20000 to 32767) are left out as well, except for the present ranges.
 
 `pods_policy` says what the selected pods may reach, and exists only with ``podEgress: Proxy``. The
 pods reach only the proxies, each other and DNS servers. So all traffic between these pods and
 outside goes through the proxy, which enforces the rules.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
-from rosproxy.ros1.registry.stand_ins import PORTS as STAND_IN_PORTS
+from rosproxy_operator.common.port_negotiation import gaps
 from rosproxy_operator.common.ros2 import discovery_port, well_known_ports
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
@@ -36,6 +36,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
 from rosproxy_operator.kubernetes.planner.manifests import metadata
 from rosproxy_operator.kubernetes.planner.pods.selection import LABEL_OFF_VALUES, own_values
 from rosproxy_operator.kubernetes.planner.retries import Task
+from rosproxy_operator.kubernetes.planner.stand_ins import STAND_INS, stand_in_protocols
 from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPolicy
 from rosproxy_operator.kubernetes.resources.model import Json, Name, RosProxy
@@ -53,13 +54,15 @@ from rosproxy_operator.kubernetes.settings import ClusterSettings
 _OFF = "the operator has --no-network-policy"
 
 
-def policy(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
-    """The NetworkPolicy of a RosProxy's proxies."""
+def policy(
+    rosproxy: RosProxy, settings: ClusterSettings, ranges: Collection[PortRange] = ()
+) -> Json:
+    """The NetworkPolicy of a RosProxy's proxies, which have these ranges."""
     return {
         "apiVersion": "networking.k8s.io/v1",
         "kind": "NetworkPolicy",
         "metadata": metadata(rosproxy, policy_id(rosproxy.id), {}),
-        "spec": _spec(rosproxy, settings),
+        "spec": _spec(rosproxy, settings, ranges),
     }
 
 
@@ -84,11 +87,13 @@ def pods_policy(rosproxy: RosProxy) -> Json:
     }
 
 
-def wanted_policies(rosproxy: RosProxy, settings: ClusterSettings) -> dict[Name, Json]:
-    """The NetworkPolicies that a RosProxy needs, by name."""
+def wanted_policies(
+    rosproxy: RosProxy, settings: ClusterSettings, ranges: Collection[PortRange] = ()
+) -> dict[Name, Json]:
+    """The NetworkPolicies that a RosProxy needs, by name. ``ranges`` are those of its proxies."""
     if not settings.network_policy:
         return {}
-    wanted = {policy_id(rosproxy.id): policy(rosproxy, settings)}
+    wanted = {policy_id(rosproxy.id): policy(rosproxy, settings, ranges)}
     if rosproxy.spec.pod_egress == "proxy":
         wanted[pods_policy_id(rosproxy.id)] = pods_policy(rosproxy)
     return wanted
@@ -101,7 +106,7 @@ def reconcile_policies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[
     """
     if context.observed.policies_error:
         return
-    wanted = wanted_policies(rosproxy, context.settings)
+    wanted = wanted_policies(rosproxy, context.settings, _ranges(context, rosproxy))
     existing = {name: p for name, p in context.observed.policies.items() if p.of == rosproxy.id}
     for current in existing.values():
         if current.owner != rosproxy.uid:
@@ -111,6 +116,14 @@ def reconcile_policies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[
             yield from _delete(context, current, "spec.podEgress is not Proxy" if on else _OFF)
     for name, body in wanted.items():
         yield from _keep(context, rosproxy, body, existing.get(name))
+
+
+def _ranges(context: ClusterContext, rosproxy: RosProxy) -> set[PortRange]:
+    """The ranges that the proxies of a RosProxy have, or get by this plan."""
+    places = context.view.places.get(rosproxy.id, ())
+    present = (proxy.range for place in places for proxy in context.view.proxies.get(place, ()))
+    given = context.ranges.given
+    return {*present, *(given[place] for place in places if place in given)}
 
 
 def _keep(
@@ -145,7 +158,7 @@ def _delete(context: ClusterContext, current: ProxyPolicy, why: str) -> Iterator
         yield DeletePolicy(current.of, current.id, current.uid, why)
 
 
-def _spec(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
+def _spec(rosproxy: RosProxy, settings: ClusterSettings, ranges: Collection[PortRange]) -> Json:
     """The spec of a policy, in the form in which the API server returns the spec.
 
     `_keep` compares this spec with the existing spec. With another form, the operator would correct
@@ -154,42 +167,35 @@ def _spec(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
     admin: dict[str, Any] = {"ports": [_port(ADMIN_PORT)]}
     if settings.admin_from is not None:
         admin["from"] = [dict(peer) for peer in settings.admin_from]
+    public_ports = [*_public_ports(rosproxy, ranges)]
     return {
         "podSelector": {"matchLabels": own_labels(rosproxy.id.name)},
         "policyTypes": ["Ingress"],
         "ingress": [
-            {"ports": [*_public_ports(rosproxy)]},
+            # A rule with an empty list of ports would open all ports.
+            *([{"ports": public_ports}] if public_ports else []),
             {"ports": [*_pod_ports(rosproxy)], "from": [{"podSelector": _pod_selector(rosproxy)}]},
             admin,
         ],
     }
 
 
-def _public_ports(rosproxy: RosProxy) -> Iterator[Json]:
+def _public_ports(rosproxy: RosProxy, ranges: Collection[PortRange]) -> Iterator[Json]:
     """The ports for any source: the window and a published master, without the proxy's own ports.
 
-    The own ports are the master port, the admin port and the well-known ports of ROS 2.
+    The own ports are the master port, the admin port, the well-known ports of ROS 2, and the ports
+    of stand-ins outside ``ranges``.
     """
     ros2_ports = well_known_ports(rosproxy.spec.ros2.number) if rosproxy.spec.ros2 else ()
     own_ports = (MASTER_PORT, ADMIN_PORT, *ros2_ports)
     for protocol in _protocols(rosproxy):
-        for first, last in _ranges_without(rosproxy.spec.window, own_ports):
-            yield _port(first, last, protocol)
+        has_stand_ins = protocol in stand_in_protocols(rosproxy.spec)
+        stand_ins = [*gaps(STAND_INS, (), ranges)] if has_stand_ins else []
+        for ports in gaps(rosproxy.spec.window, own_ports, stand_ins):
+            yield _port(ports.first, ports.last, protocol)
     publish = rosproxy.spec.master.publish
     if publish and publish not in rosproxy.spec.window:
         yield _port(publish)
-
-
-def _ranges_without(window: PortRange, excluded: Iterable[int]) -> Iterator[tuple[int, int]]:
-    """Yield the first and the last port of each range of a window without the excluded ports."""
-    first = window.first
-    for port in sorted(excluded):
-        if first <= port <= window.last:
-            if first < port:
-                yield first, port - 1
-            first = port + 1
-    if first <= window.last:
-        yield first, window.last
 
 
 def _protocols(rosproxy: RosProxy) -> list[str]:
@@ -199,12 +205,10 @@ def _protocols(rosproxy: RosProxy) -> list[str]:
 def _pod_ports(rosproxy: RosProxy) -> Iterator[Json]:
     if rosproxy.spec.ros1:
         yield _port(MASTER_PORT)
-        if rosproxy.spec.proxy.direction == "both":
-            yield _port(STAND_IN_PORTS[0], STAND_IN_PORTS[-1])
     if rosproxy.spec.ros2:
         yield _port(discovery_port(rosproxy.spec.ros2.number), protocol="UDP")
-    if rosproxy.spec.ros2 or rosproxy.spec.proxy.direction == "both":
-        yield _port(STAND_IN_PORTS[0], STAND_IN_PORTS[-1], "UDP")
+    for protocol in stand_in_protocols(rosproxy.spec):
+        yield _port(STAND_INS.first, STAND_INS.last, protocol)
 
 
 def _port(first: int, last: int = 0, protocol: str = "TCP") -> Json:
