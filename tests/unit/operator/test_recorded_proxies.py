@@ -16,6 +16,7 @@ import msgspec
 import pytest
 
 from rosproxy.access.rules import parse_rules
+from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import ProxyBounds
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
@@ -125,6 +126,11 @@ KUBERNETES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
             "udp": True,
             "policy": {"rules": RULES},
         },
+    ),
+    # The fingerprint has the former range for outgoing connections: `manifests._FORMER_LOCAL_PORTS`
+    "high ports": (
+        {"ephemeral": PortRange(61000, 65535)},
+        {"ros": 2, "portWindow": {"first": 40000, "last": 49999}},
     ),
 }
 """By name: the options of the operator, and the spec of the RosProxy."""

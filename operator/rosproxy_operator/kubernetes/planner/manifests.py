@@ -1,7 +1,7 @@
 """The Kubernetes objects that the operator creates, as JSON for the API server."""
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 import msgspec
@@ -10,8 +10,9 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.policy import AWAITED, as_variable
-from rosproxy_operator.common.port_negotiation import overlap
+from rosproxy_operator.common.port_negotiation import LAST_PORT, gaps, is_free
 from rosproxy_operator.common.ros2 import discovery_port, well_known_ports
+from rosproxy_operator.kubernetes.planner.stand_ins import STAND_INS
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     Json,
@@ -61,13 +62,14 @@ _TAINTS = (
 
 ``AddOrUpdateDaemonPodTolerations`` in k8s.io/kubernetes, pkg/controller/daemon/util.
 """
-_LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999), PortRange(12000, 30000))
+_LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999))
 """Ranges from which Linux may take the source ports of a proxy's outgoing connections.
 
 A pod gets the first range without the ports on which the proxy has to listen (`_local_ports`).
-Ports of stand-ins do not count.
 """
-
+_FORMER_LOCAL_PORTS = (*_LOCAL_PORTS, PortRange(12000, 30000))
+"""The ranges of former operators, for the fingerprint. The last range has ports of stand-ins."""
+_UNPRIVILEGED_PORTS = PortRange(1024, LAST_PORT)
 
 _FINGERPRINTS: dict[Name, tuple[object, str]] = {}
 """Cache of `proxy_fingerprint`, by the name of the pod: the inputs, and the fingerprint."""
@@ -145,14 +147,17 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     # The operator also sends new peers to a running proxy. Peers come and go with the nodes.
     live = {*LIVE_VARIABLES, variable("ros2_peer")}
     env = [v for v in container["env"] if v["name"] not in live]
-    spec = {**_spec(site, settings), "containers": [{**container, "image": "", "env": env}]}
+    # A correction of the ports for outgoing connections recreates no running proxy.
+    former_spec = _spec(site, settings, _former_local_ports(site))
+    spec = {**former_spec, "containers": [{**container, "image": "", "env": env}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
     ros2 = rosproxy.spec.ros2
     graph = f"{site.master.uri}{f' domain {ros2.number}' if ros2 else ''} {site.advertise_host}"
     identity = hashlib.sha256(graph.encode()).hexdigest()[:8]
     # The digest is of the pod without the fingerprint annotation, which is added only now.
     meta["annotations"][FINGERPRINT] = f"{digest(body)}-{identity}"
-    return {**body, "spec": {**spec, "containers": [container]}}
+    own_spec = _spec(site, settings, _local_ports(site))
+    return {**body, "spec": {**own_spec, "containers": [container]}}
 
 
 def proxy_fingerprint(site: ProxySite, settings: ClusterSettings) -> str:
@@ -293,13 +298,17 @@ def helper_pod(
     return body
 
 
-def _spec(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
-    """The spec of a proxy's pod, without the container."""
+def _spec(site: ProxySite, settings: ClusterSettings, local_ports: PortRange) -> dict[str, Any]:
+    """The spec of a proxy's pod, without the container.
+
+    Outgoing connections get their source ports from ``local_ports``.
+    """
     spec = site.rosproxy.spec
     aliases = [dict(alias) for alias in spec.host_aliases]
     # A safe sysctl, which every kubelet allows: k8s.io/kubernetes,
     # pkg/kubelet/sysctl/safe_sysctls.go.
-    sysctls = [{"name": "net.ipv4.ip_local_port_range", "value": _local_ports(site)}]
+    value = f"{local_ports.first} {local_ports.last}"
+    sysctls = [{"name": "net.ipv4.ip_local_port_range", "value": value}]
     return {
         **bound_to(site.node.name, spec, settings),
         "terminationGracePeriodSeconds": STOPS_WITHIN,
@@ -350,15 +359,33 @@ def bound_to(node: str, spec: RosProxySpec, settings: ClusterSettings) -> dict[s
     }
 
 
-def _local_ports(site: ProxySite) -> str:
-    """The value of the sysctl: the first range of `_LOCAL_PORTS` that fits, else the first."""
+def _local_ports(site: ProxySite) -> PortRange:
+    """The ports for outgoing connections: the first range of `_LOCAL_PORTS` that fits.
+
+    If none fits, the longest range without ports on which the proxy listens, stand-ins included.
+    """
+    used = _fixed_ports(site)
+    free = gaps(_UNPRIVILEGED_PORTS, (), [*used, STAND_INS])
+    longest = max(free, key=len, default=_LOCAL_PORTS[0])
+    return _first_fitting(_LOCAL_PORTS, used) or longest
+
+
+def _former_local_ports(site: ProxySite) -> PortRange:
+    """The ports that former operators gave to outgoing connections."""
+    used = _fixed_ports(site)
+    return _first_fitting(_FORMER_LOCAL_PORTS, used) or _FORMER_LOCAL_PORTS[0]
+
+
+def _first_fitting(ranges: Iterable[PortRange], used: Collection[PortRange]) -> PortRange | None:
+    return next((r for r in ranges if is_free(r, (), used)), None)
+
+
+def _fixed_ports(site: ProxySite) -> list[PortRange]:
+    """The ports on which a proxy listens, without the ports of stand-ins."""
     fixed = (MASTER_PORT, ADMIN_PORT, site.master.publish)
     ros2 = site.rosproxy.spec.ros2
     ros2_ports = sorted(well_known_ports(ros2.number)) if ros2 else ()
-    listening = [site.ports, *(PortRange(port, port) for port in (*fixed, *ros2_ports) if port)]
-    free = (r for r in _LOCAL_PORTS if not any(overlap(r, used) for used in listening))
-    ports = next(free, _LOCAL_PORTS[0])
-    return f"{ports.first} {ports.last}"
+    return [site.ports, *(PortRange(port, port) for port in (*fixed, *ros2_ports) if port)]
 
 
 def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:

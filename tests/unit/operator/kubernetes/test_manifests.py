@@ -13,7 +13,7 @@ from rosproxy_operator.common.policy import AWAITED, administrators_policy
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.resources import names, objects
-from rosproxy_operator.kubernetes.resources.model import Json, MasterSpec, Name
+from rosproxy_operator.kubernetes.resources.model import Json, MasterSpec, Name, Ros2Spec
 from tests.run_options import settings_of
 from tests.unit.operator.kubernetes.objects import RANGE, SETTINGS, node, rosproxy, site
 
@@ -188,6 +188,24 @@ def test_without_a_pull_policy_kubernetes_decides() -> None:
 def test_outgoing_connections_start_on_no_port_of_the_range(ports: PortRange, local: str) -> None:
     (sysctl,) = spec(site(rosproxy(), node(), ports))["securityContext"]["sysctls"]
     assert sysctl == {"name": "net.ipv4.ip_local_port_range", "value": local}
+
+
+@pytest.mark.parametrize(
+    ("ports", "domain", "publish", "local"),
+    [
+        (PortRange(40000, 40003), 0, 0, "40004 65535"),
+        (PortRange(40000, 65535), 0, 0, "11313 19999"),
+        (PortRange(11400, 32000), 0, 40000, "40001 65535"),
+        (PortRange(2000, 2003), 102, 0, "32911 65535"),
+    ],
+)
+def test_outgoing_connections_start_on_no_port_of_stand_ins(
+    ports: PortRange, domain: int, publish: int, local: str
+) -> None:
+    """With the former range 12000-30000 a connection could take the port of a stand-in."""
+    of = rosproxy(ros2=Ros2Spec(domain))
+    (sysctl,) = spec(site(of, node(), ports, publish))["securityContext"]["sysctls"]
+    assert sysctl["value"] == local
 
 
 def test_the_master_in_the_cluster_counts_too() -> None:
