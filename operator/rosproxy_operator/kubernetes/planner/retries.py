@@ -77,12 +77,14 @@ class Retries:
         self.noted: dict[Task, RetryRecord] = {}
         self._later: list[float] = []
         self._recent: set[Task] = set()
+        self._delayed: set[Task] = set()
 
     def is_due(self, task: Task) -> bool:
         """Whether to carry out a task now. If so, the try is recorded."""
         record = self._attempts.get(task)
         if record is not None and self._now - record.at < record.pause:
             self.noted[task] = record
+            self._delayed.add(task)
             return False
         count, error = (record.count, record.error) if record else (0, "")
         self.noted[task] = RetryRecord(count + 1, self._now, error=error)
@@ -117,8 +119,12 @@ class Retries:
         return {task.id: record.error for task, record in noted if task.of == of and record.error}
 
     def pauses(self) -> Iterator[float]:
-        """Yield the seconds until each next try, except for tasks with ``effect``."""
+        """Yield the seconds until each next try.
+
+        A task with ``effect`` counts only if the planner has asked for the task, and has to wait.
+        """
         yield from self._later
         for task, record in self.noted.items():
-            if not record.effect and task not in self._recent:
+            is_wanted = not record.effect or task in self._delayed
+            if is_wanted and task not in self._recent:
                 yield max(record.at + record.pause - self._now, 0.0)

@@ -3,6 +3,7 @@
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, CreateService, PatchStatus
+from rosproxy_operator.kubernetes.planner.retries import Retries, RetryRecord, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.model import Name
@@ -23,6 +24,7 @@ from tests.unit.operator.kubernetes.objects import (
 )
 
 PROXY = names.proxy_id(ROBOT, "one")
+EVICTION = Task(ROBOT, "remake", ROBOT)
 
 
 def refusing(name: Name = PROXY, text: str = "violates PodSecurity baseline") -> dict:
@@ -87,6 +89,34 @@ def test_a_proxy_that_ends_is_made_anew_and_not_in_a_tight_loop() -> None:
         memory = plan.state
         now = now + 1.0
     assert 5 <= created <= 12
+
+
+def test_a_delayed_creation_is_due_without_an_event() -> None:
+    """The operator then had no reason to look again until the next resync."""
+    memory = ClusterState()
+    now = 100.0
+    pauses = []
+    for _ in range(10):
+        plan = look(scene(), memory, now)
+        if not done(plan):
+            idle = look(written(scene(), plan), plan.state, now)
+            assert idle.next_look_in is not None
+            pauses.append(idle.next_look_in)
+            now += idle.next_look_in
+            plan = look(scene(), idle.state, now)
+        assert kinds(plan) == [CreateProxy]
+        failed = scene(proxy(phase="Failed"))
+        plan = look(failed, plan.state, now)
+        memory = look(written(failed, plan), plan.state, now).state
+    assert pauses == [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0]
+
+
+def test_a_delayed_eviction_is_due_without_an_event() -> None:
+    retries = Retries({EVICTION: RetryRecord(5, 100.0, effect=True)}, {}, 101.0)
+    retries.note_effect(EVICTION)
+    assert list(retries.pauses()) == []
+    assert not retries.is_due(EVICTION)
+    assert list(retries.pauses()) == [3.0]
 
 
 def test_a_proxy_that_was_well_is_made_anew_at_once_when_it_is_gone() -> None:
