@@ -132,6 +132,8 @@ KUBERNETES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {"ephemeral": PortRange(61000, 65535)},
         {"ros": 2, "portWindow": {"first": 40000, "last": 49999}},
     ),
+    # The fingerprint has the TCP hostPort that former operators gave to the LAN relay's port.
+    "both with multicast": ({}, {"ros": "1,2", "master": MASTER, "multicast": True}),
 }
 """By name: the options of the operator, and the spec of the RosProxy."""
 

@@ -147,9 +147,11 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     # The operator also sends new peers to a running proxy. Peers come and go with the nodes.
     live = {*LIVE_VARIABLES, variable("ros2_peer")}
     env = [v for v in container["env"] if v["name"] not in live]
-    # A correction of the ports for outgoing connections recreates no running proxy.
+    # The digest has the ports of former operators, so a correction recreates no running proxy.
+    former_ports = _container_ports(site, site.ports)
+    former_container = {**container, "image": "", "env": env, "ports": former_ports}
     former_spec = _spec(site, settings, _former_local_ports(site))
-    spec = {**former_spec, "containers": [{**container, "image": "", "env": env}]}
+    spec = {**former_spec, "containers": [former_container]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
     ros2 = rosproxy.spec.ros2
     graph = f"{site.master.uri}{f' domain {ros2.number}' if ros2 else ''} {site.advertise_host}"
@@ -396,9 +398,6 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
     """
     spec = site.rosproxy.spec
     policy = spec.image_pull_policy or settings.image_pull_policy
-    publish = [site.master.publish] if site.master.publish else []
-    host_ports = [("TCP", [*site.ports.ports(), *publish])] if spec.ros1 else []
-    host_ports += [("UDP", [*site.own_ports.ports()])] if spec.takes_udp else []
     always = ("port_range", "master_port", "cleanup_after", "slave_control")
     variables = environment("kubernetes", _told(site, settings), always)
     forwards = spec.proxy.data_plane == "kernel"
@@ -407,11 +406,7 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
         "image": image_of(site.rosproxy, settings),
         **({"imagePullPolicy": policy} if policy else {}),
         "env": [{"name": name, "value": value} for name, value in variables.items()],
-        "ports": [
-            {"containerPort": port, "hostPort": port, "protocol": protocol}
-            for protocol, ports in host_ports
-            for port in ports
-        ],
+        "ports": _container_ports(site, site.own_ports),
         "resources": dict(spec.resources or {}),
         "livenessProbe": _probe("/healthz", 10),
         "readinessProbe": _probe("/readyz", 2),
@@ -424,6 +419,19 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
             "capabilities": {"drop": ["ALL"], **({"add": ["NET_ADMIN"]} if forwards else {})},
         },
     }
+
+
+def _container_ports(site: ProxySite, tcp_ports: PortRange) -> list[Json]:
+    """The hostPorts of a proxy: ``tcp_ports`` for ROS 1, its own ports for UDP, and the master."""
+    spec = site.rosproxy.spec
+    publish = [site.master.publish] if site.master.publish else []
+    host_ports = [("TCP", [*tcp_ports.ports(), *publish])] if spec.ros1 else []
+    host_ports += [("UDP", [*site.own_ports.ports()])] if spec.takes_udp else []
+    return [
+        {"containerPort": port, "hostPort": port, "protocol": protocol}
+        for protocol, ports in host_ports
+        for port in ports
+    ]
 
 
 def _told(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:

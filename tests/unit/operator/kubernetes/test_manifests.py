@@ -102,6 +102,12 @@ def test_ports_for_datagrams_are_those_of_the_range() -> None:
     assert {"name": "ROSPROXY_UDP", "value": "1"} in made["env"]
 
 
+def test_the_port_of_the_lan_relay_is_no_port_of_the_proxy() -> None:
+    made = container(site(rosproxy(ros2=Ros2Spec(multicast=True)), node()))
+    ports = [(port["protocol"], port["hostPort"]) for port in made["ports"]]
+    assert ports == [(kind, port) for kind in ("TCP", "UDP") for port in (11400, 11401, 11402)]
+
+
 def test_it_can_do_nothing_that_it_need_not() -> None:
     pod = spec()
     box = container()
