@@ -73,6 +73,7 @@ class KubernetesController:
 
     `wake` and `dead` are safe in any thread. All other methods belong to the event loop. ``term``
     returns the number of this operator's present term, or 0 if the operator does not lead.
+    ``webhook_since`` returns since when this operator serves the webhook (see `WebhookState`).
     """
 
     def __init__(
@@ -81,12 +82,13 @@ class KubernetesController:
         api: Api,
         metrics: ClusterMetrics,
         term: Callable[[], int] = lambda: 1,
+        webhook_since: Callable[[], str] = lambda: "",
     ) -> None:
         self._settings = settings
         self._api = api
         self._metrics = metrics
         self._term = term
-        self._webhook = WebhookState(settings.webhook is not None, stamp(time.time()))
+        self._webhook_since = webhook_since
         self._acting = 0
         pace = Pace("API server", settings.resync, DEBOUNCE, LONGEST_LOOK)
         self._loop = loop = ControlLoop(pace, metrics)
@@ -219,7 +221,7 @@ class KubernetesController:
             observed,
             reports=self._proxy_sync.reports,
             failures=self._applier.failures,
-            webhook=self._webhook,
+            webhook=WebhookState(self._settings.webhook is not None, self._webhook_since()),
         )
         scope = self._due.due_partition(
             observed, touched.namespaces, touched.nodes, time.monotonic()

@@ -66,16 +66,16 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     metrics = ClusterMetrics()
     election = LeaderElection(api, settings.lease, metrics)
     api.gate.open = election.leads
-    controller = KubernetesController(settings, api, metrics, election.term)
-    webhook = rotation = None
+    rotation = server = None
     if settings.webhook:
-        rotation = CertificateRotation(
-            certificate_source(api, settings.webhook, election.leads), metrics
-        )
+        source = certificate_source(api, settings.webhook, election.leads)
+        rotation = CertificateRotation(source, metrics)
         server = WebhookServer(settings.webhook.bind, rotation)
-        webhook = Injector(api, settings.plan, metrics, controller.wake), server
+    webhook_since = server.serving_since if server else lambda: ""
+    controller = KubernetesController(settings, api, metrics, election.term, webhook_since)
+    webhook = (Injector(api, settings.plan, metrics, controller.wake), server) if server else None
     page = operator_page(controller.documents, logs_command)
-    unready = _first_reason(controller.unready, *([webhook[1].unready] if webhook else []))
+    unready = _first_reason(controller.unready, *([server.unready] if server else []))
     health = HealthServer(metrics.registry, controller.dead, unready, page)
     await health.start(settings.admin)
     log.info(
@@ -96,8 +96,8 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     # Without a Lease object, there is no other operator that could lead.
     if settings.lease and stopped.is_set():
         await hand_over(api, controller, election)
-        if webhook:
-            await _drain(webhook[1], stopped)
+        if server:
+            await _drain(server, stopped)
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, health.stop(), return_exceptions=True)

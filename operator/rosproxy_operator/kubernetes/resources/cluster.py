@@ -174,7 +174,10 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
 
 
 class WebhookState(msgspec.Struct, frozen=True):
-    """Whether the operator serves the webhook, and since when (RFC 3339; empty: unknown)."""
+    """Whether the operator has a webhook, and since when the operator serves the webhook.
+
+    ``since`` is in RFC 3339, and empty while the operator does not serve the webhook.
+    """
 
     served: bool = True
     since: str = ""

@@ -8,6 +8,7 @@ import asyncio
 import json
 import logging
 import ssl
+import time
 from collections.abc import AsyncIterator
 
 import kopf
@@ -17,6 +18,7 @@ from rosproxy.net.addresses import HostPort, plain_address
 from rosproxy.net.bounded_server import IDLE_TIMEOUT
 from rosproxy.net.budget import Budget, Charge, OverBudget
 from rosproxy.net.http_client import TooLong, read_bounded
+from rosproxy_operator.kubernetes.status.events import stamp
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.certificates import KeyPair
 from rosproxy_operator.kubernetes.webhook.injector import NOT_WIRED
@@ -54,7 +56,7 @@ class WebhookServer:
     def __init__(self, bind: HostPort, rotation: CertificateRotation) -> None:
         self._bind = bind
         self._rotation = rotation
-        self._serving = False
+        self._serving_since = ""
         self._draining = False
 
     def unready(self) -> str | None:
@@ -64,9 +66,16 @@ class WebhookServer:
         rollout the leading operator may run without webhook, and ends only when this operator is
         ready.
         """
-        if self._serving or self._rotation.not_made_yet:
+        if self._serving_since or self._rotation.not_made_yet:
             return None
         return "the operator does not serve the webhook yet"
+
+    def serving_since(self) -> str:
+        """Since when this operator serves the webhook, in RFC 3339; empty if it does not serve.
+
+        Any thread may ask.
+        """
+        return self._serving_since
 
     def drain(self) -> None:
         """Close each connection after the next response, because serving ends soon."""
@@ -96,12 +105,12 @@ class WebhookServer:
             bind = self._bind
             listener.start(bind)
             log.info("webhook started: https://%s", bind)
-            self._serving = True
+            self._serving_since = stamp(time.time())
             # kopf needs the URL only for a configuration of its own (`admission.managed`).
             yield kopf.WebhookClientConfig(url=f"https://{bind}")
             await self._exchange(context, pair)
         finally:
-            self._serving = False
+            self._serving_since = ""
             await listener.close()
             await runner.cleanup()
 

@@ -5,9 +5,10 @@ import base64
 import contextlib
 import socket
 import ssl
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -19,7 +20,8 @@ from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api, ApiError
 from rosproxy_operator.kubernetes.resources.model import Name
-from rosproxy_operator.kubernetes.webhook import certificates, rotation
+from rosproxy_operator.kubernetes.status.events import stamp
+from rosproxy_operator.kubernetes.webhook import certificates, rotation, webhook_server
 from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair
 from rosproxy_operator.kubernetes.webhook.rotation import (
     CertificateDirectory,
@@ -358,6 +360,24 @@ async def test_the_renewal_survives_mistakes(caplog: pytest.LogCaptureFixture) -
     await certificate_rotation.refresh()
     assert certificate_rotation.pair is None
     assert "the operator failed: RuntimeError('oops')" in caplog.text
+
+
+async def test_the_server_knows_since_when_it_serves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pod from the time before the first certificate was told that an operator was ready."""
+    monkeypatch.setattr(webhook_server, "time", SimpleNamespace(time=NOW.timestamp))
+    certificate_rotation = CertificateRotation(rotation.CertificateDirectory(""), ClusterMetrics())
+    server = WebhookServer(HostPort("127.0.0.1", 0), certificate_rotation)
+    assert server.serving_since() == ""
+    certificate_rotation.pair = certificates.make(NAMES, NOW)
+
+    async def answer(review: Any, **_: Any) -> Any:
+        return {}
+
+    serving: AsyncGenerator[Any] = cast(Any, server(answer))  # type: ignore[arg-type]
+    await anext(serving)
+    assert server.serving_since() == stamp(NOW.timestamp())
+    await serving.aclose()
+    assert server.serving_since() == ""
 
 
 async def test_the_server_exchanges_its_certificate(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,10 @@ class Running:
         self.term = 1
         api.gate.open = lambda: bool(self.term)
         settings = KubernetesSettings(resync=60.0, key_secret=Name(NAMESPACE, "key"))
-        self.controller = KubernetesController(settings, api, self.metrics, lambda: self.term)
+        self.webhook_since = ""
+        self.controller = KubernetesController(
+            settings, api, self.metrics, lambda: self.term, lambda: self.webhook_since
+        )
         self.task = asyncio.create_task(self.controller.run())
 
     def looks(self, outcome: str = "ok") -> float:
@@ -240,6 +243,23 @@ async def test_a_mistake_of_ours_does_not_end_it(
     assert running.controller.unready() == "the operator failed: RuntimeError('oops')"
     monkeypatch.setattr(module, "plan", real)
     await until(lambda: running.controller.unready() is None)
+
+
+async def test_a_plan_knows_since_when_the_webhook_is_served(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[str] = []
+
+    def planned(observed: ClusterSnapshot, *rest: Any) -> ClusterPlan:
+        seen.append(observed.webhook.since)
+        return plan(observed, *rest)
+
+    monkeypatch.setattr(module, "plan", planned)
+    running.controller.wake()
+    await until(lambda: "" in seen)
+    running.webhook_since = "2026-01-03T00:00:00Z"
+    running.controller.wake()
+    await until(lambda: "2026-01-03T00:00:00Z" in seen)
 
 
 async def test_a_failure_is_in_the_status(server: ApiServer, running: Running) -> None:
