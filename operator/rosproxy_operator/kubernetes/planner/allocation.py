@@ -24,7 +24,7 @@ from rosproxy_operator.common.port_negotiation import (
     overlap,
     within,
 )
-from rosproxy_operator.common.ros2 import well_known_ports
+from rosproxy_operator.kubernetes.planner import proxy_ports
 from rosproxy_operator.kubernetes.planner.cluster_view import (
     View,
     abbreviated,
@@ -33,7 +33,6 @@ from rosproxy_operator.kubernetes.planner.cluster_view import (
     place_of,
     serves,
 )
-from rosproxy_operator.kubernetes.planner.stand_ins import STAND_INS, stand_in_protocols
 from rosproxy_operator.kubernetes.planner.state import ClusterState, host_ports_of
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPod
 from rosproxy_operator.kubernetes.resources.model import (
@@ -42,7 +41,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPlace,
     RosProxySpec,
 )
-from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, MASTER_PORT
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status.findings import finding
 
@@ -121,7 +119,7 @@ class _Node(msgspec.Struct):
     def _wish(self, place: ProxyPlace) -> RangeWish:
         """Return the wish of a proxy for a range, with the ports that are not available."""
         spec = self.view.rosproxies[place.of].spec
-        reserved = self._reserved(spec)
+        reserved = proxy_ports.fixed_ports(spec) | {spec.master.publish}
         kernel = [*self.kernel.values()]
         most = spec.ports - 1
         ranges = [PortRange(r.first, min(r.last, r.first + most)) for r in self._past(place)]
@@ -231,17 +229,12 @@ class _Node(msgspec.Struct):
         others = (lan_relay.pod for lan_relay in lan_relays if lan_relay.of != place.of)
         return [*self.view.other_pods_by_node.get(self.node, ()), *others]
 
-    def _reserved(self, spec: RosProxySpec) -> set[int]:
-        # The proxy itself listens on these ports, and a hostPort has the container port's number.
-        ros2_ports = well_known_ports(spec.ros2.number) if spec.ros2 else frozenset[int]()
-        return {MASTER_PORT, ADMIN_PORT, spec.master.publish, *ros2_ports}
-
 
 def _avoided_stand_ins(spec: RosProxySpec) -> list[PortRange]:
     """Return the ports of stand-ins that a new range avoids, if possible.
 
     If all ranges of the window have such ports, no range is better, and the list is empty.
     """
-    others = gaps(spec.window, (), [STAND_INS])
+    others = gaps(spec.window, (), [proxy_ports.STAND_INS])
     has_choice = any(len(ports) >= spec.ports for ports in others)
-    return [STAND_INS] if has_choice and stand_in_protocols(spec) else []
+    return [proxy_ports.STAND_INS] if has_choice and proxy_ports.stand_in_protocols(spec) else []

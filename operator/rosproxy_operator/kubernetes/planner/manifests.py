@@ -11,8 +11,8 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.policy import AWAITED, as_variable
 from rosproxy_operator.common.port_negotiation import LAST_PORT, gaps, is_free
-from rosproxy_operator.common.ros2 import discovery_port, well_known_ports
-from rosproxy_operator.kubernetes.planner.stand_ins import STAND_INS
+from rosproxy_operator.common.ros2 import discovery_port
+from rosproxy_operator.kubernetes.planner.proxy_ports import STAND_INS, fixed_ports
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     Json,
@@ -366,7 +366,7 @@ def _local_ports(site: ProxySite) -> PortRange:
 
     If none fits, the longest range without ports on which the proxy listens, stand-ins included.
     """
-    used = _fixed_ports(site)
+    used = _listening(site)
     free = gaps(_UNPRIVILEGED_PORTS, (), [*used, STAND_INS])
     longest = max(free, key=len, default=_LOCAL_PORTS[0])
     return _first_fitting(_LOCAL_PORTS, used) or longest
@@ -374,7 +374,7 @@ def _local_ports(site: ProxySite) -> PortRange:
 
 def _former_local_ports(site: ProxySite) -> PortRange:
     """The ports that former operators gave to outgoing connections."""
-    used = _fixed_ports(site)
+    used = _listening(site)
     return _first_fitting(_FORMER_LOCAL_PORTS, used) or _FORMER_LOCAL_PORTS[0]
 
 
@@ -382,12 +382,10 @@ def _first_fitting(ranges: Iterable[PortRange], used: Collection[PortRange]) -> 
     return next((r for r in ranges if is_free(r, (), used)), None)
 
 
-def _fixed_ports(site: ProxySite) -> list[PortRange]:
+def _listening(site: ProxySite) -> list[PortRange]:
     """The ports on which a proxy listens, without the ports of stand-ins."""
-    fixed = (MASTER_PORT, ADMIN_PORT, site.master.publish)
-    ros2 = site.rosproxy.spec.ros2
-    ros2_ports = sorted(well_known_ports(ros2.number)) if ros2 else ()
-    return [site.ports, *(PortRange(port, port) for port in (*fixed, *ros2_ports) if port)]
+    fixed = {*fixed_ports(site.rosproxy.spec), site.master.publish}
+    return [site.ports, *(PortRange(port, port) for port in fixed if port)]
 
 
 def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:

@@ -26,7 +26,8 @@ from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.port_negotiation import gaps
-from rosproxy_operator.common.ros2 import discovery_port, well_known_ports
+from rosproxy_operator.common.ros2 import discovery_port
+from rosproxy_operator.kubernetes.planner import proxy_ports
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreatePolicy,
@@ -36,7 +37,6 @@ from rosproxy_operator.kubernetes.planner.actions import (
 from rosproxy_operator.kubernetes.planner.manifests import metadata
 from rosproxy_operator.kubernetes.planner.pods.selection import LABEL_OFF_VALUES, own_values
 from rosproxy_operator.kubernetes.planner.retries import Task
-from rosproxy_operator.kubernetes.planner.stand_ins import STAND_INS, stand_in_protocols
 from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPolicy
 from rosproxy_operator.kubernetes.resources.model import Json, Name, RosProxy
@@ -186,11 +186,10 @@ def _public_ports(rosproxy: RosProxy, ranges: Collection[PortRange]) -> Iterator
     The own ports are the master port, the admin port, the well-known ports of ROS 2, and the ports
     of stand-ins outside ``ranges``.
     """
-    ros2_ports = well_known_ports(rosproxy.spec.ros2.number) if rosproxy.spec.ros2 else ()
-    own_ports = (MASTER_PORT, ADMIN_PORT, *ros2_ports)
+    own_ports = proxy_ports.fixed_ports(rosproxy.spec)
     for protocol in _protocols(rosproxy):
-        has_stand_ins = protocol in stand_in_protocols(rosproxy.spec)
-        stand_ins = [*gaps(STAND_INS, (), ranges)] if has_stand_ins else []
+        has_stand_ins = protocol in proxy_ports.stand_in_protocols(rosproxy.spec)
+        stand_ins = [*gaps(proxy_ports.STAND_INS, (), ranges)] if has_stand_ins else []
         for ports in gaps(rosproxy.spec.window, own_ports, stand_ins):
             yield _port(ports.first, ports.last, protocol)
     publish = rosproxy.spec.master.publish
@@ -207,8 +206,8 @@ def _pod_ports(rosproxy: RosProxy) -> Iterator[Json]:
         yield _port(MASTER_PORT)
     if rosproxy.spec.ros2:
         yield _port(discovery_port(rosproxy.spec.ros2.number), protocol="UDP")
-    for protocol in stand_in_protocols(rosproxy.spec):
-        yield _port(STAND_INS.first, STAND_INS.last, protocol)
+    for protocol in proxy_ports.stand_in_protocols(rosproxy.spec):
+        yield _port(proxy_ports.STAND_INS.first, proxy_ports.STAND_INS.last, protocol)
 
 
 def _port(first: int, last: int = 0, protocol: str = "TCP") -> Json:

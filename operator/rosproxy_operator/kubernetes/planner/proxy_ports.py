@@ -1,11 +1,22 @@
-"""The ports of a proxy's stand-ins, through which only the selected pods reach outside."""
+"""The ports besides the range on which a proxy listens."""
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.ros1.registry.stand_ins import PORTS
+from rosproxy_operator.common.ros2 import well_known_ports
 from rosproxy_operator.kubernetes.resources.model import RosProxySpec
+from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, MASTER_PORT
 
 STAND_INS = PortRange(PORTS[0], PORTS[-1])
-"""The ports of stand-ins, the same for ROS 1 and ROS 2."""
+"""The ports of stand-ins, through which the selected pods reach outside. The same for ROS 2."""
+
+
+def fixed_ports(spec: RosProxySpec) -> frozenset[int]:
+    """Return the master port, the admin port, and for ROS 2 the well-known ports of the domain.
+
+    A hostPort has the number of the container's port, so no range has these ports.
+    """
+    ros2_ports = well_known_ports(spec.ros2.number) if spec.ros2 else ()
+    return frozenset({MASTER_PORT, ADMIN_PORT, *ros2_ports})
 
 
 def stand_in_protocols(spec: RosProxySpec) -> tuple[str, ...]:
