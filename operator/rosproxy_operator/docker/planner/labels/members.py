@@ -6,6 +6,7 @@ from itertools import islice
 
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem, bounded
+from rosproxy_operator.common.ros2 import read_peer_name
 from rosproxy_operator.common.spelling import NEAR, VERY_NEAR, nearest
 from rosproxy_operator.docker.planner.labels import bounds, readers, ros_versions
 from rosproxy_operator.docker.planner.labels.own_address import wrong_own_address
@@ -211,7 +212,7 @@ def _request(
         networks=networks,
         wishes=readers.wishes(labels, ros, networks, observed.networks),
         policy=readers.policy(labels),
-        peers=ros_versions.peers(labels) if is_ros2 else frozenset(),
+        peers=frozenset(readers.peers(labels, read_peer_name) if is_ros2 else ()),
         redirect=None if is_ros2 else readers.redirect(labels),
     )
 

@@ -4,14 +4,15 @@ Each function that reads a label raises UnusableLabel for an impossible value.
 """
 
 import re
-from collections.abc import Collection, Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from rosproxy.access.rules import Rule, parse_rules
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.common.ros2 import MOST_PEERS
 from rosproxy_operator.docker.option_values import MOST_PORTS
 from rosproxy_operator.docker.planner.labels import bounds
 from rosproxy_operator.docker.planner.model import Container, HostState, Key, Network
@@ -50,6 +51,7 @@ _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
 Labels = Mapping[str, str]
+Peer = TypeVar("Peer")
 
 
 class UnusableLabel(Exception):
@@ -117,6 +119,17 @@ def wishes(
         if wish.label in labels and wish.ros in ("", ros)
     }
     return {**({"direction": "both"} if internal else {}), **asked}
+
+
+def peers(labels: Labels, read: Callable[[str], Peer]) -> list[Peer]:
+    """Return the hosts outside in the label, parsed by ``read``; empty without the label."""
+    names = [name for name in re.split(r"[,\s]+", labels.get(PEERS, "")) if name]
+    if len(names) > MOST_PEERS:
+        raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts. Name fewer hosts")
+    try:
+        return [*map(read, names)]
+    except ValueError as error:
+        raise UnusableLabel(f"label {PEERS}: {error}") from None
 
 
 def policy(labels: Labels) -> tuple[Rule, ...]:

@@ -20,7 +20,6 @@ from rosproxy_operator.common.ros2 import (
     MOST_PEERS,
     ROS1_DISTROS,
     is_dds,
-    read_peer_name,
 )
 from rosproxy_operator.common.ros2_variables import OF_ROS2
 from rosproxy_operator.docker.planner.labels.readers import (
@@ -33,7 +32,6 @@ from rosproxy_operator.docker.planner.labels.readers import (
     REDIRECT,
     RMW,
     ROS,
-    Labels,
     UnusableLabel,
     named,
     quoted,
@@ -114,20 +112,6 @@ def domain(container: Container) -> int:
         fix = f"Write the domain of the nodes into the label, such as {DOMAIN}=0"
         raise UnusableLabel(f"{source} is not a domain from 0 to {LAST_DOMAIN}. {fix}")
     return int(digits)
-
-
-def peers(labels: Labels) -> frozenset[str]:
-    """The hosts outside to which the proxy announces participants; none without the label.
-
-    Raises UnusableLabel.
-    """
-    names = [name for name in re.split(r"[,\s]+", labels.get(PEERS, "")) if name]
-    if len(names) > MOST_PEERS:
-        raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts. Name fewer hosts")
-    try:
-        return frozenset(map(read_peer_name, names))
-    except ValueError as error:
-        raise UnusableLabel(f"label {PEERS}: {error}") from None
 
 
 def refuse_unserved(host: str) -> None:

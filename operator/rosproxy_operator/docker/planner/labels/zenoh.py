@@ -5,7 +5,6 @@ The proxy connects to these routers. If the container itself runs a router, the 
 serving the containers around it, and the proxy connects to the router, too.
 """
 
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -13,7 +12,6 @@ from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.setting_kinds import read_zenoh_peer
 from rosproxy.settings import MOST_ZENOH_PORTS
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.ros2 import MOST_PEERS
 from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, router_port
 from rosproxy_operator.docker.planner.label_policy import network_owner
 from rosproxy_operator.docker.planner.labels import readers
@@ -124,14 +122,7 @@ def _refuse_rules(labels: Labels, settings: PlanSettings) -> None:
 
 def _labelled(labels: Labels) -> Iterator[_Router]:
     """The routers that the label ``rosproxy.peers`` names. Raises UnusableLabel."""
-    names = [name for name in re.split(r"[,\s]+", labels.get(PEERS, "")) if name]
-    if len(names) > MOST_PEERS:
-        raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts. Name fewer hosts")
-    for name in names:
-        try:
-            address = read_zenoh_peer(name.lower())
-        except ValueError as error:
-            raise UnusableLabel(f"label {PEERS}: {error}") from None
+    for address in readers.peers(labels, lambda name: read_zenoh_peer(name.lower())):
         yield _Router(address, f"label {PEERS}")
 
 
