@@ -110,9 +110,11 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 def headings(page: Path) -> set[str]:
-    """The anchors of a page on GitHub and GitLab."""
-    titles = re.findall(r"^#+ (.*)$", page.read_text(), re.M)
-    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+    """The anchors of a page on GitHub and GitLab, with the former anchors of renamed headings."""
+    text = page.read_text()
+    titles = re.findall(r"^#+ (.*)$", text, re.M)
+    anchors = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+    return anchors | set(re.findall(r'^<a id="([\w-]+)"></a>$', text, re.M))
 
 
 def test_scripts_can_be_run() -> None:

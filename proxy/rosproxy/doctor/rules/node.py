@@ -56,12 +56,13 @@ def _cause_first(findings: list[DoctorFinding]) -> list[DoctorFinding]:
 def _counts(facts: DoctorFacts, findings: list[DoctorFinding]) -> Iterator[DoctorFinding]:
     present, ended = _present_and_ended(facts.proxy.nodes)
     if present or ended:
-        states = [node.state for node in present]
-        text = f"{states.count('ok')} of {len(states)} answer"
+        answering = sum(node.state == "ok" for node in present)
+        text = f"{answering} of {len(present)} answer"
         if ended:
             ports = f"{plural(len(ended), 'port')} for up to {facts.proxy.settings.linger:g} s"
             text += f"; ended nodes still hold {ports}"
-        yield ok(INSIDE, "inside nodes", text)
+        report = ok if answering == len(present) else note
+        yield report(INSIDE, "inside nodes", text)
     elif facts.status is not None:
         text = "no node has registered through the proxy"
         report = warning if facts.proxy.uptime >= FIRST_NODE else note
