@@ -2,13 +2,15 @@
 
     python scripts/custom_resource_docs.py [--check]
 
-They stand between ``<!-- fields of the spec -->`` and ``<!-- end of fields of the spec -->`` (and
-the same for the status), and are made from manifests/install.yaml. The chart's
+The tables stand between ``<!-- fields of the spec -->`` and ``<!-- end of fields of the spec -->``
+(and the same for the status), and are made from manifests/install.yaml. If a description has a
+sentence ``Default is ...``, the sentence goes into the column of the defaults. The chart's
 values are in its README, by helm-docs. With ``--check`` nothing is written; the exit code tells
 whether the page is as it should be.
 """
 
 import json
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,6 +21,8 @@ import yaml  # type: ignore[import-untyped]
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/reference/custom-resource.md"
 INSTALL = ROOT / "manifests/install.yaml"
+DEFAULT = re.compile(r"\s*Default(?: is|:) (.+?)\.(?=\s|$)")
+"""The sentence of a description that gives the default."""
 
 
 def custom_resource() -> Mapping[str, Any]:
@@ -50,10 +54,11 @@ def _is_list_of_objects(field: Mapping[str, Any]) -> bool:
 
 
 def _default(field: Mapping[str, Any]) -> str:
-    if "default" not in field:
-        return ""
-    value = field["default"]
-    return f"`{value if isinstance(value, str) else json.dumps(value)}`"
+    if "default" in field:
+        value = field["default"]
+        return f"`{value if isinstance(value, str) else json.dumps(value)}`"
+    stated = DEFAULT.search(str(field["description"]))
+    return stated[1].replace("|", r"\|") if stated else ""
 
 
 def _type(field: Mapping[str, Any]) -> str:
@@ -75,6 +80,8 @@ def _plural(kind: str) -> str:
 
 def _meaning(field: Mapping[str, Any]) -> str:
     text = str(field["description"])
+    if "default" not in field:
+        text = DEFAULT.sub("", text, count=1)
     rules = field.get("x-kubernetes-validations", [])
     refusals = [f"Refused with: *{rule['message']}*." for rule in rules]
     return " ".join([text, *refusals]).replace("|", r"\|")

@@ -43,8 +43,8 @@ class Settings:
         tuple[Literal["1", "2", "zenoh"], ...],
         Option(
             "ROS version that the proxy serves: `1`, `2` (DDS), or `zenoh` ([rmw_zenoh]"
-            "(../guide/zenoh.md)). Repeatable: one process then serves several, ROS 1 and ROS 2 "
-            "with one range. ROS 1 uses the range for TCP, ROS 2 for UDP.",
+            "(../guide/zenoh.md)). Repeatable: one process can serve several versions. ROS 1 and "
+            "ROS 2 then share the range: ROS 1 uses the ports for TCP, ROS 2 for UDP.",
             repeatable=True,
             note="`1 2` for both",
         ),
@@ -109,7 +109,8 @@ class Settings:
             "For a master that runs inside: port on which the proxy offers this master to "
             "outside. Publish this port, too. The master calls nodes at the advertised "
             "address, so the master must reach the host's published ports. Docker's own port "
-            "proxy makes that possible; NAT without hairpin does not.",
+            "proxy (`userland-proxy`, on by default) makes that possible. NAT does so only if it "
+            "leads connections from inside to the host's address back inside (hairpin NAT).",
             kinds.PORT,
             default="off",
         ),
@@ -168,8 +169,8 @@ class Settings:
     probe_interval: Annotated[
         float,
         Option(
-            "Time between two probes of an idle node. The proxy notices the end of a node at "
-            "once, without a probe.",
+            "Time between two probes of an idle node. The proxy notices the end of a node "
+            "immediately, without a probe.",
             kinds.time(0.05),
         ),
     ] = 5.0
@@ -270,23 +271,24 @@ class Settings:
     max_lease_call: Annotated[
         int,
         Option(
-            "Longest call from outside to a node, with 10,000 XML elements for each MiB. "
-            "[docs/reference/limits.md](limits.md) explains this option and the next five.",
+            "Maximum size of a call from outside to a node. A call may have 10,000 XML elements "
+            "for each MiB of this maximum. [docs/reference/limits.md](limits.md) explains this "
+            "option and the next five.",
             kinds.MEBIBYTES,
         ),
     ] = 1
     max_master_call: Annotated[
         int,
         Option(
-            "Longest call with addresses from a node to the master, with 5,000 XML elements "
-            "for each MiB.",
+            "Maximum size of a call with addresses from a node to the master. A call may have "
+            "5,000 XML elements for each MiB of this maximum.",
             kinds.MEBIBYTES,
         ),
     ] = 4
     max_body: Annotated[
         int,
         Option(
-            "Longest parameter, or other call or reply without addresses.",
+            "Maximum size of a parameter, and of any other call or reply without addresses.",
             kinds.MEBIBYTES,
         ),
     ] = 64
@@ -324,9 +326,9 @@ class Settings:
         tuple[HostPort, ...],
         Option(
             "ROS 2: outside host to which the proxy announces inside participants, at the "
-            "well-known ports of the host's first participants (at least 32). Or another "
-            "proxy, with the first port of that proxy's range; then this proxy can serve a "
-            "single domain only. Repeatable.",
+            "well-known ports of at least the first 32 participants of that host. For another "
+            "proxy, add the first port of its range. A proxy with such a peer serves a single "
+            "domain only. Repeatable.",
             kinds.PEER,
             variables=("ROSPROXY_ROS2_PEERS",),
             repeatable=True,

@@ -100,7 +100,7 @@ class PlanSettings:
         DataPlane,
         Option(
             "How proxies forward topics, for containers without the label `rosproxy.data-plane`. "
-            "With `kernel`, the proxies get the capability NET_ADMIN."
+            "With `kernel`, the proxies get the capability NET_ADMIN. With `auto`, they splice."
         ),
     ] = "auto"
     direction: Annotated[
@@ -147,7 +147,7 @@ class PlanSettings:
             "Repeatable.",
             option_values.NAME_PATTERN,
             repeatable=True,
-            default="names of a LAN that no container has or had",
+            default="names of a LAN that no container has, or had while the operator ran",
             note="separated by spaces",
         ),
     ] = ()
@@ -162,7 +162,7 @@ class PlanSettings:
     max_ports: Annotated[
         int,
         Option(
-            "Most ports that a label may ask for. If `--ports` is higher, that number counts.",
+            "Most ports that a label may ask for. If `--ports` is higher, `--ports` applies.",
             option_values.PORTS,
         ),
     ] = 100
