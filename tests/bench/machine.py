@@ -37,7 +37,7 @@ def described() -> dict[str, str]:
             "dpkg-query -W -f '${Package} ${Version}, ' python3-rospy libroscpp4d"
         ).rstrip(", "),
         "ROS 2": ", ".join(pinned(*words) for words in _PINS),
-        "peers": ", ".join(f"{name} {version(name)}" for name in _VERSIONS),
+        "other programs": ", ".join(f"{name} {version(name)}" for name in _VERSIONS),
     }
 
 

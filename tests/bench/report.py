@@ -79,7 +79,8 @@ def markdown(book: Book, plots: list[str]) -> str:
     for section in book.axes:
         parts += [f"### {TITLES.get(section, section)}", *tables(book, section)]
         if section in plots:
-            parts.append(f"![Growth]({section}.svg)")
+            alt = f"A plot for each measure: median and spread against {book.axes[section]}"
+            parts.append(f"![{alt}]({section}.svg)")
         parts += [note.partition(": ")[2] + "." for note in notes_of(book, section)]
     return "\n\n".join(parts) + "\n"
 
@@ -168,7 +169,7 @@ def paste(page: Path, folder: Path, section: str = "") -> None:
     plots.mkdir(exist_ok=True)
     for plot in folder.glob("*.svg"):
         shutil.copy(plot, plots)
-    results = results.replace("![Growth](", f"![Growth]({plots.name}/")
+    results = re.sub(r"(!\[[^]]*\]\()", rf"\1{plots.name}/", results)
     page.write_text(pattern.sub(lambda _: f"{begin}\n\n{results}\n{end}", text))
 
 

@@ -126,7 +126,7 @@ def test_markdown_has_a_column_for_each_size() -> None:
     assert "| rosproxy | 175 **x 0.62** (50 .. 300) | 175 **x 0.62** (50 .. 300) |" in text
     assert "| loss, % | rosproxy |" in text
     assert "| 6 MB | 0 |" in text
-    assert "![Growth](streams.svg)" in text
+    assert "measure: median and spread against connections](streams.svg)" in text
     assert "\nnginx is not installed and was not compared.\n" in text
 
 
@@ -135,11 +135,11 @@ def test_results_are_pasted_between_the_marks_alone(tmp_path: Path) -> None:
     folder = tmp_path / "results"
     folder.mkdir()
     page.write_text(f"before\n{report.BEGIN}\nold\n{report.END}\nafter\n")
-    (folder / "performance.md").write_text("![Growth](streams.svg)\n")
+    (folder / "performance.md").write_text("![Plots](streams.svg)\n")
     (folder / "streams.svg").write_text("<svg/>")
     for _ in range(2):
         report.paste(page, folder)
-    linked = "![Growth](performance/streams.svg)"
+    linked = "![Plots](performance/streams.svg)"
     assert page.read_text() == f"before\n{report.BEGIN}\n\n{linked}\n\n{report.END}\nafter\n"
     assert (tmp_path / "performance/streams.svg").read_text() == "<svg/>"
 
