@@ -41,6 +41,7 @@ def test_the_options_make_one_layer_or_none() -> None:
         (MOST_AUTHORS_RULES, "/a", ""),
         (MOST_AUTHORS_RULES + 1, "/a", "501 rules, at most 500 are accepted"),
         (200, "/" + "a" * 255, f"at most {LONGEST_POLICY} are accepted"),
+        (400, "/" + "a" * 255, f"at most {LONGEST_POLICY} are accepted"),  # over LONGEST_VARIABLE
     ],
 )
 def test_a_policy_is_bounded(count: int, glob: str, told: str) -> None:
@@ -58,9 +59,27 @@ def test_at_its_creation_a_proxy_gets_what_fits_into_a_variable() -> None:
     common = administrators_policy([RULES], "enforce")
     assert read_layers(json.loads(as_variable([*common, OWN]))) == (*common, OWN)
     assert as_variable([]) == ""
+
+
+def test_a_proxy_denies_more_if_its_policy_is_too_long_for_a_variable() -> None:
+    common = administrators_policy([RULES], "enforce")
     long = structs.replace(OWN, rules=parse_rules("deny publish /" + "a" * 255) * 400)
-    assert read_layers(json.loads(as_variable([*common, long]))) == common
-    assert as_variable([long]) == ""
+    *kept, stricter = read_layers(json.loads(as_variable([*common, long])))
+    assert tuple(kept) == common
+    assert stricter.rules == parse_rules("deny publish *")
+    assert stricter.addresses == OWN.addresses
+    for_all = structs.replace(long, addresses=None)
+    (stricter,) = read_layers(json.loads(as_variable([*common, for_all])))
+    assert stricter.rules == parse_rules("deny publish *; deny slave *")
+    assert stricter.addresses is None
+
+
+def test_a_long_policy_that_denies_nothing_becomes_empty_in_the_variable() -> None:
+    allowing = structs.replace(OWN, rules=parse_rules("allow publish /" + "a" * 255) * 400)
+    audited = structs.replace(
+        OWN, rules=parse_rules("deny call /" + "a" * 255) * 400, mode=PolicyMode.AUDIT
+    )
+    assert read_layers(json.loads(as_variable([allowing, audited]))) == ()
 
 
 class Answers:

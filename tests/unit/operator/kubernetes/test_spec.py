@@ -373,6 +373,7 @@ def test_every_kind_of_rule_has_a_word(kind):
         (rule(kind="Slave", names=["shutdown"], nodes=["x"]), "nodes[0]: 'x' is not a pattern"),
         (rule(names=["/a"] * 501), "spec.policy.rules: 501 rules, at most 500 are accepted"),
         (rule(names=["/" + "a" * 200] * 300), "bytes, at most 32768 are accepted. Join names"),
+        (rule(names=["/" + "a" * 250] * 450), "bytes, at most 32768 are accepted. Join names"),
     ],
 )
 def test_a_bad_rule_is_told(bad, said):
