@@ -103,6 +103,17 @@ def test_where_nothing_says_it_ros_1_is_assumed_and_told() -> None:
     assert read(labelled_container(env=ROBOT), settings)[1] == []
 
 
+@pytest.mark.parametrize(
+    "variables", [{"ROS_VERSION": ""}, {"ROS_DISTRO": ""}, {"ROS_VERSION": "one"}]
+)
+def test_an_unusable_variable_states_no_version(variables: Mapping[str, str]) -> None:
+    members, told = read(
+        labelled_container(variables=variables), replace(SETTINGS, master_uri=ROBOT)
+    )
+    assert [member.key for member in members] == [KEY]
+    assert ["assumes ROS 1" in text for text in told] == [True]
+
+
 @pytest.mark.parametrize("name", sorted(OF_ROS2))
 def test_a_variable_of_ros_2_alone_says_it(name: str) -> None:
     variables = {name: "localhost"} if name == STATIC_PEERS else {name: "7"}

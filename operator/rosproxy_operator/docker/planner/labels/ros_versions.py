@@ -78,13 +78,17 @@ def _ros_versions(container: Container) -> frozenset[str]:
             )
             raise UnusableLabel(text)
         return tokens
+    version = _version_of_image(container) or ("2" if _is_marked_ros2(container) else "1")
+    return frozenset({version})
+
+
+def _version_of_image(container: Container) -> str:
+    """Return the version that ROS_VERSION or ROS_DISTRO states: 1 or 2; empty if neither does."""
     version = container.variables.get("ROS_VERSION", "")
     if version in ("1", "2"):
-        return frozenset({version})
+        return version
     distro = container.variables.get("ROS_DISTRO", "").lower()
-    if distro:
-        return frozenset({"1" if distro in ROS1_DISTROS else "2"})
-    return frozenset({"2" if _is_marked_ros2(container) else "1"})
+    return ("1" if distro in ROS1_DISTROS else "2") if distro else ""
 
 
 def _is_marked_ros2(container: Container) -> bool:
@@ -150,8 +154,8 @@ def past_the_proxy(
 def is_guessed(container: Container) -> bool:
     """Whether no label and no variable states the ROS version of a container."""
     explicit = {ROS, MASTER_URI} & container.labels.keys() or container.master_uri
-    is_told = explicit or {"ROS_VERSION", "ROS_DISTRO"} & container.variables.keys()
-    return not is_told and not _is_marked_ros2(container)
+    is_stated = explicit or _version_of_image(container)
+    return not is_stated and not _is_marked_ros2(container)
 
 
 def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[str]:
