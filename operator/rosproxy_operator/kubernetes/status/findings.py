@@ -59,19 +59,20 @@ def findings(
     return tuple(dict.fromkeys(problems))
 
 
-def node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> Iterator[ClusterFinding]:
-    """The findings about a node and its pods. An obstacle comes first.
+def node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> list[ClusterFinding]:
+    """The findings about a node and its pods: an obstacle, then fatal findings, then the rest.
 
-    Findings that keep the node from being served are fatal.
+    Findings that keep the node from being served are fatal. The status of a node has the first.
     """
+    return sorted(_node_findings(rosproxy, state), key=lambda finding: not finding.fatal)
+
+
+def _node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> Iterator[ClusterFinding]:
     if state.obstacle is not None:
         yield _finding(rosproxy, f"node {state.name}", state.obstacle.text, state.obstacle.reason)
-    if (
-        state.lan_relay is not None
-        and state.lan_relay.stuck is not None
-        and not state.lan_relay.pod.deleting
-    ):
-        yield _deaf(rosproxy, state.lan_relay)
+    relay = state.lan_relay
+    if relay is not None and relay.stuck is not None and not relay.pod.deleting:
+        yield _deaf(rosproxy, relay)
     proxy = state.proxy
     if proxy is None or proxy.pod.deleting:
         return

@@ -179,7 +179,7 @@ def _shown_nodes(states: Sequence[RosProxyOnNode]) -> list[RosProxyOnNode]:
 
 def _line(rosproxy: RosProxy, state: RosProxyOnNode, names: int) -> dict[str, object]:
     proxy = state.proxy
-    problem = next(node_findings(rosproxy, state), None)
+    problem = next(iter(node_findings(rosproxy, state)), None)
     line = {
         "name": state.name,
         "advertiseHost": state.advertise_host,

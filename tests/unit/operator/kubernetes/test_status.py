@@ -9,12 +9,14 @@ from msgspec.structs import replace
 from rosproxy.admin.status_document import RangeProbeStatus
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.resources.cluster import (
+    HelperPod,
     Obstacle,
     PodFailure,
     ProxyReport,
     RosProxyOnNode,
 )
 from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Selector
+from rosproxy_operator.kubernetes.resources.names import IMAGE_CHECK, LAN_RELAY
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 from rosproxy_operator.kubernetes.status.rosproxy_status import (
     LONGEST,
@@ -123,6 +125,18 @@ def test_the_wide_output_tells_which_node_is_not_ready_and_why():
     assert rosproxy_status["addresses"] == "node1: 192.0.2.11, node2: 192.0.2.11 (not ready)"
     assert rosproxy_status["message"] == message(rosproxy_status)
     assert "the node can't get the image" in rosproxy_status["message"]
+
+
+def test_a_node_tells_first_why_its_proxy_is_stuck():
+    stuck = stuck_proxy(PodFailure.CRASHING)
+    made = (stuck.pod, stuck.of, stuck.owner, "node1", "f", "rosproxy:2")
+    relay, check = (
+        HelperPod(*made, stuck=PodFailure.IMAGE, component=component)
+        for component in (LAN_RELAY, IMAGE_CHECK)
+    )
+    node = state(proxy=stuck, answer=None, lan_relay=relay, image_check=check)
+    (line,) = status(node)["perNode"]
+    assert "the proxy's container ends again and again" in line["message"]
 
 
 def test_the_wide_output_tells_the_first_problem_of_a_rosproxy_that_is_ready():
