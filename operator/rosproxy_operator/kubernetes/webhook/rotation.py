@@ -263,6 +263,7 @@ class CertificateRotation:
             pair = await in_thread(self._source.refresh)
         except NotMadeYet:
             not_made_yet = True
+            problems = [*self._source.problems]
         except (ApiError, InvalidCertificate) as error:
             problems = [
                 Problem(_SUBJECT, f"the operator could not read or renew the certificate: {error}")
@@ -278,7 +279,8 @@ class CertificateRotation:
             self.pair = pair
             self._metrics.certificate_expiry.set(pair.expires.timestamp())
         self.not_made_yet = not_made_yet
-        self._log.update(problems)
+        if problems or not not_made_yet:  # without a certificate, no earlier problem is solved
+            self._log.update(problems)
 
 
 def certificate_source(

@@ -221,6 +221,27 @@ async def test_only_the_leading_operator_makes_the_certificate(server: ApiServer
     assert webhook.unready()
 
 
+async def test_a_problem_is_not_solved_before_there_is_a_certificate(
+    server: ApiServer, api: Api, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    put(server)
+    leading = False
+    self_signed = SelfSigned(api, NAMES, SECRET, "wh", Clock(), leads=lambda: leading)
+    certificate_rotation = CertificateRotation(self_signed, ClusterMetrics())
+    server.refuse("GET", "secrets", 500, "no etcd")
+    await certificate_rotation.refresh()
+    assert "no etcd" in caplog.text
+
+    server.refusals.clear()
+    await certificate_rotation.refresh()
+    assert certificate_rotation.not_made_yet
+    assert "webhook: solved" not in caplog.text
+    leading = True
+    await certificate_rotation.refresh()
+    assert "webhook: solved" in caplog.text
+
+
 async def test_renewed_and_trusted_before_it_is_served(server: ApiServer, api: Api) -> None:
     put(server)
     clock = Clock()
