@@ -94,7 +94,7 @@ class SelfSigned:
         self._pair: KeyPair | None = None
         self._unsaved: KeyPair | None = None
         self._serving: KeyPair | None = None
-        self._trusted_at: datetime | None = None
+        self._trusted: tuple[KeyPair, datetime] | None = None
         self.problems: list[Problem] = []
 
     def refresh(self) -> KeyPair:
@@ -112,10 +112,10 @@ class SelfSigned:
             self._serving = self._pair
         elif self._pair != self._serving and trusted:
             # API servers need time to learn of the new CA.
-            self._trusted_at = self._trusted_at or now
-            if (now - self._trusted_at).total_seconds() >= OVERLAP:
+            if self._trusted is None or self._trusted[0] != self._pair:
+                self._trusted = self._pair, now
+            if (now - self._trusted[1]).total_seconds() >= OVERLAP:
                 self._serving = self._pair
-                self._trusted_at = None
         return self._serving
 
     def _kept_pair(self) -> KeyPair:

@@ -259,6 +259,25 @@ async def test_renewed_and_trusted_before_it_is_served(server: ApiServer, api: A
     assert await in_thread(self_signed.refresh) == second
 
 
+async def test_a_pair_that_replaces_a_waiting_pair_waits_for_its_own_ca(
+    server: ApiServer, api: Api
+) -> None:
+    put(server)
+    clock = Clock()
+    self_signed = source(api, clock)
+    first = await in_thread(self_signed.refresh)
+    clock.forward(days=61)
+    assert await in_thread(self_signed.refresh) == first
+    clock.forward(seconds=9)
+    third = certificates.make(NAMES, clock(), first.ca)
+    put(server, dict(third.secret()))
+    assert await in_thread(self_signed.refresh) == first
+    clock.forward(seconds=9)
+    assert await in_thread(self_signed.refresh) == first
+    clock.forward(seconds=2)
+    assert await in_thread(self_signed.refresh) == third
+
+
 async def test_not_served_while_it_cannot_be_trusted(server: ApiServer, api: Api) -> None:
     put(server)
     clock = Clock()
