@@ -57,8 +57,10 @@ REPEATED = 30.0
 
 The operator does not notice a restart of such a proxy by its status.
 """
-_KNOWS_NO_CHANGES = (403, 404, 405, 503)
-"""HTTP answers to ``/status/changes`` from a proxy of a former release, or without a free slot."""
+_OF_FORMER_RELEASE = (404, 405)
+"""HTTP answers to ``/status/changes`` from a proxy of a former release."""
+_REFUSES_NOW = (403, 503)
+"""HTTP answers from a proxy that does not accept the token now, or has no free slot."""
 
 
 class CallLimits:
@@ -101,6 +103,7 @@ class ProxyPoller:
         self._recheck = False
         self._failures = 0
         self._tells_changes = True
+        self._is_former = False
         self._version = ""
         self._instance = ""
         self._since = time.monotonic()
@@ -223,16 +226,21 @@ class ProxyPoller:
             self._changed()
 
     async def _fetch_status(self, within: float) -> ProxyStatus:
-        if self._tells_changes:
+        """Request the status with changes, else the plain status. Raises ProxyError.
+
+        If the proxy refuses changes now, the next poll asks for changes again.
+        """
+        if not self._is_former:
             try:
                 since = self._version if within else ""
-                change = await self.session.changes(since, within)
+                self._version, status = await self.session.changes(since, within)
             except ProxyError as error:
-                if error.status not in _KNOWS_NO_CHANGES:
+                if error.status not in (*_OF_FORMER_RELEASE, *_REFUSES_NOW):
                     raise
                 self._tells_changes = False
+                self._is_former = error.status in _OF_FORMER_RELEASE
             else:
-                self._version, status = change
+                self._tells_changes = True
                 self._note_instance(status.instance)
                 return status
         return await self.session.status()
@@ -248,6 +256,7 @@ class ProxyPoller:
         """Assume that the proxy has confirmed nothing, and may report changes."""
         self.session.forget()
         self._tells_changes = True
+        self._is_former = False
 
     async def _tell_policy(self) -> bool:
         """Send the policy, unless confirmed. Return whether the proxy has the policy."""

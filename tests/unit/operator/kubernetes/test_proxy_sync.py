@@ -40,6 +40,7 @@ class Told(ProxyClient):
         self.callers: list[Any] = []
         self.deaf = False
         self.former = True
+        self.refusal = 0
         self.version = "1"
         self.listening = 0
         self.changed = asyncio.Event()
@@ -63,6 +64,8 @@ class Told(ProxyClient):
         self.waited.append((since, within))
         if self.former:
             raise ProxyError("no such path", status=404)
+        if self.refusal:
+            raise ProxyError("not now", status=self.refusal)
         if not within or since != self.version:
             return self.version, await self.status(admin)
         self.listening += 1
@@ -411,6 +414,27 @@ async def test_one_that_tells_of_changes_is_not_asked(talk: Talk) -> None:
     assert talk.proxies.asked == asked + 1
     assert talk.proxies.waited[-1][0] == "2"
     assert talk.changes == 2
+
+
+@pytest.mark.parametrize("status", [403, 503])
+async def test_a_proxy_that_refuses_changes_is_asked_for_changes_again(
+    talk: Talk, status: int
+) -> None:
+    talk.proxies.former = False
+    talk.proxies.says = UP
+    talk.proxies.refusal = status
+    talk.all.follow([proxy()], KEY)
+    await talk.asked()
+    assert talk.all.reports[UID].answered
+    talk.proxies.refusal = 0
+    await listening(talk)
+
+
+async def test_a_proxy_of_a_former_release_is_asked_for_changes_once(talk: Talk) -> None:
+    talk.proxies.says = UP
+    talk.all.follow([proxy()], KEY)
+    await talk.asked(5)
+    assert len(talk.proxies.waited) == 1
 
 
 async def test_who_is_waited_for_can_be_told(talk: Talk) -> None:
