@@ -113,12 +113,13 @@ class ClusterStore:
         collection = (kind, place)
         former = dict(self._tables[kind, place])
         gone = dict.fromkeys(former.keys() - records.keys())
-        differ = [key for key, record in records.items() if former.get(key) != record]
-        for key, record in {**gone, **records}.items():
+        kept = {key: self._as_foreign(record) for key, record in records.items()}
+        differ = [key for key, record in kept.items() if former.get(key) != record]
+        for key, record in {**gone, **kept}.items():
             self._put(collection, key, record)
         if collection in self._listed and (gone or differ):
             log.info(
-                "watch corrected: %s, the watch had missed changes of %d objects",
+                "watch corrected: %s, a new list differs from the watched state in %d objects",
                 kind,
                 len(gone) + len(differ),
             )

@@ -331,12 +331,15 @@ async def test_changes_touch_their_namespaces_and_nodes(server: ApiServer, seen:
 
 
 async def test_what_another_operator_looks_after_is_others(api: Api, server: ApiServer) -> None:
-    store = ClusterStore([("pods", "")], ("mine",), lambda: None, lambda: None)
+    corrections: list[int] = []
+    store = ClusterStore([("pods", "")], ("mine",), lambda: None, lambda: None, corrections.append)
     read = READERS["pods"]
     record = read(proxy_obj())
     assert record is not None
     store.listed("pods", "", {"key": record})
     assert store.snapshot().proxies == ()
+    store.listed("pods", "", {"key": record})
+    assert corrections == []
 
 
 @pytest.mark.parametrize("obj", [{}, {"metadata": None}, {"metadata": {"labels": None}}])
