@@ -1,7 +1,7 @@
 """A thread that serves the webhook (by kopf) and the liveness check.
 
-When kopf ends, the thread starts kopf and the liveness server again. Only the admission of pods and
-the liveness check depend on this thread.
+When kopf ends, the thread starts kopf again after a pause. The liveness server serves during the
+pause, too. Only the admission of pods and the liveness check depend on this thread.
 
 kopf watches nothing here; `watch.reflector` watches instead. kopf would keep a task and the whole
 object in memory for each object, and all of kopf ends when a single watch ends.
@@ -114,37 +114,49 @@ class ClusterServing:
     def _run(self) -> None:
         failures = 0
         while not self._ending.is_set():
-            started = time.monotonic()
-            self._run_once()
-            failures = 1 if time.monotonic() - started > WELL else failures + 1
-            self._ending.wait(BACK_OFF[min(failures, len(BACK_OFF)) - 1])
+            try:
+                with warnings.catch_warnings(action="ignore"):
+                    failures = asyncio.run(self._operate(failures))
+            except asyncio.CancelledError:
+                pass  # `stop` or `restart` has cancelled the pause
+            except Exception as error:
+                failures += 1
+                text = "liveness server ended, the operator starts it again: %s"
+                log.warning(text, _reason(error))
+                self._ending.wait(_pause(failures))
+            finally:
+                self._running = None
 
-    def _run_once(self) -> None:
-        try:
-            with warnings.catch_warnings(action="ignore"):
-                asyncio.run(self._operate())
-        except asyncio.CancelledError:
-            pass  # `restart` has cancelled the run
-        except Exception as error:
-            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-            log.warning("webhook server ended, the operator starts it again: %s", reason)
-        finally:
-            self._running = None
+    async def _operate(self, failures: int) -> int:
+        """Run kopf once, and pause. Return the failures in a row.
 
-    async def _operate(self) -> None:
+        The liveness server serves during the pause, too. Otherwise the kubelet would restart the
+        operator after three failed checks, although only kopf fails.
+        """
         loop = asyncio.get_running_loop()
         task = asyncio.current_task()
         loop.set_exception_handler(_log_exception)
         if task is not None:
             self._running = loop, task
         if self._ending.is_set():
-            return
-        namespaces = self._settings.namespaces
+            return failures
         liveness = web.ServerRunner(BoundedServer(self._tell_liveness, MOST_CONNECTIONS))
         await liveness.setup()
         try:
             bind = self._settings.liveness
             await web.TCPSite(liveness, bind.host, bind.port, backlog=BACKLOG).start()
+            started = time.monotonic()
+            await self._run_kopf()
+            failures = 1 if time.monotonic() - started > WELL else failures + 1
+            await asyncio.sleep(_pause(failures))
+        finally:
+            await liveness.cleanup()
+        return failures
+
+    async def _run_kopf(self) -> None:
+        """Run kopf until kopf ends. Raise CancelledError if `stop` has cancelled the run."""
+        namespaces = self._settings.namespaces
+        try:
             # No stop flag: with a flag, kopf takes seconds longer to end for another reason.
             await kopf.operator(
                 registry=self._handlers(),
@@ -154,8 +166,11 @@ class ClusterServing:
                 clusterwide=not namespaces,
                 namespaces=namespaces,
             )
-        finally:
-            await liveness.cleanup()
+        except asyncio.CancelledError:
+            if self._ending.is_set():
+                raise  # else `restart` has cancelled the run
+        except Exception as error:
+            log.warning("webhook server ended, the operator starts it again: %s", _reason(error))
 
     async def _tell_liveness(self, _request: web.BaseRequest) -> web.Response:
         """Answer the kubelet. kopf's own liveness endpoint does not limit connections."""
@@ -171,6 +186,15 @@ class ClusterServing:
         if self._webhook:
             _register_webhook(handlers, self._webhook[0])
         return handlers
+
+
+def _pause(failures: int) -> float:
+    """Return the seconds until the next run, after so many failures in a row."""
+    return BACK_OFF[min(failures, len(BACK_OFF)) - 1]
+
+
+def _reason(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
 def _register_webhook(handlers: kopf.OperatorRegistry, injector: Injector) -> None:

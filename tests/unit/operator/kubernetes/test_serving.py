@@ -160,6 +160,21 @@ async def test_when_kopf_ends_it_is_started_again(
     assert "patch" in await running.admit(pod_obj("talker", INJECT))
 
 
+async def test_while_kopf_fails_the_operator_stays_alive(
+    running: Running, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Otherwise the kubelet would restart an operator of which only the webhook fails."""
+
+    async def fail(**_: Any) -> None:
+        monkeypatch.setattr(serving, "BACK_OFF", (3600.0,))
+        raise RuntimeError("no webhook")
+
+    monkeypatch.setattr(kopf, "operator", fail)
+    running.serving.restart()
+    await until(lambda: "webhook server ended" in caplog.text)
+    assert await running.health() == (200, "ok\n")
+
+
 async def test_it_watches_nothing(running: Running) -> None:
     await until_alive(running)
     assert not [query for _, _, query in running.server.requests if query.get("watch")]
