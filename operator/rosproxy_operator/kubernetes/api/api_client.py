@@ -421,14 +421,14 @@ class Api:
         HTTP 429 means that the API server has not begun the request. A caller with another
         ``within`` than `WITHIN` gets the answer at once, and tries again itself.
         """
-        for _ in range(TRIES if within is WITHIN else 1):
+        for _ in range(TRIES - 1 if within is WITHIN else 0):
             answer = self._send(method, path, query, body, within)
             retry_after = str(answer.getheader("Retry-After", ""))
             if answer.status != 429 or not retry_after.isdecimal():
-                break
-            self._body(answer)
+                return answer
+            self._body(answer)  # frees the connection
             time.sleep(min(float(retry_after), LONGEST_PAUSE))
-        return answer
+        return self._send(method, path, query, body, within)
 
     def _send(
         self,
@@ -466,8 +466,7 @@ class Api:
     def _body(self, answer: Any, longest: int | None = None) -> bytes | None:
         """Return the body of an answer; None if the body exceeds ``longest`` bytes."""
         try:
-            # `_send_with_retries` has already read the body of an HTTP 429 with Retry-After.
-            if longest is None or answer.data is not None:
+            if longest is None:
                 return bytes(answer.read())
             data = bytes(answer.response.read(longest + 1))
             if len(data) <= longest:

@@ -72,9 +72,11 @@ async def test_a_throttled_request_is_repeated_after_the_given_time(
     server.retry_after = "7"
     with pytest.raises(ApiUnavailable, match="too many requests"):
         await in_thread(api.page, "nodes", "")
-    assert slept == [7.0] * 4
+    assert slept == [7.0] * 3
+    assert len(server.asked("GET", "nodes")) == 4
     with pytest.raises(ApiUnavailable):
         await in_thread(api.get, "nodes", Name("", "node1"), SOON)
+    assert slept == [7.0] * 3
     server.retry_after = "999999"
     with pytest.raises(ApiUnavailable):
         await in_thread(api.page, "nodes", "")
@@ -154,9 +156,8 @@ async def test_what_is_no_api_server_is_away(server: ApiServer, api: Api) -> Non
 async def test_what_does_not_answer_in_json_is_away(
     api: Api, monkeypatch: pytest.MonkeyPatch, text: bytes
 ) -> None:
-    answer = SimpleNamespace(
-        status=200, reason="OK", data=text, read=lambda: text, getheader=lambda *_: ""
-    )
+    response = SimpleNamespace(read=lambda _: text)
+    answer = SimpleNamespace(status=200, reason="OK", response=response, getheader=lambda *_: "")
     monkeypatch.setattr(api._client, "call_api", lambda *_, **__: answer)
 
     def listed() -> None:
