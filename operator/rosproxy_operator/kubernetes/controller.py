@@ -129,11 +129,12 @@ class KubernetesController:
         ]
         for reflector in reflectors:
             reflector.start()
-        key_check = asyncio.create_task(self._check_key())
+        checks = Tasks()  # not in self._tasks, whose tasks end with each term
+        checks.repeat(self._check_key, KEY_EVERY, "checking the key of the proxies' tokens")
         try:
             await self._loop.run(self.look)
         finally:
-            key_check.cancel()
+            await checks.cancel()
             for reflector in reflectors:
                 reflector.stop()
             await self._tasks.cancel()
@@ -143,12 +144,10 @@ class KubernetesController:
 
     async def _check_key(self) -> None:
         """Plan everything after a change of the key. No watch covers the key's Secret."""
-        while True:
-            await asyncio.sleep(KEY_EVERY)
-            with contextlib.suppress(ApiError):  # the next look reports the error
-                if self._acting and await in_thread(self._key.read) != self._secret:
-                    self._due.mark_all_due()
-                    self._loop.wake()
+        with contextlib.suppress(ApiError):  # the next look reports the error
+            if self._acting and await in_thread(self._key.read) != self._secret:
+                self._due.mark_all_due()
+                self._loop.wake()
 
     async def stop_acting(self) -> None:
         """Cancel the tasks beside the looks. The next look ends the term."""

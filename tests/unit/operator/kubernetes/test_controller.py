@@ -110,6 +110,29 @@ async def test_a_key_that_is_removed_makes_the_proxies_anew(
     await until(lambda: any(pod["metadata"]["annotations"] != first for pod in proxies(server)))
 
 
+async def test_the_check_of_the_key_goes_on_after_an_internal_error(
+    server: ApiServer,
+    running: Running,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    server.put("secrets", {"metadata": {"name": "key"}}, NAMESPACE)
+    put_all(server)
+    await until(lambda: bool(proxies(server)))
+    first = proxies(server)[0]["metadata"]["annotations"]
+    key = running.controller._key
+    read = key.read
+
+    def broken() -> bytes:
+        raise RuntimeError("oops")
+
+    monkeypatch.setattr(key, "read", broken)
+    await until(lambda: "checking the key of the proxies' tokens failed" in caplog.text)
+    monkeypatch.setattr(key, "read", read)
+    server.put("secrets", {"metadata": {"name": "key"}}, NAMESPACE)
+    await until(lambda: any(pod["metadata"]["annotations"] != first for pod in proxies(server)))
+
+
 async def test_a_pod_that_is_created_with_its_rosproxy_is_wired(
     server: ApiServer, api: Api, running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
