@@ -85,7 +85,7 @@ class ClusterApplier:
         self._tasks = tasks
         self._counted = counted
         self._doubted = doubted
-        self._stale = set[Name]()
+        self._stale = set[str]()
         self._room = asyncio.Semaphore(AT_ONCE)
         self._retiring: set[str] = set()
         self._retired: set[str] = set()
@@ -116,6 +116,7 @@ class ClusterApplier:
         self.failures = {name: errors for name, errors in self.failures.items() if name in existing}
         self.problems = {name: p for name, p in self.problems.items() if name in existing}
         self._retired &= {proxy.pod.uid for proxy in observed.proxies}
+        self._stale &= _uids(observed)
 
     async def _group(self, name: Name, actions: list[Action], observed: ClusterSnapshot) -> None:
         changes = [a for a in actions if not isinstance(a, PatchStatus | Emit)]
@@ -148,7 +149,7 @@ class ClusterApplier:
                 await in_thread(self._call_api, action, observed)
         except StateChanged as error:
             log.debug("%s: postponed: %s has changed meanwhile", describe(action), error)
-            self._doubt(_subject(action))
+            self._doubt(_uid(action))
             return None
         except NotLeading:
             return None  # the leader acts, or this operator in a later term
@@ -161,7 +162,7 @@ class ClusterApplier:
             log.exception("action failed by an internal error: %s", describe(action))
             text = f"the operator failed: {error!r}"
         else:
-            self._stale.discard(_subject(action))
+            self._stale.discard(_uid(action))
             level = logging.DEBUG if quiet else logging.INFO
             log.log(level, "%s", describe(action), extra=_log_fields(action))
             self._counted(action, "ok")
@@ -175,16 +176,16 @@ class ClusterApplier:
         self._counted(action, "failed")
         return text
 
-    def _doubt(self, id: Name) -> None:
+    def _doubt(self, uid: str) -> None:
         """Note that an object differs from the watched state. The second time, call ``doubted``.
 
         A first difference may come from a watch that lags.
         """
-        if id in self._stale:
+        if uid in self._stale:
             self._stale.clear()
             self._doubted()
         else:
-            self._stale.add(id)
+            self._stale.add(uid)
 
     async def _is_retired(self, action: Action, observed: ClusterSnapshot) -> bool:
         """Whether a proxy has unregistered its nodes.
@@ -291,6 +292,18 @@ def _subject(action: Action) -> Name:
             return action.id
         case _:
             return action.of
+
+
+def _uid(action: Action) -> str:
+    """Return the uid of the object that an action changes; empty for a new object or an Event."""
+    return action.uid if isinstance(action, ObjectAction) else ""
+
+
+def _uids(observed: ClusterSnapshot) -> set[str]:
+    """Return the uids of all objects that the operator may change or delete."""
+    services = {service.uid for service in observed.services.values()}
+    policies = {policy.uid for policy in observed.policies.values()}
+    return services | policies | {pod.uid for pod in observed.pods}
 
 
 def _log_fields(action: Action) -> dict[str, str]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from aiohttp import web
+from msgspec.structs import replace
 
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient
@@ -189,6 +190,21 @@ async def test_an_object_that_stays_different_from_the_snapshot_is_doubted(
         assert carry.doubts == times
     assert server.all("pods")
     assert carry.applier.failures == {OF: {}}
+
+
+async def test_a_vanished_object_is_doubted_no_more(server: ApiServer, carry: Carried) -> None:
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    proxies = [server.put("pods", proxy_obj(node=node), NAMESPACE) for node in ("one", "two")]
+    seen = snapshot_of(server)
+    server.drop("rosproxies", "arm", NAMESPACE)
+    names = [(Name(NAMESPACE, p["metadata"]["name"]), p["metadata"]["uid"]) for p in proxies]
+    await carry.applier.carry_out([DeleteProxy(OF, *name, "why") for name in names], seen)
+    left = [proxies[0]["metadata"]["uid"]]
+    assert len(carry.applier._stale) == 2
+
+    pods = tuple(pod for pod in seen.pods if pod.uid in left)
+    await carry.applier.carry_out([], replace(seen, pods=pods))
+    assert [*carry.applier._stale] == left
 
 
 async def test_another_image(server: ApiServer, carry: Carried) -> None:
