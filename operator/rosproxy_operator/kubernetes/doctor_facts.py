@@ -27,7 +27,7 @@ from rosproxy_operator.kubernetes.status.event_findings import MOST, RecentEvent
 from rosproxy_operator.kubernetes.status.operator_findings import (
     OPERATORS,
     Operators,
-    service_account,
+    service_accounts,
 )
 from rosproxy_operator.kubernetes.status.webhook_findings import (
     WebhookFacts,
@@ -55,17 +55,20 @@ class DoctorFacts:
         """
         pods = self._ask("operator", lambda: self._api.list_fresh("pods", "", labels=OPERATORS))
         found = Operators(None if pods is None else tuple(pods))
-        account = service_account(found)
         unnoticed = (rosproxy for rosproxy in rosproxies if is_unnoticed(rosproxy))
         namespaces = {text_at(submap(r, "metadata"), "namespace") for r in unnoticed}
-        if account is None or not namespaces:
-            return found
-        refused = self._ask("operator", lambda: self._refused(account, namespaces))
+        refused = self._ask("operator", lambda: self._refused(found, namespaces))
         return Operators(found.pods, refused or frozenset())
 
-    def _refused(self, account: Name, namespaces: Iterable[str]) -> frozenset[str]:
+    def _refused(self, operators: Operators, namespaces: Iterable[str]) -> frozenset[str]:
+        """Return the namespaces that operators manage without the right to write a status."""
         may_write = self._api.may_patch_status
-        return frozenset(n for n in sorted(namespaces) if not may_write(account, n))
+        accounts = {name: service_accounts(operators, name) for name in sorted(namespaces)}
+        return frozenset(
+            name
+            for name, group in accounts.items()
+            if group and not any(may_write(account, name) for account in group)
+        )
 
     def meant_pods(self) -> list[Pod]:
         """Return the live pods with the label rosproxy.io/inject, or with a misspelt name."""

@@ -21,7 +21,7 @@ _OPTION = "--namespace"
 class Operators(msgspec.Struct, frozen=True):
     """The operators in the cluster. ``pods`` is None if the doctor could not read the pods.
 
-    In ``refused_namespaces`` the operator lacks the right to write the status of a RosProxy.
+    In ``refused_namespaces`` no operator has the right to write the status of a RosProxy.
     """
 
     pods: tuple[Json, ...] | None = None
@@ -97,8 +97,8 @@ def unnoticed(rosproxy: Name, operators: Operators) -> DoctorFinding:
         return error(_CHECK, subject, text, fix)
     text = "the operator has not looked at the last change of this RosProxy yet"
     fix = f"check that the operator runs: kubectl get pods -A -l {OPERATORS}"
-    if operators.pods:
-        fix = _log(_id(operators.pods[0]).namespace)
+    if managers := _managers(operators, namespace):
+        fix = _log(_id(managers[0]).namespace)
     return error(_CHECK, subject, text, fix)
 
 
@@ -124,11 +124,17 @@ def ready_since(pod: Json) -> str:
     return next((text_at(c, "lastTransitionTime") for c in ready), "")
 
 
-def service_account(operators: Operators) -> Name | None:
-    """The first service account that a pod of the operators names; None without such a pod."""
-    pods = operators.pods or ()
+def service_accounts(operators: Operators, namespace: str) -> tuple[Name, ...]:
+    """The service accounts of the operators that manage a namespace, each once."""
+    pods = _managers(operators, namespace)
     ids = (Name(_id(p).namespace, text_at(submap(p, "spec"), "serviceAccountName")) for p in pods)
-    return next((id for id in ids if id.name), None)
+    return tuple(dict.fromkeys(id for id in ids if id.name))
+
+
+def _managers(operators: Operators, namespace: str) -> list[Json]:
+    """The pods of the operators that manage a namespace."""
+    managed = [(pod, frozenset(_namespaces(pod))) for pod in operators.pods or ()]
+    return [pod for pod, namespaces in managed if not namespaces or namespace in namespaces]
 
 
 def _id(pod: Json) -> Name:

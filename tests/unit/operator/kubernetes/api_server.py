@@ -50,7 +50,7 @@ class ApiServer:
         self.refusals: dict[tuple[str, str], tuple[int, str]] = {}
         self.address_refusals = Counter[str]()  # remaining refusals for each address
         self.gone_for_watches = False
-        self.granted = False  # the answer to a SubjectAccessReview
+        self.granted = set[str]()  # the users that a SubjectAccessReview allows
         self.retry_after = ""
         self.url = ""
         self._numbers = itertools.count(1)
@@ -135,7 +135,7 @@ class ApiServer:
             must = body["deleteOptions"]
             return self._delete(key, sub, must) if key in self.objects else _status(404, "gone")
         if kind == "subjectaccessreviews":
-            return web.json_response({"status": {"allowed": self.granted}})
+            return web.json_response({"status": {"allowed": body["spec"]["user"] in self.granted}})
         if request.method == "POST":
             return self._create(kind, namespace, body)
         if not name:

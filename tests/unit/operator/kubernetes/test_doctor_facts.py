@@ -233,11 +233,30 @@ async def test_an_operator_that_may_not_write_the_status(server: ApiServer, api:
     assert server.bodies[-1]["spec"]["user"] == "system:serviceaccount:system:op"
     (finding,) = cluster_findings([rosproxy_obj()], operators)
     assert finding.text.startswith("the operator lacks the right to patch rosproxies/status")
-    server.granted = True
+    server.granted = {"system:serviceaccount:system:op"}
     operators = await in_thread(facts.operators, [rosproxy_obj()])
     (finding,) = cluster_findings([rosproxy_obj()], operators)
     assert "has not looked at the last change" in finding.text
     assert facts.refused == []
+
+
+async def test_the_rights_of_the_operator_that_manages_the_namespace_count(
+    server: ApiServer, api: Api
+) -> None:
+    other = operator_obj("--namespace=elsewhere")
+    other["metadata"] |= {"name": "a", "namespace": "another"}
+    server.put("pods", other, "another")
+    put_operator(server, f"--namespace={NAMESPACE}")
+    server.granted = {"system:serviceaccount:another:op"}
+    facts = DoctorFacts(api, ())
+    operators = await in_thread(facts.operators, [rosproxy_obj()])
+    (finding,) = cluster_findings([rosproxy_obj()], operators)
+    assert finding.text.startswith("the operator lacks the right to patch rosproxies/status")
+    server.granted = {"system:serviceaccount:system:op"}
+    operators = await in_thread(facts.operators, [rosproxy_obj()])
+    (finding,) = cluster_findings([rosproxy_obj()], operators)
+    assert "has not looked at the last change" in finding.text
+    assert "kubectl -n system logs -l" in finding.fix
 
 
 async def test_a_webhook_that_no_operator_serves(server: ApiServer, api: Api) -> None:
