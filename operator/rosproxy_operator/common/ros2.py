@@ -33,9 +33,9 @@ def well_known_ports(domain: int) -> frozenset[int]:
 
 
 def read_peer_name(text: str) -> str:
-    """Parse and return a peer: ``host`` in lower case, or ``host:port``. Raises ValueError."""
+    """Parse and return a peer: ``host`` or ``host:port``, in lower case. Raises ValueError."""
     peer = read_peer(text)
-    return str(peer) if peer.port else peer.host.lower()
+    return (str(peer) if peer.port else peer.host).lower()
 
 
 def is_dds(rmw: str) -> bool:

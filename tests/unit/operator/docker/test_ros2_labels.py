@@ -154,6 +154,8 @@ def test_peers() -> None:
     (member,), told = read(labelled_container({**TWO, "rosproxy.peers": "Robot, 192.0.2.7:11400"}))
     assert sorted(member.peers) == ["192.0.2.7:11400", "robot"]
     assert not told
+    twice = labelled_container({**TWO, "rosproxy.peers": "Robot:11400, robot:11400"})
+    assert read(twice)[0][0].peers == {"robot:11400"}
     text = refusal(labelled_container({**TWO, "rosproxy.peers": "no/host"}))
     assert text == (
         "label rosproxy.peers: 'no/host' is not of the form HOST or HOST:PORT, such as robot or "
