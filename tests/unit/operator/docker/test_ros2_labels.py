@@ -208,7 +208,10 @@ def test_plane_direction_and_rules_are_its_own() -> None:
 
 def test_what_is_no_ipv4_is_left_out() -> None:
     text = refusal(labelled_container(TWO), replace(SETTINGS, advertise_host="2001:db8::1"))
-    assert text.endswith("Give an IPv4 address")
+    assert text == (
+        "advertised host 2001:db8::1 is an IPv6 address, but the operator starts proxies for ROS 2 "
+        "with IPv4 only. Give an IPv4 address"
+    )
 
 
 APP = Network("n1", "app", subnets=(IPv4Network("172.30.0.0/16"),))

@@ -328,7 +328,8 @@ def test_an_address_of_ipv6_is_not_advertised():
     of = of2()
     lost = node(addresses={"InternalIP": "fd00::1"})
     plan = look(observed(of, service(of), lost, pod()))
-    assert "IPv4 only" in told(plan, "NoAdvertiseHost")[0]
+    text = "the operator starts proxies for ROS 2 with IPv4 only. Give an IPv4 address"
+    assert text in told(plan, "NoAdvertiseHost")[0]
 
 
 def admitted(*env: Any) -> dict[str, Any]:

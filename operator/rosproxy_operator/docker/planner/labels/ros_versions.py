@@ -119,13 +119,12 @@ def domain(container: Container) -> int:
 
 
 def refuse_unserved(host: str) -> None:
-    """Raise UnusableLabel if the advertised host is an IPv6 address.
-
-    The operator starts proxies for ROS 2 with IPv4 alone.
-    """
+    """Raise UnusableLabel if the advertised host is an IPv6 address."""
     if ":" in host:
-        text = f"advertised host {host} is an IPv6 address, and for ROS 2 a proxy uses IPv4 only"
-        raise UnusableLabel(f"{text}. Give an IPv4 address")
+        raise UnusableLabel(
+            f"advertised host {host} is an IPv6 address, but the operator starts proxies for ROS 2 "
+            "with IPv4 only. Give an IPv4 address"
+        )
 
 
 def past_the_proxy(

@@ -136,9 +136,11 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
         return Obstacle("MasterUnknown", problem)
     host, problem = advertise_host(rosproxy, node)
     if rosproxy.spec.ros2 and ":" in host:
-        problem = f"advertised host {host} is an IPv6 address, and for ROS 2 a proxy uses IPv4 only"
-        command = f"kubectl annotate node {node.name} rosproxy.io/advertise-host=ADDRESS"
-        problem += f". Give an IPv4 address: run {command}"
+        problem = (
+            f"advertised host {host} is an IPv6 address, but the operator starts proxies for ROS 2 "
+            "with IPv4 only. Give an IPv4 address: run kubectl annotate node "
+            f"{node.name} rosproxy.io/advertise-host=ADDRESS"
+        )
     if problem:
         return Obstacle("NoAdvertiseHost", problem)
     if place in context.ranges.exhausted:
