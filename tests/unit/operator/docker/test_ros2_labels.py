@@ -186,11 +186,15 @@ def test_peers_that_are_not_allowed_are_left_out() -> None:
 
 def test_labels_of_the_other_version_are_told() -> None:
     assert read(labelled_container({**TWO, "rosproxy.slave-control": "master"}))[1] == [
-        "label rosproxy.slave-control is ignored: the label is for ROS 1, the container is not"
+        "label rosproxy.slave-control is ignored: the label is for ROS 1, the container is not. "
+        "Remove the label, or set rosproxy.ros=1 if the nodes use ROS 1"
     ]
     labels = {**ON, "rosproxy.master-uri": ROBOT, "rosproxy.peers": "robot"}
     told = read(labelled_container(labels, env=ROBOT))[1]
-    assert told == ["label rosproxy.peers is ignored: the label is for ROS 2, the container is not"]
+    assert told == [
+        "label rosproxy.peers is ignored: the label is for ROS 2, the container is not. Remove the "
+        "label, or set rosproxy.ros=2 if the nodes use ROS 2"
+    ]
 
 
 def test_plane_direction_and_rules_are_its_own() -> None:

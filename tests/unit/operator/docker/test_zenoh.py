@@ -198,7 +198,20 @@ def test_the_label_is_ignored_on_a_container_of_ros_1() -> None:
     labels = {RMW: "zenoh", "rosproxy.ros": "1", "rosproxy.master-uri": "http://robot:11311"}
     (member,), told = read(replace(node(labels=labels), master_uri="http://robot:11311"))
     assert member.key.ros == "1"
-    assert told == ["label rosproxy.rmw is ignored: the label is for ROS 2, the container is not"]
+    assert told == [
+        "label rosproxy.rmw is ignored: the label is for ROS 2, the container is not. Remove the "
+        "label, or set rosproxy.ros=2 if the nodes use ROS 2"
+    ]
+
+
+def test_a_container_of_ros_1_and_rmw_zenoh_has_no_domain() -> None:
+    labels = {RMW: "zenoh", "rosproxy.ros": "1,2", "rosproxy.domain": "7"}
+    ros1 = replace(node(labels=labels), master_uri="http://robot:11311")
+    members, told = read(ros1)
+    assert sorted(member.key.ros for member in members) == ["1", "zenoh"]
+    assert told == [
+        "label rosproxy.domain is ignored: the label has no effect on rmw_zenoh. Remove the label"
+    ]
 
 
 def test_rules_of_the_administrator_keep_it_out() -> None:

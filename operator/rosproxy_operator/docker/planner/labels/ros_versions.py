@@ -41,7 +41,6 @@ from rosproxy_operator.proxy_spec.spec import WISHES
 
 _OF_ROS1 = (MASTER_URI, REDIRECT, *(w.label for w in WISHES.values() if w.ros == "1"))
 _OF_ROS2 = (RMW, DOMAIN, PEERS)
-_OF_ZENOH = (RMW, PEERS, REDIRECT)
 _NOT_OF_ZENOH = (
     *(DOMAIN, PORTS, ADVERTISE_HOST, MASTER_URI),
     *(wish.label for wish in WISHES.values()),
@@ -162,17 +161,30 @@ def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[st
     labels = container.labels
     if is_guessed(container):
         yield f"{UNKNOWN}, so the operator assumes ROS 1. Add the label {ROS}=1 or {ROS}=2"
-    if ros_versions == {"zenoh"}:
-        ignored = dict.fromkeys(_NOT_OF_ZENOH, "the label has no effect on rmw_zenoh")
-    else:
-        ignored = {
-            label: f"the label is for ROS {version}, the container is not"
-            for version, of_version in (("1", _OF_ROS1), ("2", _OF_ROS2))
-            for label in of_version
-            if version not in ros_versions
-        }
-        served = _OF_ZENOH if "zenoh" in ros_versions else ()
-        ignored = {label: text for label, text in ignored.items() if label not in served}
     yield from (
-        f"label {label} is ignored: {text}" for label, text in ignored.items() if label in labels
+        f"label {label} is ignored: {text}"
+        for label, text in _ignored(ros_versions).items()
+        if label in labels
+    )
+
+
+def _ignored(ros_versions: Collection[str]) -> dict[str, str]:
+    """The labels without effect on a container of these versions, each with the reason and fix."""
+    without_effect = "the label has no effect on rmw_zenoh. Remove the label"
+    if ros_versions == {"zenoh"}:
+        return dict.fromkeys(_NOT_OF_ZENOH, without_effect)
+    ignored: dict[str, str] = {}
+    if "1" not in ros_versions:
+        ignored |= dict.fromkeys(_OF_ROS1, _of_another_version("1"))
+    if "zenoh" in ros_versions:
+        ignored[DOMAIN] = without_effect
+    elif "2" not in ros_versions:
+        ignored |= dict.fromkeys(_OF_ROS2, _of_another_version("2"))
+    return ignored
+
+
+def _of_another_version(version: str) -> str:
+    return (
+        f"the label is for ROS {version}, the container is not. Remove the label, or set "
+        f"{ROS}={version} if the nodes use ROS {version}"
     )
