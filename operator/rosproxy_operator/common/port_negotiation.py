@@ -19,6 +19,9 @@ TAKEN_FOR = 300.0
 """Seconds for which the operator avoids a port that the engine has refused."""
 MOVED_FOR = 600.0
 """Seconds for which the operator reports that a proxy had to leave its range."""
+LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999))
+"""Ranges for the outgoing connections of a proxy, best first (net.ipv4.ip_local_port_range)."""
+_UNPRIVILEGED_PORTS = PortRange(1024, LAST_PORT)
 Proxy = TypeVar("Proxy", bound=Hashable)
 """The key of a proxy, unique in an engine."""
 
@@ -188,6 +191,25 @@ def is_free(ports: PortRange, blocked: Collection[int], ranges: Iterable[PortRan
 def overlap(ports: PortRange, other_ports: PortRange) -> bool:
     """Whether two ranges have a port in common."""
     return ports.first <= other_ports.last and other_ports.first <= ports.last
+
+
+def local_ports(
+    listening: Collection[PortRange], stand_ins: Collection[PortRange] = ()
+) -> PortRange:
+    """Return the ports for outgoing connections of a proxy that listens on the ``listening`` ports.
+
+    Otherwise a connection might take a port of the range before a node needs the port. The result
+    is the first range of `LOCAL_PORTS` that fits. If none fits, the result is the longest range
+    without ports of ``listening`` and of ``stand_ins``.
+    """
+    free = gaps(_UNPRIVILEGED_PORTS, (), [*listening, *stand_ins])
+    longest = max(free, key=len, default=LOCAL_PORTS[0])
+    return first_fitting(LOCAL_PORTS, listening) or longest
+
+
+def first_fitting(ranges: Iterable[PortRange], used: Collection[PortRange]) -> PortRange | None:
+    """Return the first range without ports of ``used``."""
+    return next((ports for ports in ranges if is_free(ports, (), used)), None)
 
 
 def within(inner: PortRange, outer: PortRange) -> bool:

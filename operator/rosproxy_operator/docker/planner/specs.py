@@ -15,6 +15,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.setting_kinds import SettingError, hash_token, parse_range
 from rosproxy.settings import MOST_ZENOH_PORTS
 from rosproxy_operator.common.policy import AWAITED, as_variable
+from rosproxy_operator.common.port_negotiation import local_ports
 from rosproxy_operator.common.ros2 import (
     LAN_RELAY_COMMAND,
     LAST_DOMAIN,
@@ -316,11 +317,12 @@ def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, A
     """The body of the engine's ``POST /containers/create`` for a sandbox.
 
     The sandbox only sleeps. In the sandbox's namespace, outgoing connections of the proxy get ports
-    from 1024 to 11000: below the usual ports for master, admin endpoint and range. For rmw_zenoh,
-    these ports begin after the ports of the routers.
+    outside the range. For rmw_zenoh, these ports begin after the ports of the routers.
     """
-    first = FIRST_PORT + MOST_ZENOH_PORTS if action.key == ZENOH else 1024
-    sysctls = {"net.ipv4.ip_local_port_range": f"{first} 11000"}
+    local = local_ports([action.range])
+    if action.key == ZENOH:
+        local = PortRange(FIRST_PORT + MOST_ZENOH_PORTS, 11000)
+    sysctls = {"net.ipv4.ip_local_port_range": f"{local.first} {local.last}"}
     if action.spec.data_plane == "kernel":
         sysctls["net.ipv4.ip_forward"] = "1"
     bindings = {

@@ -1,7 +1,7 @@
 """The Kubernetes objects that the operator creates, as JSON for the API server."""
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import msgspec
@@ -10,7 +10,7 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.policy import AWAITED, as_variable
-from rosproxy_operator.common.port_negotiation import LAST_PORT, gaps, is_free
+from rosproxy_operator.common.port_negotiation import LOCAL_PORTS, first_fitting, local_ports
 from rosproxy_operator.common.ros2 import discovery_port
 from rosproxy_operator.kubernetes.planner.proxy_ports import STAND_INS, fixed_ports
 from rosproxy_operator.kubernetes.resources.model import (
@@ -62,14 +62,8 @@ _TAINTS = (
 
 ``AddOrUpdateDaemonPodTolerations`` in k8s.io/kubernetes, pkg/controller/daemon/util.
 """
-_LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999))
-"""Ranges from which Linux may take the source ports of a proxy's outgoing connections.
-
-A pod gets the first range without the ports on which the proxy has to listen (`_local_ports`).
-"""
-_FORMER_LOCAL_PORTS = (*_LOCAL_PORTS, PortRange(12000, 30000))
+_FORMER_LOCAL_PORTS = (*LOCAL_PORTS, PortRange(12000, 30000))
 """The ranges of former operators, for the fingerprint. The last range has ports of stand-ins."""
-_UNPRIVILEGED_PORTS = PortRange(1024, LAST_PORT)
 
 _FINGERPRINTS: dict[Name, tuple[object, str]] = {}
 """Cache of `proxy_fingerprint`, by the name of the pod: the inputs, and the fingerprint."""
@@ -158,7 +152,7 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     identity = hashlib.sha256(graph.encode()).hexdigest()[:8]
     # The digest is of the pod without the fingerprint annotation, which is added only now.
     meta["annotations"][FINGERPRINT] = f"{digest(body)}-{identity}"
-    own_spec = _spec(site, settings, _local_ports(site))
+    own_spec = _spec(site, settings, local_ports(_listening(site), [STAND_INS]))
     return {**body, "spec": {**own_spec, "containers": [container]}}
 
 
@@ -361,25 +355,10 @@ def bound_to(node: str, spec: RosProxySpec, settings: ClusterSettings) -> dict[s
     }
 
 
-def _local_ports(site: ProxySite) -> PortRange:
-    """The ports for outgoing connections: the first range of `_LOCAL_PORTS` that fits.
-
-    If none fits, the longest range without ports on which the proxy listens, stand-ins included.
-    """
-    used = _listening(site)
-    free = gaps(_UNPRIVILEGED_PORTS, (), [*used, STAND_INS])
-    longest = max(free, key=len, default=_LOCAL_PORTS[0])
-    return _first_fitting(_LOCAL_PORTS, used) or longest
-
-
 def _former_local_ports(site: ProxySite) -> PortRange:
     """The ports that former operators gave to outgoing connections."""
     used = _listening(site)
-    return _first_fitting(_FORMER_LOCAL_PORTS, used) or _FORMER_LOCAL_PORTS[0]
-
-
-def _first_fitting(ranges: Iterable[PortRange], used: Collection[PortRange]) -> PortRange | None:
-    return next((r for r in ranges if is_free(r, (), used)), None)
+    return first_fitting(_FORMER_LOCAL_PORTS, used) or _FORMER_LOCAL_PORTS[0]
 
 
 def _listening(site: ProxySite) -> list[PortRange]:

@@ -54,6 +54,13 @@ def test_a_sandbox_holds_ports_and_network_and_does_nothing() -> None:
     assert host["Sysctls"] == {"net.ipv4.ip_local_port_range": "1024 11000"}
 
 
+@pytest.mark.parametrize("ports", [PortRange(9000, 9031), PortRange(11000, 11031)])
+def test_outgoing_connections_take_no_port_of_the_range(ports: PortRange) -> None:
+    """--port-window may begin below 11001."""
+    body = sandbox_config(structs.replace(SANDBOX, range=ports), SETTINGS)
+    assert body["HostConfig"]["Sysctls"] == {"net.ipv4.ip_local_port_range": "32768 60999"}
+
+
 def test_a_proxy_is_in_its_sandbox_and_has_nothing_of_its_own() -> None:
     body = container_config(PROXY, SETTINGS, SECRET, "192.0.2.7")
     assert body["HostConfig"]["NetworkMode"] == "container:s"
