@@ -282,7 +282,8 @@ def _set_steps(
     outdated = [r for r in records if r.fingerprint != action.fingerprint]
     if record is None or not record.done or outdated:
         # With outdated records, run again: a user may have started an outdated record.
-        steps.append(Run(action.name))
+        # A user may have renamed the record.
+        steps.append(Run(record.container.name if record else action.name))
     return [*steps, *(Remove(r.container.name, "outdated") for r in outdated)]
 
 
@@ -308,7 +309,9 @@ def _removal_steps(
     steps = _set_steps(action, records, observed)
     if not steps and not any(r.fingerprint == action.fingerprint for r in records):
         return []  # without the image, the operator can't delete the rules
-    return [*steps, Remove(action.name, "done")]
+    matching = (r.container for r in records if r.fingerprint == action.fingerprint)
+    names = [container.name for container in matching if container.state != "dead"]
+    return [*steps, *(Remove(name, "done") for name in names or [action.name])]
 
 
 def _is_busy(records: Iterable[RedirectContainer], observed: HostState) -> bool:

@@ -114,6 +114,20 @@ def test_one_that_has_failed_or_not_run_is_run(state: str) -> None:
     assert steps(observed(node(), **nodes_proxy(), redirects=(redirect,))) == [Run(made.name)]
 
 
+def test_a_renamed_record_runs_and_is_removed_under_its_name() -> None:
+    made = wanted(observed(node(), **nodes_proxy()))
+    name = f"{made.name}-2"
+    failed = record(structs.replace(made, name=name), code=1)
+    assert steps(observed(node(), **nodes_proxy(), redirects=(failed,))) == [Run(name)]
+
+    unwanted = observed(node(redirect="false"), **nodes_proxy(), redirects=(record(made),))
+    removal = steps(unwanted)[0]
+    assert isinstance(removal, CreateRedirect)
+    failed = record(structs.replace(removal, name=f"{removal.name}-2"), code=1)
+    state = replace(unwanted, redirects=(failed,))
+    assert steps(state) == [Run(failed.container.name), Remove(failed.container.name, "done")]
+
+
 def test_it_is_set_anew_for_another_start_and_another_address() -> None:
     old = wanted(observed(node(), **nodes_proxy()))
     later = replace(node(), started_at="2026-01-01T10:00:00Z")
