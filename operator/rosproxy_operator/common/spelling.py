@@ -11,8 +11,9 @@ NEAR = 0.75
 
 def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str:
     """Return the most similar known name, ignoring case; empty if all are below ``cutoff``."""
-    # A name with more than twice the length of a known name has a similarity below 0.67.
-    longest = 2 * max(map(len, known))
+    # The similarity is twice the number of equal characters, divided by both lengths together
+    # (difflib). So a longer name stays below the cutoff, even if it contains a known name.
+    longest = (2 / cutoff - 1) * max(map(len, known))
     return _nearest(name.lower(), known, cutoff) if len(name) <= longest else ""
 
 
