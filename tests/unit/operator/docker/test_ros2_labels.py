@@ -257,3 +257,9 @@ def test_the_advertised_host_is_the_address_for_far_hosts() -> None:
     assert told[0].startswith(
         "the operator does not know this host's address. Add the label rosproxy.adv"
     )
+
+
+def test_a_container_that_opts_out_has_no_problem_with_other_labels() -> None:
+    settings = replace(SETTINGS, expose_by_default=True)
+    labels = {"rosproxy.enable": "false", "rosproxy.ros": "3"}
+    assert read(labelled_container(labels), settings) == ([], [])

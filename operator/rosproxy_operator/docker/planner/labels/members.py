@@ -63,7 +63,7 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
             continue
         wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
         try:
-            if readers.enabled(container.labels, _exposed(container, settings)):
+            if _is_enabled(container, settings):
                 granted, texts = _requests(container, observed, settings, proxies)
                 requests += granted
                 wrong += [_problem(container, text, False) for text in texts]
@@ -239,8 +239,18 @@ def _unusable(container: Container, text: str) -> Problem:
     return _problem(container, text, fatal=bool(_own(container)))
 
 
+def _is_enabled(container: Container, settings: PlanSettings) -> bool:
+    """Return whether a container gets a proxy. Raises UnusableLabel."""
+    # The other labels of a container with rosproxy.enable=false are not read.
+    enabled = readers.enabled(container.labels)
+    return _exposed(container, settings) if enabled is None else enabled
+
+
 def _exposed(container: Container, settings: PlanSettings) -> bool:
-    """Return whether a container without the label rosproxy.enable gets a proxy."""
+    """Return whether a container without the label rosproxy.enable gets a proxy.
+
+    Raises UnusableLabel.
+    """
     if not settings.expose_by_default:
         return False
     is_ros2 = not ros_versions.versions(container) <= {"1"}

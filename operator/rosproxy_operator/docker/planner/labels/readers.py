@@ -80,10 +80,9 @@ def refuse_long_values(labels: Labels) -> None:
             raise UnusableLabel(f"label {label} has more than {LONGEST_VALUE} characters. {fix}")
 
 
-def enabled(labels: Labels, otherwise: bool) -> bool:
-    """Return whether a container wants a proxy; ``otherwise`` without the label."""
-    flag = _flag(ENABLE, labels)
-    return otherwise if flag is None else flag
+def enabled(labels: Labels) -> bool | None:
+    """Return whether a container wants a proxy; None without the label."""
+    return _flag(ENABLE, labels)
 
 
 def redirect(labels: Labels) -> bool | None:
