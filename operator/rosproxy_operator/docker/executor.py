@@ -205,7 +205,7 @@ class Executor:
             self._finished()
 
     async def _carry_out_group(self, group: Group, carry_out: CarryOut) -> Problem | None:
-        """Carry out a group until an action fails, and return the last problem.
+        """Carry out a group until an action fails, and return the first problem.
 
         A group continues after a failed Connect or Disconnect: the proxy can still serve other
         networks. A taken port is no problem here: the next plan decides on the range (allocation).
@@ -220,7 +220,9 @@ class Executor:
             except EngineError as error:
                 fix = f". {group.fix}" if group.fix else ""
                 subject = _subject((group.key, group.subject))
-                problem = Problem(subject, f"{action}: {error}{fix}", group.fatal)
+                text = f"{action}: {error}{fix}"
+                # A later failure may be a consequence of the first. The log has both.
+                problem = problem or Problem(subject, text, group.fatal)
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem

@@ -145,6 +145,15 @@ async def test_a_network_that_cannot_be_joined_does_not_end_the_group(host: Host
     assert len(host.work.problems) == 1
 
 
+async def test_the_first_cause_stays_visible(host: Host) -> None:
+    connect = Connect("a", "app", ())
+    host.does[connect] = EngineError("network not found")
+    host.does[Start("a")] = EngineError("no")
+    await host.start(Group(ONE, (connect, Start("a"))))
+    (problem,) = host.work.problems
+    assert problem.text.endswith(": network not found")
+
+
 async def test_a_port_that_is_taken_is_no_failure_but_told(host: Host) -> None:
     host.does[Start("a")] = PortTaken("taken", 11405)
     await host.start(Group(ONE, (Start("a"), Start("b"))))
