@@ -231,6 +231,8 @@ def read_network(row: Json) -> Network:
         gateway=next((gateway for gateway in gateways if gateway and ":" not in gateway), ""),
         subnets=tuple(subnet for subnet in subnets if isinstance(subnet, IPv4Network)),
         made_by_operator=dig(row, "Labels", MANAGED) == "true",
+        # Engines before API 1.48 have no EnableIPv4: each network has IPv4.
+        dual_stack=row.get("EnableIPv6") is True and row.get("EnableIPv4") is not False,
     )
 
 

@@ -28,7 +28,8 @@ def desire(
     exited container count for ``grace`` seconds: the proxy keeps options and peers, and stays on
     joined networks, but joins no other network for that container. ``now`` is in monotonic seconds.
     """
-    bad = _before_uplink(observed, settings.uplink)
+    before = _before_uplink(observed, settings.uplink)
+    bad = {name for name in before if name.encode() < settings.uplink.encode()}
     usable = {network.name for network in observed.networks} - BUILT_IN - bad
     alive = [member for member in members if member.container.alive]
     recent = [
@@ -55,8 +56,11 @@ def desire(
                 _peers(key, considered, observed, settings),
             )
         )
-    bad_networks = [_bad_network(name, settings.uplink) for name in sorted(bad & _networks(alive))]
-    return tuple(desired), (*bad_networks, *_outvoted(desired))
+    problems = [
+        (_bad_network if name in bad else _preferred_network)(name, settings.uplink)
+        for name in sorted(before & _networks(alive))
+    ]
+    return tuple(desired), (*problems, *_outvoted(desired))
 
 
 def proxy_spec(key: Key, members: Iterable[Member], settings: PlanSettings) -> ProxySpec:
@@ -96,15 +100,19 @@ def _networks(members: Iterable[Member]) -> frozenset[str]:
 def _before_uplink(observed: HostState, uplink: str) -> set[str]:
     """Return the networks that would take published ports and default route from the uplink.
 
-    The engine gives ports and default route to the network whose name sorts first, internal
-    networks aside. Such a move cuts all connections.
+    The engine gives ports and default route to a network with IPv4 and IPv6, then to the network
+    whose name sorts first, internal networks aside. Such a move cuts all connections.
     """
     # moby sorts by Endpoint.Less (libnetwork/sandbox.go): networks that are not internal first,
-    # then networks with gateways for IPv4 and IPv6, then by name. Go compares names by bytes.
+    # then networks with gateways for IPv4 and IPv6, then by name. Go compares names by bytes. A
+    # gateway priority does not help: the first such network always gets the ports
+    # (libnetwork/default_gateway.go, selectGatewayEndpoint).
+    has_both = any(n.dual_stack for n in observed.networks if n.name == uplink)
     return {
         network.name
         for network in observed.networks
-        if not network.internal and network.name.encode() < uplink.encode()
+        if network.name != uplink and not network.internal
+        if (not network.dual_stack, network.name.encode()) < (not has_both, uplink.encode())
     }
 
 
@@ -114,6 +122,18 @@ def _bad_network(name: str, uplink: str) -> Problem:
         f"proxies can't join this network: its name sorts before the name of the uplink network "
         f"{uplink}, so the engine would move the published ports of the proxies there. Create the "
         "network under another name, or start the operator with an --uplink that sorts first",
+    )
+
+
+def _preferred_network(name: str, uplink: str) -> Problem:
+    """Return a warning. The proxies join, since they work there between two moves."""
+    return Problem(
+        f"network {name}",
+        f"the network has IPv6, and the uplink network {uplink} does not. So the engine moves the "
+        "published ports of a proxy when the proxy joins or leaves this network, which cuts all "
+        "connections. Create the network without IPv6, or start the operator with --uplink and the "
+        "name of a bridge that has IPv6 and sorts first",
+        fatal=False,
     )
 
 

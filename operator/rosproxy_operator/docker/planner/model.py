@@ -99,7 +99,8 @@ class Container:
 class Network:
     """A network of the engine. ``gateway`` is the IPv4 gateway; empty without.
 
-    ``made_by_operator``: the network has the operator's label.
+    ``made_by_operator``: the network has the operator's label. ``dual_stack``: the network has IPv4
+    and IPv6.
     """
 
     id: str
@@ -109,6 +110,7 @@ class Network:
     gateway: str = ""
     subnets: tuple[IPv4Network, ...] = ()
     made_by_operator: bool = False
+    dual_stack: bool = False
 
 
 @dataclass(frozen=True, slots=True, order=True)

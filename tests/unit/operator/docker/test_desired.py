@@ -125,6 +125,26 @@ def test_a_network_that_would_take_the_published_ports_is_not_joined(network: Ne
     assert "its name sorts before the name of the uplink network 0-rosproxy" in problems[0].text
 
 
+def test_a_network_with_ipv6_takes_the_ports_of_an_uplink_without() -> None:
+    """The engine prefers such a network, whatever its name. The proxy works there nevertheless."""
+    app = replace(APP, dual_stack=True)
+    desired, problems = want(observed(container(), networks=(UPLINK, app)))
+    assert desired[KEY].networks == {"app"}
+    assert [(problem.subject, problem.fatal) for problem in problems] == [("network app", False)]
+    assert "the network has IPv6, and the uplink network 0-rosproxy does not" in problems[0].text
+    internal = replace(app, internal=True)
+    uplink = replace(UPLINK, dual_stack=True)
+    for networks in ((UPLINK, internal), (uplink, app)):
+        assert want(observed(container(), networks=networks))[1] == ()
+
+
+def test_an_early_network_without_ipv6_takes_no_ports_of_an_uplink_with_ipv6() -> None:
+    uplink = replace(UPLINK, dual_stack=True)
+    early = Network("n3", "0-app")
+    desired, problems = want(observed(container(networks=("0-app",)), networks=(uplink, early)))
+    assert (desired[KEY].networks, problems) == (frozenset({"0-app"}), ())
+
+
 def test_an_early_network_that_nobody_asks_for_is_no_problem() -> None:
     assert want(observed(container(), networks=(UPLINK, APP, Network("n3", "0-a"))))[1] == ()
 

@@ -113,6 +113,20 @@ def test_a_network_and_its_subnets() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("flags", "dual_stack"),
+    [
+        ({}, False),
+        ({"EnableIPv6": False}, False),
+        ({"EnableIPv6": True}, True),
+        ({"EnableIPv6": True, "EnableIPv4": True}, True),
+        ({"EnableIPv6": True, "EnableIPv4": False}, False),
+    ],
+)
+def test_a_network_with_both_families(flags: dict[str, bool], dual_stack: bool) -> None:
+    assert read_network({**captured.network(), **flags}).dual_stack is dual_stack
+
+
 def test_a_network_without_addresses() -> None:
     host = {"Name": "host", "Id": "1", "Driver": "host", "IPAM": {"Config": None}}
     assert read_network(host).gateway == ""
