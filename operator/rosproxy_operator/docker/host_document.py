@@ -17,7 +17,6 @@ from rosproxy_operator.common.proxy_client import Json
 from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
 from rosproxy_operator.common.ros2_variables import LONGEST_VALUE, why_unheard
 from rosproxy_operator.common.zenoh import SESSION_FILE
-from rosproxy_operator.docker.planner.label_policy import network_owner
 from rosproxy_operator.docker.planner.model import (
     ZENOH,
     Container,
@@ -26,6 +25,7 @@ from rosproxy_operator.docker.planner.model import (
     Member,
     OwnContainer,
 )
+from rosproxy_operator.docker.planner.network_owner import by_reference, network_owner
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.redirect import redirect_record_name
 from rosproxy_operator.docker.planner.specs import lan_relay_name, proxy_name, sandbox_name
@@ -166,12 +166,14 @@ def _redirects(
     members: Iterable[Member], observed: HostState
 ) -> dict[tuple[str, Key | None], Json]:
     """Return the planned redirects of living containers, by container id and key of the proxy."""
-    by_id = {container.id: container for container in observed.containers}
+    containers = by_reference(observed.containers)
     return {
         (member.container.id, member.key): {
             "master": listed(map(str, member.redirected)),
             "in_place": bool(
-                redirect_record_name(observed, member.key, network_owner(member.container, by_id))
+                redirect_record_name(
+                    observed, member.key, network_owner(member.container, containers)
+                )
             ),
         }
         for member in members
@@ -258,8 +260,7 @@ def _unix_time(text: str) -> float:
 
 def _addresses(container: Container, observed: HostState) -> dict[str, str]:
     """Return the addresses by network, of the container that owns the network namespace."""
-    by_id = {other.id: other for other in observed.containers}
-    owner = network_owner(container, by_id)
+    owner = network_owner(container, by_reference(observed.containers))
     return {a.network: a.address for a in owner.attachments if a.address}
 
 

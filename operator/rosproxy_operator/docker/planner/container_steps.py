@@ -48,6 +48,7 @@ from rosproxy_operator.docker.planner.model import (
     Proxy,
     Sandbox,
 )
+from rosproxy_operator.docker.planner.network_owner import by_reference
 from rosproxy_operator.docker.planner.specs import (
     proxy_fingerprint,
     proxy_name,
@@ -87,8 +88,8 @@ class PlanContext:
     @property
     def label_policy(self) -> tuple[PolicyLayer, ...]:
         """The layers from the labels of the proxy's containers."""
-        by_id = {container.id: container for container in self.observed.containers}
-        return label_layers(self.desired.members, by_id, self.desired.networks)
+        containers = by_reference(self.observed.containers)
+        return label_layers(self.desired.members, containers, self.desired.networks)
 
     @property
     def lan_relay(self) -> HostPort | None:

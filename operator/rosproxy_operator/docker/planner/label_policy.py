@@ -14,7 +14,8 @@ from rosproxy.access.layers import LONGEST_LAYER_NAME, MOST_LAYERS, PolicyLayer
 from rosproxy.access.rules import MOST_RULES, format_rules
 from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.docker.planner.labels.readers import POLICY
-from rosproxy_operator.docker.planner.model import Container, Key, Member
+from rosproxy_operator.docker.planner.model import Key, Member
+from rosproxy_operator.docker.planner.network_owner import ByReference, network_owner
 from rosproxy_operator.docker.settings import PlanSettings
 
 OUTLIVES = 10.0
@@ -54,23 +55,18 @@ def with_bounded_rules(
 
 
 def label_layers(
-    members: Iterable[Member], by_id: Mapping[str, Container], networks: Collection[str]
+    members: Iterable[Member], containers: ByReference, networks: Collection[str]
 ) -> tuple[PolicyLayer, ...]:
     """Return the layers of living members, each for the container's addresses on ``networks``."""
     layers: list[PolicyLayer] = []
     for member in members:
-        owner = network_owner(member.container, by_id)
+        owner = network_owner(member.container, containers)
         attachments = (a for a in owner.attachments if a.network in networks)
         addresses = frozenset(a.address for a in attachments if a.address)
         if member.policy and member.container.alive and addresses:
             name = bounded(f"label of container {member.container.name}", LONGEST_LAYER_NAME)
             layers.append(PolicyLayer(name, member.policy, addresses=addresses))
     return tuple(layers)
-
-
-def network_owner(container: Container, by_id: Mapping[str, Container]) -> Container:
-    """Return the container that owns the network namespace of ``container``."""
-    return by_id.get(container.network_container or container.id, container)
 
 
 class RecentLayers:

@@ -14,11 +14,7 @@ from typing import Any
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.net.addresses import is_address, is_inside, is_loopback
-from rosproxy_operator.docker.planner.label_policy import (
-    RecentLayers,
-    label_layers,
-    network_owner,
-)
+from rosproxy_operator.docker.planner.label_policy import RecentLayers, label_layers
 from rosproxy_operator.docker.planner.model import (
     STARTED,
     Attachment,
@@ -27,6 +23,7 @@ from rosproxy_operator.docker.planner.model import (
     Member,
     Proxy,
 )
+from rosproxy_operator.docker.planner.network_owner import ByReference, by_reference, network_owner
 from rosproxy_operator.docker.planner.redirect import redirect_record_name
 from rosproxy_operator.docker.planner.specs import master
 
@@ -236,7 +233,7 @@ def network_facts(
     host = master(proxy.key).host.lower() if proxy.key.ros == "1" else ""
     sandbox = observed.sandbox_of(proxy)
     joined = {a.network for a in sandbox.container.attachments if a.address} if sandbox else set()
-    by_id = {container.id: container for container in observed.containers}
+    containers = by_reference(observed.containers)
     running = [container for container in observed.containers if container.state in STARTED]
     own_members = [member for member in members if member.key == proxy.key]
     return NetworkFacts(
@@ -257,16 +254,16 @@ def network_facts(
             arrival
             for member in own_members
             if proxy.key.ros == "1"
-            for arrival in _arrivals(member, observed, by_id, joined)
+            for arrival in _arrivals(member, observed, containers, joined)
         ),
         running=frozenset(container.id for container in running),
         selected=frozenset(
             a.address
             for member in own_members
             if member.container.alive
-            for a in _attachments(network_owner(member.container, by_id), joined)
+            for a in _attachments(network_owner(member.container, containers), joined)
         ),
-        policy=(*policy, *label_layers(own_members, by_id, joined)),
+        policy=(*policy, *label_layers(own_members, containers, joined)),
     )
 
 
@@ -275,11 +272,11 @@ def _attachments(container: Container, networks: Collection[str]) -> list[Attach
 
 
 def _arrivals(
-    member: Member, observed: HostState, by_id: Mapping[str, Container], joined: set[str]
+    member: Member, observed: HostState, containers: ByReference, joined: set[str]
 ) -> list[ContainerArrival]:
     """The arrivals of a running container, one for each network that the proxy has joined, too."""
     container = member.container
-    host = network_owner(container, by_id)
+    host = network_owner(container, containers)
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}

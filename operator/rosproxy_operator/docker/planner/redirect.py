@@ -29,7 +29,6 @@ from msgspec.structs import replace
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.docker.planner.actions import Action, CreateRedirect, Remove, Run
-from rosproxy_operator.docker.planner.label_policy import network_owner
 from rosproxy_operator.docker.planner.labels.readers import MASTER_URI
 from rosproxy_operator.docker.planner.model import (
     STARTED,
@@ -41,6 +40,7 @@ from rosproxy_operator.docker.planner.model import (
     Member,
     RedirectContainer,
 )
+from rosproxy_operator.docker.planner.network_owner import by_reference, network_owner
 from rosproxy_operator.docker.planner.specs import (
     NFT,
     helper_config,
@@ -206,9 +206,9 @@ def _wanted(
 
 def _started(proxy: Desired, observed: HostState) -> Iterator[tuple[Member, Container]]:
     """The members of a proxy that need a redirect now, each with the owner of the network."""
-    by_id = {container.id: container for container in observed.containers}
+    containers = by_reference(observed.containers)
     for member in proxy.members if proxy.live else ():
-        owner = network_owner(member.container, by_id)
+        owner = network_owner(member.container, containers)
         if member.redirected and {owner.state, member.container.state} <= STARTED:
             yield member, owner
 

@@ -87,19 +87,22 @@ def test_with_rules_that_can_not_be_read_a_container_is_not_served(text: str, to
 def test_a_layer_is_for_the_addresses_of_its_container() -> None:
     talker = container("talker", networks=[Attachment("app", A)])
     guest = container("guest", networks=[], mode="container:id-talker")
+    # The engine keeps the name if the container did not exist at the creation.
+    friend = container("friend", networks=[], mode="container:guest")
     soon = container("soon", networks=[Attachment("app", "")], state="created")
     ended = container("ended", networks=[Attachment("app", B)], state="exited")
     own = both()
     box = own["sandboxes"][0]
     home = replace(box.container, attachments=(Attachment("app", "172.18.0.2"),))
     seen = observed(
-        talker, guest, soon, ended, **{**own, "sandboxes": [replace(box, container=home)]}
+        talker, guest, friend, soon, ended, **{**own, "sandboxes": [replace(box, container=home)]}
     )
-    members = [Member(c, KEY, policy=RULES) for c in (talker, guest, soon, ended)]
+    members = [Member(c, KEY, policy=RULES) for c in (talker, guest, friend, soon, ended)]
     plain = Member(container("plain", networks=[Attachment("app", B)]), KEY)
     other = Member(talker, Key("http://other:11311", "192.0.2.10"), policy=RULES)
     facts = network_facts(seen, seen.proxies[0], [*members, plain, other], COMMON)
-    assert facts.policy == (*COMMON, layer("talker", A), layer("guest", A))
+    shared = (layer("talker", A), layer("guest", A), layer("friend", A))
+    assert facts.policy == (*COMMON, *shared)
 
 
 def test_a_proxy_is_made_with_the_layers_of_its_containers() -> None:

@@ -16,6 +16,7 @@ from rosproxy_operator.common.ros2 import MOST_PEERS
 from rosproxy_operator.docker.option_values import MOST_PORTS
 from rosproxy_operator.docker.planner.labels import bounds
 from rosproxy_operator.docker.planner.model import Container, HostState, Key, Network
+from rosproxy_operator.docker.planner.network_owner import NoOwner, by_reference, find_network_owner
 from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.spec import WISHES, Wish, words
@@ -230,22 +231,20 @@ def network_owner(container: Container, observed: HostState) -> Container:
 
     Raises UnusableLabel if that container does not exist, and for a loop of containers.
     """
-    visited = {container.id}
-    while (target := container.network_container) is not None:
-        sharer = next((c for c in observed.containers if target in (c.id, c.name)), None)
-        if sharer is None:
+    if container.network_container is None:
+        return container
+    try:
+        return find_network_owner(container, by_reference(observed.containers))
+    except NoOwner as error:
+        shared = f"shares the network of container {quoted(error.target)}, which"
+        if error.is_loop:
             raise UnusableLabel(
-                f"shares the network of container {quoted(target)}, which does not exist. Start "
-                "that container, then create this container again"
-            )
-        if sharer.id in visited:
-            raise UnusableLabel(
-                f"shares the network of container {quoted(target)}, which shares the network of "
-                "this container. Create one of the two with a network of its own"
-            )
-        visited.add(sharer.id)
-        container = sharer
-    return container
+                f"{shared} shares the network of this container. Create one of the two with a "
+                "network of its own"
+            ) from None
+        raise UnusableLabel(
+            f"{shared} does not exist. Start that container, then create this container again"
+        ) from None
 
 
 def _why_no_network(owner: Container) -> str:

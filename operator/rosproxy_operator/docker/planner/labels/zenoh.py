@@ -13,7 +13,6 @@ from rosproxy.setting_kinds import read_zenoh_peer
 from rosproxy.settings import MOST_ZENOH_PORTS
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, router_port
-from rosproxy_operator.docker.planner.label_policy import network_owner
 from rosproxy_operator.docker.planner.labels import readers
 from rosproxy_operator.docker.planner.labels.bounds import is_allowed_router
 from rosproxy_operator.docker.planner.labels.readers import (
@@ -26,6 +25,7 @@ from rosproxy_operator.docker.planner.labels.readers import (
     quoted,
 )
 from rosproxy_operator.docker.planner.model import ZENOH, Container, HostState, Member
+from rosproxy_operator.docker.planner.network_owner import by_reference, network_owner
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.zenoh_redirect import LOCAL_ROUTER, as_client
 from rosproxy_operator.docker.settings import PlanSettings
@@ -152,9 +152,9 @@ def _neighbour(host: str, member: Member, observed: HostState) -> Container | No
 
 def _has_router(owner: Container, observed: HostState) -> bool:
     """Whether a router runs in the network namespace of a container."""
-    by_id = {container.id: container for container in observed.containers}
+    containers = by_reference(observed.containers)
     routers = (c for c in observed.containers if c.is_zenoh_router and c.alive)
-    return any(network_owner(router, by_id).id == owner.id for router in routers)
+    return any(network_owner(router, containers).id == owner.id for router in routers)
 
 
 def _is_redirectable(router: _Router, owner: Container, observed: HostState) -> bool:
