@@ -8,6 +8,7 @@ from statistics import median
 
 import click
 import pytest
+import yaml  # type: ignore[import-untyped]
 from scripts import options_docs
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,6 +58,19 @@ def test_no_package_hides_the_standard_library() -> None:
 @pytest.mark.parametrize("command", ["make demo", "make test", "make test-all", "make check"])
 def test_readme_names_the_commands(command: str) -> None:
     assert command in (ROOT / "README.md").read_text()
+
+
+def test_the_yaml_of_the_pages_can_be_read() -> None:
+    """A manifest that a reader pastes is YAML: in a fence, or in the input of kubectl."""
+    fence = re.compile(r"^```yaml\n(.*?)^```|<<END\n(.*?)^END$", re.MULTILINE | re.DOTALL)
+    found = {page: fence.findall(page.read_text()) for page in PAGES}
+    assert any(found.values())
+    for page, blocks in found.items():
+        for block in blocks:
+            try:
+                list(yaml.safe_load_all("".join(block)))
+            except yaml.YAMLError as error:
+                pytest.fail(f"{page}: {error}")
 
 
 def test_every_option_is_documented() -> None:
