@@ -559,6 +559,9 @@ def test_notes(option: str, choice: str, chart_with_notes: Path) -> None:
     assert ("webhook.enabled" in text) == (choice == "off")
     assert ("crds.install" in text) == (option == "crds" and choice == "elsewhere")
     assert ("kubectl delete crd" in text) == (option != "crds" or choice == "installed")
+    # First the RosProxies: without their end, the nodes stay registered at the master.
+    deleted = re.findall(r"kubectl delete (\w+)", text)
+    assert deleted in ([], ["rosproxies", "crd"])
     assert ("-n robots apply" in text) == (choice == "two")
     assert 'write "ros: 2" instead' in text
 

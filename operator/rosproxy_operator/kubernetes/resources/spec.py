@@ -139,7 +139,7 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
     ros2 = _ros2_spec(field) if "2" in for_ros else None
     least = LEAST_PORTS if ros2 and ros2.multicast else LEAST_PER_DOMAIN
     if ros2 and ports < least:
-        fix = f"Write at least {least}: each participant takes three ports"
+        fix = f"Write at least {least}: a participant takes up to three ports"
         raise field["ports"].error("is too low for ROS 2", fix)
     return RosProxySpec(
         ros1="1" in for_ros,
