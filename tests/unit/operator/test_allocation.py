@@ -7,16 +7,16 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.port_negotiation import (
+from rosproxy_operator.common.port_ranges import (
     FormerRange,
     Move,
     PortsExhausted,
-    RangeWish,
-    after_move,
-    fill,
+    RangeRequest,
+    advice_after_move,
+    assign_ranges,
+    first_free_range,
     is_free,
-    keep,
-    negotiate,
+    kept_ranges,
     new_moves,
     overlap,
     within,
@@ -50,24 +50,24 @@ def test_the_first_range_that_is_free(
 ) -> None:
     fitting = [ports for ports in every(count) if free(ports, blocked, ranges)]
     if fitting:
-        assert negotiate(count, WINDOW, blocked, ranges) == fitting[0]
+        assert first_free_range(count, WINDOW, blocked, ranges) == fitting[0]
         return
     with pytest.raises(PortsExhausted) as error:
-        negotiate(count, WINDOW, blocked, ranges)
+        first_free_range(count, WINDOW, blocked, ranges)
     singles = sum(free(ports, blocked, ranges) for ports in every(1))
     assert f"{singles} of 40 are free" in str(error.value)
     longest = next(
         (n for n in range(count, 0, -1) if any(free(r, blocked, ranges) for r in every(n))), 0
     )
-    assert str(error.value).endswith(f", {longest} at most in a row")
+    assert str(error.value).endswith(f", the longest free stretch has {longest}")
 
 
 @given(COUNTS, BLOCKED, RANGES, RANGE)
 def test_a_range_is_never_made_shorter_and_its_own_ports_do_not_matter(
     count: int, blocked: frozenset[int], ranges: list[PortRange], ports: PortRange
 ) -> None:
-    wish = RangeWish(count, WINDOW, blocked, ranges)
-    more = fill({"proxy": wish}, {"proxy": ports})[0]["proxy"]
+    request = RangeRequest(count, WINDOW, blocked, ranges)
+    more = assign_ranges({"proxy": request}, {"proxy": ports})[0]["proxy"]
     added = PortRange(ports.last + 1, ports.first + count - 1)
     if len(ports) >= count:
         assert more == ports
@@ -94,8 +94,8 @@ def test_overlap(first: PortRange, second: PortRange) -> None:
 def test_room_is_left_where_there_is_some(
     count: int, blocked: frozenset[int], ranges: list[PortRange]
 ) -> None:
-    wish = RangeWish(count, WINDOW, blocked, (), growing=ranges, room=2)
-    given_ranges, exhausted = fill({"proxy": wish}, {})
+    request = RangeRequest(count, WINDOW, blocked, (), growing=ranges, room=2)
+    given_ranges, exhausted = assign_ranges({"proxy": request}, {})
     if exhausted:
         assert not any(free(ports, blocked, ranges) for ports in every(count))
         return
@@ -109,18 +109,21 @@ def test_room_is_left_where_there_is_some(
 
 def test_a_range_that_two_proxies_had_is_for_the_first() -> None:
     had = PortRange(100, 109)
-    wish = RangeWish(10, WINDOW, (), former=(FormerRange(had, ()),))
-    assert keep({"first": wish, "second": wish}) == {"first": had}
-    assert keep({"first": wish, "second": replace(wish, held=had)}) == {"first": had, "second": had}
-    taken = replace(wish, former=(FormerRange(had, {105}), FormerRange(had, (), [had])))
-    assert keep({"first": taken}) == {}
+    request = RangeRequest(10, WINDOW, (), former=(FormerRange(had, ()),))
+    assert kept_ranges({"first": request, "second": request}) == {"first": had}
+    assert kept_ranges({"first": request, "second": replace(request, held=had)}) == {
+        "first": had,
+        "second": had,
+    }
+    taken = replace(request, former=(FormerRange(had, {105}), FormerRange(had, (), [had])))
+    assert kept_ranges({"first": taken}) == {}
 
 
 def test_a_range_that_another_had_is_avoided_if_possible() -> None:
-    wish = RangeWish(10, WINDOW, (), avoided=[PortRange(100, 109)])
-    assert fill({"first": wish}, {}) == ({"first": PortRange(110, 119)}, {})
-    narrow = replace(wish, window=PortRange(100, 109))
-    assert fill({"first": narrow}, {}) == ({"first": PortRange(100, 109)}, {})
+    request = RangeRequest(10, WINDOW, (), avoided=[PortRange(100, 109)])
+    assert assign_ranges({"first": request}, {}) == ({"first": PortRange(110, 119)}, {})
+    narrow = replace(request, window=PortRange(100, 109))
+    assert assign_ranges({"first": narrow}, {}) == ({"first": PortRange(100, 109)}, {})
 
 
 def test_a_range_that_grows_or_shrinks_at_its_end_is_the_same() -> None:
@@ -134,9 +137,10 @@ def test_a_range_that_grows_or_shrinks_at_its_end_is_the_same() -> None:
 
 def test_the_error_says_how_many_there_are() -> None:
     with pytest.raises(PortsExhausted) as error:
-        negotiate(4, PortRange(11400, 11409), {11402, 11406}, [PortRange(11408, 20000)])
+        first_free_range(4, PortRange(11400, 11409), {11402, 11406}, [PortRange(11408, 20000)])
     assert str(error.value) == (
-        "no 4 free ports in a row between 11400 and 11409: 6 of 10 are free, 3 at most in a row"
+        "no 4 free ports in a row between 11400 and 11409: 6 of 10 are free, "
+        "the longest free stretch has 3"
     )
 
 
@@ -144,13 +148,15 @@ def test_the_range_of_a_usual_host() -> None:
     ephemeral = PortRange(32768, 60999)
     listening = {22, 80, 11311, 11405}
     window = PortRange(11400, 65535)
-    assert negotiate(32, window, listening, [ephemeral]) == PortRange(11406, 11437)
-    assert negotiate(32, PortRange(32000, 65535), (), [ephemeral]) == PortRange(32000, 32031)
-    assert negotiate(1000, PortRange(32000, 65535), (), [ephemeral]) == PortRange(61000, 61999)
+    assert first_free_range(32, window, listening, [ephemeral]) == PortRange(11406, 11437)
+    assert first_free_range(32, PortRange(32000, 65535), (), [ephemeral]) == PortRange(32000, 32031)
+    assert first_free_range(1000, PortRange(32000, 65535), (), [ephemeral]) == PortRange(
+        61000, 61999
+    )
 
 
 @pytest.mark.parametrize(("ros1", "ros2"), [(True, False), (False, True), (True, True)])
 def test_what_to_do_after_a_move_is_told(ros1: bool, ros2: bool) -> None:
-    told = after_move(ros1, ros2)
+    told = advice_after_move(ros1, ros2)
     assert ("nodes that registered" in told, "ROS 2" in told) == (ros1, ros2)
     assert "Restart" in told

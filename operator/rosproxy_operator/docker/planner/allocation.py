@@ -4,15 +4,15 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.port_negotiation import (
-    RETRY_FOR,
+from rosproxy_operator.common.port_ranges import (
+    REFUSED_RANGE_KEPT_S,
     FormerRange,
     Move,
-    RangeWish,
-    after_move,
-    fill,
+    RangeRequest,
+    advice_after_move,
+    assign_ranges,
     is_moved,
-    keep,
+    kept_ranges,
     new_moves,
     overlap,
 )
@@ -38,8 +38,8 @@ def after_refusals(
     """Return the memory after the engine's refusals to start sandboxes.
 
     A range that has never served is given up at once: the refused ports become ``taken``. A range
-    that has served is given up after `RETRY_FOR` seconds, since the engine may be slow to free the
-    ports. ``live`` are the keys of wanted proxies, ``now`` is in monotonic seconds.
+    that has served is given up after `REFUSED_RANGE_KEPT_S` seconds, since the engine may be slow
+    to free the ports. ``live`` are the keys of wanted proxies, ``now`` is in monotonic seconds.
     """
     refusals = dict(memory.refusals)
     taken = dict(memory.taken)
@@ -55,7 +55,7 @@ def after_refusals(
         # served on the former ports, so the engine may only be slow to free these ports.
         unserved = {port for port in suspects if served is None or port not in served}
         if served is not None and not unserved:
-            if now - refusal.since < RETRY_FOR:
+            if now - refusal.since < REFUSED_RANGE_KEPT_S:
                 continue
             moved[sandbox.key] = Move(served, now)
         del refusals[sandbox.container.name]
@@ -78,7 +78,7 @@ class _Host:
         udp = frozenset(port for c in containers for port in c.udp_ports)
         return self._matching(key, tcp, udp) | self.memory.taken.keys()
 
-    def wish(self, key: Key, settings: PlanSettings) -> RangeWish:
+    def request(self, key: Key, settings: PlanSettings) -> RangeRequest:
         """Return the ports that a proxy wants, and the ports that the proxy can't have."""
         observed = self.observed
         claimed = self.published(observed.containers, key) | reserved_ports(key)
@@ -98,7 +98,7 @@ class _Host:
             # On the ports of a created sandbox, the engine itself may listen to start the sandbox.
             taken = claimed if planned in created else blocked
             former.append(FormerRange(planned, taken, [observed.ephemeral, *ranges]))
-        return RangeWish(
+        return RangeRequest(
             self.live[key].ports,
             settings.port_window,
             blocked,
@@ -138,11 +138,11 @@ def allocate(
     # Proxies that serve come first, then proxies that have served, then planned, then new proxies.
     groups = (serving, memory.served, memory.planned, live)
     order = sorted(live, key=lambda key: ([key in group for group in groups].index(True), key))
-    wishes = {key: host.wish(key, settings) for key in order}
-    kept = keep(wishes)
+    requests = {key: host.request(key, settings) for key in order}
+    kept = kept_ranges(requests)
     if frozen:
-        wishes |= {key: replace(wishes[key], count=len(ports)) for key, ports in kept.items()}
-    ranges, exhausted = fill(wishes, kept)
+        requests |= {key: replace(requests[key], count=len(ports)) for key, ports in kept.items()}
+    ranges, exhausted = assign_ranges(requests, kept)
     problems = [
         _problem(
             key,
@@ -152,7 +152,7 @@ def allocate(
         )
         for key, error in exhausted.items()
     ]
-    problems += _too_short(wishes, ranges, observed.ephemeral)
+    problems += _too_short(requests, ranges, observed.ephemeral)
     if routers:
         ranges[ZENOH] = _router_ports(routers.ports, memory)
     left = new_moves(memory.served, ranges, now)
@@ -160,24 +160,25 @@ def allocate(
     moved = left | dict(memory.moved)
     for key, ports in sorted(ranges.items()):
         if key in moved and is_moved(moved[key].ports, ports):
+            advice = advice_after_move(key.ros == "1", key.is_ros2)
             text = (
                 f"has left ports {moved[key].ports} for {ports}, since another program or "
-                f"container has taken the old ports. {after_move(key.ros == '1', key.is_ros2)}"
+                f"container has taken the old ports. {advice}"
             )
             problems.append(_problem(key, text))
     return replace(memory, served=served, planned=ranges, moved=moved), problems
 
 
 def _too_short(
-    wishes: Mapping[Key, RangeWish], ranges: Mapping[Key, PortRange], ephemeral: PortRange
+    requests: Mapping[Key, RangeRequest], ranges: Mapping[Key, PortRange], ephemeral: PortRange
 ) -> Iterator[Problem]:
     """Yield a problem for each range with fewer ports than the proxy wants, with the fix."""
     for key, ports in ranges.items():
-        count = wishes[key].count
+        count = requests[key].count
         if len(ports) >= count:
             continue
         missing = PortRange(ports.last + 1, ports.first + count - 1)
-        window = wishes[key].window
+        window = requests[key].window
         others = (other for other in sorted(ranges) if other != key)
         neighbour = next((other for other in others if overlap(ranges[other], missing)), None)
         if missing.last > window.last:

@@ -15,7 +15,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.setting_kinds import SettingError, hash_token, parse_range
 from rosproxy.settings import MOST_ZENOH_PORTS
 from rosproxy_operator.common.policy import AWAITED, as_variable
-from rosproxy_operator.common.port_negotiation import local_ports
+from rosproxy_operator.common.port_ranges import local_ports
 from rosproxy_operator.common.ros2 import (
     LAN_RELAY_COMMAND,
     LAST_DOMAIN,

@@ -4,7 +4,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.port_negotiation import MOVED_FOR, TAKEN_FOR, Move, within
+from rosproxy_operator.common.port_ranges import (
+    MOVE_REPORTED_S,
+    REFUSED_PORT_AVOIDED_S,
+    Move,
+    within,
+)
 from rosproxy_operator.docker.planner.model import SERVING, Desired, HostState, Key, Member
 from rosproxy_operator.docker.planner.taken_names import (
     FormerNames,
@@ -93,8 +98,8 @@ def after_look(
         served={key: ports for key, ports in _served(memory, observed).items() if key in wanted},
         planned={key: ports for key, ports in memory.planned.items() if key in live},
         refusals={name: refusal for name, refusal in memory.refusals.items() if name in idle},
-        taken={port: at for port, at in memory.taken.items() if now - at < TAKEN_FOR},
-        moved={key: move for key, move in memory.moved.items() if now - move.at < MOVED_FOR},
+        taken={port: at for port, at in memory.taken.items() if now - at < REFUSED_PORT_AVOIDED_S},
+        moved={key: move for key, move in memory.moved.items() if now - move.at < MOVE_REPORTED_S},
         names=remember_names(memory.names, present_names(observed), observed.containers),
         outdated_flushes=flushes if memory.engine_returned else memory.outdated_flushes,
     )

@@ -13,14 +13,14 @@ from collections.abc import Iterable, Iterator, Mapping
 import msgspec
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.port_negotiation import (
+from rosproxy_operator.common.port_ranges import (
     FormerRange,
     PortsExhausted,
-    RangeWish,
-    fill,
+    RangeRequest,
+    assign_ranges,
     gaps,
     is_free,
-    keep,
+    kept_ranges,
     overlap,
     within,
 )
@@ -93,18 +93,20 @@ class _Node(msgspec.Struct):
 
         Proxies that have ports come first, then proxies that had ports, then new proxies.
         """
-        wishes = {(place, False): self._wish(place) for place in sorted(places, key=self._rank)}
+        requests = {
+            (place, False): self._request(place) for place in sorted(places, key=self._rank)
+        }
         published = {
-            (place, True): self._master_wish(place)
-            for place, _ in wishes
+            (place, True): self._master_request(place)
+            for place, _ in requests
             if self.view.rosproxies[place.of].spec.master.publish
         }
-        kept, unpublished = fill(published, keep(wishes) | keep(published))
-        given, exhausted = fill(wishes, kept)
+        kept, unpublished = assign_ranges(published, kept_ranges(requests) | kept_ranges(published))
+        given, exhausted = assign_ranges(requests, kept)
         self.ranges.findings.extend(self._unpublished(place) for place, _ in unpublished)
         for (place, is_master), ports in given.items():
             (self.ranges.published if is_master else self.ranges.given)[place] = ports
-            if not is_master and len(ports) < wishes[place, False].count:
+            if not is_master and len(ports) < requests[place, False].count:
                 self.ranges.findings.append(self._too_short(place, ports))
         for (place, _), error in exhausted.items():
             self.ranges.exhausted[place] = self._exhaustion(place, error)
@@ -116,8 +118,8 @@ class _Node(msgspec.Struct):
         ranks = (*present, place in self.state.served, proxy is not None, has_had_ports, True)
         return ranks.index(True), place
 
-    def _wish(self, place: ProxyPlace) -> RangeWish:
-        """Return the wish of a proxy for a range, with the ports that are not available."""
+    def _request(self, place: ProxyPlace) -> RangeRequest:
+        """Return the request of a proxy for a range, with the ports that are not available."""
         spec = self.view.rosproxies[place.of].spec
         reserved = proxy_ports.fixed_ports(spec) | {spec.master.publish}
         kernel = [*self.kernel.values()]
@@ -129,7 +131,7 @@ class _Node(msgspec.Struct):
         taken = set[int]() if is_held else self._taken(place)
         # If possible, a new range is not the former range of another RosProxy on this node.
         others = (r.former_ranges.get(self.node) for r in self.view.rosproxies.values())
-        return RangeWish(
+        return RangeRequest(
             spec.ports,
             spec.window,
             host_ports_of(self._other_pods(place), spec) | self.refused | reserved,
@@ -168,14 +170,14 @@ class _Node(msgspec.Struct):
                 pods.append(proxy.pod)
         return host_ports_of(pods, self.view.rosproxies[place.of].spec) | self.refused
 
-    def _master_wish(self, place: ProxyPlace) -> RangeWish:
-        """Return the wish for the port of a master in the cluster."""
+    def _master_request(self, place: ProxyPlace) -> RangeRequest:
+        """Return the request for the port of a master in the cluster."""
         proxy = self.view.current.get(place)
         port = self.view.rosproxies[place.of].spec.master.publish
         ports = PortRange(port, port)
         is_held = proxy is not None and has_ports(proxy) and port in proxy.pod.host_ports
         blocked = {port for pod in self._other_pods(place) for port in pod.host_ports}
-        return RangeWish(1, ports, blocked | self.refused, held=ports if is_held else None)
+        return RangeRequest(1, ports, blocked | self.refused, held=ports if is_held else None)
 
     def _unpublished(self, place: ProxyPlace) -> ClusterFinding:
         """Return the finding that a master in the cluster is not published."""

@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.setting_kinds import read_peer
-from rosproxy_operator.common.port_negotiation import within
+from rosproxy_operator.common.port_ranges import within
 from rosproxy_operator.kubernetes.resources.checks import quoted
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.model import (

@@ -10,7 +10,7 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.policy import AWAITED, as_variable
-from rosproxy_operator.common.port_negotiation import LOCAL_PORTS, first_fitting, local_ports
+from rosproxy_operator.common.port_ranges import LOCAL_PORTS, first_fitting, local_ports
 from rosproxy_operator.common.ros2 import discovery_port
 from rosproxy_operator.kubernetes.planner.proxy_ports import STAND_INS, fixed_ports
 from rosproxy_operator.kubernetes.resources.model import (

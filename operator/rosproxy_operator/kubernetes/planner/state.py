@@ -11,12 +11,12 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.port_negotiation import (
-    MOVED_FOR,
-    RETRY_FOR,
-    TAKEN_FOR,
+from rosproxy_operator.common.port_ranges import (
+    MOVE_REPORTED_S,
+    REFUSED_PORT_AVOIDED_S,
+    REFUSED_RANGE_KEPT_S,
     Move,
-    after_move,
+    advice_after_move,
     is_moved,
     new_moves,
     overlap,
@@ -81,13 +81,14 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
 
     If the scheduler or the kubelet refuses the range of a proxy, the ports count as taken, so that
     the proxy gets another range. This happens at once if the proxy has never served on the range.
-    Otherwise the operator waits `RETRY_FOR` seconds: a former pod may be slow to free the ports.
+    Otherwise the operator waits `REFUSED_RANGE_KEPT_S` seconds: a former pod may be slow to free
+    the ports.
     """
     absent = view.proxies.keys() - view.wanted.keys()
     lost = {p.node for p in view.observed.proxies} - view.observed.nodes.keys()
     served = _served(view, state)
     waiting, refused = _refused(view, served, state.refused, now)
-    taken = {port: at for port, at in state.taken.items() if now - at < TAKEN_FOR}
+    taken = {port: at for port, at in state.taken.items() if now - at < REFUSED_PORT_AVOIDED_S}
     return replace(
         state,
         begun=True,
@@ -98,7 +99,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
         given=_possible(view, state.given),
         refused=waiting,
         taken=taken | dict.fromkeys(refused, now),
-        moved=_recent(view, state.moved, now - MOVED_FOR),
+        moved=_recent(view, state.moved, now - MOVE_REPORTED_S),
         tried=_recent(view, state.tried, now - TRIED_FOR),
         unselected={p.id: state.unselected.get(p.id, now) for p in view.observed.unselected_pods},
     )
@@ -127,7 +128,7 @@ def moves(
                 rosproxy = view.rosproxies[place.of]
                 why = "the old ports are not free. Nothing needs to be done"
                 if has_served:
-                    lost = after_move(rosproxy.spec.ros1, rosproxy.spec.ros2 is not None)
+                    lost = advice_after_move(rosproxy.spec.ros1, rosproxy.spec.ros2 is not None)
                     why = f"the old ports are taken, or the RosProxy no longer allows them. {lost}"
                 change = f"has left ports {move.ports} for {ranges[place]}"
                 text = f"the proxy on node {place.node} {change}, since {why}"
@@ -181,7 +182,11 @@ def _refused(
             continue
         former = served.get(place)
         began = waiting.pop(place, now)
-        if former is not None and overlap(former, proxy.range) and now - began < RETRY_FOR:
+        if (
+            former is not None
+            and overlap(former, proxy.range)
+            and now - began < REFUSED_RANGE_KEPT_S
+        ):
             waiting[place] = began
             continue
         other_pods = (p.pod for p in neighbours if place_of(p) != place)

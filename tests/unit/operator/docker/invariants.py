@@ -4,7 +4,7 @@ from msgspec import structs
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common.port_negotiation import overlap
+from rosproxy_operator.common.port_ranges import overlap
 from rosproxy_operator.docker.planner.actions import Create, CreateLanRelay, CreateSandbox
 from rosproxy_operator.docker.planner.desired import proxy_spec
 from rosproxy_operator.docker.planner.model import ALIVE, STARTED, ZENOH, Key, Member

@@ -7,7 +7,7 @@ import pytest
 from msgspec import structs
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.port_negotiation import Move
+from rosproxy_operator.common.port_ranges import Move
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
@@ -569,9 +569,9 @@ def test_exhausted() -> None:
     plan = look(observed(container()), settings=settings)
     assert plan.actions == ()
     assert port_problem(plan) == (
-        "no 32 free ports in a row between 11400 and 11430: 31 of 31 are free, 31 at most in a "
-        "row. Lower --ports or the label rosproxy.ports (32), widen --port-window (11400-11430), "
-        "or stop programs that hold ports there"
+        "no 32 free ports in a row between 11400 and 11430: 31 of 31 are free, the longest free "
+        "stretch has 31. Lower --ports or the label rosproxy.ports (32), widen --port-window "
+        "(11400-11430), or stop programs that hold ports there"
     )
 
 

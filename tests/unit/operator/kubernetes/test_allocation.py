@@ -146,8 +146,8 @@ def test_without_free_ports_the_finding_names_the_holders_and_the_fix() -> None:
     (text,) = told(plan, "PortsExhausted")
     assert text == (
         "node one: no 4 free ports in a row between 11400 and 11406: 6 of 7 are free, "
-        "3 at most in a row. Not available: ports of pods ros/web. Widen spec.portWindow "
-        "(11400-11406), or lower spec.ports (4), or delete one of these pods"
+        "the longest free stretch has 3. Not available: ports of pods ros/web. Widen "
+        "spec.portWindow (11400-11406), or lower spec.ports (4), or delete one of these pods"
     )
     assert "ports" not in status(plan)["perNode"][0]
 

@@ -25,7 +25,7 @@ from collections.abc import Collection, Iterator
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.port_negotiation import gaps
+from rosproxy_operator.common.port_ranges import gaps
 from rosproxy_operator.common.ros2 import discovery_port
 from rosproxy_operator.kubernetes.planner import proxy_ports
 from rosproxy_operator.kubernetes.planner.actions import (

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 
 from rosproxy.net.addresses import is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy_operator.common.port_negotiation import RETRY_FOR
+from rosproxy_operator.common.port_ranges import REFUSED_RANGE_KEPT_S
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
@@ -284,4 +284,4 @@ def ends(context: ClusterContext) -> Iterator[float]:
     ready = {name for name, node in context.observed.nodes.items() if node.ready}
     yield from (context.grace_left(place) for place in context.state.absent if place.node in ready)
     yield from map(context.seconds_until_lost, context.state.lost)
-    yield from (at + RETRY_FOR - context.now for at in context.state.refused.values())
+    yield from (at + REFUSED_RANGE_KEPT_S - context.now for at in context.state.refused.values())

@@ -1,9 +1,9 @@
 """Chooses the range of ports of each proxy, for all engines.
 
-Ports should stay, because ROS nodes are registered at the master under the ports of the range. So
-`keep` gives each proxy its present range, or a former range that is free. Then `fill` gives ranges
-to the other proxies, and more ports to proxies with too few. The operator of each engine finds out
-which ports are not free.
+A proxy should keep its range: ROS nodes are registered at the master under the ports of the range.
+So `kept_ranges` gives each proxy its present range, or a former range that is free. Then
+`assign_ranges` gives ranges to the other proxies, and more ports to proxies with too few. The
+operator of each engine finds out which ports are not free.
 """
 
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping
@@ -13,16 +13,19 @@ from typing import TypeVar
 from rosproxy.leases.ports import PortRange
 
 LAST_PORT = 65535
-RETRY_FOR = 20.0
-"""Seconds for which a proxy that has served keeps a refused range before it gets another."""
-TAKEN_FOR = 300.0
+REFUSED_RANGE_KEPT_S = 20.0
+"""Seconds for which a proxy that has served keeps a range whose ports the engine refuses.
+
+Then the proxy gets another range.
+"""
+REFUSED_PORT_AVOIDED_S = 300.0
 """Seconds for which the operator avoids a port that the engine has refused."""
-MOVED_FOR = 600.0
+MOVE_REPORTED_S = 600.0
 """Seconds for which the operator reports that a proxy had to leave its range."""
 LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999))
 """Ranges for the outgoing connections of a proxy, best first (net.ipv4.ip_local_port_range)."""
 _UNPRIVILEGED_PORTS = PortRange(1024, LAST_PORT)
-Proxy = TypeVar("Proxy", bound=Hashable)
+ProxyKey = TypeVar("ProxyKey", bound=Hashable)
 """The key of a proxy, unique in an engine."""
 
 
@@ -36,7 +39,10 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class FormerRange:
-    """A range that a proxy had. The ports ``blocked`` and ``ranges`` are not free for the proxy."""
+    """A range that a proxy had.
+
+    The proxy gets the range again if the range has no port of ``blocked`` and of ``ranges``.
+    """
 
     ports: PortRange
     blocked: Collection[int]
@@ -44,13 +50,19 @@ class FormerRange:
 
 
 @dataclass(frozen=True, slots=True)
-class RangeWish:
+class RangeRequest:
     """The ports that a proxy needs on the host: ``count`` consecutive ports of ``window``.
 
     ``held`` is the range that the proxy has now and keeps. Without ``held``, the proxy keeps the
-    first range of ``former`` that is free. New ports are not in ``blocked``, ``ranges`` or
-    ``growing``, the ranges of other proxies. If possible, a new range has no port of ``avoided``,
-    and the new and the ``growing`` ranges can grow to ``room`` times the length.
+    first range of ``former`` that is free. New ports are never in:
+
+    - ``blocked``: single ports.
+    - ``ranges``: whole ranges.
+    - ``growing``: ranges of other proxies, which may get longer.
+
+    A new range has no port of ``avoided``, and leaves room to grow: the new range and the
+    ``growing`` ranges can all have ``room`` times their length. If there is no such range, both
+    conditions are dropped.
     """
 
     count: int
@@ -64,14 +76,14 @@ class RangeWish:
     room: int = 1
 
 
-def after_move(ros1: bool, ros2: bool) -> str:
+def advice_after_move(ros1: bool, ros2: bool) -> str:
     """Return what happens to the nodes of a proxy that had to leave its range, and what to do.
 
     Nodes of ROS 1 have to register again. Participants of ROS 2 rediscover each other, if the
     operator knows the participants' former ports.
     """
     texts = {
-        "Restart the nodes that registered on the old ports: outside can't reach them": ros1,
+        "Restart the nodes that registered on the old ports: outside can't reach these nodes": ros1,
         "Outside discovers the ROS 2 participants again. Restart the participants that outside has "
         "not discovered after a minute": ros2,
     }
@@ -87,75 +99,80 @@ class PortsExhausted(Exception):
     def __init__(self, count: int, window: PortRange, free: Collection[int]) -> None:
         super().__init__(
             f"no {count} free ports in a row between {window.first} and {window.last}: "
-            f"{sum(free)} of {len(window)} are free, {max(free, default=0)} at most in a row"
+            f"{sum(free)} of {len(window)} are free, the longest free stretch has "
+            f"{max(free, default=0)}"
         )
         self.count = count
         self.window = window
 
 
-def keep(wishes: Mapping[Proxy, RangeWish]) -> dict[Proxy, PortRange]:
-    """Return the ranges that the proxies of a host keep. Earlier wishes have priority."""
-    given: dict[Proxy, PortRange] = {}
-    for proxy, wish in wishes.items():
+def kept_ranges(requests: Mapping[ProxyKey, RangeRequest]) -> dict[ProxyKey, PortRange]:
+    """Return the ranges that the proxies of a host keep. Earlier requests have priority."""
+    given: dict[ProxyKey, PortRange] = {}
+    for proxy, request in requests.items():
         possible = (
             former.ports
-            for former in wish.former
+            for former in request.former
             if is_free(former.ports, former.blocked, [*former.ranges, *given.values()])
         )
-        if ports := wish.held or next(possible, None):
+        if ports := request.held or next(possible, None):
             given[proxy] = ports
     return given
 
 
-def fill(
-    wishes: Mapping[Proxy, RangeWish], kept: Mapping[Proxy, PortRange]
-) -> tuple[dict[Proxy, PortRange], dict[Proxy, PortsExhausted]]:
-    """Return the ranges of the proxies of a host, and for the others why there is no range.
+def assign_ranges(
+    requests: Mapping[ProxyKey, RangeRequest], kept: Mapping[ProxyKey, PortRange]
+) -> tuple[dict[ProxyKey, PortRange], dict[ProxyKey, PortsExhausted]]:
+    """Return the range of each proxy, and the `PortsExhausted` of each proxy without a range.
 
-    ``kept`` are the ranges of `keep`. A range that is too short gets more ports at its end, if all
-    of these ports are free.
+    ``kept`` are the ranges of `kept_ranges`. A range that is too short gets more ports at its end,
+    if all of these ports are free and in the window.
     """
     given = dict(kept)
-    exhausted: dict[Proxy, PortsExhausted] = {}
-    for proxy, wish in wishes.items():
-        growing = [*wish.growing, *(ports for other, ports in given.items() if other != proxy)]
+    exhausted: dict[ProxyKey, PortsExhausted] = {}
+    for proxy, request in requests.items():
+        growing = [*request.growing, *(ports for other, ports in given.items() if other != proxy)]
         try:
             if ports := given.get(proxy):
-                given[proxy] = _extended(ports, wish, growing)
+                given[proxy] = _extended(ports, request, growing)
             else:
-                given[proxy] = _new_range(wish, growing)
+                given[proxy] = _new_range(request, growing)
         except PortsExhausted as error:
             exhausted[proxy] = error
     return given, exhausted
 
 
-def _extended(ports: PortRange, wish: RangeWish, growing: Iterable[PortRange]) -> PortRange:
-    """Return the range with more ports at its end if they are free, else the unchanged range."""
-    wanted = PortRange(ports.first, ports.first + wish.count - 1)
+def _extended(ports: PortRange, request: RangeRequest, growing: Iterable[PortRange]) -> PortRange:
+    """Return the range with more ports at its end if possible, else the unchanged range."""
+    wanted = PortRange(ports.first, ports.first + request.count - 1)
     added = PortRange(ports.last + 1, wanted.last)
-    is_possible = ports.last < wanted.last <= wish.window.last
-    ranges = [*wish.ranges, *growing]
-    return wanted if is_possible and is_free(added, wish.blocked, ranges) else ports
+    is_possible = ports.last < wanted.last <= request.window.last
+    ranges = [*request.ranges, *growing]
+    return wanted if is_possible and is_free(added, request.blocked, ranges) else ports
 
 
-def _new_range(wish: RangeWish, growing: Collection[PortRange]) -> PortRange:
-    """Return the first free range, if possible with room to grow for all ranges.
+def _new_range(request: RangeRequest, growing: Collection[PortRange]) -> PortRange:
+    """Return the first range that meets all conditions, else the first free range.
 
     Raises PortsExhausted.
     """
-    more = wish.room - 1
+    more = request.room - 1
     widened = [PortRange(r.first, min(r.last + more * len(r), LAST_PORT)) for r in growing]
-    preferred = [*wish.ranges, *wish.avoided, *widened]
+    preferred = [*request.ranges, *request.avoided, *widened]
     try:
-        roomy = negotiate(wish.room * wish.count, wish.window, wish.blocked, preferred)
+        roomy = first_free_range(
+            request.room * request.count, request.window, request.blocked, preferred
+        )
     except PortsExhausted:
-        return negotiate(wish.count, wish.window, wish.blocked, [*wish.ranges, *growing])
-    return PortRange(roomy.first, roomy.first + wish.count - 1)
+        return first_free_range(
+            request.count, request.window, request.blocked, [*request.ranges, *growing]
+        )
+    return PortRange(roomy.first, roomy.first + request.count - 1)
 
 
 def new_moves(
-    former: Mapping[Proxy, PortRange], given: Mapping[Proxy, PortRange], now: float
-) -> dict[Proxy, Move]:
+    former: Mapping[ProxyKey, PortRange], given: Mapping[ProxyKey, PortRange], now: float
+) -> dict[ProxyKey, Move]:
     """Return the moves of the proxies that leave their ranges, at the time ``now``."""
     return {
         proxy: Move(ports, now)
@@ -169,7 +186,7 @@ def is_moved(former: PortRange, ports: PortRange) -> bool:
     return former.first != ports.first
 
 
-def negotiate(
+def first_free_range(
     count: int, window: PortRange, blocked: Collection[int], ranges: Iterable[PortRange] = ()
 ) -> PortRange:
     """Return the first ``count`` consecutive free ports of a window.
