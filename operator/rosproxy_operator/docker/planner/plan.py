@@ -33,21 +33,22 @@ from rosproxy_operator.docker.planner.state import DockerMemory, after_look, wit
 from rosproxy_operator.docker.settings import PlanSettings
 
 UNWANTED = "no running container needs the proxy"
-SOON = 1.0
+ENGINE_BUSY_RECHECK_S = 1.0
 """Seconds until the next look while the engine removes a container, or still holds a port."""
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Actions for a key, in order. If ``key`` is None, the actions are for the uplink.
+    """Actions for a proxy, in order. If ``key`` is None, the actions are for the uplink.
 
     Every group waits for the uplink's group. Groups with the same key and ``subject`` run in order.
     Redirects and flushes have a ``subject``, so other work for the proxy does not wait for these.
 
-    If an action fails, the executor skips the rest of the group. So the operator removes a proxy
-    only after the operator has created the successor. A failed Connect or Disconnect is an
-    exception: the group goes on. ``fix`` says what users can do if an action keeps failing; empty
-    if users can do nothing. ``fatal`` is that of the `Problem` that a failure makes.
+    If an action fails, the executor skips the rest of the group. Create comes before Remove in a
+    group, so the operator removes a proxy only after the operator has created the successor. A
+    failed Connect or Disconnect is an exception: the group goes on. ``fix`` says what users can do
+    if an action keeps failing; empty if users can do nothing. ``fatal``: whether a failure is a
+    fatal `Problem`.
     """
 
     key: Key | None
@@ -62,9 +63,10 @@ class DockerPlan:
     """The groups of actions that the operator carries out, and the memory for the next look.
 
     ``deferred`` are groups that wait for an address. A proxy for ROS 1 waits for the address of
-    the master: on the proxy's networks, the master's host name leads to the proxy itself. All
-    other proxies wait for the uplink network, since LAN relays, and routers of this host, are at
-    the gateway of the uplink.
+    the master. The proxy can't resolve the master's host name: on the proxy's networks this name is
+    an alias of the proxy itself. All other proxies wait for the uplink network: LAN relays and
+    zenoh routers of this host listen at the address of its gateway, which the proxy gets as an
+    option.
 
     ``again_in`` are the seconds until the next look if no event comes; None if nothing is pending.
     """
@@ -92,36 +94,36 @@ def plan(
 ) -> DockerPlan:
     """Return the plan for a host. The plan has no actions if nothing is left to do.
 
-    A key with a busy container gets no actions for its proxy. ``labels`` are the labels in
-    ``observed``. ``memory`` is the memory of the plan before, empty for the first plan. ``now`` is
-    in seconds of a monotonic clock, the same clock as for the plan before.
+    If a container of a proxy is busy (`HostState.busy`), the plan has no actions for this proxy.
+    ``labels`` are the labels in ``observed``. ``memory`` is the memory of the previous plan, empty
+    for the first plan. ``now`` is in seconds of a monotonic clock, the same for all plans.
     """
-    members, unplaced = find_members(labels, observed, settings)
-    members, crowded = _within_bounds(members, settings)
+    members, member_problems = find_members(labels, observed, settings)
+    members, bound_problems = _within_bounds(members, settings)
     memory = with_exited(memory, members, now)
-    desired, bad_networks = desire(observed, settings, members, memory, now)
+    desired, network_problems = desire(observed, settings, members, memory, now)
     memory = after_look(memory, observed, desired, settings.grace, now)
     naming = assign_aliases(desired, observed, settings, memory.names)
     live = {d.key for d in desired if d.live}
     memory = after_refusals(observed, live, memory, now)
     obstacle = _obstacle(observed, settings) if live else None
     creatable = obstacle is None
-    memory, tight = allocate(observed, settings, desired, memory, now, frozen=not creatable)
+    memory, port_problems = allocate(observed, settings, desired, memory, now, frozen=not creatable)
     expired = {key for key, since in memory.absent.items() if now - since >= settings.grace}
-    planned: dict[Key, list[Action] | None] = {
+    actions_by_key: dict[Key, list[Action] | None] = {
         key: [*removal_steps(observed, key, UNWANTED)] for key in expired
     }
     for wanted in desired:
-        if ports := memory.planned.get(wanted.key):  # without ports, ``tight`` has the problem
+        if ports := memory.planned.get(wanted.key):  # else the reason is in port_problems
             context = PlanContext(observed, settings, wanted, ports, naming, creatable)
             steps = wanted_steps(context)
-            planned[wanted.key] = steps if steps is None else with_lan_relay(context, steps)
-    problems = [*labels.problems, *unplaced, *crowded, *bad_networks, *naming.problems, *tight]
-    problems += _unwell(observed, live)
-    problems += _deaf(observed, settings, live)
-    if obstacle:
-        problems.append(replace(obstacle, fatal=None in planned.values()))
-    groups = [*_possible_groups(observed, settings, desired, planned, naming, memory)]
+            actions_by_key[wanted.key] = steps if steps is None else with_lan_relay(context, steps)
+    problems = [*labels.problems, *member_problems, *bound_problems, *network_problems]
+    problems += [*naming.problems, *port_problems, *_container_problems(observed, live)]
+    problems += _missing_lan_relays(observed, settings, live)
+    if obstacle:  # fatal only if a proxy lacks a container, and the operator can't create it
+        problems.append(replace(obstacle, fatal=None in actions_by_key.values()))
+    groups = [*_possible_groups(observed, settings, desired, actions_by_key, naming, memory)]
     deferred = tuple(group for group in groups if _waits(group, observed, settings.uplink))
     docker_plan = DockerPlan(
         groups=tuple(group for group in groups if group not in deferred),
@@ -131,18 +133,18 @@ def plan(
         members=members,
         desired=desired,
     )
-    delays = [delay for delay in _delays(observed, settings, docker_plan, now) if delay > 0]
-    return replace(docker_plan, again_in=min(delays, default=None))
+    waits = [*_seconds_to_changes(observed, settings, docker_plan, now)]
+    return replace(docker_plan, again_in=min((wait for wait in waits if wait > 0), default=None))
 
 
 def _within_bounds(
     members: Collection[Member], settings: PlanSettings
 ) -> tuple[tuple[Member, ...], list[Problem]]:
-    """Return the members that their proxies can serve together, and problems of all others."""
-    members, crowded = with_bounded_rules(members, settings)
-    members, peerless = with_bounded_peers(members, settings)
-    members, left_out = with_bounded_containers(members)
-    return members, [*crowded, *peerless, *left_out]
+    """Return the members within the limits of their proxies, and a problem for each other one."""
+    members, rule_problems = with_bounded_rules(members, settings)
+    members, peer_problems = with_bounded_peers(members, settings)
+    members, zenoh_problems = with_bounded_containers(members)
+    return members, [*rule_problems, *peer_problems, *zenoh_problems]
 
 
 def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
@@ -168,13 +170,13 @@ def _possible_groups(
     observed: HostState,
     settings: PlanSettings,
     desired: Collection[Desired],
-    planned: Mapping[Key, list[Action] | None],
+    actions_by_key: Mapping[Key, list[Action] | None],
     naming: Naming,
     memory: DockerMemory,
 ) -> Iterator[Group]:
     """The groups of keys without busy containers, and all groups of redirects and flushes."""
     busy = {own.key for own in observed.own if own.container.name in observed.busy}
-    groups = _groups(observed, settings.uplink, desired, planned, naming)
+    groups = _groups(observed, settings.uplink, desired, actions_by_key, naming)
     yield from (group for group in groups if group.key not in busy)
     for steps in redirect_steps(observed, settings, desired):
         yield Group(steps.key, steps.actions, f"container {steps.container}", steps.fix)
@@ -198,25 +200,25 @@ def _groups(
     observed: HostState,
     uplink: str,
     desired: Collection[Desired],
-    planned: Mapping[Key, list[Action] | None],
+    actions_by_key: Mapping[Key, list[Action] | None],
     naming: Naming,
 ) -> Iterator[Group]:
-    """The groups of proxies and the uplink, in order.
+    """The groups of proxies and the uplink.
 
-    The groups that leave networks come first, since these groups free names for other proxies. The
-    uplink comes next, and then key after key.
+    The executor carries out the uplink's group first, and the groups of a proxy in this order: the
+    groups that leave networks, then all other actions. Proxies do not wait for each other.
     """
     for wanted in desired:
-        others = planned.get(wanted.key)
+        others = actions_by_key.get(wanted.key)
         for action in disconnect_steps(observed, wanted, others, uplink, naming):
             yield Group(wanted.key, (action,))
-    all_actions = [action for actions in planned.values() for action in actions or ()]
+    all_actions = [action for actions in actions_by_key.values() for action in actions or ()]
     joins = (isinstance(a, Connect) and a.network == uplink for a in all_actions)
     is_needed = any(joins) or any(isinstance(action, CreateSandbox) for action in all_actions)
     if is_needed and uplink not in {network.name for network in observed.networks}:
         yield Group(None, (CreateNetwork(uplink),))
     for wanted in desired:
-        if actions := planned.get(wanted.key):
+        if actions := actions_by_key.get(wanted.key):
             yield Group(wanted.key, tuple(actions))
 
 
@@ -229,18 +231,20 @@ def _waits(group: Group, observed: HostState, uplink: str) -> bool:
 
 
 def _lacks_address(key: Key, observed: HostState, uplink: str) -> bool:
-    if key.ros != "1":  # LAN relays, and routers of this host, are at the uplink's gateway
+    if key.ros != "1":  # LAN relays, and zenoh routers of this host, are at the uplink's gateway
         return uplink not in {network.name for network in observed.networks}
     return observed.masters.get(master(key).host) == ""
 
 
-def _deaf(observed: HostState, settings: PlanSettings, live: Collection[Key]) -> Iterator[Problem]:
+def _missing_lan_relays(
+    observed: HostState, settings: PlanSettings, live: Collection[Key]
+) -> Iterator[Problem]:
     """Warnings for proxies for ROS 2 without a LAN relay."""
     problems = (missing_lan_relay(key, observed, settings) for key in sorted(live) if key.is_ros2)
     yield from filter(None, problems)
 
 
-def _unwell(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
+def _container_problems(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
     """Problems of containers that the engine restarts, and of masters without a known address."""
     for own in observed.own:
         name = own.container.name
@@ -252,12 +256,13 @@ def _unwell(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
         yield Problem(f"master {host}", unresolved_master(host))
 
 
-def _delays(
+def _seconds_to_changes(
     observed: HostState, settings: PlanSettings, docker_plan: DockerPlan, now: float
 ) -> Iterator[float]:
     """The seconds until the plan may change without an event.
 
-    These are the ends of graces, and `SOON` during a removal or after a refused port.
+    These are the times until a grace ends, and `ENGINE_BUSY_RECHECK_S` during a removal or after a
+    refused port.
     """
     memory = docker_plan.memory
     for wanted in docker_plan.desired:
@@ -265,10 +270,10 @@ def _delays(
         if not wanted.live and any(c.state != "removing" for c in present):
             yield settings.grace - (now - memory.absent[wanted.key])
         if wanted.live and any(c.state == "removing" or c.name in memory.refusals for c in present):
-            yield SOON
+            yield ENGINE_BUSY_RECHECK_S
     helpers = (*observed.redirects, *observed.flushes)
     if any(helper.container.state == "removing" for helper in helpers):
-        yield SOON
+        yield ENGINE_BUSY_RECHECK_S
     for member in docker_plan.members:
         sandboxes = [s.container for s in observed.sandboxes_of(member.key)]
         joined = any(c.networks & member.networks for c in sandboxes if c.state != "removing")
