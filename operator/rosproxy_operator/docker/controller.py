@@ -36,7 +36,7 @@ from rosproxy_operator.common.proxy_client import Json, ProxyClient
 from rosproxy_operator.docker import engine_json
 from rosproxy_operator.docker.engine_client import DockerClient, listen
 from rosproxy_operator.docker.errors import EngineError, FormerSocket, Unavailable
-from rosproxy_operator.docker.executor import DockerApplier, Executor
+from rosproxy_operator.docker.executor import DockerActions, Executor
 from rosproxy_operator.docker.host_document import host_document, just_started
 from rosproxy_operator.docker.operator_sign import publish_sign
 from rosproxy_operator.docker.planner.labels.members import LabelReading
@@ -138,7 +138,7 @@ class DockerController:
         self._proxies = ProxyClient()
         self._masters = MasterResolver(loop.wake)
         self._observer = DockerObserver(engine, settings, self._masters, loop.wake)
-        self._applier = DockerApplier(engine, settings, self._proxies)
+        self._docker_actions = DockerActions(engine, settings, self._proxies)
         self._executor = jobs = Executor(self._tasks, loop.wake, self._port_taken, metrics.count)
         metrics.watch_jobs(lambda: len(jobs.busy), lambda: len(jobs.problems))
         self._proxy_sync = DockerProxySync(self._tasks, self._proxies, settings, loop.wake)
@@ -228,7 +228,7 @@ class DockerController:
             self._loop.wake_in(SETTLED)  # no event reports that the list is up to date
         self._proxy_sync.update(snapshot, planned.members)  # first: calls of new nodes wait
         self._executor.start(
-            planned.groups, lambda action: self._applier.carry_out(action, snapshot), started
+            planned.groups, lambda action: self._docker_actions.carry_out(action, snapshot), started
         )
         problems = self._current(snapshot, planned)
         self._log.update(problems)

@@ -1,10 +1,11 @@
 """Carry out plans, in a job for each proxy, each redirect, each flush and the uplink.
 
+A flush is the helper container that deletes conntrack entries of a proxy (`planner.flush`).
 A job may take a minute (the engine publishes a thousand ports) or fail at every try. Meanwhile the
 operator looks again, and other jobs run.
 
-An action may already be done, and its object may have vanished since the look. Neither is an error:
-the next look shows what is left to do. A creation fails if the image or network has vanished.
+If an action is already done, or its container or network has gone since the look, nothing is left
+to do: no error. A creation is the exception: the action fails without its image or network.
 """
 
 import asyncio
@@ -59,17 +60,21 @@ from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
 log = logging.getLogger(__name__)
 
-BACK_OFF = (1.0, 2.0, 5.0, 15.0, 60.0)
-"""Seconds until failed actions are tried again, by failures in a row; the last value repeats."""
-QUIET = 120.0
-"""Seconds after a failure of an action until the same failure is logged as a warning again."""
-STOP_TIMEOUT = 2
+RETRY_PAUSES_S = (1.0, 2.0, 5.0, 15.0, 60.0)
+"""Pauses in seconds after the first, second, … failure of a job in a row. The last one repeats."""
+FAILURE_REMEMBERED_S = 120.0
+"""Seconds after which a failure of an action is forgotten, if the action has not failed again.
+
+A failure that comes again before is not logged as a warning again. Retries come at least every 60
+s, so a failure that goes on is logged as a warning once. The status reports the problem meanwhile.
+"""
+STOP_TIMEOUT_S = 2
 """Seconds that a container has to end before the engine kills it."""
-DONE: dict[type, tuple[str, ...]] = {
+HARMLESS_ERRORS: dict[type, tuple[str, ...]] = {
     # moby has these texts in libnetwork and in
     # daemon/{unpause,rename,delete,container_operations}.go.
     CreateNetwork: ("already exists",),
-    Start: ("is not running",),
+    Start: ("is not running",),  # the sandbox has ended: the next look plans its start
     Restart: (),
     Run: ("non running container",),
     Unpause: ("is not paused",),
@@ -79,29 +84,30 @@ DONE: dict[type, tuple[str, ...]] = {
     Remove: ("is already in progress",),
     RemoveNetwork: (),
 }
-"""Parts of the engine's errors that mean that nothing is left to do, by type of action.
+"""Parts of the engine's errors after which this action has nothing left to do, by type of action.
 
-For these types NoSuchObject means the same. For all other types every error is a failure.
+For these types, the error NoSuchObject also means that nothing is left to do. For all other types
+every error is a failure.
 """
 
-LONGEST_RUN = 30.0
+LONGEST_HELPER_RUN_S = 30.0
 """Seconds after which the operator removes a helper container that has not ended.
 
 Setting a redirect takes milliseconds. Deleting conntrack entries takes 13 s if each of 1,000 ports
 has entries.
 """
-RUNNING = 0.03
+END_POLL_INTERVAL_S = 0.03
 """Seconds between two checks whether a helper container has ended."""
 
 CarryOut = Callable[[Action], Awaitable[None]]
 Job = tuple[Key | None, str]
-"""The groups with the same key and subject. Different jobs run at the same time."""
+"""Identifies a job: the key and the subject of its groups. Different jobs run at the same time."""
 UPLINK: Job = (None, "")
 
 
 @dataclass(slots=True)
 class _Failure:
-    """The failed actions of a job, failures in a row, and the problem to report.
+    """All actions of a job that has failed, its failures in a row, and the problem to report.
 
     ``retry_at`` is in monotonic seconds.
     """
@@ -116,8 +122,9 @@ class Executor:
     """Carries out groups of actions. The groups of a job run one after the other.
 
     ``finished`` is called when a job has ended. If a taken port keeps a container from starting,
-    ``port_taken`` is called with the container's name and the port, or None if unknown. ``counted``
-    is called with each action and its outcome: ok, failed or taken. ``now`` is a monotonic clock.
+    ``port_taken`` is called with the container's name and the port. The port is None if the error
+    names no port. ``counted`` is called with each action and its outcome: ok, failed or taken.
+    ``now`` is a monotonic clock.
     """
 
     def __init__(
@@ -136,11 +143,11 @@ class Executor:
         self._busy: dict[Job, asyncio.Task[None]] = {}
         self._failures: dict[Job, _Failure] = {}
         self._ended_at: dict[Job, float] = {}
-        self._refused: dict[Action, tuple[str, float]] = {}
+        self._logged_failures: dict[Action, tuple[str, float]] = {}
 
     @property
     def busy(self) -> frozenset[str]:
-        """The subjects of the running jobs, as in problems."""
+        """The running jobs, by the subject of their problems (`Problem.subject`)."""
         return frozenset(map(_subject, self._busy))
 
     @property
@@ -161,7 +168,8 @@ class Executor:
         later are skipped as well: the look may not have seen their results.
         """
         now = self._now()
-        self._refused = {a: r for a, r in self._refused.items() if r[1] > now - QUIET}
+        oldest = now - FAILURE_REMEMBERED_S
+        self._logged_failures = {a: f for a, f in self._logged_failures.items() if f[1] > oldest}
         by_job: dict[Job, list[Group]] = {}
         for group in groups:
             job = group.key, group.subject
@@ -175,7 +183,8 @@ class Executor:
         for job in sorted(by_job, key=lambda job: job[0] is not None):
             actions = [action for group in by_job[job] for action in group.actions]
             failure = self._failures.get(job)
-            # Other actions than the failed ones start at once: the host has changed.
+            # If the job has other actions than at the failure, it starts at once: the host has
+            # changed.
             waiting = failure and failure.actions == actions and now < failure.retry_at
             if actions and not waiting and job not in self._busy:
                 work = self._run(job, by_job[job], actions, carry_out)
@@ -184,7 +193,7 @@ class Executor:
     async def _run(
         self, job: Job, groups: list[Group], actions: list[Action], carry_out: CarryOut
     ) -> None:
-        """Wait for the uplink's job, carry out all groups, and record the first problem."""
+        """Wait for the uplink's job, carry out all groups, and record the first group's problem."""
         problem: Problem | None = None
         try:
             if job != UPLINK and UPLINK in self._busy:
@@ -198,7 +207,7 @@ class Executor:
             previous = self._failures.pop(job, None)
             if problem is not None:
                 count = previous.count + 1 if previous and previous.actions == actions else 1
-                retry_at = self._now() + BACK_OFF[min(count, len(BACK_OFF)) - 1]
+                retry_at = self._now() + RETRY_PAUSES_S[min(count, len(RETRY_PAUSES_S)) - 1]
                 self._failures[job] = _Failure(actions, count, retry_at, problem)
             del self._busy[job]
             self._ended_at[job] = self._now()
@@ -208,7 +217,8 @@ class Executor:
         """Carry out a group until an action fails, and return the first problem.
 
         A group continues after a failed Connect or Disconnect: the proxy can still serve other
-        networks. A taken port is no problem here: the next plan decides on the range (allocation).
+        networks. A taken port is no problem here: the next plan decides on the range
+        (`planner.allocation`).
         """
         problem: Problem | None = None
         for action in group.actions:
@@ -230,9 +240,10 @@ class Executor:
     async def _carry_out_action(self, action: Action, carry_out: CarryOut) -> None:
         """Carry out an action, and log a failure. Raises EngineError.
 
-        If the next tries fail for the same reason, the log level is DEBUG (QUIET).
+        After a failure, the next tries, and failures for the same reason, are logged at level DEBUG
+        (`FAILURE_REMEMBERED_S`).
         """
-        previous, _ = self._refused.get(action, (None, 0.0))
+        previous, _ = self._logged_failures.get(action, (None, 0.0))
         fields = action.log_fields
         log.log(logging.INFO if previous is None else logging.DEBUG, "%s", action, extra=fields)
         outcome = "failed"
@@ -240,14 +251,14 @@ class Executor:
         try:
             await carry_out(action)
             outcome = "ok"
-            self._refused.pop(action, None)
+            self._logged_failures.pop(action, None)
         except EngineError as error:
             reason = str(error)
             if isinstance(error, PortTaken):
                 outcome = reason = "taken"  # the port may differ at each try
             level = logging.DEBUG if reason == previous else logging.WARNING
             log.log(level, "%s: %s", action, error, extra=fields)
-            self._refused[action] = reason, self._now()
+            self._logged_failures[action] = reason, self._now()
             raise
         finally:
             self._counted(action, outcome)
@@ -259,8 +270,8 @@ def _subject(job: Job) -> str:
     return subject or (f"proxy {proxy_name(key)}" if key else "uplink")
 
 
-class DockerApplier:
-    """Carries out single actions at the engine, each in a thread."""
+class DockerActions:
+    """Makes the engine's calls for single actions, each action in a thread."""
 
     def __init__(self, engine: DockerClient, settings: PlanSettings, proxies: ProxyClient) -> None:
         self._engine = engine
@@ -271,7 +282,7 @@ class DockerApplier:
         """Carry out an action that was planned from ``snapshot``. Raises EngineError."""
         if isinstance(action, Remove) and action.retire and action.name in snapshot.access:
             await self._retire(action.name, snapshot.access[action.name])
-        await in_thread(self._do, action, snapshot)
+        await in_thread(self._call_tolerantly, action, snapshot)
 
     async def _retire(self, name: str, access: ProxyAccess) -> None:
         fields = {"proxy": name}
@@ -283,18 +294,18 @@ class DockerApplier:
             text = "proxy not retired: %s, outside was not told that its nodes have ended: %s"
             log.warning(text, name, error, extra=fields)
 
-    def _do(self, action: Action, snapshot: DockerSnapshot) -> None:
+    def _call_tolerantly(self, action: Action, snapshot: DockerSnapshot) -> None:
         try:
-            self._call(action, snapshot)
+            self._call_engine(action, snapshot)
         except EngineError as error:
-            phrases = DONE.get(type(action))
+            phrases = HARMLESS_ERRORS.get(type(action))
             if phrases is None or not (
                 isinstance(error, NoSuchObject) or any(phrase in str(error) for phrase in phrases)
             ):
                 raise
             log.debug("nothing left to do: %s", error)
 
-    def _call(self, action: Action, snapshot: DockerSnapshot) -> None:  # noqa: C901 - cases only
+    def _call_engine(self, action: Action, snapshot: DockerSnapshot) -> None:  # noqa: C901 - cases only
         do = self._engine.do
         match action:
             case CreateNetwork() | RemoveNetwork() | Connect() | Disconnect():
@@ -307,7 +318,7 @@ class DockerApplier:
                 do("start", name)
                 self._await_end(name)
             case Restart(name):
-                do("restart", name, timeout=STOP_TIMEOUT)
+                do("restart", name, timeout=STOP_TIMEOUT_S)
             case Unpause(name):
                 do("unpause", name)
             case Rename(name, to):
@@ -332,18 +343,19 @@ class DockerApplier:
                 do("disconnect_container_from_network", name, network, force=True)
 
     def _await_end(self, name: str) -> None:
-        """Wait until a helper container has ended, and remove the container after LONGEST_RUN.
+        """Wait until a helper container has ended.
 
-        Raises EngineError after the removal, and for an exit code other than 0.
+        If the container runs longer than `LONGEST_HELPER_RUN_S`, remove it. Raises EngineError
+        after the removal, and for an exit code other than 0.
         """
         since = time.monotonic()
         while (state := self._engine.container(name)["State"])["Running"]:
-            if time.monotonic() > since + LONGEST_RUN:
+            if time.monotonic() > since + LONGEST_HELPER_RUN_S:
                 self._engine.do("remove_container", name, force=True)
                 raise EngineError(
-                    f"not ended after {LONGEST_RUN:.0f} s, and removed by the operator"
+                    f"not ended after {LONGEST_HELPER_RUN_S:.0f} s, and removed by the operator"
                 )
-            time.sleep(RUNNING)
+            time.sleep(END_POLL_INTERVAL_S)
         if state["ExitCode"]:
             raise EngineError(f"ended with exit code {state['ExitCode']}. Read docker logs {name}")
 
@@ -366,16 +378,17 @@ class DockerApplier:
         name = action.name
         if action.stop:
             try:
-                self._engine.do("stop", name, timeout=STOP_TIMEOUT)
+                self._engine.do("stop", name, timeout=STOP_TIMEOUT_S)
             except EngineError as error:
                 log.debug("container not stopped, so it is killed: %s: %s", name, error)
-        # When a container ends, the engine publishes the ports anew over each network of the
-        # container, which takes 2 s per network. So the operator disconnects these networks first.
+        # When a sandbox ends, the engine publishes the ports anew over each network that the
+        # sandbox still has, which takes 2 s per network. So disconnect the networks while the
+        # sandbox runs. A proxy's container, which gets ``stop``, has no network of its own.
         networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
         for network in networks:
             # The engine disconnects no container from the network host.
             if network not in (self._settings.uplink, "host"):
-                self._do(Disconnect(name, network), snapshot)
+                self._call_tolerantly(Disconnect(name, network), snapshot)
         self._engine.do("remove_container", name, force=True)
 
     def _create(self, name: str, config: Json, image_id: str) -> None:

@@ -12,7 +12,7 @@ from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.engine_json import uplink_secret
 from rosproxy_operator.docker.errors import EngineError
-from rosproxy_operator.docker.executor import DockerApplier
+from rosproxy_operator.docker.executor import DockerActions
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
@@ -84,7 +84,7 @@ def container_on_two_networks(engine: FakeEngine) -> None:
 
 
 async def carry_out(action: Action) -> None:
-    await DockerApplier(DockerClient(), SETTINGS, ProxyClient()).carry_out(action, LOOK)
+    await DockerActions(DockerClient(), SETTINGS, ProxyClient()).carry_out(action, LOOK)
 
 
 async def test_the_documentation_lists_exactly_what_is_called(engine: FakeEngine) -> None:
@@ -138,7 +138,7 @@ async def test_what_does_not_do_its_one_thing_is_told(engine: FakeEngine) -> Non
 async def test_what_does_not_end_is_removed(
     engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy_operator.docker.executor.LONGEST_RUN", 0.0)
+    monkeypatch.setattr("rosproxy_operator.docker.executor.LONGEST_HELPER_RUN_S", 0.0)
     engine.knows["/containers/box/json"]["State"]["Running"] = True
     with pytest.raises(EngineError, match="not ended after 0 s, and removed by the operator"):
         await carry_out(Run("box"))
