@@ -301,11 +301,11 @@ class DockerController:
     def _hear(self, event: Json | None) -> None:
         """Note an event. None: a new connection to the engine, so earlier events may be missing."""
         if event is None:
-            self._observer.mark_doubtful(None)
+            self._observer.note_event(None)
             self._memory = replace(self._memory, engine_returned=True)
             self._loop.retry()
         elif container := engine_json.container_of(event):
-            self._observer.mark_doubtful(container)
+            self._observer.note_event(container)
         self._loop.wake()
         self._loop.wake_in(SETTLED)
 

@@ -63,16 +63,16 @@ def own_address_towards(master: str, gateways: Collection[str]) -> str:
     """Return the address at which a master reaches this host; empty without a route.
 
     ``master`` is an address. If the route starts at loopback or at one of the engine's
-    ``gateways``, no other host can use that source. Then the result is `far_address`, or the
-    gateway if there is no far address.
+    ``gateways``, no other host can use that source. Then the result is `default_route_address`, or
+    the gateway without a default route.
     """
     own = address_towards(master)
     if own in gateways or is_loopback(own):
-        own = far_address() or own
+        own = default_route_address() or own
     return "" if is_loopback(own) else own
 
 
-def far_address() -> str:
+def default_route_address() -> str:
     """Return the address at which far hosts reach this host; empty without a default route."""
     far = address_towards(_ELSEWHERE)
     return "" if is_loopback(far) else far

@@ -36,7 +36,7 @@ WAIT_INTERVAL = 1.0
 """Seconds between two looks of ``--wait``."""
 ASKING = 10.0
 """Seconds that the operator has to answer: the operator looks anew, and asks all proxies."""
-PATIENCE = 3.0
+STATUS_INSPECTION_WAIT_S = 3.0
 """Seconds to wait for the inspection of containers: there is no second look."""
 
 
@@ -164,7 +164,7 @@ async def survey(settings: PlanSettings) -> Json:
     # The callbacks wake a control loop. Here is none: there is no second look.
     observer = DockerObserver(DockerClient(), settings, MasterResolver(lambda: None), lambda: None)
     try:
-        snapshot = await observer.look(PATIENCE)
+        snapshot = await observer.look(STATUS_INSPECTION_WAIT_S)
         answers = await ask_proxies(proxies, snapshot, settings.uplink)
     finally:
         await proxies.close()

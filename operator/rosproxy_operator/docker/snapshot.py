@@ -1,8 +1,8 @@
 """Looks at a Docker host: containers, networks, labels, and the addresses of the masters.
 
 A look returns the planner's data (`HostState`), and what the planner does not need: the admin
-endpoints and tokens of the proxies. A look also reads the labels, once, because the labels decide
-which names of masters the operator resolves.
+endpoints and tokens of the proxies. Each look parses the labels a single time, here, because the
+labels decide which names of masters the operator resolves.
 """
 
 import asyncio
@@ -52,12 +52,13 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 log = logging.getLogger(__name__)
 
-PATIENCE = 0.1
-"""Seconds that a look waits for inspections. A later look uses the results that come too late."""
-FIRST_PATIENCE = 1.0
+INSPECTION_WAIT_S = 0.1
+"""Seconds that a look waits for inspections. The next look uses results that come later."""
+FIRST_INSPECTION_WAIT_S = 1.0
 """Seconds that the first look of an observer waits for inspections.
 
-A proxy must not get a name that a container has. Only inspections have the aliases of containers.
+A proxy must not get an alias that is the name or alias of another container. Only inspections have
+the aliases of containers.
 """
 _KINDS: Mapping[str, type[OwnContainer]] = {
     ROLE_SANDBOX: Sandbox,
@@ -66,12 +67,12 @@ _KINDS: Mapping[str, type[OwnContainer]] = {
     ROLE_REDIRECT: RedirectContainer,
     ROLE_FLUSH: FlushContainer,
 }
-DOUBT = 1.0
-"""Seconds after an event for which each look inspects the container of the event again."""
-CHECK = 30.0
-"""Seconds between two inspections of the operator's own containers when no event arrives."""
+REINSPECTED_FOR_S = 1.0
+"""Seconds after an event of an own container in which each look inspects this container again."""
+CHECK_INTERVAL_S = 30.0
+"""Least seconds between two checks of all own containers, in case an event was missed."""
 MOST_INSPECTIONS = 16
-"""Inspections at the same time."""
+"""The highest number of inspections at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,40 +107,42 @@ class Inspector:
 
     The engine always lists containers within milliseconds. But the engine answers an inspection
     only when the start of the container is over: with 1000 published ports, this takes 26 s. Of an
-    inspection, only the aliases change during a run. The aliases change only together with the
-    endpoints, and the list has the ids of the endpoints.
+    inspection, only the aliases change during a run, and only together with the endpoints. The list
+    has the ids of the endpoints. So a changed id in the list shows that the inspector has to
+    inspect the container again.
 
     The list does not show each restart of an own container. A proxy's container has no network
     endpoint, and the list shows the end of a container late. The engine's events report the restart
-    (`mark_doubtful`). Then each look inspects this container for `DOUBT` seconds. In case an event
-    was missed, the inspector also inspects all own containers every `CHECK` seconds, beside the
-    looks. Redirects are an exception: a redirect's container has ended.
+    (`note_event`). Then each look inspects this container for `REINSPECTED_FOR_S` seconds. An event
+    may be missed. So a look that comes `CHECK_INTERVAL_S` seconds after the last check also starts
+    a check: inspections of all own containers, for which this look does not wait. Redirects are
+    not checked: a redirect's container has ended.
 
     The inspector logs an unreadable inspection once, and treats the inspection as missing. Other
-    containers are not affected. Calls ``late`` when an inspection ends after the look that wanted
-    the inspection, or when a check finds a change.
+    containers are not affected. The inspector calls ``on_late_result`` when an inspection ends
+    after the look that started the inspection, or when a check finds a change.
     """
 
-    def __init__(self, engine: DockerClient, late: Callable[[], None]) -> None:
+    def __init__(self, engine: DockerClient, on_late_result: Callable[[], None]) -> None:
         self._engine = engine
-        self._late = late
+        self._on_late_result = on_late_result
         self._cached: dict[str, tuple[object, Json]] = {}
-        self._asking: dict[str, asyncio.Task[bool]] = {}
-        self._marks: dict[str, object] = {}
+        self._inspecting: dict[str, asyncio.Task[bool]] = {}
+        self._state_keys: dict[str, object] = {}
         self._unreadable: set[str] = set()
         self._turns = asyncio.Semaphore(MOST_INSPECTIONS)
-        self._doubted: dict[str, float] = {}
-        self._all_doubted = -DOUBT
+        self._event_times: dict[str, float] = {}
+        self._events_missed_at = -REINSPECTED_FOR_S
         self._updated = time.monotonic()
         self._looks = 0
-        self._doubtful_look: dict[str, int] = {}
+        self._event_looks: dict[str, int] = {}
         self._checked = time.monotonic()
         self._checking: set[str] = set()
 
     @property
     def waiting(self) -> bool:
-        """Whether inspections are under way whose end may call ``late``."""
-        return bool(self._asking.keys() - self._checking)
+        """Whether inspections are under way whose end may call ``on_late_result``."""
+        return bool(self._inspecting.keys() - self._checking)
 
     def get(self, container: str) -> Json | None:
         """Return the last known inspection of a container, or None."""
@@ -147,81 +150,85 @@ class Inspector:
 
     def is_current(self, row: Json) -> bool:
         """Whether the inspection belongs to this row of the list, and both have the same state."""
-        mark, inspected = self._cached.get(row["Id"], (None, None))
-        fresh = mark == self._marks[row["Id"]]
+        state_key, inspected = self._cached.get(row["Id"], (None, None))
+        fresh = state_key == self._state_keys[row["Id"]]
         return fresh and engine_json.dig(inspected, "State", "Status") == row["State"]
 
-    def mark_doubtful(self, container: str | None) -> None:
-        """Note an event about a container. None: events may be missing, so doubt all containers."""
+    def note_event(self, container: str | None) -> None:
+        """Note an event about a container. None: events may be missing, of all containers."""
         if container is None:
-            self._all_doubted = time.monotonic()
+            self._events_missed_at = time.monotonic()
         else:
-            self._doubted[container] = time.monotonic()
+            self._event_times[container] = time.monotonic()
 
     async def update(self, rows: Iterable[Json], own: Mapping[str, str], patience: float) -> None:
         """Inspect new and changed containers. Wait for the results for ``patience`` seconds.
 
-        ``own`` gives the roles of the operator's own containers, by container id. A doubt lasts
-        until the next look at least, however late this look comes.
+        ``own`` gives the roles of the operator's own containers, by container id. An event counts
+        at least for the next look, even if this look comes after `REINSPECTED_FOR_S` seconds.
         """
         now = time.monotonic()
-        since = min(now - DOUBT, self._updated)
+        since = min(now - REINSPECTED_FOR_S, self._updated)
         self._updated = now
         self._looks += 1
-        self._doubted = {key: at for key, at in self._doubted.items() if at >= since}
-        doubtful = own.keys() if self._all_doubted >= since else self._doubted.keys() & own.keys()
-        self._marks = {row["Id"]: self._mark(row, own, doubtful) for row in rows}
-        self._cached = {key: c for key, c in self._cached.items() if key in self._marks}
-        self._doubtful_look = {
-            key: look for key, look in self._doubtful_look.items() if key in self._marks
+        self._event_times = {key: at for key, at in self._event_times.items() if at >= since}
+        with_event = (
+            own.keys() if self._events_missed_at >= since else self._event_times.keys() & own.keys()
+        )
+        self._state_keys = {row["Id"]: self._state_key(row, own, with_event) for row in rows}
+        self._cached = {key: c for key, c in self._cached.items() if key in self._state_keys}
+        self._event_looks = {
+            key: look for key, look in self._event_looks.items() if key in self._state_keys
         }
-        self._unreadable &= self._marks.keys()
+        self._unreadable &= self._state_keys.keys()
         tasks = [
-            self._ask(key, mark)
-            for key, mark in self._marks.items()
-            if self._cached.get(key, (None,))[0] != mark and key not in self._asking
+            self._start_inspection(key, state_key)
+            for key, state_key in self._state_keys.items()
+            if self._cached.get(key, (None,))[0] != state_key and key not in self._inspecting
         ]
         if tasks:
             _, pending = await asyncio.wait(tasks, timeout=patience)
             for task in pending:
-                task.add_done_callback(lambda _: self._late())
-        if self._checked < now - CHECK:
+                task.add_done_callback(lambda _: self._on_late_result())
+        if self._checked < now - CHECK_INTERVAL_S:
             self._checked = now
             self._check(key for key, role in own.items() if role != ROLE_REDIRECT)
 
-    def _mark(self, row: Json, own: Collection[str], doubtful: Collection[str]) -> object:
-        """Return a mark of the state. If the mark changes, the next look inspects the container."""
+    def _state_key(self, row: Json, own: Collection[str], with_event: Collection[str]) -> object:
+        """Return a value that changes when the next look has to inspect the container."""
         key = row["Id"]
         signature = engine_json.signature(row)
         if key not in own:
             return signature
-        if key in doubtful:
-            self._doubtful_look[key] = self._looks
-        return row["State"], signature, self._doubtful_look.get(key)
+        if key in with_event:
+            self._event_looks[key] = self._looks
+        return row["State"], signature, self._event_looks.get(key)
 
     def _check(self, ids: Iterable[str]) -> None:
-        """Inspect containers beside the looks. Call ``late`` if an inspection has changed."""
+        """Inspect containers without waiting. Call ``on_late_result`` for a changed inspection."""
         for key in ids:
-            if key in self._marks and key not in self._asking:
+            if key in self._state_keys and key not in self._inspecting:
                 self._checking.add(key)
-                self._ask(key, self._marks[key]).add_done_callback(self._after_check)
+                self._start_inspection(key, self._state_keys[key]).add_done_callback(
+                    self._after_check
+                )
 
     def _after_check(self, task: asyncio.Task[bool]) -> None:
         if not task.cancelled() and task.result():
-            self._late()
+            self._on_late_result()
 
-    def _ask(self, container: str, mark: object) -> asyncio.Task[bool]:
-        task = asyncio.create_task(self._inspect(container, mark))
-        self._asking[container] = task
+    def _start_inspection(self, container: str, state_key: object) -> asyncio.Task[bool]:
+        task = asyncio.create_task(self._inspect(container, state_key))
+        self._inspecting[container] = task
         return task
 
-    async def _inspect(self, container: str, mark: object) -> bool:
+    async def _inspect(self, container: str, state_key: object) -> bool:
         """Inspect a container. Return whether the inspection differs from the last inspection."""
         previous = self.get(container)
         try:
             async with self._turns:
                 inspected = await in_thread(self._engine.container, container)
-            self._cached[container] = mark, engine_json.check_inspection(inspected)
+            self._cached[container] = state_key, engine_json.check_inspection(inspected)
             self._unreadable.discard(container)
         except EngineError as error:
             log.debug("inspecting %s: %s", container[:12], error)
@@ -231,44 +238,44 @@ class Inspector:
                 log.warning(text, container[:12], error)
             self._unreadable.add(container)
         finally:
-            del self._asking[container]
+            del self._inspecting[container]
             self._checking.discard(container)
         return self.get(container) != previous
 
 
 class DockerObserver:
-    """Looks at an engine. Calls ``late`` when an inspection ends after the look that wanted it."""
+    """Looks at an engine. ``on_late_result`` is called as by the `Inspector`."""
 
     def __init__(
         self,
         engine: DockerClient,
         settings: PlanSettings,
         masters: MasterResolver,
-        late: Callable[[], None],
+        on_late_result: Callable[[], None],
     ) -> None:
         self._engine = engine
         self._settings = settings
         self._masters = masters
-        self._inspector = Inspector(engine, late)
-        self._fresh = secrets.token_hex(32)
+        self._inspector = Inspector(engine, on_late_result)
+        self._new_secret = secrets.token_hex(32)
         self._has_looked = False
 
     @property
     def waiting(self) -> bool:
-        """Whether inspections are under way whose end may call ``late``."""
+        """Whether inspections are under way whose end may call ``on_late_result``."""
         return self._inspector.waiting
 
-    def mark_doubtful(self, container: str | None) -> None:
+    def note_event(self, container: str | None) -> None:
         """Note an event of the engine about a container id. None: events may be missing."""
-        self._inspector.mark_doubtful(container)
+        self._inspector.note_event(container)
 
-    async def look(self, patience: float = PATIENCE) -> DockerSnapshot:
+    async def look(self, patience: float = INSPECTION_WAIT_S) -> DockerSnapshot:
         """Return the state of the host now. Raises EngineError.
 
-        The result has no foreign container that the operator has not inspected yet. The look waits
-        ``patience`` seconds for inspections, and the first look `FIRST_PATIENCE` at least.
+        Containers of users are missing in the result until the operator has inspected them. A look
+        waits ``patience`` seconds for inspections, the first at least `FIRST_INSPECTION_WAIT_S`.
         """
-        # Read the ports before the list: a port that the engine opens in between is not foreign.
+        # Ports first: a port that the engine opens later does not look like another program's.
         listening = host.listening_ports()
         bound = host.bound_udp_ports()
         rows, net_rows, image = await asyncio.gather(
@@ -278,7 +285,7 @@ class DockerObserver:
         )
         labelled = ((row["Id"], self._read_own(row)) for row in rows)
         own_roles = {key: own.role for key, own in labelled if own}
-        least = 0.0 if self._has_looked else FIRST_PATIENCE
+        least = 0.0 if self._has_looked else FIRST_INSPECTION_WAIT_S
         await self._inspector.update(rows, own_roles, max(patience, least))
         self._has_looked = True
         networks = tuple(map(engine_json.read_network, net_rows))
@@ -293,10 +300,10 @@ class DockerObserver:
                 state,
                 listening=foreign_ports(busy, (), listening),
                 listening_udp=foreign_ports(busy, state.lan_relays, bound),
-                far=host.far_address(),
+                default_route_address=host.default_route_address(),
             )
         secret = self._settings.secret or engine_json.uplink_secret(net_rows, self._settings.uplink)
-        state = replace(state, image_id=image, secret=secret or self._fresh)
+        state = replace(state, image_id=image, secret=secret or self._new_secret)
         labels = read_labels(state, self._settings)
         masters = await self._resolve(state, master_hosts(labels, state))
         gateways = {network.gateway for network in networks}
@@ -310,7 +317,7 @@ class DockerObserver:
             labels=labels,
             access={p.container.name: a for p in state.proxies if (a := self._access(p, state))},
             at_host=at_host,
-            new_secret=self._fresh,
+            new_secret=self._new_secret,
         )
 
     def _read_own(self, row: Json) -> OwnLabels | None:
@@ -327,9 +334,10 @@ class DockerObserver:
     ) -> HostState:
         """Return the state of the host, with the operator's own containers apart.
 
-        A container with forged labels of the operator counts as a foreign container. Without an
-        inspection, a container with the right name counts as the operator's own. The operator does
-        nothing to this container until the inspection is there (``busy``).
+        A container with forged labels of the operator counts as a container of a user. Without an
+        inspection, a container with the operator's labels and the right name counts as the
+        operator's own. The operator does nothing to this container until the inspection is there
+        (``busy``).
         """
         containers: list[Container] = []
         own_by_role: dict[str, list[Any]] = {role: [] for role in _KINDS}
@@ -378,11 +386,13 @@ class DockerObserver:
         return {name: self._masters.address(name) for name in names}
 
     def _access(self, proxy: Proxy, state: HostState) -> ProxyAccess | None:
-        box = state.sandbox_of(proxy)
-        if box is None or proxy.container.state != "running" or box.container.state != "running":
+        sandbox = state.sandbox_of(proxy)
+        if sandbox is None or {proxy.container.state, sandbox.container.state} != {"running"}:
             return None
         uplink = self._settings.uplink
-        address = next((a.address for a in box.container.attachments if a.network == uplink), "")
+        address = next(
+            (a.address for a in sandbox.container.attachments if a.network == uplink), ""
+        )
         run = f"{proxy.container.id} {proxy.container.started_at}"
         admin = HostPort(address, admin_port(proxy.key))
         variables = engine_json.environment(self._inspector.get(proxy.container.id))
@@ -397,21 +407,23 @@ def _addresses(rows: Iterable[Json]) -> frozenset[str]:
 
 
 def foreign_ports(
-    starting: Iterable[Sandbox], lan_relays: Iterable[LanRelayContainer], listening: frozenset[int]
+    busy: Iterable[Sandbox], lan_relays: Iterable[LanRelayContainer], listening: frozenset[int]
 ) -> frozenset[int]:
     """Return the listening ports of the host that may belong to other programs.
 
-    The ports of ``starting`` sandboxes and of LAN relays are left out. The engine opens a sandbox's
-    ports one after the other before it reports the sandbox as running.
+    The ports of ``busy`` sandboxes, which may be starting, and of LAN relays are left out. The
+    engine opens a sandbox's ports one after the other before the engine reports the sandbox as
+    running. The ports of all other sandboxes stay in the result: the planner knows these ports by
+    the sandboxes.
     """
-    own = {port for sandbox in starting for port in sandbox.range.ports()}
+    own = {port for sandbox in busy for port in sandbox.range.ports()}
     return listening - own - {lan_relay.range.last for lan_relay in lan_relays}
 
 
 def address_in(state: HostState, name: str, uplink: str) -> str:
-    """Return the address of this host or of a container, by a name that name servers do not know.
+    """Return the address of this host (`THIS_HOST`) or of a running container with a name.
 
-    Empty if the name is unknown here, too.
+    Empty without such a container. For names that the name servers do not know.
     """
     if name == THIS_HOST:
         return next((n.gateway for n in state.networks if n.name == uplink), "")

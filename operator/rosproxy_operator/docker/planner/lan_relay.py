@@ -70,7 +70,7 @@ def _lan(key: Key, observed: HostState, settings: PlanSettings) -> str:
     """This host's address on the LAN; empty if unknown, or if ``--ros2-lan`` is ``none``."""
     if settings.ros2_lan:
         return "" if settings.ros2_lan == NOWHERE else settings.ros2_lan
-    return key.advertise_host if is_address(key.advertise_host) else observed.far
+    return key.advertise_host if is_address(key.advertise_host) else observed.default_route_address
 
 
 def _wanted(context: PlanContext) -> CreateLanRelay | None:

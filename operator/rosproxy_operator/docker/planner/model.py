@@ -223,12 +223,12 @@ class HostState:
         ephemeral: The range from which the kernel takes ports for outgoing connections.
         listening: TCP ports of the host on which a program listens, except ports of busy
             sandboxes. Empty if the operator is not in the host's network, as are
-            ``listening_udp``, ``advertise`` and ``far``.
+            ``listening_udp``, ``advertise`` and ``default_route_address``.
         listening_udp: Bound UDP ports of the host, except ports of busy sandboxes and LAN relays.
         image_id: The id of the proxy's image; empty if the host does not have the image.
         advertise: This host's address towards a master, by the master's host name. A host name
             without entry has no known address.
-        far: This host's address on the default route; empty if unknown.
+        default_route_address: This host's address on the default route; empty if unknown.
         redirects: The records of rules in the networks of containers.
         flushes: The records of deleted conntrack entries.
         masters: The addresses of the masters' hosts, by host name; empty if unknown.
@@ -247,7 +247,7 @@ class HostState:
     listening_udp: frozenset[int] = frozenset()
     image_id: str = ""
     advertise: Mapping[str, str] = field(default_factory=dict)
-    far: str = ""
+    default_route_address: str = ""
     sandboxes: tuple[Sandbox, ...] = ()
     lan_relays: tuple[LanRelayContainer, ...] = ()
     redirects: tuple[RedirectContainer, ...] = ()

@@ -204,7 +204,7 @@ async def test_an_inspection_of_before_makes_busy(engine: FakeEngine) -> None:
     looking = observer()
     await looking.look(5.0)
     del engine.knows[f"/containers/{'p' * 64}/json"]
-    looking.mark_doubtful("p" * 64)
+    looking.note_event("p" * 64)
     look = await looking.look(5.0)
     assert look.state.busy == {proxy_name(KEY)}
     assert look.access[proxy_name(KEY)].token == TOKEN
@@ -224,7 +224,7 @@ async def test_what_nothing_happened_to_is_not_inspected_again(engine: FakeEngin
     await looking.look(5.0)
     assert inspected_again(engine) == set()
     for container, again in (("p" * 64, {"p"}), ("x" * 64, {"p"}), (None, {"p", "b"})):
-        looking.mark_doubtful(container)
+        looking.note_event(container)
         assert not (await looking.look(5.0)).state.busy
         assert inspected_again(engine) == again
 
@@ -232,12 +232,12 @@ async def test_what_nothing_happened_to_is_not_inspected_again(engine: FakeEngin
 async def test_a_doubt_is_good_for_one_look_however_late(
     engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(snapshot, "DOUBT", 0.0)
+    monkeypatch.setattr(snapshot, "REINSPECTED_FOR_S", 0.0)
     looking = observer()
     first = (await looking.look(5.0)).access[proxy_name(KEY)].run
     engine.knows[f"/containers/{'p' * 64}/json"]["State"]["StartedAt"] = "2"
     for container in ("p" * 64, None):
-        looking.mark_doubtful(container)
+        looking.note_event(container)
         await asyncio.sleep(0.01)
         assert (await looking.look(5.0)).access[proxy_name(KEY)].run != first
         engine.calls.clear()
@@ -257,7 +257,7 @@ async def test_a_redirect_that_was_run_again_is_inspected_again(engine: FakeEngi
     engine.add(row, inspection(redirect_config(made, SETTINGS)) | {"State": state})
     assert [redirect.done for redirect in (await looking.look(5.0)).state.redirects] == [False]
     state["ExitCode"] = 0
-    looking.mark_doubtful("r" * 64)
+    looking.note_event("r" * 64)
     assert [redirect.done for redirect in (await looking.look(5.0)).state.redirects] == [True]
 
 
@@ -276,7 +276,7 @@ async def test_a_start_that_no_event_told_is_found(
     engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By a separate check, which causes a look only after a change."""
-    monkeypatch.setattr(snapshot, "CHECK", 0.0)
+    monkeypatch.setattr(snapshot, "CHECK_INTERVAL_S", 0.0)
     told: list[bool] = []
     resolver = MasterResolver(lambda: None)
     looking = DockerObserver(DockerClient(), SETTINGS, resolver, lambda: told.append(True))

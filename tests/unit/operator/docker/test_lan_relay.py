@@ -190,7 +190,7 @@ def test_the_lan_is_where_the_option_says_or_the_advertised_host_or_far_hosts_ar
         box = structs.replace(box, fingerprint=sandbox_fingerprint(box, settings))
         place = (Attachment(settings.uplink, NEAR), Attachment("app", "172.18.0.9"))
         state = observed(
-            TALKER, far=far,
+            TALKER, default_route_address=far,
             sandboxes=[Sandbox(key, own(box, place, "app"), RANGE, box.fingerprint)],
         )  # fmt: skip
         plan = look(state, settings)

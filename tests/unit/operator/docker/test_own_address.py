@@ -13,7 +13,7 @@ FAR = "203.0.113.9"
 
 
 def wrong(key: Key = KEY, **variables: str) -> str:
-    seen = observed(advertise={"robot": TOWARDS}, far=FAR)
+    seen = observed(advertise={"robot": TOWARDS}, default_route_address=FAR)
     return wrong_own_address(replace(container(), variables=variables), key, seen)
 
 

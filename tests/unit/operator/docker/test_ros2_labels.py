@@ -250,7 +250,7 @@ def test_it_is_exposed_by_default_as_it_is_by_its_variables() -> None:
 
 def test_the_advertised_host_is_the_address_for_far_hosts() -> None:
     settings = replace(SETTINGS, advertise_host=None)
-    members, told = read(labelled_container(TWO), settings, far=HERE)
+    members, told = read(labelled_container(TWO), settings, default_route_address=HERE)
     assert ([member.key for member in members], told) == ([DOMAIN], [])
     members, told = read(labelled_container(TWO), settings)
     assert not members

@@ -200,7 +200,7 @@ async def test_the_first_look_waits_longer_for_inspections(
     observer = DockerObserver(DockerClient(), SETTINGS, MasterResolver(lambda: None), lambda: None)
     for _ in range(2):
         await observer.look()
-    assert waited == [snapshot.FIRST_PATIENCE, snapshot.PATIENCE]
+    assert waited == [snapshot.FIRST_INSPECTION_WAIT_S, snapshot.INSPECTION_WAIT_S]
 
 
 # what is kept of an inspection

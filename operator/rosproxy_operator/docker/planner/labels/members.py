@@ -306,7 +306,11 @@ def _advertised(request: Member, observed: HostState) -> str:
     """
     key = request.key
     networks = request.container.networks
-    towards = observed.far if key.is_ros2 else observed.advertise.get(master(key).host, "")
+    towards = (
+        observed.default_route_address
+        if key.is_ros2
+        else observed.advertise.get(master(key).host, "")
+    )
     sandboxes = [
         s
         for s in observed.sandboxes

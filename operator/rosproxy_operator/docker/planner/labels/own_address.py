@@ -37,4 +37,6 @@ def _of_this_host(key: Key, observed: HostState) -> frozenset[str]:
     """Return the known addresses and names of this host, in lower case."""
     gateways = (network.gateway for network in observed.networks)
     towards = observed.advertise.values()
-    return frozenset({key.advertise_host.lower(), observed.far, *gateways, *towards} - {""})
+    return frozenset(
+        {key.advertise_host.lower(), observed.default_route_address, *gateways, *towards} - {""}
+    )
