@@ -53,10 +53,10 @@ from rosproxy_operator.kubernetes.planner.steps.network_policy import (
     reconcile_policies,
 )
 from rosproxy_operator.kubernetes.planner.steps.reconcile import (
-    ends,
     reconcile_orphans,
     reconcile_proxies,
     reconcile_service,
+    seconds_to_deadlines,
 )
 from rosproxy_operator.kubernetes.planner.steps.remake import remake_unwired
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Obstacle, RosProxyOnNode
@@ -164,7 +164,7 @@ def _pod_findings(
 
 def _waits(context: ClusterContext, departed: departures.Departures) -> Iterator[float]:
     """Yield the seconds to each look that is due without an event."""
-    yield from (seconds for seconds in ends(context) if seconds > 0)
+    yield from (seconds for seconds in seconds_to_deadlines(context) if seconds > 0)
     yield from context.retries.pauses()
     yield from departures.next_checks(departed, context.now)
     yield from unselected_waits(context.state.unselected, context.now)

@@ -15,7 +15,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetImage,
 )
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
-from rosproxy_operator.kubernetes.planner.steps.reconcile import RESTARTS_WITHIN_S
+from rosproxy_operator.kubernetes.planner.steps.reconcile import IMAGE_CHANGE_RESTART_S
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
@@ -131,7 +131,7 @@ def test_a_kubelet_that_does_not_restart_it_holds_up_nothing_for_good() -> None:
     proxies[0] = replace(proxies[0], image=NEXT)
     waiting = look(cluster(*proxies), changed.state, 101.0)
     assert done(waiting) == []
-    later = look(cluster(*proxies), waiting.state, 100.0 + RESTARTS_WITHIN_S)
+    later = look(cluster(*proxies), waiting.state, 100.0 + IMAGE_CHANGE_RESTART_S)
     assert kinds(later) == [CreateHelper]
 
 

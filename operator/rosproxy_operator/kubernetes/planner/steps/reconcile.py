@@ -1,10 +1,10 @@
 """Plans the actions for the Service of a RosProxy, and for the proxy on each node.
 
-Each function compares the wanted object with the existing object, and yields the next action. Later
-looks yield the further actions. The comparison reads only the fingerprint annotation. A pod with
-another fingerprint is deleted, and a later look creates the pod again under the same name. If only
-the image differs, the operator sets the image of the pod. `Retries` delays the repetition of an
-action without an effect.
+Each ``reconcile_…`` function compares the wanted objects with the existing objects, and yields the
+next actions. Later looks yield the actions after these. Of the settings of an object, the
+comparison reads only the fingerprint annotation and the image. A pod with another fingerprint is
+deleted, and a later look creates the pod again under the same name. If only the image differs, the
+operator sets the image of the pod. `Retries` delays the repetition of an action without an effect.
 """
 
 from collections import Counter
@@ -47,9 +47,9 @@ from rosproxy_operator.kubernetes.resources.names import (
     service_id,
 )
 
-RESTARTS_WITHIN_S = 60.0
+IMAGE_CHANGE_RESTART_S = 60.0
 """Seconds in which a kubelet restarts a container after a change of the image."""
-IN_TURN = 1.0
+ROLLOUT_RECHECK_S = 1.0
 """Seconds to the next look while a proxy waits for its turn in a rollout."""
 
 
@@ -59,7 +59,7 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
     wired = (master.host for pod in pods if (master := parse_slave_uri(pod.wired_master_uri)))
     static_peers = (pod.static_peers for pod in pods if not pod.wired_master_uri)
     hosts = Counter(host for host in (*wired, *static_peers) if is_address(host))
-    # If the status has no address, the Service gets the address that most wired pods have.
+    # If the status has no address, the Service gets the address to which most pods are wired.
     common = min(hosts, key=lambda host: (-hosts[host], host), default="")
     body = manifests.service(rosproxy, rosproxy.cluster_ip or common)
     service = context.observed.services.get(rosproxy.id)
@@ -87,17 +87,17 @@ def _delete_service(context: ClusterContext, service: ProxyService, why: str) ->
 def reconcile_proxies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
     """Yield the next actions for the proxies of a RosProxy.
 
-    A change of the image or of the settings is a rollout. At the same time, at most
-    ``spec.maxUnavailable`` proxies do not work or have a check of the next image. The next proxy
-    waits until these proxies work again. A proxy that moves to other ports or to another master
+    A change of the image or of the settings is a rollout. A rollout stops a working proxy, or
+    checks its next image, only while fewer than ``spec.maxUnavailable`` proxies are down or have
+    such a check. The other proxies wait. A proxy that moves to other ports or to another master
     does not wait.
     """
     places = context.view.places.get(rosproxy.id, ())
-    wanted = [place for place in places if _can_be_had(context, place)]
+    wanted = [place for place in places if _is_creatable(context, place)]
     working = {place for place in wanted if _works(context, place, wanted)}
     away = [p for p in wanted if p not in working and not _lacks_ports(context, p)]
-    tried = [place for place in working if _is_tried(context, place)]
-    room = rosproxy.spec.max_unavailable.of(len(wanted)) - len(away) - len(tried)
+    checked = [place for place in working if _image_check_is_open(context, place)]
+    room = rosproxy.spec.max_unavailable.of(len(wanted)) - len(away) - len(checked)
     for place in places:
         may_stop = room > 0 or place not in working
         actions = [*_reconcile_proxy(context, place, may_stop)]
@@ -106,7 +106,7 @@ def reconcile_proxies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
         yield from actions
 
 
-def _is_tried(context: ClusterContext, place: ProxyPlace) -> bool:
+def _image_check_is_open(context: ClusterContext, place: ProxyPlace) -> bool:
     """Whether the check of a proxy's next image is under way or has failed."""
     current = context.view.current.get(place)
     site = site_of(context, place)
@@ -118,18 +118,18 @@ def _is_tried(context: ClusterContext, place: ProxyPlace) -> bool:
 
 
 def _lacks_ports(context: ClusterContext, place: ProxyPlace) -> bool:
-    """Whether a proxy waits for its ports. No rollout has caused this, so no rollout waits."""
+    """Whether a proxy waits for its ports. So a rollout does not count this proxy as down."""
     current = context.view.current.get(place)
     return current is not None and current.stuck is PodFailure.PORTS
 
 
-def _can_be_had(context: ClusterContext, place: ProxyPlace) -> bool:
+def _is_creatable(context: ClusterContext, place: ProxyPlace) -> bool:
     """Whether a proxy is wanted, and has no obstacle."""
     return place in context.view.wanted and not isinstance(site_of(context, place), Obstacle)
 
 
 def _works(context: ClusterContext, place: ProxyPlace, places: Iterable[ProxyPlace]) -> bool:
-    """Whether a proxy serves, with the image of its pod, and is ready.
+    """Whether a proxy serves and is ready. False right after a change of the image.
 
     If no proxy of ``places`` is ready, readiness does not count: the master may be down.
     """
@@ -137,7 +137,7 @@ def _works(context: ClusterContext, place: ProxyPlace, places: Iterable[ProxyPla
     if current is None or not serves(current) or current.stuck is not None:
         return False
     # After a change of the image, a pod stays ready until the kubelet ends the former container.
-    if context.retries.is_recent(_setting_image(current, current.image), RESTARTS_WITHIN_S):
+    if context.retries.is_recent(_setting_image(current, current.image), IMAGE_CHANGE_RESTART_S):
         return False
     every = filter(None, map(context.view.current.get, places))
     return current.ready or not any(proxy.ready for proxy in every)
@@ -152,9 +152,9 @@ def _reconcile_proxy(
     if place in context.view.wanted:
         site = site_of(context, place)
         if isinstance(site, Obstacle):
-            _note_creation(context, place)
+            _keep_creation_count(context, place)
         else:
-            yield from _ensure(context, place, site, may_stop)
+            yield from _reconcile_wanted(context, place, site, may_stop)
     elif node is None:
         for proxy in proxies if context.seconds_until_lost(place.node) <= 0 else ():
             yield from _delete_pod(context, proxy, "its node is gone")
@@ -165,7 +165,7 @@ def _reconcile_proxy(
             yield from _delete_pod(context, proxy, why, retire=True)
 
 
-def _ensure(
+def _reconcile_wanted(
     context: ClusterContext, place: ProxyPlace, site: ProxySite, may_stop: bool
 ) -> Iterator[Action]:
     """Yield the next action for a wanted proxy without an obstacle."""
@@ -174,11 +174,11 @@ def _ensure(
     misplaced = [p for p in context.view.proxies.get(place, ()) if p.pod.id != name]
     if misplaced:
         for proxy in misplaced:
-            yield from _delete_pod(context, proxy, "the proxy of this node has another name")
+            yield from _delete_pod(context, proxy, "the pod has a former name")
     elif name in context.view.names:
-        _note_creation(context, place)
-        if current is not None:  # otherwise the pod with this name is deleted first
-            yield from _update(context, current, site, may_stop)
+        _keep_creation_count(context, place)
+        if current is not None:  # None: a pod with this name is still being deleted
+            yield from _reconcile_existing(context, current, site, may_stop)
     elif (seconds := context.seconds_until_torn_down(place)) > 0:
         # A pod that was deleted by force may still hold its hostPorts: see `TORN_DOWN_WITHIN_S`.
         context.retries.look_again_in(seconds)
@@ -186,9 +186,10 @@ def _ensure(
         yield CreateProxy(place.of, manifests.proxy_pod(site, context.settings))
 
 
-def _update(
+def _reconcile_existing(
     context: ClusterContext, proxy: ProxyPod, site: ProxySite, may_stop: bool
 ) -> Iterator[Action]:
+    """Yield the next action for a wanted proxy whose pod exists."""
     image = manifests.image_of(site.rosproxy, context.settings)
     fingerprint = manifests.proxy_fingerprint(site, context.settings)
     if proxy.pod.ended:
@@ -200,14 +201,14 @@ def _update(
     elif serves(proxy) and proxy.stuck is None and proxy.image != image:
         state = image_state(context, proxy, site)
         if state is ImageState.USABLE:
-            yield from _change(context, proxy, site, may_stop)
+            yield from _replace_or_set_image(context, proxy, site, may_stop)
         elif state is ImageState.MISSING and may_stop:
             yield from check_image(context, site)
     else:
-        yield from _change(context, proxy, site, may_stop)
+        yield from _replace_or_set_image(context, proxy, site, may_stop)
 
 
-def _change(
+def _replace_or_set_image(
     context: ClusterContext, proxy: ProxyPod, site: ProxySite, may_stop: bool
 ) -> Iterator[Action]:
     """Yield the deletion of a proxy that has to be recreated, or the change of the image.
@@ -216,13 +217,13 @@ def _change(
     """
     image = manifests.image_of(site.rosproxy, context.settings)
     fingerprint = manifests.proxy_fingerprint(site, context.settings)
-    # If the next proxy can't find the nodes at the master, the present proxy unregisters the nodes
+    # If the successor can't find the nodes at the master, the present proxy unregisters the nodes
     # (`retire`). A range with the same first port has only grown or shrunk at the end, so the
     # nodes keep their ports.
     moved = proxy.range.first != site.ports.first
     lost = moved or not manifests.keeps_registrations(proxy.fingerprint, fingerprint)
     if not may_stop and not lost:
-        context.retries.look_again_in(IN_TURN)
+        context.retries.look_again_in(ROLLOUT_RECHECK_S)
     elif proxy.fingerprint != fingerprint:
         why = "replaced, since the RosProxy, the node or the operator's options have changed"
         if proxy.range != site.ports:
@@ -233,7 +234,10 @@ def _change(
 
 
 def _setting_image(proxy: ProxyPod, image: str) -> Task:
-    """The task that sets an image. The task is another one after each restart of the container."""
+    """The task that sets an image.
+
+    After each restart of the container this is another task, without a pause from earlier tries.
+    """
     return Task(proxy.of, "image", proxy.pod.id, f"{proxy.pod.uid} {proxy.restarts} {image}")
 
 
@@ -242,8 +246,9 @@ def _delete_pod(
 ) -> Iterator[Action]:
     """Yield the deletion of a proxy's pod, unless the pod is being deleted already.
 
-    With ``retire`` the proxy first unregisters its nodes. A pod that is being deleted may still do
-    this, because the garbage collector often deletes a pod before the operator acts.
+    With ``retire`` the proxy first unregisters its nodes. Then the deletion is also for a pod that
+    is being deleted already and still runs: the garbage collector is often faster than the
+    operator.
     """
     node = context.observed.nodes.get(proxy.node)
     runs = serves(proxy) and node is not None and node.ready
@@ -252,8 +257,11 @@ def _delete_pod(
         yield DeleteProxy(proxy.of, proxy.pod.id, proxy.pod.uid, why, retire)
 
 
-def _note_creation(context: ClusterContext, place: ProxyPlace) -> None:
-    """Keep the count of creations of a proxy until the proxy serves: see `PROMPT_RECREATIONS`."""
+def _keep_creation_count(context: ClusterContext, place: ProxyPlace) -> None:
+    """Keep the retry record of the creation of a proxy while the proxy does not serve.
+
+    So the operator creates a pod that never runs again ever more slowly (`PROMPT_RECREATIONS`).
+    """
     current = context.view.current.get(place)
     if current is None or not serves(current):
         context.retries.note_effect(_creation(place))
@@ -273,14 +281,18 @@ def reconcile_orphans(context: ClusterContext) -> Iterator[Action]:
         # not unregister the nodes.
         takes_over = proxy.of in context.view.rosproxies
         yield from _delete_pod(context, proxy, "its RosProxy is gone", retire=not takes_over)
+    # An unusable RosProxy exists. Its Service stays, so that its pods keep the address.
     unusable = {r.uid for r in context.observed.unusable.values()}
     for service in context.observed.services.values():
         if service.of not in context.view.rosproxies and service.owner not in unusable:
             yield from _delete_service(context, service, "its RosProxy is gone")
 
 
-def ends(context: ClusterContext) -> Iterator[float]:
-    """Yield the seconds to the end of each period of the state. No event tells such an end."""
+def seconds_to_deadlines(context: ClusterContext) -> Iterator[float]:
+    """Yield the seconds until a grace ends, a missing node counts as gone, or a range is given up.
+
+    No watch event reports these ends.
+    """
     ready = {name for name, node in context.observed.nodes.items() if node.ready}
     yield from (context.grace_left(place) for place in context.state.absent if place.node in ready)
     yield from map(context.seconds_until_lost, context.state.lost)
