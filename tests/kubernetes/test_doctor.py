@@ -131,7 +131,9 @@ def test_a_webhook_that_the_api_server_does_not_reach_is_told(net: Namespace) ->
     code, findings = doctor(net.name)
     assert code == 1
     (found,) = [f for f in findings if f["check"] == "webhook" and f["severity"] == "error"]
-    assert found["text"].startswith("the API server reached no operator (chart value webhook.port)")
+    assert found["text"].startswith(
+        "no operator answered the API server at the webhook port (chart value webhook.port)"
+    )
     assert f"{net.name}/{pod.name}" in found["text"]
 
 

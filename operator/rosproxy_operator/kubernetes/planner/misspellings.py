@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from heapq import nsmallest
 
 from rosproxy_operator.kubernetes.planner.cluster_view import View, group_by_key
-from rosproxy_operator.kubernetes.planner.pods.injection import edited
+from rosproxy_operator.kubernetes.planner.pods.wiring import edit_fix
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Name,
@@ -48,7 +48,7 @@ def misspelt_pod_findings(view: View) -> Iterator[ClusterFinding]:
         of = min(rosproxies, default=Name(namespace, ""))
         for pod in nsmallest(MOST_PODS, group, key=lambda p: p.id):
             about = Reference("Pod", pod.id, pod.uid)
-            fix = edited("Correct the name in the template", pod)
+            fix = edit_fix("Correct the name in the template", pod)
             for text in pod.misspelt:
                 joint = " " if text.endswith("?") else ". "
                 yield ClusterFinding(

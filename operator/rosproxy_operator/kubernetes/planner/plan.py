@@ -28,12 +28,12 @@ from rosproxy_operator.kubernetes.planner.misspellings import (
     misspellings,
     misspelt_pod_findings,
 )
-from rosproxy_operator.kubernetes.planner.pods.injection import wiring_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.pods.unselected import (
     unselected_findings,
     unselected_waits,
 )
+from rosproxy_operator.kubernetes.planner.pods.wiring import wiring_finding
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
 from rosproxy_operator.kubernetes.planner.steps.context import (

@@ -110,9 +110,9 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
 
 def _cut_off(subject: str, service: Name, pods: Sequence[str]) -> DoctorFinding:
     text = (
-        "the API server reached no operator (chart value webhook.port) when these pods were "
-        "created, although an "
-        f"operator was ready: {listed(pods)}"
+        "no operator answered the API server at the webhook port (chart value webhook.port) when "
+        "these pods were created, although an operator was ready: "
+        f"{listed(pods)}"
     )
     fix = (
         "allow connections from the API server to the webhook port of the operator's pods in "

@@ -26,8 +26,8 @@ from rosproxy_operator.kubernetes.api.api_client import (
     ApiUnavailable,
 )
 from rosproxy_operator.kubernetes.planner.bounds import Consents, bounds_violation
-from rosproxy_operator.kubernetes.planner.pods.injection import Wiring, target_of, wire
 from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, why_not_selected
+from rosproxy_operator.kubernetes.planner.pods.wiring import Wiring, pod_variables, wire
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import service_id
@@ -129,7 +129,7 @@ class Injector:
         rosproxy = select_rosproxy(pod, usable)
         if isinstance(rosproxy, RosProxy):
             address, hold = self._address(rosproxy, dry_run)
-            return wire(body, target_of(rosproxy, address), rosproxy.spec.host_aliases), hold
+            return wire(body, pod_variables(rosproxy, address), rosproxy.spec.host_aliases), hold
         if rosproxy is not None:
             return Wiring(warnings=(NOT_WIRED + rosproxy.text,)), 0.0
         text = why_not_selected(pod, usable)

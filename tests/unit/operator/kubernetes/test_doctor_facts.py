@@ -111,9 +111,9 @@ async def test_a_webhook_that_the_api_server_does_not_reach(server: ApiServer, a
     (finding,) = await about_webhook(api, ("robots/talker",))
     assert finding.severity is Severity.ERROR
     assert finding.text == (
-        "the API server reached no operator (chart value webhook.port) when these pods were "
-        "created, although an "
-        "operator was ready: robots/talker"
+        "no operator answered the API server at the webhook port (chart value webhook.port) when "
+        "these pods were created, although an operator was ready: "
+        "robots/talker"
     )
     assert "the webhook port of the operator's pods in namespace system" in finding.fix
 

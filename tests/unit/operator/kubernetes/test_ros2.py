@@ -15,8 +15,8 @@ from rosproxy_operator.kubernetes.planner.actions import (
     DeleteProxy,
 )
 from rosproxy_operator.kubernetes.planner.bounds import bounds_violation
-from rosproxy_operator.kubernetes.planner.pods.injection import Target, target_of, wire
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
+from rosproxy_operator.kubernetes.planner.pods.wiring import PodVariables, pod_variables, wire
 from rosproxy_operator.kubernetes.planner.steps.context import TORN_DOWN_WITHIN_S
 from rosproxy_operator.kubernetes.planner.steps.lan_relay import lan_relay_pod
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
@@ -338,8 +338,8 @@ def admitted(*env: Any) -> dict[str, Any]:
 
 
 def test_what_the_webhook_sets():
-    to = target_of(of2(Ros2Spec(5)), ADDRESS)
-    assert to == Target("", ADDRESS, 5)
+    to = pod_variables(of2(Ros2Spec(5)), ADDRESS)
+    assert to == PodVariables("", ADDRESS, 5)
 
     wiring = wire(admitted(), to)
 
@@ -350,7 +350,7 @@ def test_what_the_webhook_sets():
     assert wiring.annotations == {names.STATIC_PEERS: ADDRESS}
     own = ({"name": "ROS_STATIC_PEERS", "value": "a"}, {"name": "ROS_DOMAIN_ID", "value": "4"})
     assert wire(admitted(*own), to).spec is None
-    both = wire(admitted(), target_of(some.rosproxy(ros2=Ros2Spec()), ADDRESS))
+    both = wire(admitted(), pod_variables(some.rosproxy(ros2=Ros2Spec()), ADDRESS))
     assert both.spec is not None
     set_ = [variable["name"] for variable in both.spec["containers"][0]["env"]]
     assert set_ == ["ROS_MASTER_URI", "ROS_STATIC_PEERS", "ROS_IP"]
@@ -359,7 +359,7 @@ def test_what_the_webhook_sets():
 def test_a_copy_of_a_wired_pod_is_wired_anew():
     old = admitted({"name": "ROS_STATIC_PEERS", "value": "10.96.9.9"})
     old["metadata"]["annotations"] = {names.STATIC_PEERS: "10.96.9.9"}
-    wiring = wire(old, Target(static_peers=ADDRESS))
+    wiring = wire(old, PodVariables(static_peers=ADDRESS))
     assert wiring.spec is not None
     assert wiring.spec["containers"][0]["env"][0]["value"] == ADDRESS
 

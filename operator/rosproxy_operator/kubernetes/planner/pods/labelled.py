@@ -5,13 +5,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from rosproxy.admin.doctor_finding import DoctorFinding, error
 from rosproxy.telemetry.text import listed, plural
 from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
-from rosproxy_operator.kubernetes.planner.pods.injection import (
-    edited,
-    has_come_unwired,
-    is_late,
-    restart_of,
-)
 from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, wants_proxy
+from rosproxy_operator.kubernetes.planner.pods.wiring import (
+    edit_fix,
+    needs_recreation,
+    recreate_command,
+    should_be_wired,
+)
 from rosproxy_operator.kubernetes.resources.model import Pod, RosProxy
 from rosproxy_operator.kubernetes.resources.names import INJECT
 
@@ -33,7 +33,7 @@ def lonely_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> Itera
             f"the namespace has no RosProxy, but {plural(len(group), 'pod')} with the label "
             f"{INJECT} ({names}), so outside can't reach the ROS nodes of these pods"
         )
-        restarts = sorted({restart_of(pod) for pod in group})[:MOST_COMMANDS]
+        restarts = sorted({recreate_command(pod) for pod in group})[:MOST_COMMANDS]
         fix = f"create a RosProxy in the namespace, then run {'; '.join(restarts)}"
         yield error("pods", f"namespace {namespace}", text, fix)
 
@@ -47,7 +47,7 @@ def misspelt_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> lis
     first: dict[tuple[str, str], Pod] = {}
     for pod in lonely:
         for text in pod.misspelt:
-            first.setdefault((text, edited("correct the name in the template", pod)), pod)
+            first.setdefault((text, edit_fix("correct the name in the template", pod)), pod)
     found = [error("pods", f"pod {pod.id}", text, fix) for (text, fix), pod in first.items()]
     return found[:MOST_MISSPELT]
 
@@ -65,6 +65,6 @@ def unreached(pods: Iterable[Pod], rosproxies: Sequence[RosProxy], ready_since: 
         if isinstance(rosproxy, RosProxy)
         and rosproxy.cluster_ip
         and not (pod.wired_master_uri or pod.static_peers)
-        and has_come_unwired(pod, rosproxy, rosproxy.cluster_ip)
-        and is_late(pod, rosproxy, ready_since)
+        and needs_recreation(pod, rosproxy, rosproxy.cluster_ip)
+        and should_be_wired(pod, rosproxy, ready_since)
     )

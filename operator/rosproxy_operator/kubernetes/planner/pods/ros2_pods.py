@@ -11,11 +11,11 @@ from collections.abc import Iterator
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.ros2 import is_dds
-from rosproxy_operator.kubernetes.planner.pods.injection import (
-    UNKNOWN,
+from rosproxy_operator.kubernetes.planner.pods.wiring import (
+    UNKNOWN_WEBHOOK,
     has_peers,
     missing_variable_text,
-    restart_of,
+    recreate_command,
 )
 from rosproxy_operator.kubernetes.resources.cluster import WebhookState
 from rosproxy_operator.kubernetes.resources.model import (
@@ -36,7 +36,7 @@ _RANGES_WITHOUT_PEERS = ("OFF", "SYSTEM_DEFAULT")
 
 
 def ros2_findings(
-    pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState = UNKNOWN
+    pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState = UNKNOWN_WEBHOOK
 ) -> Iterator[ClusterFinding]:
     """Yield findings about a pod. ``address`` is the address of the RosProxy's Service."""
     if rosproxy.spec.ros2 is None:
@@ -57,7 +57,7 @@ def _peers_problem(pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookS
     if pod.static_peers and pod.static_peers != address:
         return (
             f"was wired to {clean(pod.static_peers)[:200]} (ROS_STATIC_PEERS), but the proxy is at "
-            f"{address} now. Run {restart_of(pod)}"
+            f"{address} now. Run {recreate_command(pod)}"
         )
     if pod.static_peers or any(map(has_peers, pod.containers)):
         return ""
@@ -91,7 +91,7 @@ def _problems(
             f"variable ROS_DOMAIN_ID={_shown(str(domain))} is not domain {number} of RosProxy "
             f"{rosproxy.id.name}"
         )
-        fix = f"Change the variable or spec.domain, then run {restart_of(pod)}"
+        fix = f"Change the variable or spec.domain, then run {recreate_command(pod)}"
         yield "OtherDomain", f"{text}. {fix}"
     distro = _OLD.search(get("ROS_DISTRO", "").lower()) or _OLD.search(container.image.lower())
     if distro:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
-from rosproxy_operator.kubernetes.planner.pods.injection import again, edited
+from rosproxy_operator.kubernetes.planner.pods.wiring import edit_fix, recreate_fix
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     ClusterNode,
@@ -78,7 +78,7 @@ def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
     if not names:
         return (
             f"namespace {pod.id.namespace} has no RosProxy, so {lost}. Create a RosProxy there, "
-            f"then {again(pod)}"
+            f"then {recreate_fix(pod)}"
         )
     if label not in (_ANY, *names):
         value = " or ".join(names[:MOST_NAMES])
@@ -86,12 +86,12 @@ def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
             value = f"{label.lower()} in lower case"
         return (
             f"label {INJECT}={label} names no RosProxy of namespace {pod.id.namespace}, so {lost}. "
-            f"{edited(f'Set the label to {value} in the template', pod)}"
+            f"{edit_fix(f'Set the label to {value} in the template', pod)}"
         )
     return (
         "the labels of the pod do not match spec.podSelector of RosProxy "
         f"{' and '.join(names[:MOST_NAMES])}, "
-        f"so {lost}. Change the labels or the selector, then {again(pod)}"
+        f"so {lost}. Change the labels or the selector, then {recreate_fix(pod)}"
     )
 
 

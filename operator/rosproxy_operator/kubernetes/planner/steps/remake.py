@@ -12,8 +12,8 @@ work leads to at most one eviction a minute.
 from collections.abc import Iterator
 
 from rosproxy_operator.kubernetes.planner.actions import Action, EvictPod
-from rosproxy_operator.kubernetes.planner.pods.injection import has_come_unwired
 from rosproxy_operator.kubernetes.planner.pods.selection import selects
+from rosproxy_operator.kubernetes.planner.pods.wiring import needs_recreation
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext
 from rosproxy_operator.kubernetes.resources.model import Pod, RosProxy
@@ -45,4 +45,4 @@ def is_to_be_remade(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
     ``cluster_ip`` is the address of the RosProxy's Service.
     """
     makes_anew = pod.controller in RECREATING_CONTROLLERS and not pod.deleting and not pod.ended
-    return makes_anew and has_come_unwired(pod, rosproxy, cluster_ip)
+    return makes_anew and needs_recreation(pod, rosproxy, cluster_ip)

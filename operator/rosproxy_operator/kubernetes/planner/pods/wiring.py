@@ -2,8 +2,8 @@
 
 The containers of a wired pod have ROS_MASTER_URI and ROS_IP, or ROS_STATIC_PEERS for ROS 2.
 ROS_MASTER_URI and ROS_STATIC_PEERS name the RosProxy's Service, which leads to the proxy on the
-same node. The webhook uses `wire`. The planner uses `wiring_finding` (and `ros2_pods`) to find pods
-that no webhook has wired.
+same node. The webhook uses `wire`. The planner finds pods that do not use their proxy:
+`wiring_finding` for ROS 1, `ros2_pods` for ROS 2.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -40,9 +40,9 @@ from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 MIRROR = "kubernetes.io/config.mirror"
 """Annotation of the mirror pod of a static pod. A change of a mirror pod changes no container."""
-SETTLED = timedelta(minutes=1)
-"""Time after which a new RosProxy or a new operator is sure to wire pods: see `is_late`."""
-UNKNOWN = WebhookState()
+WEBHOOK_READY_AFTER = timedelta(minutes=1)
+"""Time after which a new RosProxy, or the webhook of a new operator, is sure to wire pods."""
+UNKNOWN_WEBHOOK = WebhookState()
 _KINDS = ("initContainers", "containers")
 
 
@@ -54,8 +54,8 @@ class Wiring(msgspec.Struct, frozen=True):
     warnings: tuple[str, ...] = ()
 
 
-class Target(msgspec.Struct, frozen=True):
-    """The values for the variables of a pod. The webhook sets no variable for an empty value.
+class PodVariables(msgspec.Struct, frozen=True):
+    """The variables that the webhook sets in a pod. An empty value sets no variable.
 
     ``masters`` has the hosts and ports of the real master. The webhook replaces a ROS_MASTER_URI of
     the template that names this master.
@@ -67,10 +67,10 @@ class Target(msgspec.Struct, frozen=True):
     masters: frozenset[HostPort] = frozenset()
 
 
-def target_of(rosproxy: RosProxy, cluster_ip: str) -> Target:
-    """Return the values for the pods of a RosProxy. ``cluster_ip`` is the Service's address."""
+def pod_variables(rosproxy: RosProxy, cluster_ip: str) -> PodVariables:
+    """Return the variables for the pods of a RosProxy. ``cluster_ip``: the Service's address."""
     ros2 = rosproxy.spec.ros2
-    return Target(
+    return PodVariables(
         master_uri(cluster_ip) if rosproxy.spec.ros1 else "",
         cluster_ip if ros2 else "",
         ros2.domain if ros2 else None,
@@ -78,7 +78,7 @@ def target_of(rosproxy: RosProxy, cluster_ip: str) -> Target:
     )
 
 
-def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring:
+def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> Wiring:
     """Return the wiring of a pod at admission, with ``host_aliases`` added to the pod's aliases.
 
     Each container and init container gets these variables, unless the template sets the variable:
@@ -88,8 +88,9 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
 
     New variables come first, because Kubernetes expands ``$(ROS_MASTER_URI)`` only in the variables
     after it. The webhook replaces a ROS_MASTER_URI that names the RosProxy's own master, and keeps
-    the first such value in an annotation. The webhook also replaces an address that the webhook set
-    earlier, as in a copy of a wired pod. A second wiring of the same pod changes nothing.
+    the first such value in an annotation. A copy of a wired pod may have a former address of the
+    proxy. The webhook knows this address from another annotation, and replaces the address. A
+    second wiring of the same pod changes nothing.
 
     The caller must not pass a pod in the host's network: see `selection.select_rosproxy`.
     """
@@ -98,13 +99,13 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
         warning = (
             "rosproxy: this pod was not wired to a proxy: the pod is a static pod, made from a "
             "file on its node. Set "
-            f"{'ROS_MASTER_URI and ROS_IP' if target.uri else 'ROS_STATIC_PEERS'} in that file, or "
+            f"{'ROS_MASTER_URI and ROS_IP' if wanted.uri else 'ROS_STATIC_PEERS'} in that file, or "
             "run an ordinary pod"
         )
         return Wiring(warnings=(warning,))
     spec = submap(pod, "spec")
     wired: dict[str, Any] = {
-        kind: [_wired(container, target, annotations) for container in submaps(spec, kind)]
+        kind: [_wired(container, wanted, annotations) for container in submaps(spec, kind)]
         for kind in _KINDS
         if spec.get(kind)
     }
@@ -112,10 +113,10 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
     if aliases:
         wired["hostAliases"] = aliases
     changed = any(spec.get(key) != value for key, value in wired.items())
-    replaced = _replaced(spec, target) or annotations.get(REPLACED_URI, "")
+    replaced = _replaced_uri(spec, wanted) or annotations.get(REPLACED_URI, "")
     new_annotations = {
         annotation: value
-        for annotation, variable, value in _addresses(target)
+        for annotation, variable, value in _address_variables(wanted)
         if any(_value(c, variable) == value for kind in _KINDS for c in wired.get(kind, ()))
     }
     if replaced and MASTER_URI in new_annotations:
@@ -124,21 +125,22 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
 
 
 def wiring_finding(
-    pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState = UNKNOWN
+    pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState = UNKNOWN_WEBHOOK
 ) -> ClusterFinding | None:
-    """Return a finding (reason NotWired) if a selected pod does not use its proxy as the master.
+    """Return a finding (reason NotWired) if the ROS 1 nodes of a selected pod do not use its proxy.
 
-    ``cluster_ip`` is the address of the RosProxy's Service.
+    Also if the pod has to be recreated so that the nodes use the proxy. ``cluster_ip`` is the
+    address of the RosProxy's Service.
     """
-    text = _wrong_master(pod, rosproxy, cluster_ip, webhook)
+    text = _master_fault(pod, rosproxy, cluster_ip, webhook)
     return pod_finding(pod, rosproxy, "NotWired", text, fatal=False) if text else None
 
 
-def has_come_unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
+def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
     """Whether a pod does not use its proxy, and the webhook would wire a recreated pod.
 
-    The webhook does not wire a pod without the label. The webhook also keeps ROS_STATIC_PEERS of
-    the template, and a ROS_MASTER_URI of the template that does not name the RosProxy's master.
+    False for a pod that the webhook would not wire: without the label, or with these variables in
+    the template: ROS_STATIC_PEERS, or a ROS_MASTER_URI that does not name the RosProxy's master.
     """
     masters = _masters_of(rosproxy)
     lacks_master = (
@@ -160,7 +162,7 @@ def has_peers(container: PodContainer) -> bool:
     return "ROS_STATIC_PEERS" in container.variables
 
 
-def restart_of(pod: Pod) -> str:
+def recreate_command(pod: Pod) -> str:
     """The kubectl command that recreates a pod."""
     if pod.workload:
         return f"kubectl -n {pod.id.namespace} rollout restart {pod.workload}"
@@ -168,16 +170,16 @@ def restart_of(pod: Pod) -> str:
     return command if pod.controller else f"{command}, and create the pod again"
 
 
-def again(pod: Pod) -> str:
+def recreate_fix(pod: Pod) -> str:
     """The fix that recreates a pod. A pod at admission has no uid, and may have no name."""
-    return f"run {restart_of(pod)}" if pod.uid or pod.workload else "create the pod again"
+    return f"run {recreate_command(pod)}" if pod.uid or pod.workload else "create the pod again"
 
 
-def edited(change: str, pod: Pod) -> str:
+def edit_fix(change: str, pod: Pod) -> str:
     """The fix that makes a ``change`` in the template of a pod, with the kubectl command."""
     if pod.workload:
         return f"{change}: kubectl -n {pod.id.namespace} edit {pod.workload}"
-    return f"{change}, then {again(pod)}"
+    return f"{change}, then {recreate_fix(pod)}"
 
 
 def _is_of_former(pod: Pod, rosproxy: RosProxy) -> bool:
@@ -194,40 +196,44 @@ def _is_older(pod: Pod, rosproxy: RosProxy) -> bool:
     return bool(pod.created) and pod.created < rosproxy.created
 
 
-def is_late(pod: Pod, rosproxy: RosProxy, ready_since: str) -> bool:
-    """Whether a pod is newer, by `SETTLED`, than its RosProxy and than the ready webhook.
+def should_be_wired(pod: Pod, rosproxy: RosProxy, ready_since: str) -> bool:
+    """Whether the webhook was sure to wire pods when a pod was created.
 
-    ``ready_since`` is in RFC 3339. False if a time is not known.
+    That is `WEBHOOK_READY_AFTER` after the creation of the pod's RosProxy, and after the time
+    ``ready_since`` at which the webhook became ready (RFC 3339). False if a time is not known.
     """
     if not (pod.created and rosproxy.created and ready_since):
         return False
     others = (rosproxy.created, ready_since)
     latest = max(datetime.fromisoformat(time) for time in others)
-    return datetime.fromisoformat(pod.created) - latest >= SETTLED
+    return datetime.fromisoformat(pod.created) - latest >= WEBHOOK_READY_AFTER
 
 
-def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState) -> str:
+def _master_fault(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState) -> str:
+    """Return why the ROS 1 nodes of a pod do not use the proxy, and the fix; empty if they do."""
     masters = _masters_of(rosproxy)
-    around = [uri for uri in pod.own_masters if not _leads_to_proxy(uri, rosproxy.id, cluster_ip)]
-    foreign = [uri for uri in around if not _names_one(uri, masters)]
+    bypassing = [
+        uri for uri in pod.own_masters if not _leads_to_proxy(uri, rosproxy.id, cluster_ip)
+    ]
+    foreign = [uri for uri in bypassing if not _names_one(uri, masters)]
     if foreign:
         return (
             f"variable ROS_MASTER_URI={clean(foreign[0])[:200]} of the template does not lead to "
             "the proxy, so the nodes bypass the proxy. "
-            f"{edited('Remove the variable from the template', pod)}"
+            f"{edit_fix('Remove the variable from the template', pod)}"
         )
     if pod.wired_master_uri and pod.wired_master_uri != master_uri(cluster_ip):
         return (
             f"was wired to {clean(pod.wired_master_uri)[:200]}, but the proxy is at "
-            f"{master_uri(cluster_ip)} now. Run {restart_of(pod)}"
+            f"{master_uri(cluster_ip)} now. Run {recreate_command(pod)}"
         )
     if _is_of_former(pod, rosproxy):
         return (
             f"is older than RosProxy {rosproxy.id.name}: the former RosProxy of that name was "
             "deleted, and the ROS nodes of the pod were unregistered at the master. Run "
-            f"{restart_of(pod)}"
+            f"{recreate_command(pod)}"
         )
-    if not around and (pod.wired_master_uri or pod.own_masters):
+    if not bypassing and (pod.wired_master_uri or pod.own_masters):
         return ""
     return missing_variable_text("ROS_MASTER_URI", pod, rosproxy, webhook)
 
@@ -239,17 +245,18 @@ def missing_variable_text(
     text = f"has no variable {variable} with the address of the proxy"
     if INJECT not in pod.labels:
         label = f"{INJECT}={rosproxy.id.name}"
-        return f"{text}. {edited(f'Add the label {label} to the template', pod)}"
-    restart = f"Run {restart_of(pod)}"
+        return f"{text}. {edit_fix(f'Add the label {label} to the template', pod)}"
+    restart = f"Run {recreate_command(pod)}"
     if not webhook.served:
-        fix = edited(f"Set {variable} in the template", pod)
+        fix = edit_fix(f"Set {variable} in the template", pod)
         return f"{text}, since the operator serves no webhook (webhook.enabled=false). {fix}"
     if _is_older(pod, rosproxy):
         return f"{text}, since the pod is older than RosProxy {rosproxy.id.name}. {restart}"
     reason = (
-        "the API server reached no operator (chart value webhook.port) when the pod was created"
+        "no operator answered the API server at the webhook port (chart value webhook.port) when "
+        "the pod was created"
     )
-    if is_late(pod, rosproxy, webhook.since):
+    if should_be_wired(pod, rosproxy, webhook.since):
         return (
             f"{text}, since {reason}, although an operator was ready. Allow connections from the "
             "API server to the webhook port of the operator's pods (NetworkPolicy, firewall). "
@@ -298,30 +305,31 @@ def _names_one(uri: str, masters: Collection[HostPort]) -> bool:
     return HostPort(named.host.rstrip("."), named.port) in masters
 
 
-def _replaced(spec: Json, target: Target) -> str:
+def _replaced_uri(spec: Json, wanted: PodVariables) -> str:
     """The first ROS_MASTER_URI of a template that the webhook replaces; empty without one."""
     containers = (container for kind in _KINDS for container in submaps(spec, kind))
     own = (v for c in containers for v in submaps(c, "env") if v.get("name") == VARIABLE)
     values = (text_at(variable, "value") for variable in own)
-    return next((value for value in values if _names_one(value, target.masters)), "")
+    return next((value for value in values if _names_one(value, wanted.masters)), "")
 
 
-def _addresses(target: Target) -> list[tuple[str, str, str]]:
+def _address_variables(wanted: PodVariables) -> list[tuple[str, str, str]]:
     """The annotation, the variable and the value of each address for a pod."""
     variables = (
-        (MASTER_URI, VARIABLE, target.uri),
-        (STATIC_PEERS, "ROS_STATIC_PEERS", target.static_peers),
+        (MASTER_URI, VARIABLE, wanted.uri),
+        (STATIC_PEERS, "ROS_STATIC_PEERS", wanted.static_peers),
     )
     return [v for v in variables if v[2]]
 
 
-def _wired(container: Json, target: Target, annotations: Mapping[str, str]) -> Json:
+def _wired(container: Json, wanted: PodVariables, annotations: Mapping[str, str]) -> Json:
+    """Return a container with the wanted variables. ``annotations`` are those of the pod."""
     variables = list(submaps(container, "env"))
     names = {text_at(v, "name") for v in variables}
     added: list[Json] = []
-    for annotation, name, value in _addresses(target):
+    for annotation, name, value in _address_variables(wanted):
         former = annotations.get(annotation)
-        masters = target.masters if name == VARIABLE else frozenset[HostPort]()
+        masters = wanted.masters if name == VARIABLE else frozenset[HostPort]()
         for index, variable in enumerate(variables):
             own = text_at(variable, "value")
             is_ours = bool(former) and own == former
@@ -329,11 +337,11 @@ def _wired(container: Json, target: Target, annotations: Mapping[str, str]) -> J
                 variables[index] = {**variable, "value": value}
         if name not in names:
             added.append({"name": name, "value": value})
-    if target.uri and not names & {"ROS_IP", "ROS_HOSTNAME"}:
+    if wanted.uri and not names & {"ROS_IP", "ROS_HOSTNAME"}:
         source = {"fieldRef": {"apiVersion": "v1", "fieldPath": "status.podIP"}}
         added.append({"name": "ROS_IP", "valueFrom": source})
-    if target.domain is not None and "ROS_DOMAIN_ID" not in names:
-        added.append({"name": "ROS_DOMAIN_ID", "value": str(target.domain)})
+    if wanted.domain is not None and "ROS_DOMAIN_ID" not in names:
+        added.append({"name": "ROS_DOMAIN_ID", "value": str(wanted.domain)})
     env = [*added, *variables]
     return {**container, "env": env} if env else container
 

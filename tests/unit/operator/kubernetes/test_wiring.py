@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.kubernetes.planner.pods.injection import (
+from rosproxy_operator.kubernetes.planner.pods.wiring import (
     MIRROR,
-    Target,
+    PodVariables,
     Wiring,
-    has_come_unwired,
-    target_of,
+    needs_recreation,
+    pod_variables,
     wire,
     wiring_finding,
 )
@@ -28,8 +28,8 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from tests.unit.operator.kubernetes.builders_api import CLUSTER_IP, NAMESPACE, URI, pod, rosproxy
 
-TO = Target(URI)
-TO_ROBOT = Target(URI, masters=frozenset({HostPort("robot", 11311)}))
+TO = PodVariables(URI)
+TO_ROBOT = PodVariables(URI, masters=frozenset({HostPort("robot", 11311)}))
 MASTER = {"name": "ROS_MASTER_URI", "value": URI}
 IP = {
     "name": "ROS_IP",
@@ -153,7 +153,7 @@ def test_the_own_masters_uri_is_replaced_and_any_other_stays(master, uri, names_
     of = rosproxy(master=MASTERS[master])
     obj = admitted(container({"name": "A", "value": "b"}, own(uri)))
 
-    wiring = wire(obj, target_of(of, CLUSTER_IP))
+    wiring = wire(obj, pod_variables(of, CLUSTER_IP))
 
     assert env_of(wiring) == [IP, {"name": "A", "value": "b"}, MASTER if names_it else own(uri)]
     notes = {ANNOTATION: URI, "rosproxy.io/replaced-master-uri": uri}
@@ -161,13 +161,13 @@ def test_the_own_masters_uri_is_replaced_and_any_other_stays(master, uri, names_
     finding = wiring_finding(objects.pod(applied(obj, wiring)), of, CLUSTER_IP)
     assert bool(finding) == (not names_it and "$" not in uri)
     unwired = objects.pod({**obj, "metadata": {"labels": {INJECT: "true"}}})
-    assert has_come_unwired(unwired, of, CLUSTER_IP) == names_it
+    assert needs_recreation(unwired, of, CLUSTER_IP) == names_it
     finding = wiring_finding(unwired, of, CLUSTER_IP)
     assert finding is None or ("Remove the variable" in finding.text) == (not names_it)
 
 
 def test_what_was_replaced_stays_visible_when_it_is_wired_again():
-    target = target_of(rosproxy(), CLUSTER_IP)
+    target = pod_variables(rosproxy(), CLUSTER_IP)
     obj = admitted(container(own("http://robot:11311")))
     first = wire(obj, target)
 
@@ -179,7 +179,7 @@ def test_what_was_replaced_stays_visible_when_it_is_wired_again():
 def test_ros_2_alone_replaces_nothing():
     of = replace(rosproxy(), spec=replace(rosproxy().spec, ros1=False, ros2=Ros2Spec()))
 
-    assert target_of(of, CLUSTER_IP).masters == frozenset()
+    assert pod_variables(of, CLUSTER_IP).masters == frozenset()
 
 
 def test_a_pod_of_which_one_container_sets_it_is_still_wired():
@@ -219,7 +219,7 @@ def test_without_host_aliases_none_are_made():
 
 def test_a_copy_of_a_wired_pod_is_wired_anew():
     obj = admitted(container())
-    copied = applied(obj, wire(obj, Target("http://10.96.0.1:11311")))
+    copied = applied(obj, wire(obj, PodVariables("http://10.96.0.1:11311")))
 
     wiring = wire(copied, TO)
 
@@ -352,7 +352,7 @@ def test_a_pod_that_goes_around_its_proxy_is_told(master):
     [
         (
             pod(),
-            "reached no operator (chart value webhook.port) when the pod was created. Run kubectl",
+            "at the webhook port (chart value webhook.port) when the pod was created. Run kubectl",
         ),
         (pod(controller="Job"), f". Run kubectl -n {NAMESPACE} delete pod {pod().id.name}"),
         (pod(workload="daemonset/arm"), f"kubectl -n {NAMESPACE} rollout restart daemonset/arm"),
