@@ -19,20 +19,23 @@ from rosproxy.page.page_document import Document
 from rosproxy_operator.common.merged_page import read_document
 
 Json = dict[str, Any]
-WITHIN = 3.0
+ANSWER_TIMEOUT_S = 3.0
 """Seconds in which a proxy must answer."""
-PAGES_AT_ONCE = 8
-"""Proxies from which the operator requests the page document at the same time."""
-LONGEST = 64 * 1024
-"""Bytes of an answer at most. An attacker may control a proxy, so the client follows no redirects
-and decompresses no answers."""
-LONGEST_STATUS = MOST_BYTES + LONGEST
-"""Bytes of a status at most. While the operator reads a status, all other proxies wait."""
-LONGEST_PAGE = 8 * 1024 * 1024
+MOST_PAGE_REQUESTS = 8
+"""The highest number of requests for page documents at the same time."""
+MOST_ANSWER_BYTES = 64 * 1024
+"""Bytes of an answer at most.
+
+An attacker may control a proxy. So answers have limits, and the client follows no redirects and
+decompresses no answers.
+"""
+MOST_STATUS_BYTES = MOST_BYTES + MOST_ANSWER_BYTES
+"""Bytes of a status at most. Parsing blocks the event loop, and so delays all proxies."""
+MOST_PAGE_BYTES = 8 * 1024 * 1024
 """Bytes of a page document at most. The nodes and links of the document have up to 5 MiB."""
-WITHIN_PAGE = 12.0
+PAGE_TIMEOUT_S = 12.0
 """Seconds for a page document. A proxy takes up to 10 s for the first document (`page.routes`)."""
-WITHIN_MASTER = 40.0
+MASTER_CALL_TIMEOUT_S = 40.0
 """Seconds for a call for which the proxy first calls the master, which may take 30 s."""
 _KEEP_ALIVE = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 3, socket.TCP_KEEPCNT: 3}
 """Keep-alive, see tcp(7): seconds until the first probe and between probes, and lost probes."""
@@ -41,19 +44,24 @@ _KEEP_ALIVE = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 3, socket.TCP_KEEP
 class ProxyError(Exception):
     """A proxy did not carry out a request.
 
-    ``is_unreachable``: there is no route to the proxy, or no answer. ``lacks_master``: the proxy is
-    well, but its master does not answer. ``status`` is the HTTP status; 0 without an HTTP answer.
-    ``is_unreadable``: the answer has more bytes than the operator reads. The process of the proxy
-    is still the same then, so the operator need not send everything again.
+    ``is_unreachable``: no answer in time, or an error of the operating system, such as no route. A
+    refused connection does not count. ``status`` is the HTTP status; 0 without an HTTP answer.
+    ``lacks_master``: HTTP 503. The proxy answers, but its master does not, or all places for
+    callers are taken. ``is_unreadable``: the answer has more bytes than the operator reads. Such an
+    answer does not show a restart of the proxy, so the operator does not send everything again.
     """
 
     def __init__(
-        self, message: str, away: bool = False, status: int = 0, unreadable: bool = False
+        self,
+        message: str,
+        is_unreachable: bool = False,
+        status: int = 0,
+        is_unreadable: bool = False,
     ) -> None:
         super().__init__(message)
-        self.is_unreachable = away
+        self.is_unreachable = is_unreachable
         self.status = status
-        self.is_unreadable = unreadable
+        self.is_unreadable = is_unreadable
         self.lacks_master = status == 503
 
 
@@ -69,7 +77,7 @@ class ProxyClient:
 
     async def status(self, admin: HostPort) -> ProxyStatus:
         """Request the ``/status`` of a proxy."""
-        text = await self._ask("GET", admin, "/status", longest=LONGEST_STATUS)
+        text = await self._request("GET", admin, "/status", most_bytes=MOST_STATUS_BYTES)
         try:
             return parse_status(text)
         except NotAStatus:
@@ -80,11 +88,14 @@ class ProxyClient:
     ) -> tuple[str, ProxyStatus]:
         """Wait until the version of the status differs from ``since``. Return version and status.
 
-        Returns after ``within`` seconds in any case. A proxy of a former release answers HTTP 404.
+        The proxy answers after ``within`` seconds, even without a change. If a proxy can't report
+        changes, the error has the HTTP status 403, 404, 405 or 503.
         """
         path = f"/status/changes?since={quote(since)}&within={within:g}"
-        within += WITHIN
-        text = await self._ask("GET", admin, path, token, within=within, longest=LONGEST_STATUS)
+        within += ANSWER_TIMEOUT_S
+        text = await self._request(
+            "GET", admin, path, token, within=within, most_bytes=MOST_STATUS_BYTES
+        )
         answer = _read(text, admin)
         version = answer.get("version")
         status = answer.get("status")
@@ -98,8 +109,8 @@ class ProxyClient:
     async def document(self, admin: HostPort, token: str) -> Document:
         """Request the document of a proxy's live page."""
         try:
-            text = await self._ask(
-                "GET", admin, "/graph", token, within=WITHIN_PAGE, longest=LONGEST_PAGE
+            text = await self._request(
+                "GET", admin, "/graph", token, within=PAGE_TIMEOUT_S, most_bytes=MOST_PAGE_BYTES
             )
         except ProxyError as error:
             if error.status == 404:
@@ -115,7 +126,7 @@ class ProxyClient:
         self, proxies: Mapping[str, tuple[HostPort, str]]
     ) -> dict[str, Document | str]:
         """Request many page documents, by name of the proxy. Instead of an error, return a text."""
-        room = asyncio.Semaphore(PAGES_AT_ONCE)
+        room = asyncio.Semaphore(MOST_PAGE_REQUESTS)
 
         async def ask(admin: HostPort, token: str) -> Document | str:
             async with room:
@@ -127,25 +138,28 @@ class ProxyClient:
         answers = await asyncio.gather(*(ask(*access) for access in proxies.values()))
         return dict(zip(proxies, answers, strict=True))
 
-    async def master_address(self, admin: HostPort, token: str, address: str) -> None:
+    async def send_master_address(self, admin: HostPort, token: str, address: str) -> None:
         """Send the current address of the master's host."""
-        await self._ask("POST", admin, "/master-address", token, {"address": address})
+        await self._request("POST", admin, "/master-address", token, {"address": address})
 
-    async def containers(self, admin: HostPort, token: str, body: Mapping[str, Any]) -> Json:
-        """Send which containers have gone, moved or arrived. Return counts of affected nodes."""
-        text = await self._ask("POST", admin, "/containers", token, body, WITHIN_MASTER)
+    async def send_containers(self, admin: HostPort, token: str, body: Mapping[str, Any]) -> Json:
+        """Send the addresses of containers that have gone, moved or arrived.
+
+        Return the answer, with counts of affected nodes.
+        """
+        text = await self._request("POST", admin, "/containers", token, body, MASTER_CALL_TIMEOUT_S)
         return _read(text, admin)
 
-    async def policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
+    async def send_policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
         """Send the policy's layers, which replace all earlier layers. Raises PolicyRefused, too.
 
         The layers are in force at once. HTTP 503 is no error: the master does not answer now, and
-        the proxy keeps trying to tell the master. HTTP 404 comes from a proxy of a former release,
-        which has no policy; without layers, this is no error.
+        the proxy repeats the changes of registrations until the master answers. HTTP 404 comes from
+        a proxy of a former release, which has no policy; without layers, this is no error.
         """
         try:
             body = {"layers": layers_as_json(layers)}
-            await self._ask("POST", admin, "/policy", token, body, WITHIN_MASTER)
+            await self._request("POST", admin, "/policy", token, body, MASTER_CALL_TIMEOUT_S)
         except ProxyError as error:
             if error.status == 404 and layers:
                 text = (
@@ -162,7 +176,7 @@ class ProxyClient:
             if error.status not in (404, 503):
                 raise
 
-    async def selected(
+    async def send_selected(
         self,
         admin: HostPort,
         token: str,
@@ -180,35 +194,40 @@ class ProxyClient:
             body["peers"] = sorted(peers)
         if former:
             body["former"] = {prefix: list(ports) for prefix, ports in former.items()}
-        await self._ask("POST", admin, "/containers", token, body)
+        await self._request("POST", admin, "/containers", token, body)
 
     async def retire(self, admin: HostPort, token: str) -> Json:
-        """Let the proxy unregister all nodes and end all participants. Return the count."""
-        return _read(await self._ask("POST", admin, "/retire", token, {}, WITHIN_MASTER), admin)
+        """Let the proxy unregister all nodes and end all participants.
+
+        Return the answer; ``unregistered`` is the number of nodes and participants.
+        """
+        return _read(
+            await self._request("POST", admin, "/retire", token, {}, MASTER_CALL_TIMEOUT_S), admin
+        )
 
     async def close(self) -> None:
         """Close all connections."""
         if self._session is not None:
             await self._session.close()
 
-    async def _ask(
+    async def _request(
         self,
         method: str,
         admin: HostPort,
         path: str,
         token: str = "",
         body: Mapping[str, Any] | None = None,
-        within: float = WITHIN,
-        longest: int = LONGEST,
+        within: float = ANSWER_TIMEOUT_S,
+        most_bytes: int = MOST_ANSWER_BYTES,
     ) -> str:
-        """Send a request. Return the body of an HTTP 200 answer with ``longest`` bytes at most."""
+        """Send a request. Return the body of the answer, with ``most_bytes`` bytes at most."""
         if self._session is None:
             # No limit: each waiting call of `changes` takes a connection, and the callers bound the
             # other calls.
             connector = aiohttp.TCPConnector(limit=0, socket_factory=_kept_alive)
             self._session = aiohttp.ClientSession(connector=connector, auto_decompress=False)
-        # A missing proxy should fail soon, even if an answer may take long.
-        limits = aiohttp.ClientTimeout(total=within, sock_connect=WITHIN)
+        # A call to a proxy that does not exist should fail soon, even if an answer may take long.
+        limits = aiohttp.ClientTimeout(total=within, sock_connect=ANSWER_TIMEOUT_S)
         headers = {"Accept-Encoding": "identity"}
         if token:
             headers["Authorization"] = f"Bearer {token}"
@@ -217,19 +236,19 @@ class ProxyClient:
             async with self._session.request(
                 method, url, json=body, headers=headers, timeout=limits, allow_redirects=False
             ) as reply:
-                text = (await read_bounded(reply.content, longest)).decode(errors="replace")
+                text = (await read_bounded(reply.content, most_bytes)).decode(errors="replace")
                 if reply.status == 200:
                     return text
                 request = f"{method} {path.partition('?')[0]}"
                 message = f"{admin} answers HTTP {reply.status} to {request}: {text.strip()[:200]}"
                 raise ProxyError(message, status=reply.status)
         except TimeoutError:
-            raise ProxyError(f"{admin} does not answer", away=True) from None
+            raise ProxyError(f"{admin} does not answer", is_unreachable=True) from None
         except TooLong:
             request = f"{method} {path.partition('?')[0]}"
-            text = f"{admin} answers more than {longest} bytes to {request}"
+            text = f"{admin} answers more than {most_bytes} bytes to {request}"
             text = f"{text}: the proxy is of another release, or compromised"
-            raise ProxyError(text, unreadable=True) from None
+            raise ProxyError(text, is_unreadable=True) from None
         except (OSError, aiohttp.ClientError) as error:
             raise _no_answer(admin, error) from None
 
@@ -251,7 +270,7 @@ def _read(text: str, admin: HostPort) -> Json:
 
 
 def _no_rosproxy(admin: HostPort) -> ProxyError:
-    return ProxyError(f"{admin} does not answer as a rosproxy does")
+    return ProxyError(f"{admin} gives an answer that is not from a rosproxy")
 
 
 def _no_answer(admin: HostPort, error: Exception) -> ProxyError:
@@ -259,4 +278,4 @@ def _no_answer(admin: HostPort, error: Exception) -> ProxyError:
     if number == errno.ECONNREFUSED:
         return ProxyError(f"{admin} refuses connections")
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return ProxyError(f"{admin} can't be reached ({reason})", away=number is not None)
+    return ProxyError(f"{admin} can't be reached ({reason})", is_unreachable=number is not None)

@@ -19,7 +19,7 @@ from rosproxy_operator.common.proxy_status import Leases
 
 @dataclass(frozen=True, slots=True)
 class AllowedCallers:
-    """The addresses that may use a proxy.
+    """The addresses that may use a proxy, and what the operator sends in the same call.
 
     ``peers`` are the peers of ROS 2. None: not sent, for ROS 1 and on Docker; there, an option of
     the proxy has the peers. ``former_leases`` are the ports of participants at the previous proxy.
@@ -39,7 +39,7 @@ class ProxySession:
         self._client = client
         self._policy: tuple[PolicyLayer, ...] | None = None
         self._callers: AllowedCallers | None = None
-        self._telling_policy = asyncio.Lock()
+        self._sending_policy = asyncio.Lock()
         self._runs = 0
 
     def forget(self) -> None:
@@ -63,30 +63,30 @@ class ProxySession:
         """Wait for another status (`ProxyClient.changes`). Return version and status."""
         return await self._client.changes(self.admin, self.token, since, within)
 
-    async def tell_policy(self, layers: tuple[PolicyLayer, ...]) -> None:
+    async def send_policy(self, layers: tuple[PolicyLayer, ...]) -> None:
         """Send the policy's layers if they are not confirmed. Raises PolicyRefused, too."""
         # If two tasks send the same layers, the second task waits, and then sends nothing.
-        async with self._telling_policy:
+        async with self._sending_policy:
             if self.has_policy(layers):
                 return
             run = self._runs
-            await self._client.policy(self.admin, self.token, layers)
+            await self._client.send_policy(self.admin, self.token, layers)
             if run == self._runs:  # else maybe the former process has confirmed
                 self._policy = layers
 
-    async def tell_callers(self, callers: AllowedCallers) -> None:
+    async def send_callers(self, callers: AllowedCallers) -> None:
         """Send the callers, even if the proxy has confirmed them already."""
         run = self._runs
         peers = callers.peers
         former = callers.former_leases
-        await self._client.selected(self.admin, self.token, callers.addresses, peers, former)
+        await self._client.send_selected(self.admin, self.token, callers.addresses, peers, former)
         if run == self._runs:
             self._callers = callers
 
-    async def tell_containers(self, body: Mapping[str, Any]) -> Json:
-        """Send which containers have gone, moved or arrived. Return counts of affected nodes."""
-        return await self._client.containers(self.admin, self.token, body)
+    async def send_containers(self, body: Mapping[str, Any]) -> Json:
+        """Send the addresses of containers that have gone, moved or arrived. Return the counts."""
+        return await self._client.send_containers(self.admin, self.token, body)
 
-    async def tell_master_address(self, address: str) -> None:
+    async def send_master_address(self, address: str) -> None:
         """Send the current address of the master's host."""
-        await self._client.master_address(self.admin, self.token, address)
+        await self._client.send_master_address(self.admin, self.token, address)

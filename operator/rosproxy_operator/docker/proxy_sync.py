@@ -97,10 +97,10 @@ class ProxyUpdater:
             self._selecting.clear()
             addresses = tuple(self._update.facts.selected)
             try:
-                await self._session.tell_policy(self._update.policy)
+                await self._session.send_policy(self._update.policy)
                 former_leases = {} if self.leases else self._former_leases
                 callers = AllowedCallers(addresses, former_leases=former_leases)
-                await self._session.tell_callers(callers)
+                await self._session.send_callers(callers)
                 failures = 0
                 logged = ""
             except ProxyError as error:
@@ -145,7 +145,7 @@ class ProxyUpdater:
         # Read the facts only now: a look may have ended while the calls above waited.
         address = self._update.facts.master_address
         if address and status.master.address != address:
-            await self._session.tell_master_address(address)
+            await self._session.send_master_address(address)
             text = "master moved: %s, the master is now at %s"
             log.info(text, self._name, address, extra={"proxy": self._name})
         now = time.monotonic()
@@ -154,7 +154,7 @@ class ProxyUpdater:
             body.pop("arrived", None)  # the proxy would adopt nodes without checking the policy
         if body:
             log.debug("updating proxy: %s, %s", self._name, body)
-            answer = await self._session.tell_containers(body)
+            answer = await self._session.send_containers(body)
             counts = {change: answer.get(change) for change in ("unregistered", "moved", "adopted")}
             if text := ", ".join(f"{count} {change}" for change, count in counts.items() if count):
                 log.info("nodes updated: %s, %s", self._name, text, extra={"proxy": self._name})
@@ -164,7 +164,7 @@ class ProxyUpdater:
     async def _policy_refusal(self) -> PolicyRefused | None:
         """Send the policy. Return the refusal, or None if the proxy accepts. Raises ProxyError."""
         try:
-            await self._session.tell_policy(self._update.policy)
+            await self._session.send_policy(self._update.policy)
         except PolicyRefused as error:
             return error
         return None

@@ -108,22 +108,22 @@ async def proxy(*routes: web.RouteDef) -> AsyncIterator[tuple[ProxyClient, HostP
 async def test_a_proxy_is_told_all_layers() -> None:
     answers = Answers()
     async with proxy(web.post("/policy", answers.policy)) as (client, admin):
-        await client.policy(admin, "token", [OWN])
+        await client.send_policy(admin, "token", [OWN])
     assert answers.told == [("Bearer token", {"layers": layers_as_json([OWN])})]
 
 
 async def test_a_proxy_of_a_former_release_has_no_policy_at_all() -> None:
     async with proxy() as (client, admin):
-        await client.policy(admin, "token", [])
+        await client.send_policy(admin, "token", [])
         with pytest.raises(PolicyRefused, match="its image is of a former release"):
-            await client.policy(admin, "token", [OWN])
+            await client.send_policy(admin, "token", [OWN])
 
 
 async def test_it_is_in_force_before_the_master_has_heard() -> None:
     answers = Answers()
     answers.status = 503
     async with proxy(web.post("/policy", answers.policy)) as (client, admin):
-        await client.policy(admin, "token", [OWN])
+        await client.send_policy(admin, "token", [OWN])
     assert len(answers.told) == 1
 
 
@@ -134,6 +134,6 @@ async def test_one_that_does_not_take_it(status: int, kind: type[ProxyError]) ->
     answers.text = "layer 'x': too long"
     async with proxy(web.post("/policy", answers.policy)) as (client, admin):
         with pytest.raises(ProxyError, match="layer 'x': too long") as error:
-            await client.policy(admin, "token", [OWN])
+            await client.send_policy(admin, "token", [OWN])
     assert type(error.value) is kind
     assert error.value.status == status

@@ -55,7 +55,7 @@ async def test_a_redirect_is_not_followed(evil: Evil, client: ProxyClient) -> No
 async def test_nothing_is_inflated(evil: Evil, client: ProxyClient) -> None:
     body = gzip.compress(b'{"nodes": []}')
     evil.answer = lambda: web.Response(body=body, headers={"Content-Encoding": "gzip"})
-    with pytest.raises(ProxyError, match="as a rosproxy does"):
+    with pytest.raises(ProxyError, match="not from a rosproxy"):
         await client.status(evil.admin)
 
 
@@ -64,7 +64,7 @@ async def test_a_long_answer_is_not_read(
     evil: Evil, client: ProxyClient, status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The error says that the proxy's answer is too long, not that another program answers."""
-    monkeypatch.setattr(proxy_client, "LONGEST_STATUS", 1000)
+    monkeypatch.setattr(proxy_client, "MOST_STATUS_BYTES", 1000)
     evil.answer = lambda: web.Response(status=status, body=b"[" * 1001)
     for asking, path in (
         (client.status(evil.admin), "/status"),
@@ -82,7 +82,7 @@ async def test_a_long_answer_is_not_read(
 
 async def test_what_is_no_text_is_no_answer(evil: Evil, client: ProxyClient) -> None:
     evil.answer = lambda: web.Response(body=b"\xff\xfe", content_type="application/json")
-    with pytest.raises(ProxyError, match="as a rosproxy does"):
+    with pytest.raises(ProxyError, match="not from a rosproxy"):
         await client.status(evil.admin)
 
 
@@ -96,20 +96,22 @@ async def test_an_answer_without_a_bottom_is_no_answer(evil: Evil, client: Proxy
         client.changes(admin, "token", "", 0.0),
         client.document(admin, "token"),
     ):
-        with pytest.raises(ProxyError, match="as a rosproxy does"):
+        with pytest.raises(ProxyError, match="not from a rosproxy"):
             await asking
-    evil.answer = lambda: web.Response(text=deep[: proxy_client.LONGEST])
-    for telling in (client.containers(admin, "token", {}), client.retire(admin, "token")):
-        with pytest.raises(ProxyError, match="as a rosproxy does"):
+    evil.answer = lambda: web.Response(text=deep[: proxy_client.MOST_ANSWER_BYTES])
+    for telling in (client.send_containers(admin, "token", {}), client.retire(admin, "token")):
+        with pytest.raises(ProxyError, match="not from a rosproxy"):
             await telling
     page = await client.documents({"evil": (admin, ""), "gone": (HostPort("127.0.0.1", 1), "")})
     assert [type(answer) for answer in page.values()] == [str, str]
 
 
 async def test_an_answer_to_update_is_short(evil: Evil, client: ProxyClient) -> None:
-    evil.answer = lambda: web.Response(text=f'{{"moved": "{"x" * proxy_client.LONGEST}"}}')
+    evil.answer = lambda: web.Response(
+        text=f'{{"moved": "{"x" * proxy_client.MOST_ANSWER_BYTES}"}}'
+    )
     with pytest.raises(ProxyError, match="answers more than 65536 bytes"):
-        await client.containers(evil.admin, "token", {})
+        await client.send_containers(evil.admin, "token", {})
 
 
 @pytest.mark.parametrize(

@@ -31,10 +31,10 @@ class SlowClient(ProxyClient):
         if self.error:
             raise self.error
 
-    async def policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
+    async def send_policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
         await self._answer()
 
-    async def selected(
+    async def send_selected(
         self,
         admin: HostPort,
         token: str,
@@ -49,8 +49,8 @@ async def test_what_was_confirmed_is_known_until_forgotten() -> None:
     client = SlowClient()
     client.answers.set()
     session = ProxySession(client, ADMIN, "token")
-    await session.tell_policy(())
-    await session.tell_callers(CALLERS)
+    await session.send_policy(())
+    await session.send_callers(CALLERS)
     assert session.has_policy(())
     assert session.has_callers(CALLERS)
     session.forget()
@@ -64,14 +64,14 @@ async def test_what_was_refused_is_not_known() -> None:
     client.error = ProxyError("refuses")
     session = ProxySession(client, ADMIN, "token")
     with pytest.raises(ProxyError, match="refuses"):
-        await session.tell_policy(())
+        await session.send_policy(())
     assert not session.has_policy(())
 
 
 async def test_two_that_want_the_policy_told_tell_it_once() -> None:
     client = SlowClient()
     session = ProxySession(client, ADMIN, "token")
-    telling = [asyncio.create_task(session.tell_policy(())) for _ in range(2)]
+    telling = [asyncio.create_task(session.send_policy(())) for _ in range(2)]
     await client.asked.wait()
     client.answers.set()
     await asyncio.gather(*telling)
@@ -83,8 +83,8 @@ async def test_a_process_that_came_meanwhile_has_confirmed_nothing() -> None:
     client = SlowClient()
     session = ProxySession(client, ADMIN, "token")
     telling = [
-        asyncio.create_task(session.tell_policy(())),
-        asyncio.create_task(session.tell_callers(CALLERS)),
+        asyncio.create_task(session.send_policy(())),
+        asyncio.create_task(session.send_callers(CALLERS)),
     ]
     await client.asked.wait()
     session.forget()

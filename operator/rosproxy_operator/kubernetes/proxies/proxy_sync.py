@@ -1,9 +1,9 @@
-"""Keeps proxies and operator in step, over the proxies' admin endpoints.
+"""Sends the operator's data to the proxies, and reads their status, at their admin endpoints.
 
 Each proxy's pod with an address has a `ProxyPoller`. The poller waits until the proxy reports a
 change (``/status/changes``), so an idle proxy causes no calls. The poller polls a proxy that is
-starting, does not answer, or is of a former release. Each look reads the reports
-(`ClusterProxySync.reports`), and a changed report wakes the operator.
+starting, does not answer, has not confirmed a call, or does not report changes. Each look reads the
+reports (`ClusterProxySync.reports`), and a changed report wakes the operator.
 
 The poller also sends the proxy's policy (``/policy``), the addresses of pods that may use the
 proxy, and the addresses of gone pods (``/containers``). The poller repeats each call until the
@@ -31,31 +31,37 @@ from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, token_of
 
 log = logging.getLogger(__name__)
 
-EVERY = 3.0
-"""Seconds between two polls while a call is unconfirmed, or no answer comes after a minute."""
-EVERY_STARTING = 0.5
+POLL_INTERVAL_S = 3.0
+"""Seconds between two polls while a call is unconfirmed.
+
+Also while the proxy does not answer, after the poller's first minute.
+"""
+STARTING_POLL_INTERVAL_S = 0.5
 """Seconds between two polls in the poller's first minute, while the proxy does not answer."""
-LEAST_INTERVAL = 0.5
+LEAST_REPORT_INTERVAL_S = 0.5
 """Seconds between two reports of changes. A hostile proxy may report changes for ever."""
-EVERY_FORMER = 15.0
+FORMER_POLL_INTERVAL_S = 15.0
 """Seconds between two polls of a proxy that does not report changes (``/status/changes``)."""
-WAIT = 1800.0
-"""Longest wait for a change, in seconds. Then the proxy answers without a change.
+LONGEST_CHANGE_WAIT_S = 1800.0
+"""The longest wait for a change, in seconds. Then the proxy answers without a change.
 
 TCP keep-alive finds a proxy that is cut off (`common.proxy_client`).
 """
-STARTING = 10.0
-"""Seconds for which a new proxy counts as starting. Its silence is then no fault yet."""
-SILENT = 2
-"""Unanswered polls in a row after which a proxy counts as silent."""
-AT_ONCE = 32
-"""Short calls to all proxies at the same time."""
-SLOW_AT_ONCE = 256
-"""Calls at the same time that may wait for a master. So these calls hold up no short calls."""
-REPEATED = 30.0
-"""Seconds after which the poller repeats the allowed callers to a proxy that reports no changes.
+STARTING_S = 10.0
+"""Seconds for which a new proxy counts as starting. During this time, no answer is no fault."""
+SILENT_AFTER_POLLS = 2
+"""The number of polls in a row without an answer after which a proxy counts as silent."""
+MOST_SHORT_CALLS = 32
+"""The highest number of short calls at the same time, to all proxies."""
+MOST_SLOW_CALLS = 256
+"""The highest number of calls at the same time that may wait for a master.
 
-The operator does not notice a restart of such a proxy by its status.
+These calls have a limit of their own, so that short calls do not wait for a master.
+"""
+CALLERS_REPEAT_INTERVAL_S = 30.0
+"""Seconds after which the poller sends the allowed callers again to a proxy without change reports.
+
+The status of such a proxy does not show that another process of the proxy answers.
 """
 _OF_FORMER_RELEASE = (404, 405)
 """HTTP answers to ``/status/changes`` from a proxy of a former release."""
@@ -67,8 +73,8 @@ class CallLimits:
     """Limits of calls at the same time: short calls, and calls that may wait for a master."""
 
     def __init__(self) -> None:
-        self.questions = asyncio.Semaphore(AT_ONCE)
-        self.slow = asyncio.Semaphore(SLOW_AT_ONCE)
+        self.short = asyncio.Semaphore(MOST_SHORT_CALLS)
+        self.slow = asyncio.Semaphore(MOST_SLOW_CALLS)
 
 
 class ProxyPoller:
@@ -98,7 +104,7 @@ class ProxyPoller:
         self._policy: tuple[PolicyLayer, ...] | None = None
         self._refusal = ""
         self._callers: AllowedCallers | None = None
-        self._callers_told_at = 0.0
+        self._callers_sent_at = 0.0
         self._pending = asyncio.Event()
         self._recheck = False
         self._failures = 0
@@ -109,7 +115,10 @@ class ProxyPoller:
         self._since = time.monotonic()
 
     def brief(self, briefing: Briefing) -> None:
-        """Send the proxy the parts of a briefing that the proxy has not confirmed."""
+        """Send the proxy the parts of a briefing that the proxy has not confirmed.
+
+        A briefing is all that the operator sends to a proxy (`planner.briefing`).
+        """
         self._gone |= {*briefing.gone}
         if briefing.policy is not None:
             self._policy = briefing.policy
@@ -130,20 +139,20 @@ class ProxyPoller:
         long_poll: asyncio.Task[None] | None = None
         try:
             while True:
-                told_gone = await self._tell()
-                if self._listens and not told_gone:
-                    long_poll = long_poll or asyncio.create_task(self._ask(_random_wait()))
+                confirmed_gone = await self._send_all()
+                if self._listens and not confirmed_gone:
+                    long_poll = long_poll or asyncio.create_task(self._read_status(_random_wait()))
                     await self._wait_for_either(long_poll)
                     if long_poll.done():
                         long_poll = long_poll.result()  # None; raises the error of a failed task
-                        await self._wait_for_update(LEAST_INTERVAL)
+                        await self._wait_for_update(LEAST_REPORT_INTERVAL_S)
                     continue
-                # The proxy may need a moment to act on gone pods. So the next poll, not this poll,
-                # passes on the report even without a change.
-                self._recheck = self._recheck and not told_gone
-                async with self._limits.questions:
-                    await self._ask()
-                self._recheck = told_gone
+                # The proxy may need a moment to act on gone pods. So only the next poll calls
+                # `changed` even if the report is the same.
+                self._recheck = self._recheck and not confirmed_gone
+                async with self._limits.short:
+                    await self._read_status()
+                self._recheck = confirmed_gone
                 if not self._listens:
                     await self._pause()
         finally:
@@ -181,9 +190,13 @@ class ProxyPoller:
     async def _pause(self) -> None:
         """Wait until the next poll is due, or until the poller has something to send."""
         answers = self.report is not None and self.report.answered
-        pause = EVERY if answers or self._has_waited(EVERY * 20) else EVERY_STARTING
+        pause = (
+            POLL_INTERVAL_S
+            if answers or self._has_waited(POLL_INTERVAL_S * 20)
+            else STARTING_POLL_INTERVAL_S
+        )
         if answers and not self._is_busy:
-            pause = EVERY_FORMER
+            pause = FORMER_POLL_INTERVAL_S
         await self._wait_for_update(pause)
 
     async def _wait_for_update(self, seconds: float) -> None:
@@ -192,14 +205,14 @@ class ProxyPoller:
             async with asyncio.timeout(seconds):
                 await self._pending.wait()
 
-    async def _tell(self) -> bool:
+    async def _send_all(self) -> bool:
         """Send all unconfirmed parts. Return whether the proxy has now confirmed gone pods."""
         self._pending.clear()
-        if await self._tell_policy():  # no pod gets in before the policy is in force
-            await self._tell_callers()
-        return await self._tell_gone()
+        if await self._send_policy():  # no pod gets in before the policy is in force
+            await self._send_callers()
+        return await self._send_gone()
 
-    async def _ask(self, within: float = 0.0) -> None:
+    async def _read_status(self, within: float = 0.0) -> None:
         """Request the status, or wait up to ``within`` seconds for a changed status."""
         try:
             status = await self._fetch_status(within)
@@ -211,14 +224,16 @@ class ProxyPoller:
                 new_report = unreadable(self.report, str(error))
             else:
                 self._forget()  # the next answer may come from a new process
-                if self._failures < SILENT or not (self.report or self._has_waited(STARTING)):
+                if self._failures < SILENT_AFTER_POLLS or not (
+                    self.report or self._has_waited(STARTING_S)
+                ):
                     return
                 new_report = no_answer(str(error))
-        starting = self.report is None and not self._has_waited(STARTING)
+        starting = self.report is None and not self._has_waited(STARTING_S)
         if starting and new_report.answered and not new_report.master_up:
             return  # the proxy may not have asked its master yet
-        # A gone pod's process may run on for a moment and register again: then the next look sends
-        # the gone address again.
+        # A gone pod's process may run on for a moment and register again. So wake the operator: its
+        # next look sends the gone address again if nodes there are registered.
         recheck = self._recheck
         self._recheck = False
         if new_report != self.report or recheck:
@@ -258,7 +273,7 @@ class ProxyPoller:
         self._tells_changes = True
         self._is_former = False
 
-    async def _tell_policy(self) -> bool:
+    async def _send_policy(self) -> bool:
         """Send the policy, unless confirmed. Return whether the proxy has the policy."""
         policy = self._policy
         if policy is None or self.session.has_policy(policy):
@@ -267,39 +282,42 @@ class ProxyPoller:
             async with self._limits.slow:
                 if not self._leads():
                     return False
-                await self.session.tell_policy(policy)
+                await self.session.send_policy(policy)
         except PolicyRefused as error:
             self._refusal = short(str(error))
             return False
         except ProxyError as error:
             log.debug("policy not sent: proxy %s: %s", self.session.admin, error)
             return False
-        self._recheck = self._recheck or bool(self._refusal)  # the report has no refusal now
+        self._recheck = self._recheck or bool(self._refusal)  # the next report has no refusal
         self._refusal = ""
         return True
 
-    async def _tell_callers(self) -> None:
+    async def _send_callers(self) -> None:
         """Send the addresses of pods that may use the proxy, unless confirmed.
 
         New pods wait for this call, and the call about gone pods may wait for the master. So the
         two calls are separate, and this call comes first.
         """
         callers = self._callers
-        recent = self._tells_changes or time.monotonic() - self._callers_told_at < REPEATED
+        recent = (
+            self._tells_changes
+            or time.monotonic() - self._callers_sent_at < CALLERS_REPEAT_INTERVAL_S
+        )
         if callers is None or (self.session.has_callers(callers) and recent):
             return
         try:
-            async with self._limits.questions:
+            async with self._limits.short:
                 if not self._leads():  # sending the policy may have taken long
                     return
-                await self.session.tell_callers(callers)
+                await self.session.send_callers(callers)
         except ProxyError as error:
             text = "allowed callers not sent: proxy %s, %s: %s"
             log.debug(text, self.session.admin, callers, error)
             return
-        self._callers_told_at = time.monotonic()
+        self._callers_sent_at = time.monotonic()
 
-    async def _tell_gone(self) -> bool:
+    async def _send_gone(self) -> bool:
         """Send the addresses of gone pods, if any. Return whether the proxy has confirmed."""
         gone = sorted(self._gone)
         if not gone:
@@ -308,7 +326,7 @@ class ProxyPoller:
             async with self._limits.slow:
                 if not self._leads():
                     return False
-                answer = await self.session.tell_containers({"gone": gone})
+                answer = await self.session.send_containers({"gone": gone})
         except ProxyError as error:
             # The proxy may have no master at the moment. The next poll sends the addresses again.
             log.debug("gone addresses not sent: proxy %s, %s: %s", self.session.admin, gone, error)
@@ -324,7 +342,7 @@ class ProxyPoller:
 class ClusterProxySync:
     """The pollers of all proxies whose pods have an address.
 
-    A poller calls ``changed`` with the proxy's namespace when the report has changed.
+    A poller calls ``changed`` with a list of the proxy's namespace when the report has changed.
     """
 
     def __init__(
@@ -355,7 +373,7 @@ class ClusterProxySync:
     def follow(self, proxies: Iterable[ProxyPod], key: bytes = b"") -> None:
         """Poll exactly these proxies, with tokens computed from ``key``.
 
-        A changed address or token gets a new poller.
+        If the address or the token of a proxy changes, the proxy gets a new poller.
         """
         wanted = {p.pod.uid: p for p in proxies if p.pod.ip and not p.pod.ended}
         for uid in [*self._pollers]:
@@ -395,7 +413,7 @@ class ClusterProxySync:
 
 def _random_wait() -> float:
     """Return the seconds to wait for a change, random because all pollers begin together."""
-    return WAIT * random.random()  # noqa: S311 - no secret
+    return LONGEST_CHANGE_WAIT_S * random.random()  # noqa: S311 - no secret
 
 
 def address_of(proxy: ProxyPod) -> HostPort:

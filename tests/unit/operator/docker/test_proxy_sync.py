@@ -58,17 +58,17 @@ class Proxies(ProxyClient):
             await asyncio.Event().wait()
         return self.known_status
 
-    async def containers(self, admin: HostPort, token: str, body: Mapping[str, Any]) -> Any:
+    async def send_containers(self, admin: HostPort, token: str, body: Mapping[str, Any]) -> Any:
         self.bodies.append(body)
         return {}
 
-    async def policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
+    async def send_policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
         assert (admin, token) == (WHERE, "token")
         self.calls.append([layer.name for layer in layers])
         if self.refuses:
             raise self.refuses
 
-    async def selected(
+    async def send_selected(
         self,
         admin: HostPort,
         token: str,
@@ -193,7 +193,7 @@ async def test_a_proxy_that_says_too_much_is_told_what_is_new_by_what_it_said_la
     while not sync.answers(name):
         await asyncio.sleep(0)
 
-    proxies.unreadable = ProxyError("answers GET /status with more than", unreadable=True)
+    proxies.unreadable = ProxyError("answers GET /status with more than", is_unreadable=True)
     proxies.bodies.clear()
     sync.update(*look("172.18.0.5", "172.18.0.6"))
     await proxies.next()

@@ -66,9 +66,9 @@ async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Ru
     monkeypatch.setattr(module, "KEY_EVERY", 0.05)
     monkeypatch.setattr(control_loop, "PAUSES", (0.02,))
     monkeypatch.setattr(reflector, "PAUSES", (0.02,))
-    monkeypatch.setattr(proxy_sync, "EVERY", 0.05)
-    monkeypatch.setattr(proxy_sync, "EVERY_STARTING", 0.02)
-    monkeypatch.setattr(proxy_sync, "EVERY_FORMER", 0.05)
+    monkeypatch.setattr(proxy_sync, "POLL_INTERVAL_S", 0.05)
+    monkeypatch.setattr(proxy_sync, "STARTING_POLL_INTERVAL_S", 0.02)
+    monkeypatch.setattr(proxy_sync, "FORMER_POLL_INTERVAL_S", 0.05)
     started = Running(api)
     yield started
     started.task.cancel()

@@ -76,18 +76,18 @@ class Told(ProxyClient):
         self.changed.clear()
         return self.version, await self.status(admin)
 
-    async def containers(self, admin: HostPort, token: str, body: Any) -> dict[str, Any]:
+    async def send_containers(self, admin: HostPort, token: str, body: Any) -> dict[str, Any]:
         self.told.append(body)
         if not self.hears:
             raise ProxyError("its master is away", status=503)
         return {}
 
-    async def policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
+    async def send_policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
         self.policies.append((token, *layers))
         if self.refuses:
             raise self.refuses
 
-    async def selected(
+    async def send_selected(
         self,
         admin: HostPort,
         token: str,
@@ -119,9 +119,9 @@ class Talk:
 
 @pytest.fixture
 async def talk(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Talk]:
-    monkeypatch.setattr(proxy_sync, "EVERY", 0.01)
-    monkeypatch.setattr(proxy_sync, "EVERY_STARTING", 0.01)
-    monkeypatch.setattr(proxy_sync, "EVERY_FORMER", 0.01)
+    monkeypatch.setattr(proxy_sync, "POLL_INTERVAL_S", 0.01)
+    monkeypatch.setattr(proxy_sync, "STARTING_POLL_INTERVAL_S", 0.01)
+    monkeypatch.setattr(proxy_sync, "FORMER_POLL_INTERVAL_S", 0.01)
     conversation = Talk()
     yield conversation
     await conversation.tasks.cancel()
@@ -152,7 +152,7 @@ async def test_a_proxy_with_too_long_an_answer_keeps_its_last_report(talk: Talk)
     talk.all.brief({UID: Briefing(callers=("10.244.1.9",))})
     await talk.asked()
     await until(lambda: bool(talk.proxies.callers))
-    talk.proxies.unreadable = ProxyError("the answer is too long", unreadable=True)
+    talk.proxies.unreadable = ProxyError("the answer is too long", is_unreadable=True)
     told = len(talk.proxies.callers)
     await talk.asked(5)
     report = talk.all.reports[UID]
@@ -168,8 +168,8 @@ async def test_a_proxy_with_too_long_an_answer_keeps_its_last_report(talk: Talk)
 async def test_a_proxy_with_too_long_a_first_answer_does_not_answer(
     talk: Talk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(proxy_sync, "STARTING", 0.0)
-    talk.proxies.unreadable = ProxyError("the answer is too long", unreadable=True)
+    monkeypatch.setattr(proxy_sync, "STARTING_S", 0.0)
+    talk.proxies.unreadable = ProxyError("the answer is too long", is_unreadable=True)
     talk.all.follow([proxy()])
     await talk.asked()
     assert not talk.all.reports[UID].answered
@@ -197,7 +197,7 @@ async def test_a_proxy_with_endless_changes_keeps_no_other_waiting(
     monkeypatch.setattr(talk.proxies, "changes", changes)
     talk.all.follow([proxy()])
     await talk.asked(20)
-    assert waits.count(proxy_sync.LEAST_INTERVAL) >= 15
+    assert waits.count(proxy_sync.LEAST_REPORT_INTERVAL_S) >= 15
 
 
 async def test_one_that_is_just_starting_is_not_told(talk: Talk) -> None:
@@ -216,7 +216,7 @@ async def test_one_that_is_just_starting_is_not_told(talk: Talk) -> None:
 async def test_one_that_never_gets_well_is_told_of(
     talk: Talk, says: dict[str, Any] | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(proxy_sync, "STARTING", 0.05)
+    monkeypatch.setattr(proxy_sync, "STARTING_S", 0.05)
     talk.proxies.says = says
     talk.all.follow([proxy()])
     await until(lambda: UID in talk.all.reports)
@@ -371,7 +371,7 @@ async def test_without_its_policy_a_proxy_gets_no_callers(talk: Talk) -> None:
 
 
 async def test_it_is_told_now_and_then(talk: Talk, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(proxy_sync, "REPEATED", 0.02)
+    monkeypatch.setattr(proxy_sync, "CALLERS_REPEAT_INTERVAL_S", 0.02)
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
@@ -457,7 +457,7 @@ async def test_an_address_that_stays_is_not_reported_over_and_over(
     talk: Talk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The operator looks at the result after a while, not at once."""
-    monkeypatch.setattr(proxy_sync, "EVERY", 3600.0)
+    monkeypatch.setattr(proxy_sync, "POLL_INTERVAL_S", 3600.0)
     talk.proxies.former = False
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
@@ -534,12 +534,12 @@ async def test_proxies_whose_masters_hang_keep_nobody_waiting(
         await asyncio.Event().wait()
         return {}
 
-    monkeypatch.setattr(talk.proxies, "containers", containers)
+    monkeypatch.setattr(talk.proxies, "send_containers", containers)
     talk.proxies.former = False
     talk.proxies.says = UP
     (well, *sick) = [
         replace(proxy(), pod=replace(proxy().pod, uid=f"uid-{number}"))
-        for number in range(proxy_sync.AT_ONCE + 2)
+        for number in range(proxy_sync.MOST_SHORT_CALLS + 2)
     ]
     talk.all.follow([well, *sick], KEY)
     await until(lambda: talk.proxies.listening == len(sick) + 1)
@@ -561,7 +561,7 @@ async def test_an_operator_that_lost_the_lead_sends_no_more_updates(
         asked.set()
         await hears.wait()
 
-    monkeypatch.setattr(talk.proxies, "policy", policy)
+    monkeypatch.setattr(talk.proxies, "send_policy", policy)
     talk.proxies.former = False
     talk.proxies.says = UP
     talk.all = ClusterProxySync(talk.tasks, talk.proxies, talk.changed, lambda: leading)
