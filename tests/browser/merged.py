@@ -15,7 +15,7 @@ from prometheus_client import CollectorRegistry
 
 from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy.page.page_document import Document
-from rosproxy_operator.common.health_server import HealthServer
+from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.proxy_client import ProxyClient
 
@@ -28,7 +28,7 @@ async def serve(port: int, token: str, proxies: dict[str, HostPort]) -> None:
         return await client.documents({name: (admin, token) for name, admin in proxies.items()})
 
     page = operator_page(documents, "docker logs {}".format)
-    server = HealthServer(CollectorRegistry(), lambda: None, lambda: None, page)
+    server = OperatorAdminServer(CollectorRegistry(), lambda: None, lambda: None, page)
     await server.start(HostPort("127.0.0.1", port))
     print("serving", flush=True)
     await asyncio.Event().wait()

@@ -27,8 +27,8 @@ from rosproxy_operator.common.control_loop import (
     LookImpossible,
     Pace,
 )
-from rosproxy_operator.common.health_server import HealthServer
 from rosproxy_operator.common.master_resolver import AGAIN_UNRESOLVED, MasterResolver
+from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_metrics import DockerMetrics
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.problem import Problem, ProblemLog
@@ -97,10 +97,10 @@ async def _run(
     metrics = DockerMetrics()
     controller = DockerController(settings, resync, metrics, mistakes=mistakes)
     page = operator_page(controller.documents, "docker logs {}".format)
-    health = HealthServer(
+    admin_server = OperatorAdminServer(
         metrics.registry, controller.dead, controller.unready, page, controller.status
     )
-    await health.start(admin)
+    await admin_server.start(admin)
     sign = publish_sign(admin, controller.engine_url)
     log.info("rosproxy-operator %s: health and metrics at http://%s", __version__, admin)
     running = asyncio.create_task(controller.run())
@@ -110,7 +110,7 @@ async def _run(
         await running  # raises the exceptions of the controller
     if sign:
         sign.close()
-    await health.stop()
+    await admin_server.stop()
 
 
 class DockerController:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from rosproxy import __version__
-from rosproxy_operator.common.health_server import HealthServer
+from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.threads import in_thread
@@ -76,8 +76,8 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     webhook = (Injector(api, settings.plan, metrics, controller.wake), server) if server else None
     page = operator_page(controller.documents, logs_command)
     unready = _first_reason(controller.unready, *([server.unready] if server else []))
-    health = HealthServer(metrics.registry, controller.dead, unready, page)
-    await health.start(settings.admin)
+    admin_server = OperatorAdminServer(metrics.registry, controller.dead, unready, page)
+    await admin_server.start(settings.admin)
     log.info(
         "rosproxy-operator %s: manages %s at %s, health and metrics at http://%s",
         __version__,
@@ -100,7 +100,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
             await _drain(server, stopped)
     for task in tasks:
         task.cancel()
-    await asyncio.gather(*tasks, health.stop(), return_exceptions=True)
+    await asyncio.gather(*tasks, admin_server.stop(), return_exceptions=True)
     serving.stop()
     for task in done:
         task.result()  # raises the error of a failed task

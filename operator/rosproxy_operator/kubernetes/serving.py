@@ -21,7 +21,7 @@ from aiohttp import web
 
 from rosproxy.net.bounded_server import BoundedServer
 from rosproxy.net.sockets import BACKLOG
-from rosproxy_operator.common.health_server import MOST_CONNECTIONS
+from rosproxy_operator.common.operator_admin import MOST_CONNECTIONS
 from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.resources.names import INJECT
 from rosproxy_operator.kubernetes.settings import KubernetesSettings

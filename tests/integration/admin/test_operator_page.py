@@ -12,7 +12,7 @@ from examples.demo.fake_http import free_ports
 from examples.demo.fake_node import FakeNode
 from rosproxy.net.addresses import HostPort
 from rosproxy.page.page_document import Document
-from rosproxy_operator.common.health_server import HealthServer
+from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.proxy_client import ProxyClient
 from tests.integration.conftest import MakeProxy
@@ -29,13 +29,15 @@ async def client() -> AsyncIterator[ProxyClient]:
     await made.close()
 
 
-async def opened(proxies: dict[str, tuple[HostPort, str]], client: ProxyClient) -> HealthServer:
+async def opened(
+    proxies: dict[str, tuple[HostPort, str]], client: ProxyClient
+) -> OperatorAdminServer:
     """An operator's endpoint over these proxies."""
 
     async def documents() -> dict[str, Document | str]:
         return await client.documents(proxies)
 
-    return HealthServer(
+    return OperatorAdminServer(
         CollectorRegistry(),
         lambda: None,
         lambda: None,

@@ -14,9 +14,9 @@ from prometheus_client.exposition import generate_latest
 from examples.demo.fake_http import free_ports
 from rosproxy import __version__
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common import health_server
+from rosproxy_operator.common import operator_admin
 from rosproxy_operator.common.control_loop import LookFailed
-from rosproxy_operator.common.health_server import MOST_CONNECTIONS, HealthServer
+from rosproxy_operator.common.operator_admin import MOST_CONNECTIONS, OperatorAdminServer
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.docker import host_status
 from rosproxy_operator.docker.host_status import HostStatus
@@ -46,7 +46,9 @@ class RunningOperator:
             return {}
 
         page = operator_page(documents, "docker logs {}".format)
-        self.server = HealthServer(CollectorRegistry(), lambda: None, lambda: None, page, status)
+        self.server = OperatorAdminServer(
+            CollectorRegistry(), lambda: None, lambda: None, page, status
+        )
 
 
 @pytest.fixture
@@ -160,7 +162,7 @@ async def test_callers_that_ask_at_once_share_one_reply_with_the_metrics(
         made += 1
         return generate_latest(registry)
 
-    monkeypatch.setattr(health_server, "generate_latest", counted)
+    monkeypatch.setattr(operator_admin, "generate_latest", counted)
     address = operator.address.host, operator.address.port
     ask = ASK.replace(b"/healthz", b"/metrics")
     sources = [f"127.0.5.{number}" for number in range(16)]

@@ -18,7 +18,7 @@ import pytest
 
 from examples.demo.fake_http import free_ports
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common.health_server import MOST_CONNECTIONS
+from rosproxy_operator.common.operator_admin import MOST_CONNECTIONS
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes import serving

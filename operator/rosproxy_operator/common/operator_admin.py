@@ -1,8 +1,9 @@
 """The admin endpoint of an operator: /healthz, /readyz, /metrics, /status, and the live page.
 
-The same rules hold as at the admin endpoint of a proxy. The server refuses a ``Host`` name that a
-stranger may have registered. Each address may have a few connections. Callers that request the
-metrics at the same time share a reply.
+The same rules hold as at the admin endpoint of a proxy. The server answers only requests whose
+``Host`` no stranger can register, such as an IP address or the server's own host name
+(`rosproxy.admin.host_rule`, DNS rebinding). Each client address may have `MOST_CONNECTIONS`
+connections. Callers that request the metrics at the same time share a reply.
 """
 
 import socket
@@ -27,19 +28,24 @@ from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.proxy_client import Json
 
 MOST_CONNECTIONS = 32
-"""Connections from an address at most. The kubelet, Prometheus and a browser need a few each."""
+"""The highest number of connections from one address.
+
+The kubelet, Prometheus and a browser need a few each.
+"""
 
 Check = Callable[[], str | None]
+"""Returns None if all is well, else the reason for HTTP 503."""
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
+"""Returns the reply to a request."""
 GetStatus = Callable[[], Awaitable[Json]]
 """Returns the document at ``/status``. Raises LookFailed."""
 
 
-class HealthServer:
+class OperatorAdminServer:
     """The HTTP server of the admin endpoint.
 
-    ``alive`` and ``ready`` return None, or the reason for HTTP 503. ``status`` and the ``page``
-    answer only callers on loopback.
+    ``alive`` and ``ready`` are the checks at ``/healthz`` and ``/readyz``. ``status`` and the
+    ``page`` answer only callers on loopback.
     """
 
     def __init__(
@@ -54,13 +60,13 @@ class HealthServer:
         self._exposition = SharedDocument(lambda: generate_latest(metrics))
         routes: dict[tuple[str, str], Handler] = {
             **page.routes,
-            ("GET", "/healthz"): partial(_check, alive),
-            ("GET", "/readyz"): partial(_check, ready),
-            ("GET", "/metrics"): partial(_show, self._exposition),
+            ("GET", "/healthz"): partial(_reply_check, alive),
+            ("GET", "/readyz"): partial(_reply_check, ready),
+            ("GET", "/metrics"): partial(_reply_metrics, self._exposition),
         }
         if status is not None:
             visitors = Visitors(None, time.monotonic, local=True)
-            routes["GET", "/status"] = partial(_tell, status, visitors)
+            routes["GET", "/status"] = partial(_reply_status, status, visitors)
         self._runner = web.ServerRunner(BoundedServer(partial(_answer, routes), MOST_CONNECTIONS))
 
     async def start(self, listener: HostPort) -> None:
@@ -84,7 +90,7 @@ async def _answer(
     routes: Mapping[tuple[str, str], Handler], request: web.BaseRequest
 ) -> web.StreamResponse:
     host = request.headers.get("Host", "")
-    # DNS rebinding: a stranger may have registered any other name (`rosproxy.admin.host_rule`).
+    # A stranger may have registered any other name: DNS rebinding (`rosproxy.admin.host_rule`).
     if not is_own_host(host, {socket.gethostname().lower()}):
         return web.Response(status=403, text=refusal(host))
     method = "GET" if request.method == "HEAD" else request.method
@@ -98,17 +104,21 @@ async def _answer(
     return web.Response(status=405, text="405: Method Not Allowed", headers=headers)
 
 
-async def _check(check: Check, _request: web.BaseRequest) -> web.Response:
+async def _reply_check(check: Check, _request: web.BaseRequest) -> web.Response:
     reason = check()
     return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
 
 
-async def _show(exposition: SharedDocument[bytes], request: web.BaseRequest) -> web.StreamResponse:
+async def _reply_metrics(
+    exposition: SharedDocument[bytes], request: web.BaseRequest
+) -> web.StreamResponse:
     headers = {"Content-Type": CONTENT_TYPE_LATEST}
     return await send_shared(request, [await exposition.newest()], headers)
 
 
-async def _tell(status: GetStatus, visitors: Visitors, request: web.BaseRequest) -> web.Response:
+async def _reply_status(
+    status: GetStatus, visitors: Visitors, request: web.BaseRequest
+) -> web.Response:
     if not visitors.may_look(request):
         return web.Response(
             status=403, text="/status answers only callers on loopback of this machine\n"
