@@ -2,11 +2,11 @@
 
     python scripts/custom_resource_docs.py [--check]
 
-The tables stand between ``<!-- fields of the spec -->`` and ``<!-- end of fields of the spec -->``
-(and the same for the status), and are made from manifests/install.yaml. If a description has a
-sentence ``Default is ...``, the sentence goes into the column of the defaults. The chart's
-values are in its README, by helm-docs. With ``--check`` nothing is written; the exit code tells
-whether the page is as it should be.
+Each table stands between two comments, for example ``<!-- fields of the spec -->`` and ``<!-- end
+of fields of the spec -->``. The rows come from the custom resource definition in
+manifests/install.yaml. If a description has a sentence ``Default is ...``, the sentence goes into
+the column of the defaults. With ``--check`` the script writes nothing, and exits with 1 if the
+tables of the page are outdated.
 """
 
 import json
@@ -26,13 +26,13 @@ DEFAULT = re.compile(r"\s*Default(?: is|:) (.+?)\.(?=\s|$)")
 
 
 def custom_resource() -> Mapping[str, Any]:
-    """The custom resource definition, as it is installed."""
+    """Return the custom resource definition that manifests/install.yaml installs."""
     documents = yaml.safe_load_all(INSTALL.read_text())
     return next(d for d in documents if d["kind"] == "CustomResourceDefinition")
 
 
 def fields_table(section: str, definition: Mapping[str, Any]) -> str:
-    """The fields of the spec or of the status, as a table."""
+    """Return the table of the fields of the spec or of the status."""
     schema = definition["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"][section]
     rows = ["| field | type | default | meaning |", "|---|---|---|---|", *_fields(schema, section)]
     return "\n".join(rows)
@@ -87,8 +87,8 @@ def _meaning(field: Mapping[str, Any]) -> str:
     return " ".join([text, *refusals]).replace("|", r"\|")
 
 
-def page(text: str) -> str:
-    """The page with its tables made anew."""
+def with_new_tables(text: str) -> str:
+    """Return the page with new tables."""
     definition = custom_resource()
     tables = {
         "fields of the spec": fields_table("spec", definition),
@@ -104,7 +104,7 @@ def page(text: str) -> str:
 
 def main() -> int:
     text = PAGE.read_text()
-    wanted = page(text)
+    wanted = with_new_tables(text)
     if "--check" not in sys.argv:
         PAGE.write_text(wanted)
     return int("--check" in sys.argv and text != wanted)

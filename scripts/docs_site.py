@@ -1,8 +1,9 @@
-"""Lay out the pages of the documentation for MkDocs, as they lie in the repository.
+"""Copy the pages of the documentation to build/docs for MkDocs, at the same paths.
 
-    python scripts/docs_site.py        writes build/docs
+    python scripts/docs_site.py
 
-GitHub shows a directory's README.md where a link names the directory; MkDocs wants the file.
+If a link names a directory, GitHub shows the README.md of the directory. MkDocs needs the name of
+the file, so the script writes this name into the link.
 """
 
 import re
@@ -12,22 +13,22 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "build/docs"
-SHOWN = (
+PAGE_PATTERNS = (
     *("*.md", "LICENSE", "docs", "examples/docker", "manifests"),
     *("charts/*/files/*", "charts/*/README.md"),
 )
-HIDDEN = (".github",)
+OMITTED_PREFIXES = (".github",)
 
 
 def sources() -> list[Path]:
-    """The files that pages are made of or link to."""
-    words = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "--", *SHOWN]
-    said = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    return [Path(line) for line in said.splitlines() if not line.startswith(HIDDEN)]
+    """Return the files that become pages, and the files to which pages link."""
+    words = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "--", *PAGE_PATTERNS]
+    output = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    return [Path(line) for line in output.splitlines() if not line.startswith(OMITTED_PREFIXES)]
 
 
 def page(path: Path) -> str:
-    """A page in which links to directories lead to their README.md."""
+    """Return a page in which each link to a directory leads to the README.md of the directory."""
 
     def link(match: re.Match[str]) -> str:
         directory = ROOT / path.parent / match[1]

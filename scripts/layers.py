@@ -83,7 +83,7 @@ class Layer:
         return LOGS / f"{self.name}-cache"
 
     def report(self, again: bool = False) -> Path:
-        """The JUnit report of the first run, or of the second."""
+        """The JUnit report of the first run; with ``again`` of the second run."""
         return LOGS / f"{self.name}{'-again' * again}.xml"
 
     def command(self, smoke: bool, again: bool = False) -> list[str]:
@@ -99,19 +99,19 @@ class Layer:
 
 
 def debian_root_obstacle() -> str | None:
-    """Say what keeps this machine from making namespaces and installing packages."""
+    """Return why this machine can't make namespaces and install packages, or None."""
     if platform.system() != "Linux" or not is_debian():
         return "it needs Debian or Ubuntu"
     if os.geteuid() != 0:
         return "it needs root"
-    wanted = CAP_NET_ADMIN | CAP_SYS_ADMIN
-    if effective_capabilities() & wanted != wanted:
+    needed = CAP_NET_ADMIN | CAP_SYS_ADMIN
+    if effective_capabilities() & needed != needed:
         return "root lacks CAP_NET_ADMIN or CAP_SYS_ADMIN here (a container?)"
     return None
 
 
 def abuse_obstacle() -> str | None:
-    """Say what keeps this machine from bounding a process's memory, and from making namespaces."""
+    """Return why this machine can't bound a process's memory and make namespaces, or None."""
     if platform.system() != "Linux":
         return "it needs Linux"
     if os.geteuid() != 0:
@@ -148,7 +148,7 @@ CHART = Layer(
 )
 IMAGE = Layer("image", setup=(ENGINE, COMPOSE, IMAGES), obstacle=debian_root_obstacle)
 ROS_NODES = Layer("ros", MARKED, (ROS, NODES), (ROS, NODES), 2, debian_root_obstacle)
-ALIKE = (
+INSIDE_ONLY_CASES = (
     *("inside-to-inside", "inside-to-outside"),
     *("inside-about-inside", "inside-about-itself", "outside-about-inside"),
 )
@@ -166,7 +166,7 @@ ISOLATED = Layer(
                 *("networks", "rosnode", "rostopic"),
             )
         ),
-        *("-k", " and ".join(f"not {name}" for name in ALIKE)),
+        *("-k", " and ".join(f"not {name}" for name in INSIDE_ONLY_CASES)),
     ),
     environment=("ROS_TESTS_ISOLATED=1",),
 )

@@ -2,8 +2,9 @@
 
     python -m scripts.options_docs
 
-Each stands between two comments with the program's name, and is made of the annotations of its
-settings: that of ``rosproxy run`` of `rosproxy.settings.Settings`.
+Each table stands between two comments with the name of a program. The rows come from the
+annotations of the program's settings classes. Example: ``rosproxy run`` has the class
+`rosproxy.settings.Settings`.
 """
 
 from collections.abc import Iterable, Iterator
@@ -28,16 +29,17 @@ SETTINGS: dict[str, tuple[type, ...]] = {
         *(ClusterSettings, Bounds, KubernetesSettings, WebhookSettings),
     ),
 }
-"""The classes of each program's settings."""
+"""The settings classes of each program."""
 
 
-def page(text: str) -> str:
-    """The page with its tables made anew."""
+def with_new_tables(text: str) -> str:
+    """Return the page with new tables."""
     for program, classes in SETTINGS.items():
         begin = f"<!-- {program} -->\n"
         end = f"<!-- end of {program} -->"
         before, rest = text.split(begin)
-        table = "\n".join(_table(setting for kind in classes for setting in declared(kind)))
+        declarations = map(declared, classes)
+        table = "\n".join(_table(setting for settings in declarations for setting in settings))
         text = f"{before}{begin}\n{table}\n\n{end}{rest.split(end)[1]}"
     return text
 
@@ -74,4 +76,4 @@ def _default(setting: Setting) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(PAGE.read_text()))
+    PAGE.write_text(with_new_tables(PAGE.read_text()))

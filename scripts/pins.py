@@ -30,7 +30,7 @@ class Pin(NamedTuple):
 
 
 def pins(extras: Iterable[str]) -> list[Pin]:
-    """The pins of rosproxy's requirements with some extras, and of all indirect requirements.
+    """Return the pins of rosproxy's requirements with some extras, indirect requirements included.
 
     Raises KeyError if there is no such extra, LookupError if a requirement has no pin.
     """
@@ -39,16 +39,16 @@ def pins(extras: Iterable[str]) -> list[Pin]:
     wanted = {name for extra in ("", *extras) for name in _required(project, extra)}
     missing = wanted - {pin.name for pin in every}
     if missing:
-        raise LookupError(f"constraints.txt has no {', '.join(sorted(missing))}: make lock")
-    grown: set[str] = set()
-    while grown != wanted:
-        grown = set(wanted)
-        wanted |= {pin.name for pin in every if pin.via & grown}
+        raise LookupError(f"constraints.txt has no {', '.join(sorted(missing))}. Run make lock")
+    known: set[str] = set()
+    while known != wanted:
+        known = set(wanted)
+        wanted |= {pin.name for pin in every if pin.via & known}
     return [pin for pin in every if pin.name in wanted]
 
 
 def _required(project: dict[str, Any], extra: str) -> Iterator[str]:
-    """The names that rosproxy itself (no extra) or one of its extras requires."""
+    """Yield the names that rosproxy itself (no extra) or one of its extras requires."""
     if extra == "build-system":
         requirements = project["build-system"]["requires"]
     elif extra:
@@ -65,7 +65,7 @@ def _required(project: dict[str, Any], extra: str) -> Iterator[str]:
 
 
 def _read(text: str) -> Iterator[Pin]:
-    """The pins in a file of ``uv pip compile`` or ``pip-compile``."""
+    """Yield the pins in a file of ``uv pip compile`` or ``pip-compile``."""
     for block in re.split(r"^(?=[A-Za-z0-9])", text, flags=re.M):
         if not _NAME.match(block):
             continue  # the heading
@@ -77,7 +77,7 @@ def _read(text: str) -> Iterator[Pin]:
 
 
 def _name(text: str) -> str:
-    """The name at the start of a requirement, normalised (PEP 503)."""
+    """Return the name at the start of a requirement, normalised (PEP 503)."""
     match = _NAME.match(text)
     return re.sub(r"[-_.]+", "-", match[0]).lower() if match else ""
 

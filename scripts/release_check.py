@@ -48,8 +48,8 @@ PROGRAMS = {"rosproxy": "", "rosproxy-operator": "operator"}
 SETTINGS = ("--master-uri", "http://127.0.0.1:11311", "--advertise-host", "127.0.0.1")
 
 
-class Wrong(Exception):
-    """The release is not in order; the text says what to do."""
+class ReleaseFault(Exception):
+    """A part of the release is not right. The text says which part, and what to do."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Release:
 
     @property
     def runbook(self) -> str:
-        """The page about alerts, for the person on call."""
+        """The URL or path of the page about alerts."""
         at = f"{self.repository}/blob/v{self.version}/" if self.repository else ""
         return f"{at}docs/guide/alerts.md"
 
@@ -78,13 +78,13 @@ class Release:
 
 
 def run(*command: str | Path, **more: str) -> str:
-    """Run a program and return the output. If the program fails, raises Wrong with the output."""
+    """Run a program and return the output. If it fails, raises ReleaseFault with the output."""
     done = subprocess.run(
         [str(argument) for argument in command], cwd=ROOT, env={**os.environ, **more}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
     )  # fmt: skip
     if done.returncode:
-        raise Wrong(f"{' '.join(map(str, command))}: exit {done.returncode}\n{done.stdout}")
+        raise ReleaseFault(f"{' '.join(map(str, command))}: exit {done.returncode}\n{done.stdout}")
     return done.stdout
 
 
@@ -93,7 +93,7 @@ def project_version() -> str:
     text = (ROOT / "proxy/rosproxy/__init__.py").read_text()
     match = re.search(r'^__version__ = "(\d+\.\d+\.\d+)"$', text, re.M)
     if match is None:
-        raise Wrong("proxy/rosproxy/__init__.py has no __version__ of three numbers")
+        raise ReleaseFault("proxy/rosproxy/__init__.py has no __version__ of three numbers")
     return match[1]
 
 
@@ -101,31 +101,38 @@ def project_version() -> str:
 
 
 def check_versions(release: Release) -> None:
-    """Check that all files have the same version; with a tag, tag and changelog, too."""
+    """Check that all files have the same version, and with a tag also the tag and the changelog."""
     chart = yaml.safe_load((CHART / "Chart.yaml").read_text())
-    told = {"Chart.yaml, version": chart["version"], "Chart.yaml, appVersion": chart["appVersion"]}
+    versions = {
+        "Chart.yaml, version": chart["version"],
+        "Chart.yaml, appVersion": chart["appVersion"],
+    }
     manifest = (ROOT / "manifests/install.yaml").read_text()
     images = re.findall(r"\b(rosproxy(?:-operator)?):([\w.+-]+)\"?$", manifest, re.M)
     labels = set(re.findall(r"app\.kubernetes\.io/version: \"(.*)\"", manifest))
-    told |= {f"manifests/install.yaml, image {name}": tag for name, tag in images}
-    told["manifests/install.yaml, labels"] = " ".join(sorted(labels))
-    if len(told) != 5:
-        raise Wrong(f"manifests/install.yaml has not both images: {sorted(told)}")
+    versions |= {f"manifests/install.yaml, image {name}": tag for name, tag in images}
+    versions["manifests/install.yaml, labels"] = " ".join(sorted(labels))
+    if len(versions) != 5:
+        raise ReleaseFault(f"manifests/install.yaml has not both images: {sorted(versions)}")
     if release.tag:
-        told["tag"] = release.tag.removeprefix("v")
-        told["CHANGELOG.md, newest heading"] = newest(ROOT / "CHANGELOG.md")
-    differing = {source: version for source, version in told.items() if version != release.version}
+        versions["tag"] = release.tag.removeprefix("v")
+        versions["CHANGELOG.md, newest heading"] = newest(ROOT / "CHANGELOG.md")
+    differing = {
+        source: version for source, version in versions.items() if version != release.version
+    }
     if differing:
         text = f"the code has {release.version}, and others another version: {differing}"
-        raise Wrong(f"{text}; docs/releasing.md lists the places to change")
+        raise ReleaseFault(f"{text}; docs/releasing.md lists the places to change")
 
 
 def newest(changelog: Path) -> str:
-    """The version of the newest entry. Raises Wrong if there are unreleased changes."""
+    """Return the version of the newest entry. Raises ReleaseFault if changes are unreleased."""
     headings = re.findall(r"^## \[(.*?)\](?: - \d{4}-\d{2}-\d{2})?$", changelog.read_text(), re.M)
     unreleased = changelog.read_text().partition("## [Unreleased]")[2].partition("\n## ")[0]
     if unreleased.strip():
-        raise Wrong("CHANGELOG.md has changes under [Unreleased]: give them the version's heading")
+        raise ReleaseFault(
+            "CHANGELOG.md has changes under [Unreleased]: give them the version's heading"
+        )
     return next((heading for heading in headings if heading != "Unreleased"), "none")
 
 
@@ -133,7 +140,7 @@ def newest(changelog: Path) -> str:
 
 
 def check_packages(release: Release) -> None:
-    """Build wheel and sdist twice, compare, install."""
+    """Build wheel and sdist twice, compare the builds, and install the wheel."""
     for path in DIST.glob("rosproxy-*"):
         path.unlink()
     with tempfile.TemporaryDirectory() as again:
@@ -143,10 +150,10 @@ def check_packages(release: Release) -> None:
         expected = [f"rosproxy-{release.version}-py3-none-any.whl",
                     f"rosproxy-{release.version}.tar.gz"]  # fmt: skip
         if built != expected:
-            raise Wrong(f"dist has {built}, and not {expected}")
+            raise ReleaseFault(f"dist has {built}, and not {expected}")
         differing = [name for name in built if digest(DIST / name) != digest(Path(again) / name)]
         if differing:
-            raise Wrong(f"built twice, these differ: {differing}")
+            raise ReleaseFault(f"built twice, these differ: {differing}")
     wheel, sdist = (DIST / name for name in expected)
     check_contents(wheel, sdist)
     # `python -m build` makes the wheel from the sdist, so testing the wheel suffices.
@@ -155,7 +162,7 @@ def check_packages(release: Release) -> None:
         for words in (("--version",), ("--help",)):
             said = run(environment / "bin" / program, *words)
             if words == ("--version",) and release.version not in said:
-                raise Wrong(f"{program} of {wheel.name} has version {said}")
+                raise ReleaseFault(f"{program} of {wheel.name} has version {said}")
     run(ROOT / "build/release/rosproxy/bin/rosproxy", "run", "--check", *SETTINGS)
 
 
@@ -168,15 +175,17 @@ def check_contents(wheel: Path, sdist: Path) -> None:
     needed |= {f"rosproxy/page/files/{name}" for name in (*page, "login.html")}
     tops = {name.partition("/")[0].partition("-")[0] for name in names}
     if not needed <= names or tops != {"rosproxy", "rosproxy_operator"}:
-        raise Wrong(f"{wheel.name} has {sorted(tops)}, and lacks {sorted(needed - names)}")
+        raise ReleaseFault(f"{wheel.name} has {sorted(tops)}, and lacks {sorted(needed - names)}")
     if not [name for name in names if name.endswith("licenses/LICENSE")]:
-        raise Wrong(f"{wheel.name} has no LICENSE")
+        raise ReleaseFault(f"{wheel.name} has no LICENSE")
     with tarfile.open(sdist) as archive:
         inside = {name.partition("/")[2] for name in archive.getnames()}
     lacking = {"LICENSE", "README.md", "pyproject.toml", "proxy/rosproxy/py.typed"} - inside
     extra = [name for name in inside if name.startswith((".venv", "build/", "dist/", ".git/"))]
     if lacking or extra:
-        raise Wrong(f"{sdist.name} lacks {sorted(lacking)}, and has {sorted(extra)[:5]} besides")
+        raise ReleaseFault(
+            f"{sdist.name} lacks {sorted(lacking)}, and has {sorted(extra)[:5]} besides"
+        )
 
 
 def digest(path: Path) -> str:
@@ -184,7 +193,7 @@ def digest(path: Path) -> str:
 
 
 def install(wheel: Path, extra: str) -> Path:
-    """A fresh environment with the wheel and the pinned requirements only."""
+    """Make a new environment with the wheel and the pinned requirements only. Return its path."""
     target = ROOT / "build/release" / ("rosproxy-operator" if extra else "rosproxy")
     shutil.rmtree(target, ignore_errors=True)
     run(BIN / "python", "-m", "venv", "--without-pip", target)
@@ -205,7 +214,7 @@ def check_sbom(release: Release) -> None:
     for program in PROGRAMS:
         python = ROOT / "build/release" / program / "bin/python"
         if not python.exists():
-            raise Wrong(f"{python} is not there: run the step packages first")
+            raise ReleaseFault(f"{python} is not there: run the step packages first")
         path = DIST / f"{program}-{release.version}.cdx.json"
         options = ("--pyproject", "pyproject.toml", "--output-reproducible", "--validate")
         run(BIN / "cyclonedx-py", "environment", *options, "-o", path, python)
@@ -215,7 +224,7 @@ def check_sbom(release: Release) -> None:
         lines = run(BIN / "python", "-m", "pip", "--python", python, "freeze", "--all")
         installed = {line.partition("==")[0].lower() for line in lines.splitlines() if "==" in line}
         if len(installed) < 10 or installed - listed:
-            raise Wrong(f"{path.name} lacks {sorted(installed - listed)}")
+            raise ReleaseFault(f"{path.name} lacks {sorted(installed - listed)}")
         print(f"  {path.name}: {len(listed)} components")
 
 
@@ -231,7 +240,7 @@ def check_chart(release: Release) -> None:
     package = DIST / f"rosproxy-operator-{release.version}.tgz"
     with tarfile.open(package) as archive:
         if f"{CHART.name}/LICENSE" not in archive.getnames():
-            raise Wrong(f"{package.name} has no LICENSE")
+            raise ReleaseFault(f"{package.name} has no LICENSE")
     rules = ("--set", "prometheusRule.enabled=true")
     made = run(helm, "template", "r", package, "--kube-version", "1.30.0", *rules)
     text = (ROOT / "manifests/install.yaml").read_text()
@@ -242,13 +251,13 @@ def check_chart(release: Release) -> None:
         for image in (f'image: "{release.image("rosproxy-operator")}"',
                       f"--proxy-image={release.image('rosproxy')}"):  # fmt: skip
             if f"{image}\n" not in objects:
-                raise Wrong(f"{file_name} does not pull {image}")
+                raise ReleaseFault(f"{file_name} does not pull {image}")
     alerts = (CHART / "files/alerts.yaml").read_text()
     alerts = alerts.replace("runbook_url: docs/guide/alerts.md", f"runbook_url: {release.runbook}")
     (DIST / "alerts.yaml").write_text(alerts)
     shutil.copy(CHART / "files/dashboard.json", DIST)
     if f"runbook_url: {release.runbook}#" not in made or release.runbook not in alerts:
-        raise Wrong(f"the alerts of {package.name} do not link to {release.runbook}")
+        raise ReleaseFault(f"the alerts of {package.name} do not link to {release.runbook}")
 
 
 def adapt(chart: Path, release: Release) -> None:
@@ -302,19 +311,23 @@ def cluster_program(name: str) -> Path:
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     path = Path(os.environ.get("CLUSTER_BIN") or Path(cache) / "rosproxy/cluster") / name
     if not path.exists():
-        raise Wrong(f"{name} is not here: scripts/install-kubernetes.sh builds it")
+        raise ReleaseFault(f"{name} is not here: scripts/install-kubernetes.sh builds it")
     return path
 
 
 def check_images(release: Release) -> None:
     """Build both images, and check the versions."""
-    told = {"TAG": release.version, "REGISTRY": release.registry, "BASE_IMAGE": release.base_image}
-    run("make", "image", *(f"{name}={value}" for name, value in told.items()))
+    versions = {
+        "TAG": release.version,
+        "REGISTRY": release.registry,
+        "BASE_IMAGE": release.base_image,
+    }
+    run("make", "image", *(f"{name}={value}" for name, value in versions.items()))
     for program in PROGRAMS:
         image = release.image(program)
         said = run("docker", "run", "--rm", "--network", "none", image, "--version")
         if release.version not in said:
-            raise Wrong(f"the image {image} has version {said}")
+            raise ReleaseFault(f"the image {image} has version {said}")
         size = int(run("docker", "image", "inspect", "--format", "{{.Size}}", image))
         print(f"  {image}: {size / 1e6:.0f} MB")
 
@@ -334,7 +347,7 @@ def check_registry(release: Release) -> None:
         pulled = run(helm, "template", "r", *wanted, "--plain-http", "--kube-version", "1.30.0")
         made = run(helm, "template", "r", package, "--kube-version", "1.30.0")
         if not pulled.endswith(made):  # Helm prints the address of the pull first
-            raise Wrong(f"the chart of {wanted[0]} makes other objects than {package.name}")
+            raise ReleaseFault(f"the chart of {wanted[0]} makes other objects than {package.name}")
 
 
 def check_pulled(image: str, pushed: str) -> None:
@@ -347,7 +360,7 @@ def check_pulled(image: str, pushed: str) -> None:
         run("docker", "rmi", pushed)
         run("docker", "pull", pushed)
         if run(*identity, pushed) != before:
-            raise Wrong(f"{image} differs after push and pull")
+            raise ReleaseFault(f"{image} differs after push and pull")
         run("docker", "run", "--rm", "--network", "none", pushed, "--version")
     finally:
         subprocess.run(["docker", "rmi", pushed], capture_output=True, check=False)
@@ -375,7 +388,7 @@ def running_registry(directory: Path) -> Iterator[str]:
         end = time.monotonic() + 30
         while not answers(address):
             if process.poll() is not None or time.monotonic() > end:
-                raise Wrong(f"the registry does not start:\n{log.read_text()}")
+                raise ReleaseFault(f"the registry does not start:\n{log.read_text()}")
             time.sleep(0.1)
         yield address
     finally:
@@ -417,7 +430,7 @@ def main() -> int:
         for name in options.only:
             print(f"{name} …", flush=True)
             STEPS[name](release)
-    except Wrong as error:
+    except ReleaseFault as error:
         print(f"release-check: {error}", file=sys.stderr)
         return 1
     print(f"rosproxy {release.version} is in {DIST.relative_to(ROOT)}:")

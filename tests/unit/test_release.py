@@ -8,7 +8,7 @@ import yaml  # type: ignore[import-untyped]
 from scripts.release_check import (
     CHART,
     Release,
-    Wrong,
+    ReleaseFault,
     adapt,
     chart_changes,
     check_versions,
@@ -30,7 +30,7 @@ def test_one_version_everywhere() -> None:
 
 
 def test_another_version_is_named_with_its_place() -> None:
-    with pytest.raises(Wrong, match=r"Chart\.yaml, appVersion"):
+    with pytest.raises(ReleaseFault, match=r"Chart\.yaml, appVersion"):
         check_versions(release("9.9.9"))
 
 
@@ -39,7 +39,7 @@ def test_a_release_has_its_entry_in_the_changelog(tmp_path: Path) -> None:
     changelog.write_text("# Changelog\n\n## [Unreleased]\n\n## [1.2.3] - 2030-01-31\n\n- x\n")
     assert newest(changelog) == "1.2.3"
     changelog.write_text("# Changelog\n\n## [Unreleased]\n\n- new\n\n## [1.2.3] - 2030-01-31\n")
-    with pytest.raises(Wrong, match="Unreleased"):
+    with pytest.raises(ReleaseFault, match="Unreleased"):
         newest(changelog)
 
 

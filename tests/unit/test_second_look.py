@@ -9,7 +9,15 @@ from pathlib import Path
 import pytest
 from scripts import layers
 from scripts.layers import LAYERS, Layer
-from scripts.second_look import ALLOWED, MOST, Case, flakes, read_cases, too_many, worth_a_look
+from scripts.second_look import (
+    MOST_FAILED,
+    MOST_FLAKY,
+    Case,
+    flakes,
+    flaky_failure,
+    is_worth_second_run,
+    read_cases,
+)
 
 TESTS = """
 from pathlib import Path
@@ -87,16 +95,18 @@ def test_a_flake_tells_both_durations() -> None:
 
 
 def test_so_many_flaky_tests_refuse_a_run() -> None:
-    assert [bool(too_many(count, strict=False)) for count in (0, ALLOWED, ALLOWED + 1)] == [
-        *(False, False, True)
-    ]
-    assert [bool(too_many(count, strict=True)) for count in (0, 1)] == [False, True]
+    assert [
+        bool(flaky_failure(count, strict=False)) for count in (0, MOST_FLAKY, MOST_FLAKY + 1)
+    ] == [*(False, False, True)]
+    assert [bool(flaky_failure(count, strict=True)) for count in (0, 1)] == [False, True]
 
 
 def test_a_run_in_which_all_fails_ends_soon() -> None:
-    few = [case(str(n), failed=True) for n in range(MOST)]
-    assert worth_a_look([*few, *(replace(failure, failed=False, passed=True) for failure in few)])
-    assert not worth_a_look([*few, case("more", failed=True)])
+    few = [case(str(n), failed=True) for n in range(MOST_FAILED)]
+    assert is_worth_second_run(
+        [*few, *(replace(failure, failed=False, passed=True) for failure in few)]
+    )
+    assert not is_worth_second_run([*few, case("more", failed=True)])
 
 
 def test_each_layer_runs_once_and_what_is_pure_has_no_second_look() -> None:
