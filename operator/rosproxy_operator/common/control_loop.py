@@ -4,8 +4,9 @@ A reason is an event (`wake`), a time (`wake_in`, or the result of the look), or
 is level-triggered: each look reads the whole state. So an event needs no content, and a burst of
 events costs a single look.
 
-After a failed look, the loop pauses (`PAUSES`). Events do not shorten the pause, because more
-requests do not help an engine that does not answer. `retry` ends the pause: the engine is back.
+After a failed look, the loop pauses (`RETRY_PAUSES_S`). Events do not shorten the pause, because
+more requests do not help an engine that does not answer. `retry` ends the pause: the engine is
+back.
 
 The loop does not depend on the engine. All times are times of the event loop's clock, so tests can
 advance the clock.
@@ -21,14 +22,14 @@ from rosproxy_operator.common.operator_metrics import CommonMetrics
 
 log = logging.getLogger(__name__)
 
-PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
+RETRY_PAUSES_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Seconds from a failed look to the next look; the last value repeats."""
-BEAT = 1.0
-"""Seconds between two notes of the event loop that it runs."""
-LONGEST_BEAT = 20.0
-"""Seconds without a note after which the event loop counts as hanging."""
+BEAT_INTERVAL_S = 1.0
+"""Seconds between two times at which the event loop notes that it runs."""
+HANGING_AFTER_S = 20.0
+"""Seconds without such a note after which the event loop counts as hanging."""
 
-UNSETTLED = 1.0
+UNSETTLED_RECHECK_S = 1.0
 """Seconds until the next look of `ControlLoop.run_until` without an event."""
 
 Look = Callable[[], Awaitable[float | None]]
@@ -106,7 +107,7 @@ class ControlLoop:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(seconds):
                     while not (await self._try(look, patient=False) and settled()):
-                        await self._pause(UNSETTLED)
+                        await self._pause(UNSETTLED_RECHECK_S)
 
     @property
     def woken(self) -> bool:
@@ -155,7 +156,7 @@ class ControlLoop:
             return None
         now = self._loop.time()
         since = self._looking_since
-        if now - self._beat_at > LONGEST_BEAT:
+        if now - self._beat_at > HANGING_AFTER_S:
             return f"the event loop has not run for {now - self._beat_at:.0f} s"
         if since is not None and now - since > self._pace.longest:
             return f"a look at the {self._pace.engine} has lasted for {now - since:.0f} s"
@@ -214,7 +215,7 @@ class ControlLoop:
         """Wait until the next look is due."""
         if self._failures:
             reason = self._back
-            seconds = PAUSES[min(self._failures, len(PAUSES)) - 1]
+            seconds = RETRY_PAUSES_S[min(self._failures, len(RETRY_PAUSES_S)) - 1]
         else:
             reason = self._woken
             seconds = resync if self._again_in is None else min(resync, self._again_in)
@@ -240,4 +241,4 @@ class ControlLoop:
     async def _beat(self, loop: asyncio.AbstractEventLoop) -> None:
         while True:
             self._beat_at = loop.time()
-            await asyncio.sleep(BEAT)
+            await asyncio.sleep(BEAT_INTERVAL_S)

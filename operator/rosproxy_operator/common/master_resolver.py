@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Mapping
 from rosproxy.net.addresses import is_address, is_loopback, plain_address
 from rosproxy.net.resolver import resolve
 
-AGAIN = 15.0
+RESOLVE_INTERVAL_S = 15.0
 """Seconds after which the resolver resolves a name again."""
-AGAIN_UNRESOLVED = 3.0
+UNRESOLVED_RETRY_S = 3.0
 """Seconds after which the resolver retries a name without an address."""
 
 
@@ -59,7 +59,7 @@ class MasterResolver:
             self._changed()
 
     def _age(self, host: str) -> float:
-        return AGAIN if host in self._resolved else AGAIN_UNRESOLVED
+        return RESOLVE_INTERVAL_S if host in self._resolved else UNRESOLVED_RETRY_S
 
     async def _ask(self, hosts: list[str]) -> None:
         answers = await asyncio.gather(*map(resolve, hosts))

@@ -1,9 +1,9 @@
 """The live page of all proxies of an operator, served like the page of a proxy (`rosproxy.page`).
 
 While a page is open, the operator requests the document of every proxy in rounds, with pauses of
-`EVERY` seconds. The requests also keep the proxies collecting data. Without an open page, the
-operator requests nothing. The page answers only callers on loopback, because a user with the token
-of a single proxy must not see all proxies.
+`ROUND_PAUSE_S` seconds. The requests also keep the proxies collecting data. Without an open page,
+the operator requests nothing. The page answers only callers on loopback, because a user with the
+token of a single proxy must not see all proxies.
 """
 
 import asyncio
@@ -19,7 +19,7 @@ from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
 from rosproxy_operator.common.merged_page import merged
 
-EVERY = 2.0
+ROUND_PAUSE_S = 2.0
 """Seconds from the end of a round to the next round."""
 Documents = Callable[[], Awaitable[Mapping[str, Document | str]]]
 
@@ -31,6 +31,6 @@ def operator_page(documents: Documents, logs: Callable[[str], str]) -> Page:
         while True:
             proxy_documents = await documents()
             yield await asyncio.to_thread(merged, proxy_documents, __version__, logs)
-            await asyncio.sleep(EVERY)
+            await asyncio.sleep(ROUND_PAUSE_S)
 
     return Page(Feed(Tasks(), make), Visitors(None, time.monotonic, local=True))

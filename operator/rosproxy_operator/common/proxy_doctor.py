@@ -12,7 +12,7 @@ from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, Severity,
 from rosproxy.telemetry.text import brief
 
 MOST_FINDINGS = 500
-LONGEST_TEXT = 2000
+MOST_TEXT_CHARACTERS = 2000
 """Characters of a text at most."""
 _SEVERITIES = {severity.name.lower(): severity for severity in Severity}
 
@@ -66,6 +66,6 @@ def _words(finding: DoctorFinding) -> set[str]:
 def _finding(proxy: str, row: Mapping[str, Any]) -> DoctorFinding:
     severity = _SEVERITIES[row["severity"]]
     check, subject, text, fix = (
-        brief(str(row[key]), LONGEST_TEXT) for key in ("check", "subject", "text", "fix")
+        brief(str(row[key]), MOST_TEXT_CHARACTERS) for key in ("check", "subject", "text", "fix")
     )
     return DoctorFinding(severity, check, f"{proxy}: {subject}" if subject else proxy, text, fix)

@@ -15,7 +15,7 @@ from rosproxy.net.addresses import parse_host_port, plain_address
 
 Leases = Mapping[str, tuple[int, ...]]
 """The ports of participants by GUID prefix, in the order of the participant's locators."""
-MOST_LEASED = 512
+MOST_PARTICIPANTS = 512
 """Participants whose ports the operator keeps. A proxy has no more participants inside
 (docs/reference/limits.md)."""
 MOST_PORTS = 16
@@ -54,7 +54,7 @@ def leases(status: ProxyStatus) -> Leases:
         participant.guid_prefix: tuple(
             lease.port for lease in participant.leases[:MOST_PORTS] if lease.port <= _LAST_PORT
         )
-        for participant in islice(readable, MOST_LEASED)
+        for participant in islice(readable, MOST_PARTICIPANTS)
     }
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 from rosproxy.telemetry.text import brief
 
-LONGEST_VALUE = 80
+MOST_VALUE_CHARACTERS = 80
 """Characters of a variable's value in a report at most."""
 
 _PROFILE = (
@@ -60,5 +60,5 @@ def why_unheard(variables: Mapping[str, str]) -> str:
     for name, (keeps_apart, text) in _KEEP_APART.items():
         value = variables.get(name, "")
         if value and keeps_apart(value):
-            return f"variable {name}={brief(value, LONGEST_VALUE)}. {text}"
+            return f"variable {name}={brief(value, MOST_VALUE_CHARACTERS)}. {text}"
     return ""

@@ -3,9 +3,9 @@
 import difflib
 from functools import lru_cache
 
-VERY_NEAR = 0.9
+LEAST_SIMILARITY = 0.9
 """Least similarity (0 to 1) of any name: a less similar name may belong to another program."""
-NEAR = 0.75
+LEAST_SIMILARITY_WITH_PREFIX = 0.75
 """Least similarity of a name that begins like the operator's names."""
 
 

@@ -27,7 +27,7 @@ from rosproxy_operator.common.control_loop import (
     LookImpossible,
     Pace,
 )
-from rosproxy_operator.common.master_resolver import AGAIN_UNRESOLVED, MasterResolver
+from rosproxy_operator.common.master_resolver import UNRESOLVED_RETRY_S, MasterResolver
 from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_metrics import DockerMetrics
 from rosproxy_operator.common.operator_page import operator_page
@@ -51,13 +51,13 @@ from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
 log = logging.getLogger(__name__)
 
-DEBOUNCE = 0.05
-"""Shortest time in seconds between two looks: ``compose up`` causes dozens of events."""
-SETTLED = 0.25
+LEAST_LOOK_INTERVAL_S = 0.05
+"""Least seconds between two looks: ``compose up`` causes dozens of events."""
+EVENT_RECHECK_S = 0.25
 """Seconds from an event to a further look: some events come before the engine's lists change."""
-LONGEST_LOOK = 60.0
+LOOK_TIMEOUT_S = 60.0
 """Seconds after which the loop cancels a look."""
-ONCE = 60.0
+COMMAND_TIMEOUT_S = 60.0
 """Seconds in which ``--once`` and ``uninstall`` must finish."""
 
 Decide = Callable[[HostState, LabelReading, PlanSettings, DockerMemory, float], DockerPlan]
@@ -70,13 +70,13 @@ def run_once(settings: PlanSettings, resync: float, mistakes: Sequence[Problem])
     ``mistakes`` as in `run`.
     """
     controller = DockerController(settings, resync, DockerMetrics(), mistakes=mistakes)
-    return asyncio.run(controller.run_once(ONCE))
+    return asyncio.run(controller.run_once(COMMAND_TIMEOUT_S))
 
 
 def uninstall(settings: PlanSettings, resync: float) -> list[Problem]:
     """Remove everything that operators created on this host. Return problems. Raises LookFailed."""
     controller = DockerController(settings, resync, DockerMetrics(), decide=Uninstall())
-    return asyncio.run(controller.run_once(ONCE))
+    return asyncio.run(controller.run_once(COMMAND_TIMEOUT_S))
 
 
 def run(
@@ -128,7 +128,7 @@ class DockerController:
         self._metrics = metrics
         self._decide = decide
         self._mistakes = mistakes
-        pace = Pace("engine", resync, DEBOUNCE, LONGEST_LOOK)
+        pace = Pace("engine", resync, LEAST_LOOK_INTERVAL_S, LOOK_TIMEOUT_S)
         self._loop = loop = ControlLoop(pace, metrics)
         self.dead = loop.dead
         self.unready = loop.unready
@@ -150,7 +150,7 @@ class DockerController:
     async def run(self) -> None:
         """Reconcile until cancelled. The proxies go on without the operator."""
         listen(self._engine, self._hear)
-        self._tasks.repeat(self._masters.refresh, AGAIN_UNRESOLVED, "resolving masters")
+        self._tasks.repeat(self._masters.refresh, UNRESOLVED_RETRY_S, "resolving masters")
         try:
             await self._loop.run(self.look)
         finally:
@@ -225,7 +225,7 @@ class DockerController:
         self._memory = planned.memory
         self._last = (snapshot, planned)
         if snapshot.state.busy and not self._observer.waiting:
-            self._loop.wake_in(SETTLED)  # no event reports that the list is up to date
+            self._loop.wake_in(EVENT_RECHECK_S)  # no event reports that the list is up to date
         self._proxy_sync.update(snapshot, planned.members)  # first: calls of new nodes wait
         self._executor.start(
             planned.groups, lambda action: self._docker_actions.carry_out(action, snapshot), started
@@ -307,7 +307,7 @@ class DockerController:
         elif container := engine_json.container_of(event):
             self._observer.note_event(container)
         self._loop.wake()
-        self._loop.wake_in(SETTLED)
+        self._loop.wake_in(EVENT_RECHECK_S)
 
     async def _close(self) -> None:
         await self._tasks.cancel()

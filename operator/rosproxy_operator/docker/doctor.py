@@ -18,8 +18,8 @@ from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.host_status import HostStatus
 
-AT_ONCE = 4
-"""Doctors of proxies that run at the same time: each doctor is a Python process."""
+MOST_DOCTORS = 4
+"""The highest number of doctors that run at the same time: each is a Python process."""
 _CAUSES = ("engine", "proxy image", "network", "master", "container", "proxy")
 """The kinds of subjects, causes before consequences."""
 _BEING_MADE = ("absent", "created")
@@ -37,7 +37,7 @@ def examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding]:
 async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding]:
     status = await host.now()
     engine = DockerClient()
-    limit = asyncio.Semaphore(AT_ONCE)
+    limit = asyncio.Semaphore(MOST_DOCTORS)
 
     async def ask(name: str) -> list[DoctorFinding]:
         async with limit:

@@ -28,11 +28,11 @@ from rosproxy_operator.docker.errors import (
 
 Json = dict[str, Any]
 DEFAULT_SOCKET = "unix:///var/run/docker.sock"
-READ_TIMEOUT = 20
+READ_TIMEOUT_S = 20
 """Seconds in which the engine must answer a read call."""
-WRITE_TIMEOUT = 300
+WRITE_TIMEOUT_S = 300
 """Seconds for a call that changes something: 1000 ports to publish or free take a minute."""
-RUN_TIMEOUT = 60
+RUN_TIMEOUT_S = 60
 """Seconds for a command in a container: the doctor waits for nodes that do not answer."""
 FILTERS = {
     "type": ["container", "network", "image"],
@@ -43,7 +43,7 @@ FILTERS = {
     ],
 }
 """Events that may change a plan, without the many of health checks and ``docker exec``."""
-PAUSES = (0.2, 0.5, 1.0, 2.0, 5.0)
+LISTEN_RETRY_PAUSES_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Seconds before each new attempt to listen to events; the last value repeats."""
 
 
@@ -71,28 +71,28 @@ class DockerClient:
 
     def containers(self) -> list[Json]:
         """List all containers, in all states."""
-        return list(self._call(READ_TIMEOUT, "containers", all=True))
+        return list(self._call(READ_TIMEOUT_S, "containers", all=True))
 
     def container(self, name: str) -> Json:
         """Inspect a container, by id or name."""
-        inspected: Json = self._call(READ_TIMEOUT, "inspect_container", name)
+        inspected: Json = self._call(READ_TIMEOUT_S, "inspect_container", name)
         return inspected
 
     def networks(self) -> list[Json]:
         """List all networks."""
-        return list(self._call(READ_TIMEOUT, "networks"))
+        return list(self._call(READ_TIMEOUT_S, "networks"))
 
     def image_id(self, image: str) -> str:
         """Return the id of an image; empty if the host does not have the image."""
         try:
-            return str(self._call(READ_TIMEOUT, "inspect_image", image)["Id"])
+            return str(self._call(READ_TIMEOUT_S, "inspect_image", image)["Id"])
         except NoSuchObject:
             return ""
 
     def run(self, container: str, *command: str) -> bytes:
         """Run a command in a running container until its end. Return the stdout."""
-        instance = self._call(READ_TIMEOUT, "exec_create", container, list(command), stderr=False)
-        output: bytes = self._call(RUN_TIMEOUT, "exec_start", instance["Id"])
+        instance = self._call(READ_TIMEOUT_S, "exec_create", container, list(command), stderr=False)
+        output: bytes = self._call(RUN_TIMEOUT_S, "exec_start", instance["Id"])
         return output
 
     def events(self) -> Iterator[Json]:
@@ -109,7 +109,7 @@ class DockerClient:
 
     def do(self, method: str, *arguments: Any, **keywords: Any) -> None:
         """Call a method of the SDK's APIClient that changes something."""
-        self._call(WRITE_TIMEOUT, method, *arguments, **keywords)
+        self._call(WRITE_TIMEOUT_S, method, *arguments, **keywords)
 
     def _call(self, within: int, method: str, *arguments: Any, **keywords: Any) -> Any:
         """Call a method of an SDK client that is idle: threads must not share a client."""
@@ -128,10 +128,10 @@ class DockerClient:
         if self.url.startswith("unix://"):
             # Without a listener, the SDK would leave a socket open after each attempt.
             with socket.socket(socket.AF_UNIX) as probe:
-                probe.settimeout(READ_TIMEOUT)
+                probe.settimeout(READ_TIMEOUT_S)
                 probe.connect(self.url.removeprefix("unix://"))
         version = self._version or "auto"
-        client = docker.APIClient(version=version, timeout=READ_TIMEOUT, **kwargs_from_env())
+        client = docker.APIClient(version=version, timeout=READ_TIMEOUT_S, **kwargs_from_env())
         self._version = client.api_version
         major, _, minor = self._version.partition(".")
         self._last_version = (int(major), int(minor))
@@ -177,7 +177,7 @@ def listen(engine: DockerClient, tell: Callable[[Json | None], None]) -> None:
                 loop.call_soon_threadsafe(tell, None)
                 for event in events:
                     loop.call_soon_threadsafe(tell, event)
-            time.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
+            time.sleep(LISTEN_RETRY_PAUSES_S[min(failures, len(LISTEN_RETRY_PAUSES_S) - 1)])
             failures += 1
 
     threading.Thread(target=work, daemon=True, name="events").start()

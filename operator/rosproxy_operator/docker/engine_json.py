@@ -27,7 +27,7 @@ _VARIABLES = OF_ROS2 | {
 }
 """Variables that show the version of ROS in a container, and how the nodes find each other."""
 _KEPT_VARIABLES = _VARIABLES | {"ROS_MASTER_URI", FORMER_TOKEN}
-LONGEST_TEXT = 4096
+MOST_TEXT_CHARACTERS = 4096
 """Characters of a variable or an argument that the operator keeps; longer texts get an ellipsis.
 
 An image may have megabytes of both, and the operator keeps these as long as the container exists.
@@ -105,7 +105,7 @@ def check_inspection(inspection: object) -> Json:
         "Cmd": islice(config.get("Cmd") or (), MOST_ARGUMENTS),
     }
     for key, items in texts.items():
-        config[key] = [bounded(text, LONGEST_TEXT) for text in items]
+        config[key] = [bounded(text, MOST_TEXT_CHARACTERS) for text in items]
     return {**document, "Config": config}
 
 

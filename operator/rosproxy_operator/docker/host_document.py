@@ -15,7 +15,7 @@ from rosproxy.telemetry.text import brief, listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json
 from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
-from rosproxy_operator.common.ros2_variables import LONGEST_VALUE, why_unheard
+from rosproxy_operator.common.ros2_variables import MOST_VALUE_CHARACTERS, why_unheard
 from rosproxy_operator.common.zenoh import SESSION_FILE
 from rosproxy_operator.docker.planner.model import (
     ZENOH,
@@ -33,9 +33,9 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 ProxyStatuses = Mapping[str, ProxyStatus]
 """The status of each proxy that answers, by container name."""
-STARTING = 8.0
+PROXY_STARTING_S = 8.0
 """Seconds after the start of a proxy in which a missing answer is no problem."""
-SETTLED = 15.0
+NODES_STARTING_S = 15.0
 """Seconds after the start of container and proxy in which missing nodes are no problem."""
 
 
@@ -182,11 +182,11 @@ def _redirects(
 
 
 def just_started(observed: HostState, now: float) -> frozenset[str]:
-    """Return the names of proxies started less than STARTING seconds ago; ``now`` is Unix time."""
+    """Return the names of proxies started in the last `PROXY_STARTING_S`; ``now`` is Unix time."""
     containers = (proxy.container for proxy in observed.proxies)
     ages = {container.name: now - _unix_time(container.started_at) for container in containers}
     # If the clock of the engine's machine is ahead, the age is negative and says nothing.
-    return frozenset(name for name, age in ages.items() if 0 <= age < STARTING)
+    return frozenset(name for name, age in ages.items() if 0 <= age < PROXY_STARTING_S)
 
 
 def _silent(
@@ -238,15 +238,15 @@ def _unconnected(
             yield Problem(
                 f"container {container.name}",
                 "no node of this container has connected to the proxy. Possible cause: variable "
-                f"{SESSION_FILE}={brief(file, LONGEST_VALUE)}. The file may name other "
+                f"{SESSION_FILE}={brief(file, MOST_VALUE_CHARACTERS)}. The file may name other "
                 "endpoints than tcp/localhost:7447. Unset the variable, or change the file",
             )
 
 
 def _is_settled(container: Container, status: ProxyStatus, now: float) -> bool:
-    """Return whether a container and the proxy have both run for SETTLED seconds."""
+    """Return whether a container and the proxy have both run for NODES_STARTING_S seconds."""
     age = now - _unix_time(container.started_at)
-    return container.state == "running" and min(status.uptime, age) >= SETTLED
+    return container.state == "running" and min(status.uptime, age) >= NODES_STARTING_S
 
 
 def _unix_time(text: str) -> float:

@@ -32,9 +32,9 @@ from rosproxy_operator.docker.snapshot import DockerObserver
 
 STEPS_LEFT = 3
 """The exit code of ``plan`` if actions are left."""
-WAIT_INTERVAL = 1.0
+WAIT_INTERVAL_S = 1.0
 """Seconds between two looks of ``--wait``."""
-ASKING = 10.0
+OPERATOR_ANSWER_TIMEOUT_S = 10.0
 """Seconds that the operator has to answer: the operator looks anew, and asks all proxies."""
 STATUS_INSPECTION_WAIT_S = 3.0
 """Seconds to wait for the inspection of containers: there is no second look."""
@@ -80,7 +80,7 @@ def ask_operators(first: HostPort) -> Json | None:
 def _ask(endpoint: HostPort) -> Json | None:
     client = AdminClient(default_url(str(endpoint)))
     try:
-        document = json.loads(client.get("/status", within=ASKING))
+        document = json.loads(client.get("/status", within=OPERATOR_ANSWER_TIMEOUT_S))
     except (AdminError, ValueError, RecursionError):
         return None
     # A proxy may listen at this endpoint. The status of a proxy has no field uplink.
@@ -120,7 +120,7 @@ def _await(host: HostStatus, seconds: float, good: Callable[[Json], bool]) -> Js
     """Return the first good status, or the status after so many seconds. Raises EngineError."""
     end = time.monotonic() + seconds
     while not good(status := asyncio.run(host.now())) and time.monotonic() < end:
-        time.sleep(WAIT_INTERVAL)
+        time.sleep(WAIT_INTERVAL_S)
     return status
 
 

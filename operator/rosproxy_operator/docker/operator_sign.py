@@ -10,8 +10,8 @@ import socket
 from rosproxy.net import signs
 from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
 
-MOST = 4
-"""Most endpoints that a command asks."""
+MOST_ENDPOINTS_ASKED = 4
+"""The highest number of endpoints that a command asks."""
 
 
 def publish_sign(admin: HostPort, engine: str) -> socket.socket | None:
@@ -23,14 +23,14 @@ def publish_sign(admin: HostPort, engine: str) -> socket.socket | None:
 
 
 def operators(first: HostPort, engine: str) -> list[HostPort]:
-    """Return endpoints at which operators of this engine may listen, MOST at most.
+    """Return endpoints at which operators of this engine may listen, MOST_ENDPOINTS_ASKED at most.
 
     ``first`` comes first, then the endpoints of the signs on loopback or a wildcard address.
     """
     matches = signs.read_all(_begin(engine) + r"/([0-9a-f.:\[\]]{1,60})")
     listeners = (parse_host_port(match[1]) for match in matches)
     near = (at for at in listeners if at and (is_loopback(at.host) or at.host in ("0.0.0.0", "::")))
-    return list(dict.fromkeys([first, *near]))[:MOST]
+    return list(dict.fromkeys([first, *near]))[:MOST_ENDPOINTS_ASKED]
 
 
 def _begin(engine: str) -> str:

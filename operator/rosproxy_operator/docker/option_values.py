@@ -12,13 +12,12 @@ MOST_PORTS = 1000
 """Most ports of a proxy. Each port costs the engine rules and, by default, a process."""
 NOWHERE = "none"
 """The value of ``--ros2-lan`` for no LAN."""
-LEAST_MEMORY = 64 * 1024**2
-MOST_MEMORY = 1024**4
+LEAST_MEMORY_BYTES = 64 * 1024**2
+MOST_MEMORY_BYTES = 1024**4
 """Least and most bytes of a memory bound. An idle proxy takes 32 MiB."""
 LEAST_PIDS = 256
 """Threads and processes that a proxy needs for a hundred connections."""
-LEAST_SECRET = 32
-"""Characters."""
+LEAST_SECRET_CHARACTERS = 32
 _MEMORY = re.compile(r"([0-9]{1,15})([bkmg]?)b?")
 _UNITS = {"": 1, "b": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
 _NETWORK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -78,7 +77,7 @@ def read_memory(text: str) -> int:
     """Return bytes of a size such as 512m or 1g; 0 for no bound. Raises ValueError."""
     match = _MEMORY.fullmatch(text.strip().lower())
     size = int(match[1]) * _UNITS[match[2]] if match else -1
-    if size and not LEAST_MEMORY <= size <= MOST_MEMORY:
+    if size and not LEAST_MEMORY_BYTES <= size <= MOST_MEMORY_BYTES:
         raise ValueError(
             f"{text[:40]!r} is neither a size from 64m to 1024g, such as 1g, nor 0 for no bound"
         )
@@ -99,7 +98,7 @@ def read_pids(text: str) -> int:
 def read_secret(path: str) -> str:
     """Return the stripped secret of a file; empty for no path.
 
-    Raises ValueError for an unreadable file, and for fewer than LEAST_SECRET characters.
+    Raises ValueError for an unreadable file, and for fewer than LEAST_SECRET_CHARACTERS characters.
     """
     if not path:
         return ""
@@ -108,10 +107,10 @@ def read_secret(path: str) -> str:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8"
         raise ValueError(f"{path} can't be read: {reason}") from None
-    if len(secret) < LEAST_SECRET:
+    if len(secret) < LEAST_SECRET_CHARACTERS:
         raise ValueError(
-            f"{path} has fewer than {LEAST_SECRET} characters. openssl rand -hex 32 prints a new "
-            "secret"
+            f"{path} has fewer than {LEAST_SECRET_CHARACTERS} characters. openssl rand -hex 32 "
+            "prints a new secret"
         )
     return secret
 

@@ -27,7 +27,7 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 from rosproxy_operator.common.proxy_status import Leases, inside_addresses, leases
-from rosproxy_operator.docker.host_document import STARTING
+from rosproxy_operator.docker.host_document import PROXY_STARTING_S
 from rosproxy_operator.docker.planner.model import ZENOH, Member
 from rosproxy_operator.docker.planner.proxy_update import NetworkFacts, ProxyUpdate, network_facts
 from rosproxy_operator.docker.settings import PlanSettings
@@ -35,7 +35,7 @@ from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
 log = logging.getLogger(__name__)
 
-PAUSES = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
+RETRY_PAUSES_S = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
 """Seconds until the operator asks a silent proxy again. The last pause is repeated."""
 
 
@@ -105,12 +105,16 @@ class ProxyUpdater:
                 logged = ""
             except ProxyError as error:
                 # Log each error once, and only after all pauses (19 s): the proxy may be starting.
-                if not error.is_unreachable and failures >= len(PAUSES) and str(error) != logged:
+                if (
+                    not error.is_unreachable
+                    and failures >= len(RETRY_PAUSES_S)
+                    and str(error) != logged
+                ):
                     logged = str(error)
                     text = "proxy not updated: %s, does not know which addresses may use it: %s"
                     log.warning(text, self._name, error, extra={"proxy": self._name})
                 self._selecting.set()
-                await asyncio.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
+                await asyncio.sleep(RETRY_PAUSES_S[min(failures, len(RETRY_PAUSES_S) - 1)])
                 failures += 1
 
     async def _keep_told(self) -> None:
@@ -119,7 +123,7 @@ class ProxyUpdater:
         while True:
             pause = self._update.next_due(time.monotonic())
             if failures:
-                pause = PAUSES[min(failures, len(PAUSES)) - 1]
+                pause = RETRY_PAUSES_S[min(failures, len(RETRY_PAUSES_S)) - 1]
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
                     await self._looked.wait()
@@ -236,8 +240,8 @@ class DockerProxySync:
         return name in self._running and self._running[name][0].silent_since is None
 
     def problems(self, snapshot: DockerSnapshot) -> list[Problem]:
-        """Return a problem for each proxy that has failed for at least `STARTING` seconds."""
-        lately = time.monotonic() - STARTING
+        """Return a problem for each proxy that has failed for `PROXY_STARTING_S` seconds."""
+        lately = time.monotonic() - PROXY_STARTING_S
         return [
             silence(name, updater.error, snapshot, self._settings.uplink)
             for name, (updater, _) in self._running.items()

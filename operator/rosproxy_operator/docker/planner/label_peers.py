@@ -15,7 +15,7 @@ from rosproxy_operator.docker.planner.labels.readers import PEERS
 from rosproxy_operator.docker.planner.model import ZENOH, Key, Member
 from rosproxy_operator.docker.settings import PlanSettings
 
-MOST_OF_PROXY = 256
+MOST_PEERS_OF_PROXY = 256
 """Most peers of a proxy from labels. These take 66 KiB: a host has 253 characters at most."""
 
 
@@ -48,7 +48,7 @@ def with_bounded_peers(
 
 
 def _most(key: Key) -> int:
-    return MOST_ZENOH_PEERS if key == ZENOH else MOST_OF_PROXY
+    return MOST_ZENOH_PEERS if key == ZENOH else MOST_PEERS_OF_PROXY
 
 
 def _ignored(key: Key) -> str:

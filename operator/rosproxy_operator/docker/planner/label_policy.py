@@ -18,7 +18,7 @@ from rosproxy_operator.docker.planner.model import Key, Member
 from rosproxy_operator.docker.planner.network_owner import ByReference, network_owner
 from rosproxy_operator.docker.settings import PlanSettings
 
-OUTLIVES = 10.0
+LAYERS_KEPT_S = 10.0
 """Seconds for which an address keeps the layers of a container that has gone.
 
 The proxy unregisters the nodes of that container a moment later. Until then the layers have to hide
@@ -70,7 +70,7 @@ def label_layers(
 
 
 class RecentLayers:
-    """The layers of containers' labels, also of containers that have gone OUTLIVES seconds ago."""
+    """The layers of containers' labels, also of containers gone in the last `LAYERS_KEPT_S`."""
 
     def __init__(self) -> None:
         self._last_seen: dict[tuple[PolicyLayer, str], float] = {}
@@ -91,7 +91,7 @@ class RecentLayers:
         recent = {
             pair: since
             for pair, since in self._last_seen.items()
-            if now < since + OUTLIVES and pair[1] not in taken
+            if now < since + LAYERS_KEPT_S and pair[1] not in taken
         }
         self._last_seen = recent | current
         # The proxy refuses a policy that is too large. So remembered layers are left out first.

@@ -2,8 +2,8 @@
 
 `network_facts` takes from a look what a single proxy needs. `ProxyUpdate` compares the facts with
 earlier facts and with the nodes of the proxy, and decides what to tell next, and when. If the proxy
-does not answer, arrivals stay due until the proxy answers, and moves for `MOVING` seconds. Times
-are seconds of a monotonic clock.
+does not answer, arrivals stay due until the proxy answers, and moves for `MOVE_REPEATED_FOR_S`
+seconds. Times are seconds of a monotonic clock.
 """
 
 import re
@@ -27,14 +27,16 @@ from rosproxy_operator.docker.planner.network_owner import ByReference, by_refer
 from rosproxy_operator.docker.planner.redirect import redirect_record_name
 from rosproxy_operator.docker.planner.specs import master
 
-AGAIN = (0.0, 1.0, 3.0, 10.0)
-"""Seconds after a container's arrival at which the operator tells the proxy of the arrival. The
-operator repeats the message, because nodes need time to register."""
-AGAIN_MOVED = 1.0
+ARRIVAL_MESSAGE_TIMES_S = (0.0, 1.0, 3.0, 10.0)
+"""Seconds after a container's arrival at which the operator tells the proxy of the arrival.
+
+The operator repeats the message, because nodes need time to register.
+"""
+MOVE_MESSAGE_INTERVAL_S = 1.0
 """Seconds between two messages about a move: the new address may not be reachable at once."""
-AWAY = 2.0
+ADDRESS_GONE_AFTER_S = 2.0
 """Seconds for which a running container may be off a network before the address counts as gone."""
-MOVING = 5.0
+MOVE_REPEATED_FOR_S = 5.0
 """Seconds for which the operator tells a proxy of a move, unless the proxy has found the nodes."""
 ContainerNetwork = tuple[str, str]
 """The id of a container, and the name of a network."""
@@ -104,7 +106,7 @@ class AddressHistory:
         missing = [place for place in self._at if place not in latest.addresses]
         self._absent = {place: self._absent.get(place, now) for place in missing}
         for place, since in list(self._absent.items()):
-            if place[0] not in latest.running or now >= since + AWAY:
+            if place[0] not in latest.running or now >= since + ADDRESS_GONE_AFTER_S:
                 del self._at[place], self._absent[place]
         for place, address in latest.addresses.items():
             previous = self._at.get(place, address)
@@ -115,7 +117,7 @@ class AddressHistory:
         self._moves = {
             old: (new, since)
             for old, (new, since) in self._moves.items()
-            if now < since + MOVING and old not in latest.addresses.values()
+            if now < since + MOVE_REPEATED_FOR_S and old not in latest.addresses.values()
         }
 
     def _follow(self, latest: NetworkFacts, now: float) -> None:
@@ -141,8 +143,8 @@ class AddressHistory:
     @property
     def next_expiry(self) -> float | None:
         """The time at which the first absence or move expires; None without absence and move."""
-        times = [since + AWAY for since in self._absent.values()]
-        times += [since + MOVING for _, since in self._moves.values()]
+        times = [since + ADDRESS_GONE_AFTER_S for since in self._absent.values()]
+        times += [since + MOVE_REPEATED_FOR_S for _, since in self._moves.values()]
         return min(times, default=None)
 
     def moved(self, nodes: Collection[str]) -> dict[str, str]:
@@ -173,7 +175,7 @@ class ProxyUpdate:
         self.policy = (*common, *self._layers.look(own, latest.taken, now))
         self._subnets |= set(latest.subnets)
         self._due = {
-            arrival: self._due.get(arrival, [now + after for after in AGAIN])
+            arrival: self._due.get(arrival, [now + after for after in ARRIVAL_MESSAGE_TIMES_S])
             for arrival in latest.arrivals
         }
 
@@ -215,7 +217,7 @@ class ProxyUpdate:
         """Return the seconds until the next update is due; None if no update is due."""
         times = [when for due in self._due.values() for when in due[:1]]
         times += [self._places.next_expiry] if self._places.next_expiry else []
-        times += [now + AGAIN_MOVED] if self._moving else []
+        times += [now + MOVE_MESSAGE_INTERVAL_S] if self._moving else []
         return max(min(times) - now, 0.0) if times else None
 
 

@@ -15,9 +15,9 @@ Status = Mapping[str, Any]
 
 PROXIES = ("PROXY", "STATE", "MASTER OR DOMAIN", "OUTSIDE", "PORTS")
 CONTAINERS = ("CONTAINER", "STATE", "PROXY", "PORTS", "NODES")
-LEAST_NAME = 20
+LEAST_NAME_COLUMNS = 20
 """Least columns of a name, even if the line is then too long."""
-MOST_LINES = 3
+MOST_NODE_LINES = 3
 """Most lines for the nodes of a container, and for the topics of a participant or node."""
 INDENT = "    "
 
@@ -123,12 +123,12 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
             yield from wrap(f"{redirect['master']} {effect}", columns, INDENT)
         if details:
             names = [clean(name) for node in container["nodes"] for name in node["names"]]
-            yield from wrap("  ".join(names), columns, INDENT, most=MOST_LINES)
+            yield from wrap("  ".join(names), columns, INDENT, most=MOST_NODE_LINES)
             for participant in container["participants"]:
                 text = _topics(participant["vendor"], participant)
-                yield from wrap(text, columns, INDENT, most=MOST_LINES)
+                yield from wrap(text, columns, INDENT, most=MOST_NODE_LINES)
             for node in container["zenoh_nodes"]:
-                yield from wrap(_topics(node["name"], node), columns, INDENT, most=MOST_LINES)
+                yield from wrap(_topics(node["name"], node), columns, INDENT, most=MOST_NODE_LINES)
         yield from _wrong(filter(None, (p["problem"] for p in container["participants"])), columns)
         # A container with both versions of ROS has two rows, and the report shows problems once.
         subject = f"container {container['name']}"
@@ -167,7 +167,7 @@ def _listing(title: str, texts: Sequence[str], columns: int) -> list[str]:
 
 
 def _table(rows: list[tuple[str, ...]], columns: int) -> list[str]:
-    room = max(columns - besides_first(rows), LEAST_NAME)
+    room = max(columns - besides_first(rows), LEAST_NAME_COLUMNS)
     return table(
         [tuple(shorten(cell, columns) for cell in row) for row in rows], len(rows[0]), room
     )

@@ -84,7 +84,7 @@ _ROLES = {
     CreateRedirect: ROLE_REDIRECT,
     CreateFlush: ROLE_FLUSH,
 }
-LAN_RELAY_MEMORY = 128 * 1024**2
+LAN_RELAY_MEMORY_BYTES = 128 * 1024**2
 """Bytes of memory that a LAN relay may have. A LAN relay takes 30 MiB."""
 LAN_RELAY_PIDS = 64
 """Threads that a LAN relay may have. A LAN relay has a single thread."""
@@ -113,7 +113,7 @@ only for ports with entries.
 HELPER_USER = "0:0"
 """Root. The capability of another user would need a program with file capabilities, and
 no-new-privileges makes file capabilities ineffective."""
-HELPER_MEMORY = 64 * 1024**2
+HELPER_MEMORY_BYTES = 64 * 1024**2
 """Bytes of memory that a helper may have. nft and conntrack take 5 MiB."""
 HELPER_PIDS = 16
 """Threads that a helper may have."""
@@ -365,7 +365,7 @@ def helper_config(settings: PlanSettings, network_mode: str) -> dict[str, Any]:
             "RestartPolicy": {"Name": "no"},
             "CapAdd": ["NET_ADMIN"],
             "Init": False,
-            "Memory": HELPER_MEMORY,
+            "Memory": HELPER_MEMORY_BYTES,
             "PidsLimit": HELPER_PIDS,
             "NetworkMode": network_mode,
         },
@@ -460,7 +460,7 @@ def lan_relay_config(action: CreateLanRelay, settings: PlanSettings, secret: str
         "HostConfig": {
             **COMMON,
             "Init": False,
-            "Memory": LAN_RELAY_MEMORY,
+            "Memory": LAN_RELAY_MEMORY_BYTES,
             "PidsLimit": LAN_RELAY_PIDS,
             "NetworkMode": "host",
         },

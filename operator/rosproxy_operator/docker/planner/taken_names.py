@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from rosproxy_operator.docker.planner.labels.readers import BUILT_IN
 from rosproxy_operator.docker.planner.model import Container, HostState
 
-MOST_REMEMBERED = 10_000
+MOST_REMEMBERED_NAMES = 10_000
 """Most names that the operator remembers. The names unseen for the longest time are dropped first.
 
 A container usually has two names on a network, and each name takes about 150 bytes.
@@ -78,4 +78,4 @@ def remember_names(
         if name not in short_ids
     }
     known = {place: holder for place, holder in former.items() if place not in current} | current
-    return dict(list(known.items())[-MOST_REMEMBERED:])
+    return dict(list(known.items())[-MOST_REMEMBERED_NAMES:])

@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Literal, NamedTuple
 
 from rosproxy.telemetry.text import clean, shorten
-from rosproxy_operator.common.spelling import VERY_NEAR, nearest
+from rosproxy_operator.common.spelling import LEAST_SIMILARITY, nearest
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.checks import texts_at
 from rosproxy_operator.kubernetes.resources.model import Json
@@ -70,7 +70,7 @@ def _texts(metadata: Json, kind: Kind) -> Iterator[str]:
             shown = f"{place} {shorten(clean(name), 100)}"
             if named:
                 yield f"{shown} is ignored here. The operator reads only {named}"
-            elif _is_ours(name) or nearest(name, tuple(_BY_NAME), VERY_NEAR):
+            elif _is_ours(name) or nearest(name, tuple(_BY_NAME), LEAST_SIMILARITY):
                 yield f"{shown} is unknown and ignored. {_meant(name, kind)}"
 
 

@@ -12,7 +12,7 @@ from rosproxy_operator.docker.planner.model import Container, Key, Network
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
-from rosproxy_operator.docker.planner.taken_names import MOST_REMEMBERED, remember_names
+from rosproxy_operator.docker.planner.taken_names import MOST_REMEMBERED_NAMES, remember_names
 from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import (
     APP,
@@ -253,15 +253,15 @@ def test_a_proxy_that_can_not_be_made_leaves_a_container_its_name() -> None:
 
 def test_names_are_forgotten_when_there_are_too_many() -> None:
     present = {"app": {"db": frozenset({"db"})}}
-    crowd = {"app": {f"c{n}": frozenset({f"c{n}"}) for n in range(MOST_REMEMBERED - 1)}}
+    crowd = {"app": {f"c{n}": frozenset({f"c{n}"}) for n in range(MOST_REMEMBERED_NAMES - 1)}}
     former = remember_names({}, present, ())
     former = remember_names(former, crowd, ())
     assert former["app", "db"] == "db"
-    assert len(former) == MOST_REMEMBERED
+    assert len(former) == MOST_REMEMBERED_NAMES
     former = remember_names(
         former, {"app": {"c0": frozenset({"c0"}), "new": frozenset({"new"})}}, ()
     )
-    assert len(former) == MOST_REMEMBERED
+    assert len(former) == MOST_REMEMBERED_NAMES
     assert ("app", "db") not in former
     assert {("app", "c0"), ("app", "new")} <= former.keys()
 

@@ -16,7 +16,7 @@ from rosproxy.admin.status_document import (
 )
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.host_document import SETTLED, STARTING, host_document
+from rosproxy_operator.docker.host_document import NODES_STARTING_S, PROXY_STARTING_S, host_document
 from rosproxy_operator.docker.planner.model import ZENOH, Attachment, Key
 from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.planner.specs import proxy_name
@@ -77,8 +77,8 @@ TALKER = Attachment("app", "172.30.0.5")
 def told_of_talker(
     variables: Mapping[str, str],
     inside: Sequence[str] = (),
-    age: float = SETTLED,
-    uptime: float = SETTLED,
+    age: float = NODES_STARTING_S,
+    uptime: float = NODES_STARTING_S,
 ) -> list[str]:
     """The problems of a labelled ROS 2 container in the status of a host.
 
@@ -100,7 +100,8 @@ def told_of_talker(
 
 
 @pytest.mark.parametrize(
-    ("age", "is_told"), [(-3600.0, True), (1.0, False), (STARTING - 0.1, False), (STARTING, True)]
+    ("age", "is_told"),
+    [(-3600.0, True), (1.0, False), (PROXY_STARTING_S - 0.1, False), (PROXY_STARTING_S, True)],
 )
 def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) -> None:
     """Even if the engine's clock is ahead, later silence is a problem."""
@@ -170,10 +171,10 @@ def test_a_container_in_the_network_of_another_has_its_participants() -> None:
 @pytest.mark.parametrize(
     ("file", "remote", "age", "is_told"),
     [
-        ("/my.json5", "172.30.0.9:4000", SETTLED, True),
-        ("/my.json5", f"{TALKER.address}:4000", SETTLED, False),
+        ("/my.json5", "172.30.0.9:4000", NODES_STARTING_S, True),
+        ("/my.json5", f"{TALKER.address}:4000", NODES_STARTING_S, False),
         ("/my.json5", "172.30.0.9:4000", 1.0, False),
-        ("", "172.30.0.9:4000", SETTLED, False),
+        ("", "172.30.0.9:4000", NODES_STARTING_S, False),
     ],
 )
 def test_a_file_of_sessions_is_named_where_no_node_has_connected(
@@ -185,7 +186,7 @@ def test_a_file_of_sessions_is_named_where_no_node_has_connected(
     state = observed(talker)
     made = planned(state, SETTINGS, DockerMemory(), 0.0)
     sessions = (ZenohSessionStatus(7448, "peer", "1", "172.30.0.2:7448", remote),)
-    status = ProxyStatus(uptime=SETTLED, zenoh=ZenohStatus(sessions=sessions))
+    status = ProxyStatus(uptime=NODES_STARTING_S, zenoh=ZenohStatus(sessions=sessions))
     answers = {proxy_name(ZENOH): status}
     document = host_document(state, made, (), answers, SETTINGS, STARTED + age + 1)
     told = [problem["text"] for problem in document["problems"]]

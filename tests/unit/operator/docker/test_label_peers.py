@@ -1,7 +1,7 @@
 """The peers that the labels of all containers of a proxy name."""
 
 from rosproxy_operator.docker.planner.actions import Create
-from rosproxy_operator.docker.planner.label_peers import MOST_OF_PROXY
+from rosproxy_operator.docker.planner.label_peers import MOST_PEERS_OF_PROXY
 from rosproxy_operator.docker.planner.model import Container
 from rosproxy_operator.docker.planner.specs import container_config
 from rosproxy_operator.docker.planner.state import DockerMemory
@@ -23,7 +23,7 @@ def test_many_containers_with_peers_keep_no_proxy_from_starting() -> None:
     crowd = [of_domain(f"c{n:02}", 32) for n in range(20)]
     plan = planned(observed(*crowd, of_domain("few", 2)), SETTINGS, DockerMemory(), 0.0)
     (made,) = [action for action in plan.actions if isinstance(action, Create)]
-    assert len(made.peers) <= MOST_OF_PROXY
+    assert len(made.peers) <= MOST_PEERS_OF_PROXY
     assert len([peer for peer in made.peers if "few-" in peer]) == 2
     body = container_config(made, SETTINGS, SECRET, "")
     assert max(len(variable) for variable in body["Env"]) < 128 * 1024

@@ -9,7 +9,11 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import MOST_RULES, Rule, parse_rules
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.docker.planner.actions import Create
-from rosproxy_operator.docker.planner.label_policy import OUTLIVES, RecentLayers, with_bounded_rules
+from rosproxy_operator.docker.planner.label_policy import (
+    LAYERS_KEPT_S,
+    RecentLayers,
+    with_bounded_rules,
+)
 from rosproxy_operator.docker.planner.labels.readers import MOST_LABEL_RULES
 from rosproxy_operator.docker.planner.model import Attachment, Key, Member
 from rosproxy_operator.docker.planner.proxy_update import ProxyUpdate, network_facts
@@ -123,7 +127,7 @@ def test_what_a_container_that_has_gone_hid_stays_hidden_until_its_nodes_are_gon
     recent = RecentLayers()
     assert recent.look([layer("a", A)], {A}, 0.0) == (layer("a", A),)
     assert recent.look([], set(), 1.0) == (layer("a", A),)
-    assert recent.look([], set(), OUTLIVES) == ()
+    assert recent.look([], set(), LAYERS_KEPT_S) == ()
     recent.look([layer("a", A)], {A}, 0.0)
     assert recent.look([], {A}, 1.0) == ()  # another container has the address
 
@@ -132,7 +136,7 @@ def test_a_container_that_comes_back_elsewhere_has_one_layer() -> None:
     recent = RecentLayers()
     recent.look([layer("a", A)], {A}, 0.0)
     assert recent.look([layer("a", B)], {B}, 1.0) == (layer("a", A, B),)
-    assert recent.look([layer("a", B)], {B}, OUTLIVES) == (layer("a", B),)
+    assert recent.look([layer("a", B)], {B}, LAYERS_KEPT_S) == (layer("a", B),)
 
 
 def test_those_of_gone_containers_take_no_room_from_others() -> None:

@@ -4,8 +4,8 @@ import pytest
 
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels import members
-from rosproxy_operator.docker.planner.labels.members import MOST_LABELS, MOST_UNKNOWN
-from rosproxy_operator.docker.planner.labels.readers import LABELS, LONGEST_VALUE
+from rosproxy_operator.docker.planner.labels.members import MOST_LABELS, MOST_UNKNOWN_LABELS
+from rosproxy_operator.docker.planner.labels.readers import LABELS, MOST_VALUE_CHARACTERS
 from tests.unit.operator.docker.builders import ENABLED, container, observed, read_members
 
 LONGEST_PROBLEM = 1000
@@ -21,10 +21,10 @@ def told(**labels: str) -> list[Problem]:
 
 def test_unknown_labels_are_told_up_to_a_number() -> None:
     problems = told(**{f"rosproxy.x{n:05}": "y" for n in range(10_000)})
-    assert len(problems) == MOST_UNKNOWN + 1
+    assert len(problems) == MOST_UNKNOWN_LABELS + 1
     assert problems[-1].text == (
-        f"{10_000 - MOST_UNKNOWN} more labels rosproxy.… are unknown and ignored. Remove these "
-        "labels"
+        f"{10_000 - MOST_UNKNOWN_LABELS} more labels rosproxy.… are unknown and ignored. "
+        "Remove these labels"
     )
     assert not any(problem.fatal for problem in problems)
 
@@ -53,13 +53,13 @@ def test_the_spelling_of_many_labels_is_not_checked(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(members, "nearest", nearest)
     told(**{f"com.example.x{n:05}": "y" for n in range(10_000)})
-    assert len(checked) <= MOST_LABELS + MOST_UNKNOWN
+    assert len(checked) <= MOST_LABELS + MOST_UNKNOWN_LABELS
 
 
 @pytest.mark.parametrize("label", LABELS)
 @pytest.mark.parametrize("ros", ["1", "2"])
 def test_a_long_value_leaves_its_container_out(label: str, ros: str) -> None:
-    labels = {**ENABLED, "rosproxy.ros": ros, label: "a," * LONGEST_VALUE}
+    labels = {**ENABLED, "rosproxy.ros": ros, label: "a," * MOST_VALUE_CHARACTERS}
     seen = observed(container("bad", labels), container("good"))
     served, problems = read_members(seen)
     assert [member.container.name for member in served] == ["good"]

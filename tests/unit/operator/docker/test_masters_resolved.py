@@ -22,8 +22,8 @@ class Names:
 def names(monkeypatch: pytest.MonkeyPatch) -> Names:
     names = Names()
     monkeypatch.setattr(master_resolver, "resolve", names.resolve)
-    monkeypatch.setattr(master_resolver, "AGAIN", 0.0)
-    monkeypatch.setattr(master_resolver, "AGAIN_UNRESOLVED", 0.0)
+    monkeypatch.setattr(master_resolver, "RESOLVE_INTERVAL_S", 0.0)
+    monkeypatch.setattr(master_resolver, "UNRESOLVED_RETRY_S", 0.0)
     return names
 
 

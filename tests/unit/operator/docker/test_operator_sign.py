@@ -5,7 +5,7 @@ from contextlib import ExitStack, closing
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.docker.operator_sign import MOST, operators, publish_sign
+from rosproxy_operator.docker.operator_sign import MOST_ENDPOINTS_ASKED, operators, publish_sign
 
 ENGINE = "unix:///test.sock"
 DEFAULT = HostPort("127.0.0.1", 11313)
@@ -32,8 +32,8 @@ def test_nobody_is_asked_who_is_not_on_this_machine(host: str) -> None:
 
 def test_of_many_signs_some_are_asked() -> None:
     with ExitStack() as stack:
-        for number in range(2 * MOST):
+        for number in range(2 * MOST_ENDPOINTS_ASKED):
             sign = publish_sign(HostPort("0.0.0.0", 61400 + number), ENGINE)
             assert sign
             stack.enter_context(closing(sign))
-        assert len(operators(DEFAULT, ENGINE)) == MOST
+        assert len(operators(DEFAULT, ENGINE)) == MOST_ENDPOINTS_ASKED

@@ -210,7 +210,7 @@ async def test_a_proxy_that_says_too_much_is_told_what_is_new_by_what_it_said_la
 async def test_what_was_not_heard_is_told_again(
     tasks: Tasks, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(proxy_sync, "PAUSES", (0.0, 0.0))
+    monkeypatch.setattr(proxy_sync, "RETRY_PAUSES_S", (0.0, 0.0))
     proxies = Proxies()
     proxies.errors = [ProxyError("answers HTTP 400: selected: unknown field")] * 5
     sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
@@ -248,7 +248,7 @@ async def test_a_policy_is_told_before_who_may_use_it_and_only_when_it_has_chang
 async def test_without_its_policy_nobody_new_is_let_in(
     tasks: Tasks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(proxy_sync, "PAUSES", (0.0, 0.0))
+    monkeypatch.setattr(proxy_sync, "RETRY_PAUSES_S", (0.0, 0.0))
     proxies = Proxies()
     proxies.refuses = PolicyRefused("knows no policies")
     sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)

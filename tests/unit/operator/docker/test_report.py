@@ -173,7 +173,7 @@ def test_a_plan_waits_for_a_proxy_that_has_just_been_started(
         return looks.pop(0)
 
     monkeypatch.setattr(host_status, "survey", survey)
-    monkeypatch.setattr(host_status, "WAIT_INTERVAL", 0.0)
+    monkeypatch.setattr(host_status, "WAIT_INTERVAL_S", 0.0)
     host = HostStatus(PlanSettings(), operator=None)
     assert host_status.show_plan(host, as_json=False, wait=60) == 0
     assert capsys.readouterr().out.splitlines() == ["Nothing to do."]

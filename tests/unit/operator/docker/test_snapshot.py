@@ -11,8 +11,8 @@ from rosproxy_operator.common.master_resolver import MasterResolver
 from rosproxy_operator.docker import snapshot
 from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.engine_json import (
-    LONGEST_TEXT,
     MOST_ARGUMENTS,
+    MOST_TEXT_CHARACTERS,
     check_inspection,
     container_of,
     environment,
@@ -220,7 +220,7 @@ def test_what_is_kept_of_a_container_is_bounded() -> None:
     kept = kept_of(
         Env=[f"ROS_MASTER_URI={uri}"], Cmd=["a" * 1_000_000] * 1000, Entrypoint=None, User="1"
     )
-    assert len(str(kept["Config"])) < (MOST_ARGUMENTS + 1) * (LONGEST_TEXT + 10) + 100
+    assert len(str(kept["Config"])) < (MOST_ARGUMENTS + 1) * (MOST_TEXT_CHARACTERS + 10) + 100
     assert kept["Config"]["User"] == "1"
     # Cut off, a URI must not become another one.
     labels = {"rosproxy.enable": "true"}

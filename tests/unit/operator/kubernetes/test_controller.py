@@ -64,7 +64,7 @@ async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Ru
     monkeypatch.setattr(module, "DEBOUNCE", 0.01)
     monkeypatch.setattr(module, "SETTLED", 0.05)
     monkeypatch.setattr(module, "KEY_EVERY", 0.05)
-    monkeypatch.setattr(control_loop, "PAUSES", (0.02,))
+    monkeypatch.setattr(control_loop, "RETRY_PAUSES_S", (0.02,))
     monkeypatch.setattr(reflector, "PAUSES", (0.02,))
     monkeypatch.setattr(proxy_sync, "POLL_INTERVAL_S", 0.05)
     monkeypatch.setattr(proxy_sync, "STARTING_POLL_INTERVAL_S", 0.02)

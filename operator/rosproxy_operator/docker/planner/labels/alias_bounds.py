@@ -17,7 +17,7 @@ import re
 from fnmatch import fnmatchcase
 
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy_operator.docker.planner.labels.readers import LONGEST_HOST
+from rosproxy_operator.docker.planner.labels.readers import MOST_HOST_CHARACTERS
 from rosproxy_operator.docker.settings import PlanSettings
 
 LAN_SUFFIXES = ("local", "lan", "home", "localdomain", "home.arpa", "test")
@@ -46,7 +46,7 @@ def is_allowed_by_administrator(name: str, settings: PlanSettings) -> bool:
 
 def alias_refusal(name: str, settings: PlanSettings) -> str:
     """Return why labels may not give a proxy a name in lower case; empty for an allowed name."""
-    if not _HOST_NAME.fullmatch(name) or len(name) > LONGEST_HOST:
+    if not _HOST_NAME.fullmatch(name) or len(name) > MOST_HOST_CHARACTERS:
         return "the name is not a host name"
     if is_allowed_by_administrator(name, settings):
         return ""

@@ -7,7 +7,11 @@ from itertools import islice
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.common.ros2 import read_peer_name
-from rosproxy_operator.common.spelling import NEAR, VERY_NEAR, nearest
+from rosproxy_operator.common.spelling import (
+    LEAST_SIMILARITY,
+    LEAST_SIMILARITY_WITH_PREFIX,
+    nearest,
+)
 from rosproxy_operator.docker.planner.labels import bounds, readers, ros_versions
 from rosproxy_operator.docker.planner.labels.own_address import wrong_own_address
 from rosproxy_operator.docker.planner.labels.readers import (
@@ -30,9 +34,9 @@ _PREFIX = "rosproxy"
 _COUNTED = ALIVE | {"exited"}
 MOST_LABELS = 256
 """Labels of a container that are checked for their spelling. A check takes some 30 microseconds."""
-MOST_UNKNOWN = 8
+MOST_UNKNOWN_LABELS = 8
 """Unknown labels of a container with a warning each. Further unknown labels are only counted."""
-LONGEST_NAME = 80
+MOST_NAME_CHARACTERS = 80
 """Characters of a label's name in a warning."""
 
 
@@ -264,7 +268,7 @@ def _own(container: Container) -> list[str]:
     # Labels io.rosproxy.… are the operator's: io.rosproxy.domain is 0.91 near to rosproxy.domain.
     others = (name for name in container.labels if not name.startswith(f"io.{_PREFIX}."))
     checked = islice(others, MOST_LABELS)
-    near = [name for name in checked if nearest(name, LABELS, VERY_NEAR)]
+    near = [name for name in checked if nearest(name, LABELS, LEAST_SIMILARITY)]
     return sorted({*prefixed, *near})
 
 
@@ -285,16 +289,18 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
     if container.labels.get(ENABLE, "").strip().lower() == "false":
         return
     unknown = [name for name in own if name not in LABELS]
-    told = unknown[:MOST_UNKNOWN]
+    told = unknown[:MOST_UNKNOWN_LABELS]
     for name in told:
-        near = nearest(name, LABELS, NEAR)
+        near = nearest(name, LABELS, LEAST_SIMILARITY_WITH_PREFIX)
         fix = f"Did you mean {near}?" if near else f"Known labels: {', '.join(LABELS)}"
-        yield f"label {bounded(name, LONGEST_NAME)} is unknown and ignored. {fix}"
+        yield f"label {bounded(name, MOST_NAME_CHARACTERS)} is unknown and ignored. {fix}"
     if left_out := len(unknown) - len(told):
         yield f"{left_out} more labels {_PREFIX}.… are unknown and ignored. Remove these labels"
-    misspelt = any(nearest(name, LABELS, NEAR) == ENABLE for name in told)  # warned of above
+    misspelt = any(
+        nearest(name, LABELS, LEAST_SIMILARITY_WITH_PREFIX) == ENABLE for name in told
+    )  # warned of above
     if own and not misspelt and ENABLE not in container.labels and not settings.expose_by_default:
-        names = listed(f"label {bounded(name, LONGEST_NAME)}" for name in own)
+        names = listed(f"label {bounded(name, MOST_NAME_CHARACTERS)}" for name in own)
         yield f"{names} ignored, since the label {ENABLE}=true is missing. Add that label"
 
 

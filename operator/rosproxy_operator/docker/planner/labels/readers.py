@@ -44,9 +44,9 @@ BUILT_IN = frozenset({"bridge", "host", "none"})
 """Networks that every engine has. No names resolve there, so nodes can't find a proxy."""
 MOST_LABEL_RULES = 100
 """Most rules of a container."""
-LONGEST_VALUE = 16 * 1024
+MOST_VALUE_CHARACTERS = 16 * 1024
 """Most characters of a label's value. The rules of a container are the longest value."""
-LONGEST_HOST = 253
+MOST_HOST_CHARACTERS = 253
 """Most characters of a host name (RFC 1035, 2.3.4)."""
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
@@ -76,9 +76,11 @@ def named(label: str, labels: Labels) -> str:
 def refuse_long_values(labels: Labels) -> None:
     """Raise UnusableLabel for a long value, since the operator reads all values at each look."""
     for label in LABELS:
-        if len(labels.get(label, "")) > LONGEST_VALUE:
+        if len(labels.get(label, "")) > MOST_VALUE_CHARACTERS:
             fix = "Join rules by globs" if label == POLICY else "Shorten the value"
-            raise UnusableLabel(f"label {label} has more than {LONGEST_VALUE} characters. {fix}")
+            raise UnusableLabel(
+                f"label {label} has more than {MOST_VALUE_CHARACTERS} characters. {fix}"
+            )
 
 
 def enabled(labels: Labels) -> bool | None:
@@ -363,7 +365,9 @@ def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:
     """Return the canonical URI of a master: the host in lower case, no slash at the end."""
     host_port = parse_slave_uri(uri.strip())
     path = urlsplit(uri.strip()).path.rstrip("/") if host_port else ""
-    is_readable = host_port and host_port.host.isascii() and len(host_port.host) <= LONGEST_HOST
+    is_readable = (
+        host_port and host_port.host.isascii() and len(host_port.host) <= MOST_HOST_CHARACTERS
+    )
     if host_port is None or not is_readable or not _PATH.fullmatch(path):
         raise UnusableLabel(f"{source} is not of the form http://HOST:11311")
     host = host_port.host.lower()
