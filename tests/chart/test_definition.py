@@ -17,7 +17,12 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     RosProxyOnNode,
 )
 from rosproxy_operator.kubernetes.resources.model import Name, Pod
-from rosproxy_operator.kubernetes.resources.spec import MOST_NAME, MOST_PORTS, RULE_KINDS, rosproxy
+from rosproxy_operator.kubernetes.resources.spec import (
+    MOST_NAME_CHARACTERS,
+    MOST_PORTS,
+    RULE_KINDS,
+    rosproxy,
+)
 from rosproxy_operator.kubernetes.status.rosproxy_status import status_of
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, words
 from tests.chart.chart import Json
@@ -126,7 +131,7 @@ def test_defaults_are_the_operators(spec: Json) -> None:
 
 def test_limits_are_the_operators() -> None:
     assert SPEC["spec.ports"]["maximum"] == MOST_PORTS
-    assert f"size() <= {MOST_NAME}" in SCHEMA["x-kubernetes-validations"][0]["rule"]
+    assert f"size() <= {MOST_NAME_CHARACTERS}" in SCHEMA["x-kubernetes-validations"][0]["rule"]
 
 
 @pytest.mark.parametrize("name", WISHES)

@@ -38,9 +38,9 @@ from rosproxy_operator.kubernetes.status.event_findings import event_findings
 from rosproxy_operator.kubernetes.status.operator_findings import operator_findings
 from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
 
-AT_ONCE = 4
+MOST_DOCTORS = 4
 """Proxies checked at the same time: each doctor is a separate Python process in the pod."""
-WITHIN = 60
+DOCTOR_TIMEOUT_S = 60
 """Seconds for the doctor of a proxy: this doctor waits for nodes that may not answer."""
 
 
@@ -72,7 +72,7 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
     finally:
         api.close()
     proxies = running_proxies(own_pods)
-    with ThreadPoolExecutor(AT_ONCE) as threads:
+    with ThreadPoolExecutor(MOST_DOCTORS) as threads:
         answers = threads.map(lambda pod: [*_ask(pod["metadata"], names)], proxies)
         return [*findings, *without_names_of_others([*answers], names)]
 
@@ -110,7 +110,7 @@ def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
 
 
 def _run(namespace: str, pod: str, arguments: Sequence[str]) -> bytes:
-    """Return all output of a command in a pod, after at most `WITHIN` seconds."""
+    """Return all output of a command in a pod, after at most `DOCTOR_TIMEOUT_S` seconds."""
     with ApiClient(configuration()) as client:  # `stream` changes the client during the call
         channel = stream(
             CoreV1Api(client).connect_get_namespaced_pod_exec,
@@ -124,7 +124,7 @@ def _run(namespace: str, pod: str, arguments: Sequence[str]) -> bytes:
             _preload_content=False,
         )
         try:
-            channel.run_forever(timeout=WITHIN)
+            channel.run_forever(timeout=DOCTOR_TIMEOUT_S)
             return str(channel.read_stdout(timeout=1)).encode()
         finally:
             channel.close()

@@ -26,13 +26,18 @@ from rosproxy_operator.kubernetes.api.api_client import (
     ApiNotFound,
 )
 from rosproxy_operator.kubernetes.planner import leadership
-from rosproxy_operator.kubernetes.planner.leadership import LOOK, RENEW, Candidate, LeaseRecord
+from rosproxy_operator.kubernetes.planner.leadership import (
+    RENEWAL_INTERVAL_S,
+    STANDBY_READ_INTERVAL_S,
+    Candidate,
+    LeaseRecord,
+)
 from rosproxy_operator.kubernetes.resources.checks import int_at, submap, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 
 log = logging.getLogger(__name__)
 
-LONGEST = 60.0
+MOST_LEASE_DURATION_S = 60.0
 """Upper bound for the seconds that a Lease object lasts. No operator here writes a longer time."""
 
 
@@ -79,7 +84,8 @@ class LeaderElection:
             # Random pauses keep candidates from writing at once. After a failed renewal, a leader
             # also takes the short pause: little time is left to renew.
             calm = self.leads() and not self._error
-            await asyncio.sleep(RENEW if calm else LOOK * random.uniform(0.5, 1.0))  # noqa: S311
+            short_pause = STANDBY_READ_INTERVAL_S * random.uniform(0.5, 1.0)  # noqa: S311
+            await asyncio.sleep(RENEWAL_INTERVAL_S if calm else short_pause)
         await asyncio.Event().wait()  # `run` ends the process when any task ends
 
     def resign(self) -> None:
@@ -176,7 +182,7 @@ def lease_record(obj: Json) -> LeaseRecord:
     return LeaseRecord(
         version=text_at(submap(obj, "metadata"), "resourceVersion"),
         holder=text_at(spec, "holderIdentity"),
-        duration=min(float(int_at(spec, "leaseDurationSeconds")), LONGEST),
+        duration=min(float(int_at(spec, "leaseDurationSeconds")), MOST_LEASE_DURATION_S),
         transitions=int_at(spec, "leaseTransitions"),
         acquired=text_at(spec, "acquireTime"),
     )

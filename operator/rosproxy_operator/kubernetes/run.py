@@ -1,8 +1,8 @@
 """Start and end of the Kubernetes operator.
 
 After a signal, an operator with a Lease object first stops acting and releases the Lease object.
-Then the operator serves the webhook for `DRAINING` seconds, until kube-proxy sends no more requests
-to this pod.
+Then the operator serves the webhook for `WEBHOOK_DRAIN_S` seconds, until kube-proxy sends no more
+requests to this pod.
 """
 
 import asyncio
@@ -29,12 +29,12 @@ from rosproxy_operator.kubernetes.webhook.webhook_server import WebhookServer
 
 log = logging.getLogger(__name__)
 
-UNDER_WAY = 5.0
+REQUESTS_END_TIMEOUT_S = 5.0
 """Seconds for requests to end before the operator releases the Lease object.
 
 If a request takes longer, the operator does not release the Lease object, which then expires.
 """
-DRAINING = 6.0
+WEBHOOK_DRAIN_S = 6.0
 """Seconds for which the webhook is served after that, so that each kube-proxy notices the end."""
 
 
@@ -110,16 +110,16 @@ async def hand_over(api: Api, controller: KubernetesController, election: Leader
     """Stop acting, and release the Lease object once no request is under way."""
     election.resign()
     await controller.stop_acting()
-    if await in_thread(api.gate.close, UNDER_WAY):
+    if await in_thread(api.gate.close, REQUESTS_END_TIMEOUT_S):
         await election.release()
 
 
 async def _drain(server: WebhookServer, stopped: asyncio.Event) -> None:
-    """Serve the webhook for `DRAINING` seconds. A second signal ends the wait."""
+    """Serve the webhook for `WEBHOOK_DRAIN_S` seconds. A second signal ends the wait."""
     stopped.clear()
     server.drain()
     with contextlib.suppress(TimeoutError):
-        await asyncio.wait_for(stopped.wait(), DRAINING)
+        await asyncio.wait_for(stopped.wait(), WEBHOOK_DRAIN_S)
 
 
 def _first_reason(*checks: Callable[[], str | None]) -> Callable[[], str | None]:

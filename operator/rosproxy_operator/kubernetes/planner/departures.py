@@ -17,20 +17,20 @@ from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.model import ClusterNode
 
-UNKNOWN_ADDRESS_GRACE = 15.0
+UNKNOWN_ADDRESS_GRACE_S = 15.0
 """Seconds until an address in a node's pod networks counts as gone, if no pod was seen with it.
 
 A pod's containers run before the API server knows the address of the pod.
 """
-REMEMBERED = 15.0
+GONE_ADDRESS_KEPT_S = 15.0
 """Seconds that the operator remembers the address of a gone pod that no proxy reports.
 
 The report of a proxy may be older than the look. A node that has just registered is in the next
 report.
 """
-LONGEST = 3600.0
+SILENT_PROXY_ADDRESS_KEPT_S = 3600.0
 """The same time, in seconds, while a proxy of the node does not answer."""
-LOOK_AGAIN_AFTER = 3.0
+DEPARTURE_RECHECK_S = 3.0
 """Seconds to the next look after pods have gone."""
 
 
@@ -45,7 +45,7 @@ def find_departures(observed: ClusterSnapshot, state: ClusterState, now: float) 
     """Return the addresses that proxies report and that no running pod of the node has.
 
     An address that a pod of the node had at a former look counts as gone at once. Any other address
-    has to be in the pod networks of the node, and counts as gone after `UNKNOWN_ADDRESS_GRACE`
+    has to be in the pod networks of the node, and counts as gone after `UNKNOWN_ADDRESS_GRACE_S`
     seconds. Such an address does not count while a pod of the node has no address yet. Proxies that
     do not answer and nodes that are not ready are skipped.
     """
@@ -70,7 +70,9 @@ def find_departures(observed: ClusterSnapshot, state: ClusterState, now: float) 
         # A pod that the API server lists without an address may have the unseen address.
         has_pending = any(not pod.ip and not pod.host_network for pod in living)
         late = {
-            ip for ip, at in since.items() if now - at >= UNKNOWN_ADDRESS_GRACE and not has_pending
+            ip
+            for ip, at in since.items()
+            if now - at >= UNKNOWN_ADDRESS_GRACE_S and not has_pending
         }
         if addresses := (missing & last_seen[node.name].keys()) | late:
             departed[proxy.pod.uid] = tuple(sorted(addresses))
@@ -99,7 +101,7 @@ def _kept(
     """Return the addresses to remember: a proxy reports the address, or may still report it."""
     answered = [report for report in reports if report is not None and report.answered]
     named = {address for report in answered for address in report.addresses}
-    longest = REMEMBERED if len(answered) == len(reports) else LONGEST
+    longest = GONE_ADDRESS_KEPT_S if len(answered) == len(reports) else SILENT_PROXY_ADDRESS_KEPT_S
     return {ip: at for ip, at in last_seen.items() if ip in named or now - at < longest}
 
 
@@ -107,7 +109,7 @@ def next_checks(departed: Departures, now: float) -> Iterator[float]:
     """Yield the seconds until the next look that may find gone addresses."""
     # An address with another time than `now` is of a pod that this look has not seen.
     recent = (at for ips in departed.state.addresses.values() for at in ips.values() if at != now)
-    if departed.addresses or any(now - at < REMEMBERED for at in recent):
-        yield LOOK_AGAIN_AFTER
-    strange = (at + UNKNOWN_ADDRESS_GRACE - now for at in departed.state.strange.values())
+    if departed.addresses or any(now - at < GONE_ADDRESS_KEPT_S for at in recent):
+        yield DEPARTURE_RECHECK_S
+    strange = (at + UNKNOWN_ADDRESS_GRACE_S - now for at in departed.state.strange.values())
     yield from (seconds for seconds in strange if seconds > 0)

@@ -1,30 +1,34 @@
 """Decides which operator leads. Each operator decides by itself, from the same Lease object.
 
 The Lease object (coordination.k8s.io/v1) names the holder. The holder renews the object every
-`RENEW` seconds. The rules are from k8s.io/client-go, tools/leaderelection:
+`RENEWAL_INTERVAL_S` seconds. The rules are from k8s.io/client-go, tools/leaderelection:
 
-- The holder acts for `DEADLINE` seconds after a successful write, and stops unless the next write
-  succeeds. The time counts from before the operator sent the write.
-- An operator takes the Lease object after `DURATION` seconds without a new version, or after the
-  duration in the object if this is longer. The time counts from the operator's first read of the
-  version, which is after the write.
+- The holder acts for `RENEWAL_DEADLINE_S` seconds after a successful write, and stops unless the
+  next write succeeds. The time counts from before the operator sent the write.
+- An operator takes the Lease object after `LEASE_DURATION_S` seconds without a new version, or
+  after the duration in the object if this is longer. The time counts from the operator's first read
+  of the version, which is after the write.
 - A write succeeds only if the Lease object still has the version that was read (resourceVersion).
 
-`DURATION` is longer than `DEADLINE`, so the former leader has stopped before the next leader acts.
-Each operator counts on its own clock. The timestamps in the Lease object are only for people.
+`LEASE_DURATION_S` is longer than `RENEWAL_DEADLINE_S`, so the former leader has stopped before the
+next leader acts. Each operator counts on its own clock. The timestamps in the Lease object are only
+for people.
 """
 
 import msgspec
 from msgspec.structs import replace
 
-DURATION = 10.0
+LEASE_DURATION_S = 10.0
 """Seconds without a renewal after which another operator takes the Lease object."""
-DEADLINE = 6.0
-"""Seconds that a holder acts after a renewal. Requests under way may arrive until `DURATION`."""
-RENEW = 2.0
+RENEWAL_DEADLINE_S = 6.0
+"""Seconds that a holder acts after a renewal.
+
+Requests under way may arrive until `LEASE_DURATION_S`.
+"""
+RENEWAL_INTERVAL_S = 2.0
 """Seconds between two renewals."""
-LOOK = 1.0
-"""Longest time between two reads of the Lease object by a standby, in seconds."""
+STANDBY_READ_INTERVAL_S = 1.0
+"""Most seconds between two reads of the Lease object by a standby."""
 NEVER = float("-inf")
 NOBODY = "nobody"
 """Holder of a Lease object that an operator creates because there is none.
@@ -44,7 +48,7 @@ class LeaseRecord(msgspec.Struct, frozen=True):
 
     version: str
     holder: str = ""
-    duration: float = DURATION
+    duration: float = LEASE_DURATION_S
     transitions: int = 0
     acquired: str = ""
 
@@ -87,8 +91,8 @@ def next_record(candidate: Candidate, now: float) -> LeaseRecord | None:
     if record is None:  # a user may have deleted the Lease object while an operator acts
         return LeaseRecord("", NOBODY)
     if record.holder == candidate.name:
-        return replace(record, duration=DURATION)
-    if record.holder and now - since < max(record.duration, DURATION):
+        return replace(record, duration=LEASE_DURATION_S)
+    if record.holder and now - since < max(record.duration, LEASE_DURATION_S):
         return None
     return LeaseRecord(record.version, candidate.name, transitions=record.transitions + 1)
 
@@ -99,7 +103,7 @@ def after_write(candidate: Candidate, record: LeaseRecord, begun: float, now: fl
         return candidate
     # A renewal after `leads_until` begins a new term: the operator had stopped acting before.
     terms = candidate.terms if candidate.leads(now) else candidate.terms + 1
-    return replace(candidate, leads_until=begun + DEADLINE, terms=terms)
+    return replace(candidate, leads_until=begun + RENEWAL_DEADLINE_S, terms=terms)
 
 
 def after_resignation(candidate: Candidate) -> Candidate:

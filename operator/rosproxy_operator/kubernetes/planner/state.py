@@ -34,7 +34,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.status.findings import finding
 
-TRIED_FOR = 60.0
+TRIED_RANGE_REPORTED_S = 60.0
 """Seconds that the status reports that a proxy got other ports than the operator tried first."""
 
 
@@ -100,7 +100,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
         refused=waiting,
         taken=taken | dict.fromkeys(refused, now),
         moved=_recent(view, state.moved, now - MOVE_REPORTED_S),
-        tried=_recent(view, state.tried, now - TRIED_FOR),
+        tried=_recent(view, state.tried, now - TRIED_RANGE_REPORTED_S),
         unselected={p.id: state.unselected.get(p.id, now) for p in view.observed.unselected_pods},
     )
 

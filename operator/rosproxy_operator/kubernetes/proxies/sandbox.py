@@ -1,7 +1,8 @@
 """Events that say why the kubelet can't set up a proxy's pod, for example for a taken hostPort.
 
 The pod's status does not say so. The operator requests these Events while proxies wait for more
-than `PATIENCE` seconds: a single request for a namespace, at most every `EVERY` seconds.
+than `WAIT_BEFORE_REQUEST_S` seconds: a single request for a namespace, at most every
+`REQUEST_INTERVAL_S` seconds.
 """
 
 import asyncio
@@ -22,13 +23,13 @@ from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
 
 FAILED = "FailedCreatePodSandBox"
 """Reason of the kubelet's Event. Only this Event says that a hostPort was not free."""
-PATIENCE = 2.0
+WAIT_BEFORE_REQUEST_S = 2.0
 """Seconds for which a proxy's pod waits on its node before the operator requests Events."""
-EVERY = 3.0
+REQUEST_INTERVAL_S = 3.0
 """Seconds between two requests for a namespace's Events."""
 _IDS = re.compile(r"\b[0-9a-f]{32,64}\b")
 """Ids of sandboxes, as container runtimes write them."""
-_LONGEST = 300
+_MOST_MESSAGE_CHARACTERS = 300
 """Characters that are kept of a message."""
 
 
@@ -48,8 +49,16 @@ class SandboxFailures:
         uids = {p.pod.uid for p in waiting}
         self._waiting_since = {uid: self._waiting_since.get(uid, now) for uid in uids}
         self._messages = {uid: text for uid, text in self._messages.items() if uid in uids}
-        late = {p.of.namespace for p in waiting if now - self._waiting_since[p.pod.uid] >= PATIENCE}
-        due = [name for name in late if now - self._asked_at.get(name, -EVERY) >= EVERY]
+        late = {
+            p.of.namespace
+            for p in waiting
+            if now - self._waiting_since[p.pod.uid] >= WAIT_BEFORE_REQUEST_S
+        }
+        due = [
+            name
+            for name in late
+            if now - self._asked_at.get(name, -REQUEST_INTERVAL_S) >= REQUEST_INTERVAL_S
+        ]
         self._asked_at = {name: at for name, at in self._asked_at.items() if name in late}
         self._asked_at |= dict.fromkeys(due, now)
         event_lists = await asyncio.gather(*(in_thread(self._events, name) for name in due))
@@ -72,14 +81,14 @@ class SandboxFailures:
 
     def again_in(self) -> float | None:
         """Return the seconds until the next request for Events, None if no proxy waits."""
-        return EVERY if self._waiting_since else None
+        return REQUEST_INTERVAL_S if self._waiting_since else None
 
     def _shown(self, proxy: ProxyPod) -> ProxyPod:
         message = self._messages.get(proxy.pod.uid, "")
         if not message or not _waits(proxy):
             return proxy
         # Each try has a new sandbox id. Without the id, the message stays the same.
-        steady = clean(_IDS.sub("…", " ".join(message.split())))[:_LONGEST]
+        steady = clean(_IDS.sub("…", " ".join(message.split())))[:_MOST_MESSAGE_CHARACTERS]
         return replace(proxy, stuck=stuck_by_event(message), message=steady)
 
 

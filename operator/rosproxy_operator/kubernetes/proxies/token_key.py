@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 ENTRY = "key"
 """Name of the key's entry in the Secret's data."""
-LENGTH = 32
+KEY_BYTES = 32
 """Bytes of the key: the length of a SHA-256 hash (RFC 2104, section 3)."""
 
 
@@ -57,7 +57,7 @@ class TokenKey:
             manifest = self._api.get("secrets", self._secret)
             key = _read(manifest)
             if not key:
-                key = secrets.token_bytes(LENGTH)
+                key = secrets.token_bytes(KEY_BYTES)
                 self._put(self._secret, key, manifest)
         except ApiUnavailable:
             raise
@@ -81,7 +81,7 @@ class TokenKey:
 
     def _kept_key(self) -> bytes:
         """Return the last known key, or else a key that only this process has."""
-        self._cached_key = self._cached_key or secrets.token_bytes(LENGTH)
+        self._cached_key = self._cached_key or secrets.token_bytes(KEY_BYTES)
         return self._cached_key
 
     def _complain(self, error: ApiError) -> None:
@@ -100,4 +100,4 @@ def _read(secret: Json) -> bytes:
         key = base64.b64decode(text_at(submap(secret, "data"), ENTRY), validate=True)
     except binascii.Error:
         return b""
-    return key if len(key) >= LENGTH else b""
+    return key if len(key) >= KEY_BYTES else b""

@@ -47,23 +47,23 @@ _OPERATORS = frozenset(
 """Names that the operator sets. Users may copy such names, since some are in users' pods."""
 _PREFIXES = (f"{names.GROUP}/", "rosproxy.", "rosproxy/")
 _PLACES = {"label": "labels", "annotation": "annotations"}
-MOST = 3
+MOST_MISSPELT_NAMES = 3
 """Misspelt names that are reported for an object."""
-MOST_CHECKED = 256
+MOST_CHECKED_NAMES = 256
 """Labels of an object that are checked, and as many annotations. Each check takes 30 us."""
 
 
 def misspelt_names(metadata: Json, kind: Kind) -> tuple[str, ...]:
-    """Return a warning for each misspelt label and annotation of an object, at most `MOST`."""
+    """Return a warning for each misspelt name of an object, for at most `MOST_MISSPELT_NAMES`."""
     if names.is_own(texts_at(metadata, "labels")):
         return ()
-    return tuple(islice(_texts(metadata, kind), MOST))
+    return tuple(islice(_texts(metadata, kind), MOST_MISSPELT_NAMES))
 
 
 def _texts(metadata: Json, kind: Kind) -> Iterator[str]:
     for place, key in _PLACES.items():
         own_first = sorted(texts_at(metadata, key), key=lambda name: (not _is_ours(name), name))
-        for name in own_first[:MOST_CHECKED]:
+        for name in own_first[:MOST_CHECKED_NAMES]:
             named = _BY_NAME.get(name)
             if name in _OPERATORS or (named and (named.place, named.kind) == (place, kind)):
                 continue

@@ -63,11 +63,11 @@ TOKEN_VARIABLE = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
 """Variable in which former operators wrote the token itself."""
 
 _PREFIX = "rosproxy-"
-_DIGITS = 6
+_HASH_DIGITS = 6
 """Hex digits of the hash in a pod's name."""
-_LONGEST = 63
+_MOST_HOST_NAME_CHARACTERS = 63
 """Characters of a pod's host name. Kubernetes cuts off a longer pod name there."""
-_SLUG = 30
+_MOST_NODE_NAME_CHARACTERS = 30
 """Characters of the node's name in a pod's name."""
 
 
@@ -101,8 +101,11 @@ def proxy_id(rosproxy: Name, node: str) -> Name:
 
     The name is always the same. So the API server refuses a second pod for the same place.
     """
-    digest = hashlib.sha256(f"{rosproxy.name} {node}".encode()).hexdigest()[:_DIGITS]
-    room = min(_SLUG, _LONGEST - len(f"{_PREFIX}{rosproxy.name}--{digest}"))
+    digest = hashlib.sha256(f"{rosproxy.name} {node}".encode()).hexdigest()[:_HASH_DIGITS]
+    room = min(
+        _MOST_NODE_NAME_CHARACTERS,
+        _MOST_HOST_NAME_CHARACTERS - len(f"{_PREFIX}{rosproxy.name}--{digest}"),
+    )
     slug = re.sub(r"[^a-z0-9]+", "-", node.lower())[: max(room, 0)].strip("-")
     segments = (f"{_PREFIX}{rosproxy.name}", slug, digest)
     return Name(rosproxy.namespace, "-".join(s for s in segments if s))

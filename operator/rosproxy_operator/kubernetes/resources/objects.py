@@ -59,9 +59,9 @@ _RESTARTED = ("StatefulSet", "DaemonSet")
 """Kinds of pods' controllers that `kubectl rollout restart` takes directly."""
 MOST_CONTAINERS = 64
 """Containers that are kept of a pod, and as many values of ROS_MASTER_URI, to bound the memory."""
-LONGEST_TEXT = 2048
+MOST_TEXT_CHARACTERS = 2048
 """Characters that are kept of a variable, an annotation or an image. No usable URI is longer."""
-_LONGEST_LIST = 16 * 1024
+_MOST_LIST_CHARACTERS = 16 * 1024
 """Characters that are read of the annotation `names.ALLOW_FROM`."""
 
 
@@ -222,7 +222,9 @@ def policy(obj: Json) -> ProxyPolicy | None:
 
 def allowed_from(service: Json) -> frozenset[str]:
     """Return the other namespaces whose RosProxies may name a Service as master; ``*`` for all."""
-    text = text_at(submap(service, "metadata", "annotations"), names.ALLOW_FROM)[:_LONGEST_LIST]
+    text = text_at(submap(service, "metadata", "annotations"), names.ALLOW_FROM)[
+        :_MOST_LIST_CHARACTERS
+    ]
     namespaces = (namespace.strip() for namespace in text.split(","))
     return frozenset(n for n in namespaces if n == "*" or is_label(n))
 
@@ -263,7 +265,7 @@ def _kept_labels(meta: Json) -> dict[str, str]:
 
 
 def _short(text: str) -> str:
-    return bounded(text, LONGEST_TEXT)
+    return bounded(text, MOST_TEXT_CHARACTERS)
 
 
 def _host_ports(spec: Json, protocol: str) -> Iterator[int]:

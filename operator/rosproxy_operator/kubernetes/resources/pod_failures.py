@@ -57,7 +57,7 @@ _TAKEN = ("address already in use", "port is already allocated", "cannot open ho
 
 The CNI plugin portmap reports nothing: its DNAT rules take the port over from the listener.
 """
-_LONGEST = 300
+_MOST_MESSAGE_CHARACTERS = 300
 """Characters that are kept of a message."""
 _STABLE_AFTER_S = 60.0
 """Seconds after which the end of a container counts as no crash.
@@ -166,4 +166,4 @@ def _crashing(ended: Json) -> tuple[PodFailure, str]:
 
 def _text(reason: str, message: str) -> str:
     text = ": ".join(s for s in (reason, " ".join(message.split())) if s)
-    return bounded(clean(text), _LONGEST)
+    return bounded(clean(text), _MOST_MESSAGE_CHARACTERS)

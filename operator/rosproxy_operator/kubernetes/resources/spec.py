@@ -51,7 +51,7 @@ from rosproxy_operator.kubernetes.resources.objects import is_deleted, name_of
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, words
 
 MOST_PORTS = 500
-MOST_NAME = 46
+MOST_NAME_CHARACTERS = 46
 """Characters of a RosProxy's name. With more, a proxy's name would not fit in a host name."""
 _OF_ROS = {"1": ("master", WISHES["udp"].field), "2": ("domain", "peers", "multicast")}
 """The fields that belong to a single ROS version."""
@@ -73,9 +73,9 @@ _PULL_POLICY = {policy: policy for policy in ("", "Always", "IfNotPresent", "Nev
 _OPERATORS = {operator: operator for operator in ("In", "NotIn", "Exists", "DoesNotExist")}
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _EXAMPLE = "http://robot.example:11311"
-_HIGH = (1024, 65535)
+_LISTEN_PORTS = (1024, 65535)
 """Ports that a proxy may listen on."""
-_DAY = 86400
+_DAY_S = 86400
 _Value = TypeVar("_Value")
 
 
@@ -101,8 +101,8 @@ def rosproxy(obj: Json) -> RosProxy:
     id = name_of(meta)
     service = parse_slave_uri(text_at(status, "masterURI"))
     address = service.host if service else text_at(status, "staticPeers")
-    if not is_label(id.name) or len(id.name) > MOST_NAME:
-        fix = f"Use at most {MOST_NAME} characters a-z, 0-9 and -"
+    if not is_label(id.name) or len(id.name) > MOST_NAME_CHARACTERS:
+        fix = f"Use at most {MOST_NAME_CHARACTERS} characters a-z, 0-9 and -"
         raise Field("metadata.name", id.name).error("can't be the name of a RosProxy", fix)
     return RosProxy(
         id=id,
@@ -151,8 +151,8 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
         node_selector=_given(field["nodeSelector"], Field.texts),
         tolerations=_given(field["tolerations"], _maps),
         advertise=field["advertise"].one_of(_ADVERTISE, Advertise.INTERNAL_IP.value),
-        cleanup_after=field["cleanupAfterSeconds"].number(30.0, 0, _DAY),
-        grace=field["graceSeconds"].number(60.0, 0, _DAY),
+        cleanup_after=field["cleanupAfterSeconds"].number(30.0, 0, _DAY_S),
+        grace=field["graceSeconds"].number(60.0, 0, _DAY_S),
         max_unavailable=_max_unavailable(field["maxUnavailable"]),
         proxy=_proxy_spec(field),
         policy=_policy(field["policy"], of),
@@ -273,7 +273,9 @@ def _glob(field: Field, ros_name: bool) -> str:
 def _window(field: Field, ports: int) -> PortRange:
     # The default lies above the ports of roscore (11311) and rosserial (11411), and below the
     # NodePorts (from 30000).
-    window = PortRange(field["first"].number(11412, *_HIGH), field["last"].number(29999, *_HIGH))
+    window = PortRange(
+        field["first"].number(11412, *_LISTEN_PORTS), field["last"].number(29999, *_LISTEN_PORTS)
+    )
     if window.last - window.first + 1 < ports:
         raise InvalidField(
             f"{field.path}: {window} has fewer than the {ports} ports of spec.ports. Widen "
@@ -345,7 +347,7 @@ def _master(field: Field, of: Name) -> MasterSpec:
     uri = field["uri"]
     address = field["address"]
     service = field["service"]
-    publish = field["publish"].number(0, *_HIGH)
+    publish = field["publish"].number(0, *_LISTEN_PORTS)
     if (uri.value is None) == (service.value is None):
         raise InvalidField(
             f"{field.path}: give exactly one of uri (a master outside of the cluster) and service "

@@ -19,7 +19,7 @@ from rosproxy_operator.kubernetes.status.events import COMPONENT
 
 MOST = 10
 """Events that the doctor reports at most."""
-LONGEST = 400
+MOST_TEXT_CHARACTERS = 400
 """Characters of a reason or a message at most."""
 _CHECK = "events"
 
@@ -75,7 +75,8 @@ def event_findings(
     for event in [*events][:MOST]:
         subject = f"{event.kind.lower()} {event.id}"
         often = f", {event.count} times" if event.count > 1 else ""
-        text = f"{event.reason} {duration(event.age)} ago{often}: {brief(event.message, LONGEST)}"
+        message = brief(event.message, MOST_TEXT_CHARACTERS)
+        text = f"{event.reason} {duration(event.age)} ago{often}: {message}"
         if event.own:
             yield note(_CHECK, subject, f"{text} (no condition reports this now)")
         elif event.uid in ready:
@@ -106,7 +107,7 @@ def _read(event: Json, now: float) -> RecentEvent:
         kind=text_at(about, "kind"),
         id=Name(text_at(about, "namespace"), text_at(about, "name")),
         uid=text_at(about, "uid"),
-        reason=brief(text_at(event, "reason"), LONGEST),
+        reason=brief(text_at(event, "reason"), MOST_TEXT_CHARACTERS),
         message=text_at(event, "message"),
         age=max(now - _time(event, series), 0.0),
         count=int_at(series, "count") or int_at(event, "count") or 1,

@@ -28,21 +28,21 @@ from rosproxy_operator.kubernetes.resources.names import (
     PORT_RANGE,
 )
 
-QUIET = 60.0
+EVENT_REPEAT_QUIET_S = 60.0
 """Seconds without a problem after which the same problem gets an Event again."""
-MOST = 50
+MOST_WARNINGS = 50
 """Warning Events of a plan at most; the next plan has the rest."""
 MOST_TEXTS = 10
-"""Texts of the same reason about the same object that may come and go in `QUIET` seconds.
+"""The most texts of a reason about an object that come and go in `EVENT_REPEAT_QUIET_S` seconds.
 
 Further texts wait. A hostile proxy or master chooses the texts of its errors, and could cause any
 number of Events.
 """
 MOST_RESULTS = 20
 """Normal Events of a reason in a plan for a RosProxy; one more Event counts the rest."""
-LONGEST = 1024
+MOST_MESSAGE_BYTES = 1024
 """Bytes of the message of an Event at most."""
-COUNT_EVERY = 60.0
+COUNT_INTERVAL_S = 60.0
 """Least seconds between two counts of the same Event."""
 COMPONENT = "rosproxy-operator"
 """The source that the Events name."""
@@ -71,19 +71,19 @@ def warnings(
 ) -> NewEvents:
     """Return Warning Events for new problems that name an object in ``about``.
 
-    A problem that comes and goes gets a second Event only after `QUIET` seconds without the
-    problem. If the text of a problem keeps changing, further texts wait (`MOST_TEXTS`).
+    A problem that comes and goes gets a second Event only after `EVENT_REPEAT_QUIET_S` seconds
+    without the problem. If the text of a problem keeps changing, further texts wait (`MOST_TEXTS`).
 
     After a restart of the operator all problems are new. The API server then has the Events, and
     `count_patch` counts each Event once more. ``reported`` is from the plan before, and empty at
     first; ``now`` is in seconds of the same clock.
     """
     findings = dict.fromkeys(f for f in problems if f.about)
-    recent = {f: then for f, then in reported.items() if now - then < QUIET}
+    recent = {f: then for f, then in reported.items() if now - then < EVENT_REPEAT_QUIET_S}
     gone = Counter(_kind(f) for f in recent if f not in findings)
     new = [f for f in findings if f not in reported]
     changing = {f for f in new if gone[_kind(f)] >= MOST_TEXTS}
-    told = [f for f in new if f not in changing][:MOST]
+    told = [f for f in new if f not in changing][:MOST_WARNINGS]
     late = {*new}.difference(told)
     current = {f: now for f in findings if f not in late}
     return NewEvents(tuple(map(_warning, told)), {**recent, **current})
@@ -167,14 +167,14 @@ def event_body(event: Emit, now: float) -> Json:
 def count_patch(event: Json, now: float) -> list[Json]:
     """The JSON patch that counts an Event once more.
 
-    Empty if the last count is less than `COUNT_EVERY` seconds old. ``now`` is in seconds of Unix
-    time.
+    Empty if the last count is less than `COUNT_INTERVAL_S` seconds old. ``now`` is in seconds of
+    Unix time.
     """
     try:
         last = datetime.fromisoformat(text_at(event, "lastTimestamp")).timestamp()
     except (ValueError, OverflowError):
-        last = now - COUNT_EVERY
-    if now - last < COUNT_EVERY:
+        last = now - COUNT_INTERVAL_S
+    if now - last < COUNT_INTERVAL_S:
         return []
     return [
         {"op": "add", "path": "/count", "value": (int_at(event, "count") or 1) + 1},
@@ -197,7 +197,7 @@ def _warning(finding: ClusterFinding) -> Emit:
 
 
 def _bounded(text: str) -> str:
-    if len(text.encode()) <= LONGEST:
+    if len(text.encode()) <= MOST_MESSAGE_BYTES:
         return text
     # The ellipsis has three bytes. `ignore` drops a character that the bound cuts.
-    return text.encode()[: LONGEST - 3].decode(errors="ignore") + "…"
+    return text.encode()[: MOST_MESSAGE_BYTES - 3].decode(errors="ignore") + "…"

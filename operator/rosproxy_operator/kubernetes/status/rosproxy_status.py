@@ -37,7 +37,7 @@ PORTS = "PortsAllocated"
 MASTER = "MasterReachable"
 DEGRADED = "Degraded"
 WAY_IN = "PortsReachable"
-LONGEST = 1024
+MOST_MESSAGE_CHARACTERS = 1024
 """Characters of a message at most."""
 MOST_NODES = 200
 """Nodes in ``perNode`` at most.
@@ -163,7 +163,7 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
     return {
         **former,
         "observedGeneration": rosproxy.generation,
-        "message": bounded(text, LONGEST),
+        "message": bounded(text, MOST_MESSAGE_CHARACTERS),
         "conditions": _conditions(judged, former, rosproxy.generation, stamp),
     }
 
@@ -275,7 +275,7 @@ def _conditions(
             "observedGeneration": generation,
             "lastTransitionTime": since.get((c.type, c.status)) or stamp,
             "reason": c.reason if _REASON.fullmatch(c.reason) else "Problem",
-            "message": bounded(c.message, LONGEST),
+            "message": bounded(c.message, MOST_MESSAGE_CHARACTERS),
         }
         for c in judged
     ]
@@ -323,7 +323,7 @@ def _message(ready: Condition, problems: Sequence[ClusterFinding]) -> str:
     """The text of Ready if the RosProxy is not ready or has no finding, else the first finding."""
     is_ready = ready.status == "True"
     text = _one_line(problems[0]) if is_ready and problems else ready.message
-    return bounded(text, LONGEST)
+    return bounded(text, MOST_MESSAGE_CHARACTERS)
 
 
 def _of_pod(problem: ClusterFinding) -> bool:

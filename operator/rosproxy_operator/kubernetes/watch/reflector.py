@@ -1,9 +1,10 @@
 """Follows objects of a kind in a thread: lists the objects, then watches changes.
 
 When a watch ends, the reflector starts the next watch at the last version. If the API server no
-longer has this version (410 Gone), the reflector lists all objects again. After `CHECKED` seconds
-the reflector lists again in any case, to find missed changes. Lists come in pages. After an error
-the reflector tries again. The pauses grow, and are random so that not all watches return at once.
+longer has this version (410 Gone), the reflector lists all objects again. After `RELIST_INTERVAL_S`
+seconds the reflector lists again in any case, to find missed changes. Lists come in pages. After an
+error the reflector tries again. The pauses grow, and are random so that not all watches return at
+once.
 
 kopf's indices and the SharedInformer of the Kubernetes client keep whole objects, which takes too
 much memory. kopf also needs a task for each object. The SharedInformer lists without pages, and
@@ -32,20 +33,20 @@ from rosproxy_operator.kubernetes.resources.records import READERS, Change, Reco
 
 log = logging.getLogger(__name__)
 
-PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
+RETRY_PAUSES_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Longest pauses in seconds after the first error, the second, and so on; the last repeats.
 
 Each pause is random, between half and all of this time. A first lost watch has no pause.
 """
-WELL = 10.0
+STABLE_AFTER_S = 10.0
 """Seconds. A watch that lasted longer resets the failure count."""
-CHECKED = 1800.0
+RELIST_INTERVAL_S = 1800.0
 """Seconds after a list until the reflector lists again, once the present watch has ended."""
-DOUBTED = 60.0
+LEAST_RELIST_INTERVAL_S = 60.0
 """Least seconds from a list to a further list because the watched state was wrong (`relist`)."""
-SHORT = 1.0
+LEAST_WATCH_S = 1.0
 """Seconds. A shorter watch without events is an error: else the reflector would loop fast."""
-STOPPING = 3.0
+STOP_TIMEOUT_S = 3.0
 """Seconds that the thread of a reflector has to end."""
 
 
@@ -104,28 +105,28 @@ class Reflector:
     def relist(self) -> None:
         """List all objects again soon, because the watched state is wrong.
 
-        Within `DOUBTED` seconds after a list, the call does nothing.
+        Within `LEAST_RELIST_INTERVAL_S` seconds after a list, the call does nothing.
         """
-        if time.monotonic() - self._listed_at > DOUBTED:
-            self._listed_at = -CHECKED  # old enough even if the monotonic clock is near 0
+        if time.monotonic() - self._listed_at > LEAST_RELIST_INTERVAL_S:
+            self._listed_at = -RELIST_INTERVAL_S  # old enough even if the monotonic clock is near 0
             if self._watch is not None:
                 self._watch.stop()
 
     def join(self) -> None:
-        """Wait until the thread has ended, for `STOPPING` seconds at most."""
-        self._thread.join(STOPPING)
+        """Wait until the thread has ended, for `STOP_TIMEOUT_S` seconds at most."""
+        self._thread.join(STOP_TIMEOUT_S)
 
     def _run(self) -> None:
         failures = 0
         while not self._ending.is_set():
             began = time.monotonic()
             try:
-                if not self._version or began - self._listed_at > CHECKED:
+                if not self._version or began - self._listed_at > RELIST_INTERVAL_S:
                     self._version = self._list()
                 self._follow()
                 failures = 0
             except ApiError as error:
-                failures = 1 if time.monotonic() - began > WELL else failures + 1
+                failures = 1 if time.monotonic() - began > STABLE_AFTER_S else failures + 1
                 # After a loss of etcd the API server refuses a former version as too large.
                 if isinstance(error, ApiExpired) or "resource version" in str(error).lower():
                     self._version = ""
@@ -147,7 +148,7 @@ class Reflector:
             self._tell(self._listener.failed, error)
 
     def _pause(self, failures: int) -> None:
-        longest = PAUSES[min(failures, len(PAUSES)) - 1]
+        longest = RETRY_PAUSES_S[min(failures, len(RETRY_PAUSES_S)) - 1]
         self._ending.wait(longest * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
 
     def _list(self) -> str:
@@ -186,7 +187,7 @@ class Reflector:
                 self._tell(self._listener.changed, changes)
             self._version = _version(events) or self._version
             heard = True
-        if not heard and time.monotonic() - began < SHORT:
+        if not heard and time.monotonic() - began < LEAST_WATCH_S:
             raise ApiLost("the watch ended at once")
 
     def _changes(self, events: Iterable[Event]) -> list[Change]:

@@ -37,14 +37,14 @@ from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
 
 log = logging.getLogger(__name__)
 
-LONGEST = 4.0
+ADMISSION_TIMEOUT_S = 4.0
 """Seconds until the injector admits a pod unwired.
 
 The API server must wait longer for the webhook (timeoutSeconds, 5 s by default in the chart).
 """
-AGAIN = 0.2
+RETRY_INTERVAL_S = 0.2
 """Seconds between tries while the API server does not answer, or the Service is missing."""
-YOUNG = 3.0
+YOUNG_SERVICE_S = 3.0
 """Seconds after the creation of a Service in which some nodes may not know the Service.
 
 kube-proxy gathers changes for 1 s, and a creationTimestamp has whole seconds. If a pod connects too
@@ -80,7 +80,7 @@ class Injector:
 
     async def wiring(self, body: Json, dry_run: bool) -> Wiring:
         """The wiring of a pod; on any error a warning only. A ``dry_run`` waits for no Service."""
-        deadline = time.monotonic() + LONGEST
+        deadline = time.monotonic() + ADMISSION_TIMEOUT_S
         try:
             wiring, hold = await self._wiring_by(body, dry_run, deadline)
             await asyncio.sleep(min(hold, deadline - time.monotonic()))
@@ -101,7 +101,9 @@ class Injector:
         Tries until the deadline, because an API server may be starting, or the Service may be
         missing. Raises ApiError, NotWired.
         """
-        missing = f"the API server did not answer within {LONGEST:g} s. Create the pod again"
+        missing = (
+            f"the API server did not answer within {ADMISSION_TIMEOUT_S:g} s. Create the pod again"
+        )
         while True:
             try:
                 async with asyncio.timeout(deadline - time.monotonic()):
@@ -115,7 +117,7 @@ class Injector:
                 self._wake()
             except TimeoutError:
                 raise NotWired(missing) from None
-            await asyncio.sleep(AGAIN)
+            await asyncio.sleep(RETRY_INTERVAL_S)
 
     def _wiring(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
         pod = objects.pod(body)
@@ -158,7 +160,9 @@ class Injector:
             return service.cluster_ip, 0.0
         # Bounded, because the clocks of the API server and of this machine may differ.
         created_at = datetime.fromisoformat(manifest["metadata"]["creationTimestamp"]).timestamp()
-        return service.cluster_ip, min(max(created_at + YOUNG - time.time(), 0.0), YOUNG)
+        return service.cluster_ip, min(
+            max(created_at + YOUNG_SERVICE_S - time.time(), 0.0), YOUNG_SERVICE_S
+        )
 
     def _missing(self, rosproxy: RosProxy) -> NotWired:
         """The error for a RosProxy without a Service.

@@ -27,22 +27,22 @@ from rosproxy_operator.kubernetes.webhook.tls_listener import TlsListener
 
 log = logging.getLogger(__name__)
 
-CHECK = 0.5
+CERTIFICATE_CHECK_INTERVAL_S = 0.5
 """Seconds between two checks for another certificate to serve."""
-MOST = 4 * 2**20
+MOST_REQUEST_BYTES = 4 * 2**20
 """Bytes of a request at most. A review contains a pod, and the API server takes 3 MiB for a pod.
 
 k8s.io/apiserver, pkg/server/config.go: MaxRequestBodyBytes.
 """
-MOST_HELD = 96 * 2**20
-"""Bytes of all requests in memory at the same time, with `VALUE_SIZE` for each value."""
-MOST_HELD_OF_SOURCE = 32 * 2**20
+MOST_HELD_BYTES = 96 * 2**20
+"""Bytes of all requests in memory at the same time, with `VALUE_BYTES` for each value."""
+MOST_HELD_BYTES_OF_SOURCE = 32 * 2**20
 """Bytes of the requests of an address. A review of 20 KB counts as 80 KB."""
-VALUE_SIZE = 100
+VALUE_BYTES = 100
 """Bytes that a value of a JSON document takes in memory, besides the text."""
 BODY_TIMEOUT_S = 10.0
 """Seconds until the whole body must be there. An API server sends the body at once."""
-ENDING = 2.0
+END_TIMEOUT_S = 2.0
 """Seconds to answer open requests when serving ends."""
 
 
@@ -86,14 +86,14 @@ class WebhookServer:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         while (pair := self._rotation.pair) is None:  # noqa: ASYNC110 - set in another thread
-            await asyncio.sleep(CHECK)
+            await asyncio.sleep(CERTIFICATE_CHECK_INTERVAL_S)
         certificates.load(context, pair)
         application = _application(fn)
         application.on_response_prepare.append(self._prepare)
         runner = web.AppRunner(
             application,
             access_log=None,
-            shutdown_timeout=ENDING,
+            shutdown_timeout=END_TIMEOUT_S,
             keepalive_timeout=IDLE_TIMEOUT,
             # A small compressed body may become a very large body.
             auto_decompress=False,
@@ -119,9 +119,9 @@ class WebhookServer:
             response.force_close()
 
     async def _exchange(self, context: ssl.SSLContext, served: KeyPair) -> None:
-        """Serve another certificate within `CHECK` seconds."""
+        """Serve another certificate within `CERTIFICATE_CHECK_INTERVAL_S` seconds."""
         while True:
-            await asyncio.sleep(CHECK)
+            await asyncio.sleep(CERTIFICATE_CHECK_INTERVAL_S)
             pair = self._rotation.pair
             if pair is not None and pair != served:
                 try:
@@ -134,7 +134,7 @@ class WebhookServer:
 
 
 def _application(fn: kopf.WebhookFn) -> web.Application:
-    held = Budget(MOST_HELD, MOST_HELD_OF_SOURCE, "bytes of reviews")
+    held = Budget(MOST_HELD_BYTES, MOST_HELD_BYTES_OF_SOURCE, "bytes of reviews")
 
     async def serve(request: web.Request) -> web.Response:
         with Charge(held, plain_address(request.remote or "")) as charge:
@@ -157,8 +157,8 @@ def _application(fn: kopf.WebhookFn) -> web.Application:
 async def _read_body(request: web.Request, charge: Charge) -> bytes:
     """Read and charge the body of a request. Raises OverBudget, TooLong, TimeoutError."""
     async with asyncio.timeout(BODY_TIMEOUT_S):
-        body = await read_bounded(request.content, MOST, charge.add)
-    charge.add(VALUE_SIZE * sum(map(body.count, (b"{", b"[", b","))))
+        body = await read_bounded(request.content, MOST_REQUEST_BYTES, charge.add)
+    charge.add(VALUE_BYTES * sum(map(body.count, (b"{", b"[", b","))))
     return body
 
 

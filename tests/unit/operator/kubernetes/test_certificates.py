@@ -421,7 +421,9 @@ async def test_the_server_knows_since_when_it_serves(monkeypatch: pytest.MonkeyP
 
 
 async def test_the_server_exchanges_its_certificate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.webhook_server.CHECK", 0.01)
+    monkeypatch.setattr(
+        "rosproxy_operator.kubernetes.webhook.webhook_server.CERTIFICATE_CHECK_INTERVAL_S", 0.01
+    )
     old = certificates.make(NAMES, NOW)
     new = certificates.make(NAMES, NOW, before=old.ca)
     port = free_ports(1)

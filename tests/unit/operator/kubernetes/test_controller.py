@@ -65,7 +65,7 @@ async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Ru
     monkeypatch.setattr(module, "SETTLED", 0.05)
     monkeypatch.setattr(module, "KEY_EVERY", 0.05)
     monkeypatch.setattr(control_loop, "RETRY_PAUSES_S", (0.02,))
-    monkeypatch.setattr(reflector, "PAUSES", (0.02,))
+    monkeypatch.setattr(reflector, "RETRY_PAUSES_S", (0.02,))
     monkeypatch.setattr(proxy_sync, "POLL_INTERVAL_S", 0.05)
     monkeypatch.setattr(proxy_sync, "STARTING_POLL_INTERVAL_S", 0.02)
     monkeypatch.setattr(proxy_sync, "FORMER_POLL_INTERVAL_S", 0.05)
@@ -137,7 +137,7 @@ async def test_a_pod_that_is_created_with_its_rosproxy_is_wired(
     server: ApiServer, api: Api, running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The webhook waits for the Service that the operator makes."""
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG", 0.0)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG_SERVICE_S", 0.0)
     await until(lambda: running.looks() > 0)
     put_all(server)
     injector = Injector(api, ClusterSettings(), running.metrics, running.controller.wake)

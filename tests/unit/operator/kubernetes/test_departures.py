@@ -5,9 +5,9 @@ from typing import Any
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.departures import (
-    LOOK_AGAIN_AFTER,
-    REMEMBERED,
-    UNKNOWN_ADDRESS_GRACE,
+    DEPARTURE_RECHECK_S,
+    GONE_ADDRESS_KEPT_S,
+    UNKNOWN_ADDRESS_GRACE_S,
     find_departures,
     next_checks,
 )
@@ -58,10 +58,13 @@ def test_it_is_told_until_the_proxy_does_not_name_them_any_more() -> None:
     first = find_departures(seen(), KNOWN, 1.0)
     second = find_departures(seen(), first.state, 2.0)
     assert first.addresses == second.addresses == {PROXY: (TALKER,)}
-    assert TALKER in find_departures(seen(), first.state, 2 * REMEMBERED).state.addresses["one"]
+    assert (
+        TALKER
+        in find_departures(seen(), first.state, 2 * GONE_ADDRESS_KEPT_S).state.addresses["one"]
+    )
     third = find_departures(seen(names=()), second.state, 3.0)
     assert third.addresses == {}
-    fourth = find_departures(seen(names=()), third.state, REMEMBERED)
+    fourth = find_departures(seen(names=()), third.state, GONE_ADDRESS_KEPT_S)
     assert TALKER not in fourth.state.addresses["one"]
 
 
@@ -69,13 +72,13 @@ def test_a_node_that_has_registered_just_before_its_pod_went_is_told() -> None:
     """The proxy's answer with the node comes after the look that finds the pod gone."""
     unnamed = seen(names=())
     second = find_departures(unnamed, KNOWN, 3.0)
-    assert list(next_checks(second, 3.0)) == [LOOK_AGAIN_AFTER]
+    assert list(next_checks(second, 3.0)) == [DEPARTURE_RECHECK_S]
     assert find_departures(seen(), second.state, 6.0).addresses == {PROXY: (TALKER,)}
 
 
 def test_the_controller_looks_again_until_it_is_told_no_more() -> None:
     first = find_departures(seen(), KNOWN, 1.0)
-    assert list(next_checks(first, 1.0)) == [LOOK_AGAIN_AFTER]
+    assert list(next_checks(first, 1.0)) == [DEPARTURE_RECHECK_S]
     quiet = find_departures(seen(pod(ip=TALKER)), KNOWN, 1.0)
     assert list(next_checks(quiet, 1.0)) == []
 
@@ -93,9 +96,9 @@ def test_a_pod_may_run_before_its_address_is_known() -> None:
     starting = seen(pod(ip="", phase="Pending"), names=(TALKER,))
     first = find_departures(starting, ClusterState(), 0.0)
     assert first.addresses == {}
-    assert find_departures(starting, first.state, UNKNOWN_ADDRESS_GRACE + 1).addresses == {}
+    assert find_departures(starting, first.state, UNKNOWN_ADDRESS_GRACE_S + 1).addresses == {}
     assert (
-        find_departures(seen(pod(ip=TALKER)), first.state, UNKNOWN_ADDRESS_GRACE + 1).addresses
+        find_departures(seen(pod(ip=TALKER)), first.state, UNKNOWN_ADDRESS_GRACE_S + 1).addresses
         == {}
     )
 
@@ -103,8 +106,8 @@ def test_a_pod_may_run_before_its_address_is_known() -> None:
 def test_after_a_restart_addresses_in_the_pod_network_are_given_up_after_a_while() -> None:
     first = find_departures(seen(), ClusterState(), 0.0)
     assert first.addresses == {}
-    assert find_departures(seen(), first.state, UNKNOWN_ADDRESS_GRACE - 1).addresses == {}
-    assert find_departures(seen(), first.state, UNKNOWN_ADDRESS_GRACE).addresses == {
+    assert find_departures(seen(), first.state, UNKNOWN_ADDRESS_GRACE_S - 1).addresses == {}
+    assert find_departures(seen(), first.state, UNKNOWN_ADDRESS_GRACE_S).addresses == {
         PROXY: (TALKER,)
     }
 
@@ -112,9 +115,9 @@ def test_after_a_restart_addresses_in_the_pod_network_are_given_up_after_a_while
 def test_the_controller_looks_again_when_that_while_is_over() -> None:
     again = look(seen(names=(TALKER,)), now=0.0)
     assert again.state.strange == {("one", TALKER): 0.0}
-    later = look(seen(names=(TALKER,)), again.state, UNKNOWN_ADDRESS_GRACE - 0.5)
+    later = look(seen(names=(TALKER,)), again.state, UNKNOWN_ADDRESS_GRACE_S - 0.5)
     assert later.next_look_in == 0.5
-    last = look(seen(names=(TALKER,)), later.state, UNKNOWN_ADDRESS_GRACE)
+    last = look(seen(names=(TALKER,)), later.state, UNKNOWN_ADDRESS_GRACE_S)
     assert last.briefings[PROXY].gone == (TALKER,)
 
 

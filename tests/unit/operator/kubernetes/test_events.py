@@ -10,11 +10,11 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Name, Reference
 from rosproxy_operator.kubernetes.status.events import (
-    LONGEST,
-    MOST,
+    EVENT_REPEAT_QUIET_S,
+    MOST_MESSAGE_BYTES,
     MOST_RESULTS,
     MOST_TEXTS,
-    QUIET,
+    MOST_WARNINGS,
     NewEvents,
     event_body,
     results,
@@ -74,10 +74,10 @@ def test_a_problem_that_comes_and_goes_is_told_once():
 
 
 def test_a_problem_that_comes_back_after_a_while_is_told_again():
-    told = warnings([], warnings([finding()], {}, 0.0).reported, QUIET)
+    told = warnings([], warnings([finding()], {}, 0.0).reported, EVENT_REPEAT_QUIET_S)
 
     assert told.reported == {}
-    assert len(warnings([finding()], told.reported, QUIET + 1).emits) == 1
+    assert len(warnings([finding()], told.reported, EVENT_REPEAT_QUIET_S + 1).emits) == 1
 
 
 def test_another_text_is_another_problem():
@@ -95,12 +95,12 @@ def test_the_same_problem_twice_makes_one_event():
 
 
 def test_many_problems_have_their_turn():
-    many = [finding(str(i)) for i in range(MOST + 5)]
+    many = [finding(str(i)) for i in range(MOST_WARNINGS + 5)]
 
     first = warnings(many, {}, 0.0)
     second = warnings(many, first.reported, 1.0)
 
-    assert (len(first.emits), len(second.emits)) == (MOST, 5)
+    assert (len(first.emits), len(second.emits)) == (MOST_WARNINGS, 5)
     assert warnings(many, second.reported, 2.0).emits == ()
 
 
@@ -108,21 +108,21 @@ def test_a_problem_whose_text_changes_all_the_time_makes_few_events():
     """Otherwise a hostile proxy could cause an Event each half second."""
     told = NewEvents()
     emits = list[Emit]()
-    for second in range(10 * int(QUIET)):
+    for second in range(10 * int(EVENT_REPEAT_QUIET_S)):
         told = warnings([finding(str(second))], told.reported, float(second))
         emits += told.emits
     assert len(emits) <= 10 * (MOST_TEXTS + 1)
     assert len(told.reported) <= MOST_TEXTS + 1
 
     other = ClusterFinding("node node2", "no ports", reason="PortsExhausted", of=ARM, about=OF_ARM)
-    told = warnings([other], told.reported, 10 * QUIET)
+    told = warnings([other], told.reported, 10 * EVENT_REPEAT_QUIET_S)
     assert [emit.message for emit in told.emits] == ["node node2: no ports"]
 
 
 def test_a_message_is_not_longer_than_the_api_server_takes():
-    (emit,) = warnings([finding("ü" * LONGEST)], {}, 0.0).emits
+    (emit,) = warnings([finding("ü" * MOST_MESSAGE_BYTES)], {}, 0.0).emits
 
-    assert LONGEST - 3 <= len(emit.message.encode()) <= LONGEST
+    assert MOST_MESSAGE_BYTES - 3 <= len(emit.message.encode()) <= MOST_MESSAGE_BYTES
     assert emit.message.endswith("ü…")
 
 

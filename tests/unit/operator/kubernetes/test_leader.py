@@ -28,8 +28,8 @@ def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The clock, which stands still, and short pauses."""
     clock = [1000.0]
     monkeypatch.setattr(module, "clock", lambda: clock[0])
-    monkeypatch.setattr(module, "RENEW", 0.02)
-    monkeypatch.setattr(module, "LOOK", 0.02)
+    monkeypatch.setattr(module, "RENEWAL_INTERVAL_S", 0.02)
+    monkeypatch.setattr(module, "STANDBY_READ_INTERVAL_S", 0.02)
     return clock
 
 
@@ -77,7 +77,7 @@ async def test_one_of_two_leads(candidates: Candidates, server: ApiServer) -> No
     await until(lambda: server.get(*KEY)["spec"]["renewTime"] != renewed)
     assert (first.term(), second.term()) == (1, 0)
     assert spec["leaseTransitions"] == 1
-    assert spec["leaseDurationSeconds"] == leadership.DURATION
+    assert spec["leaseDurationSeconds"] == leadership.LEASE_DURATION_S
 
 
 async def test_another_one_leads_when_it_is_killed(
@@ -91,10 +91,10 @@ async def test_another_one_leads_when_it_is_killed(
     await until(
         lambda: second._candidate.record is not None and second._candidate.record.version == last
     )
-    now[0] += leadership.DEADLINE
+    now[0] += leadership.RENEWAL_DEADLINE_S
     assert candidates.leaders() == []
     assert not first.leads()
-    now[0] += leadership.DURATION
+    now[0] += leadership.LEASE_DURATION_S
     await until(second.leads)
     assert server.get(*KEY)["spec"]["leaseTransitions"] == 2
 
@@ -119,7 +119,7 @@ async def test_a_leader_that_cannot_renew_stops(
     election = candidates.join()
     await until(election.leads)
     server.refuse("PATCH", "leases", 403, "patch is not for you")
-    now[0] += leadership.DEADLINE
+    now[0] += leadership.RENEWAL_DEADLINE_S
     assert election.term() == 0
     await until(lambda: "stands by: no operator leads" in caplog.text)
     assert caplog.text.count("patch is not for you") == 1
@@ -136,7 +136,7 @@ async def test_a_lease_that_was_taken_away_is_made_anew(
     server.forget(*KEY)
     await until(lambda: not election.leads())
     await until(lambda: election._candidate.record is not None)
-    now[0] += leadership.DURATION
+    now[0] += leadership.LEASE_DURATION_S
     await until(election.leads)
 
 

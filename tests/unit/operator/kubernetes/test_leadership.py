@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy_operator.kubernetes.planner.leadership import (
-    DEADLINE,
-    DURATION,
+    LEASE_DURATION_S,
     NOBODY,
+    RENEWAL_DEADLINE_S,
     Candidate,
     LeaseRecord,
     after_resignation,
@@ -32,13 +32,16 @@ def test_a_missing_lease_is_made_and_has_to_expire_first() -> None:
     assert made == LeaseRecord("", NOBODY)
     assert not after_write(candidate, made, 5.0, 5.0).leads(5.0)
     candidate = observe(candidate, LeaseRecord("1", NOBODY), 6.0)
-    assert next_record(candidate, 6.0 + DURATION - 0.1) is None
-    assert next_record(candidate, 6.0 + DURATION) == LeaseRecord("1", "a", transitions=1)
+    assert next_record(candidate, 6.0 + LEASE_DURATION_S - 0.1) is None
+    assert next_record(candidate, 6.0 + LEASE_DURATION_S) == LeaseRecord("1", "a", transitions=1)
 
 
 def test_one_acts_for_a_time_that_begins_before_its_write() -> None:
     candidate = after_write(Candidate("a"), MINE, 15.0, 16.0)
-    assert (candidate.leads(15.0 + DEADLINE - 0.1), candidate.leads(15.0 + DEADLINE)) == (
+    assert (
+        candidate.leads(15.0 + RENEWAL_DEADLINE_S - 0.1),
+        candidate.leads(15.0 + RENEWAL_DEADLINE_S),
+    ) == (
         True,
         False,
     )
@@ -51,14 +54,14 @@ def test_one_that_nobody_holds_is_taken_at_once() -> None:
 def test_one_that_is_held_is_taken_once_it_has_been_the_same_for_long() -> None:
     candidate = observe(Candidate("a"), OTHER, 100.0)
     candidate = observe(candidate, OTHER, 105.0)
-    assert next_record(candidate, 100.0 + DURATION - 0.1) is None
-    assert next_record(candidate, 100.0 + DURATION) == LeaseRecord("7", "a", transitions=4)
+    assert next_record(candidate, 100.0 + LEASE_DURATION_S - 0.1) is None
+    assert next_record(candidate, 100.0 + LEASE_DURATION_S) == LeaseRecord("7", "a", transitions=4)
 
 
 def test_a_renewal_begins_the_time_anew() -> None:
     candidate = observe(Candidate("a"), OTHER, 100.0)
     candidate = observe(candidate, LeaseRecord("8", "b"), 109.0)
-    assert next_record(candidate, 109.0 + DURATION - 0.1) is None
+    assert next_record(candidate, 109.0 + LEASE_DURATION_S - 0.1) is None
 
 
 def test_a_holder_that_promises_longer_is_waited_for() -> None:

@@ -10,7 +10,10 @@ from rosproxy_operator.kubernetes.planner.misspellings import MOST_PODS
 from rosproxy_operator.kubernetes.planner.partition import partitions
 from rosproxy_operator.kubernetes.resources import misspelt_names as module
 from rosproxy_operator.kubernetes.resources import objects
-from rosproxy_operator.kubernetes.resources.misspelt_names import MOST, misspelt_names
+from rosproxy_operator.kubernetes.resources.misspelt_names import (
+    MOST_MISSPELT_NAMES,
+    misspelt_names,
+)
 from rosproxy_operator.kubernetes.resources.model import MasterSpec, Name, Reference
 from rosproxy_operator.kubernetes.resources.names import own_labels
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
@@ -93,7 +96,7 @@ def test_right_names_and_those_of_others_are_nothing_to_tell(kind, metadata):
 def test_of_one_object_only_some_are_told_and_all_are_harmless():
     names = {f"rosproxy.io/{'x' * 300}{number}\x1b[2J": "" for number in range(9)}
     texts = misspelt_names({"annotations": names}, "pods")
-    assert len(texts) == MOST
+    assert len(texts) == MOST_MISSPELT_NAMES
     assert all(len(text) < 300 and "\x1b" not in text for text in texts)
 
 
@@ -197,7 +200,7 @@ def test_of_many_names_a_bounded_number_is_checked(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(module, "nearest", counted)
     labels = {f"a{number}": "x" for number in range(60_000)}
     assert misspelt_names({"labels": labels}, "pods") == ()
-    assert checked == module.MOST_CHECKED
+    assert checked == module.MOST_CHECKED_NAMES
     own = {f"rosproxy.io/x{number}": "x" for number in range(60_000)}
-    assert len(misspelt_names({"labels": labels | own}, "pods")) == MOST
-    assert checked <= module.MOST_CHECKED + MOST
+    assert len(misspelt_names({"labels": labels | own}, "pods")) == MOST_MISSPELT_NAMES
+    assert checked <= module.MOST_CHECKED_NAMES + MOST_MISSPELT_NAMES

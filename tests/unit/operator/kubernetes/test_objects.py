@@ -389,9 +389,9 @@ def test_of_a_pod_little_is_kept_whatever_it_has() -> None:
     assert len(kept.labels) == objects.MOST_LABELS
     assert kept.labels["rosproxy.io/inject"] == "true"
     assert (len(kept.containers), len(kept.own_masters)) == (64, 64)
-    assert len(kept.containers[0].variables["ROS_DISTRO"]) == objects.LONGEST_TEXT
+    assert len(kept.containers[0].variables["ROS_DISTRO"]) == objects.MOST_TEXT_CHARACTERS
     obj["metadata"]["annotations"] = {"rosproxy.io/master-uri": long}
-    assert len(pod(obj).wired_master_uri) == objects.LONGEST_TEXT
+    assert len(pod(obj).wired_master_uri) == objects.MOST_TEXT_CHARACTERS
 
 
 def test_a_long_list_of_namespaces_is_cut() -> None:

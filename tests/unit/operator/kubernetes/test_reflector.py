@@ -71,7 +71,7 @@ class Seen:
 
 @pytest.fixture
 async def seen(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Seen]:
-    monkeypatch.setattr(reflector, "PAUSES", (0.02,))
+    monkeypatch.setattr(reflector, "RETRY_PAUSES_S", (0.02,))
     monkeypatch.setattr(api_module, "PAGE", 2)
     reflected_store = Seen(api)
     yield reflected_store
@@ -211,8 +211,8 @@ async def test_after_a_lost_watch_no_event_comes_twice(server: ApiServer, seen: 
 async def test_watches_that_end_at_once_are_not_asked_for_in_a_loop(
     server: ApiServer, seen: Seen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reflector, "PAUSES", (60.0,))
-    monkeypatch.setattr(reflector, "SHORT", 60.0)
+    monkeypatch.setattr(reflector, "RETRY_PAUSES_S", (60.0,))
+    monkeypatch.setattr(reflector, "LEAST_WATCH_S", 60.0)
     put_all(server)
     await begun(server, seen)
 
@@ -231,7 +231,7 @@ async def test_it_is_checked_against_a_full_list(
     put_all(server)
     await begun(server, seen)
     server.forget("pods", "talker", NAMESPACE)
-    monkeypatch.setattr(reflector, "CHECKED", 0.0)
+    monkeypatch.setattr(reflector, "RELIST_INTERVAL_S", 0.0)
     server.close_watches()
     await until(lambda: "talker" not in seen.pods())
     assert seen.corrected == 1
@@ -243,7 +243,7 @@ async def test_what_is_doubted_is_listed_anew(
     put_all(server)
     await begun(server, seen)
     server.forget("pods", "talker", NAMESPACE)
-    monkeypatch.setattr(reflector, "DOUBTED", 0.0)
+    monkeypatch.setattr(reflector, "LEAST_RELIST_INTERVAL_S", 0.0)
     for collection_reflector in seen.all:
         collection_reflector.relist()
     await until(lambda: "talker" not in seen.pods())
@@ -368,7 +368,7 @@ async def test_a_missing_crd_is_told(server: ApiServer, seen: Seen) -> None:
 async def test_what_only_an_event_tells(
     server: ApiServer, api: Api, seen: Seen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sandbox, "PATIENCE", 0.0)
+    monkeypatch.setattr(sandbox, "WAIT_BEFORE_REQUEST_S", 0.0)
     put_all(server)
     name = proxy_obj(node="node2")["metadata"]["name"]
     server.drop("pods", name, NAMESPACE)

@@ -237,7 +237,7 @@ async def test_a_pod_that_comes_before_its_service_waits_for_the_controller(
 async def test_a_pod_whose_service_does_not_come_is_admitted(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.5)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.ADMISSION_TIMEOUT_S", 0.5)
     running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     answer = await running.admit(pod_obj("talker", INJECT))
     assert (
@@ -253,7 +253,7 @@ async def test_a_pod_whose_service_does_not_come_is_admitted(
 async def test_a_service_that_is_about_to_go_is_waited_for(
     running: Running, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
 ) -> None:
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.3)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.ADMISSION_TIMEOUT_S", 0.3)
     running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     running.server.put("services", service_obj(**change), NAMESPACE)
     answer = await running.admit(pod_obj("talker", INJECT))
@@ -283,7 +283,7 @@ async def test_a_pod_of_a_rosproxy_that_asks_for_too_much_does_not_wait(
     """The operator makes no Service for such a RosProxy. Once allowed, the pod waits for the
     Service.
     """
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 60.0)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.ADMISSION_TIMEOUT_S", 60.0)
     server = running.server
     server.put("rosproxies", rosproxy_obj(spec), NAMESPACE)
     answer = await running.admit(pod_obj("talker", INJECT))
@@ -298,7 +298,7 @@ async def test_a_pod_of_a_rosproxy_that_asks_for_too_much_does_not_wait(
 async def test_a_dry_run_waits_for_no_service(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 60.0)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.ADMISSION_TIMEOUT_S", 60.0)
     running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     answer = await running.admit(pod_obj("talker", INJECT), dryRun=True)
     assert "has no cluster IP yet" in answer["warnings"][0]
@@ -309,7 +309,7 @@ async def test_a_dry_run_waits_for_no_service(
 async def test_a_pod_is_admitted_whatever_the_api_server_says(
     running: Running, status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.3)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.ADMISSION_TIMEOUT_S", 0.3)
     running.server.refuse("GET", "rosproxies", status, "no")
     answer = await running.admit(pod_obj("talker", INJECT))
     assert answer["warnings"][0].startswith("rosproxy: this pod was not wired to a proxy: ")
@@ -327,7 +327,7 @@ async def test_a_pod_waits_for_a_service_that_is_just_made(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before kube-proxy knows the Service, a connection attempt would hang for two minutes."""
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG", 0.5)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG_SERVICE_S", 0.5)
     put_rosproxy(running.server)
     (service,) = running.server.all("services")
     made = datetime.now(UTC) + timedelta(seconds=3600)
@@ -336,7 +336,7 @@ async def test_a_pod_waits_for_a_service_that_is_just_made(
     assert "patch" in await running.admit(pod_obj("second", INJECT))
     assert time.monotonic() - started > 0.4  # and not for an hour, if a clock is wrong
     service["metadata"]["creationTimestamp"] = "2026-01-01T00:00:00Z"
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG", 3600.0)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG_SERVICE_S", 3600.0)
     assert "patch" in await running.admit(pod_obj("third", INJECT))
 
 

@@ -19,7 +19,7 @@ from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Select
 from rosproxy_operator.kubernetes.resources.names import IMAGE_CHECK, LAN_RELAY
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 from rosproxy_operator.kubernetes.status.rosproxy_status import (
-    LONGEST,
+    MOST_MESSAGE_CHARACTERS,
     MOST_NAMES,
     MOST_NODES,
     status_of_invalid,
@@ -260,7 +260,7 @@ def test_a_large_cluster_is_told_in_bounds():
     assert all(line["pods"] for line in rosproxy_status["perNode"])
     assert all(line["rosNodes"] == 80 for line in rosproxy_status["perNode"])
     assert rosproxy_status["nodes"] == MOST_NODES + 50
-    assert all(len(c["message"]) <= LONGEST for c in rosproxy_status["conditions"])
+    assert all(len(c["message"]) <= MOST_MESSAGE_CHARACTERS for c in rosproxy_status["conditions"])
     assert len(json.dumps(rosproxy_status)) < 700_000
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api, ApiUnavailable
-from rosproxy_operator.kubernetes.proxies.token_key import LENGTH, TokenKey
+from rosproxy_operator.kubernetes.proxies.token_key import KEY_BYTES, TokenKey
 from rosproxy_operator.kubernetes.resources.model import Name
 from tests.unit.operator.kubernetes.api_server import ApiServer
 
@@ -30,7 +30,7 @@ def stored_key(server: ApiServer) -> bytes:
 async def test_it_is_made_once(server: ApiServer, api: Api) -> None:
     put(server)
     key = await read(TokenKey(api, SECRET))
-    assert len(key) == LENGTH
+    assert len(key) == KEY_BYTES
     assert stored_key(server) == key
     assert await read(TokenKey(api, SECRET)) == key
     assert len(server.asked("PATCH", "secrets")) == 1

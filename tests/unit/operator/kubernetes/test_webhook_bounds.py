@@ -119,8 +119,8 @@ async def test_of_many_addresses_the_one_with_most_loses(callers: Callers) -> No
 
 async def test_bodies_that_do_not_end_are_bounded(callers: Callers) -> None:
     """50 unfinished bodies of 8 MB took all memory of the operator."""
-    share = webhook_server.MOST_HELD_OF_SOURCE
-    part = b"[" + b" " * (webhook_server.MOST - 2)
+    share = webhook_server.MOST_HELD_BYTES_OF_SOURCE
+    part = b"[" + b" " * (webhook_server.MOST_REQUEST_BYTES - 2)
     wires = [await callers.ask(len(part) + 1, part) for _ in range(share // len(part) + 1)]
     refused = {asyncio.ensure_future(status_of(wire)) for wire in wires}
     done, waiting = await asyncio.wait(refused, return_when=asyncio.FIRST_COMPLETED)
@@ -134,8 +134,8 @@ async def test_bodies_that_do_not_end_are_bounded(callers: Callers) -> None:
 @pytest.mark.parametrize(
     ("body", "status"),
     [
-        (b"[" + b"[]," * (webhook_server.MOST // 4) + b"[]]", 503),
-        (b" " * (webhook_server.MOST + 1), 413),
+        (b"[" + b"[]," * (webhook_server.MOST_REQUEST_BYTES // 4) + b"[]]", 503),
+        (b" " * (webhook_server.MOST_REQUEST_BYTES + 1), 413),
         (b"[" * 200_000, 400),
     ],
 )

@@ -17,7 +17,7 @@ from rosproxy_operator.kubernetes.resources.names import INJECT
 
 MOST_COMMANDS = 5
 """Most commands in a fix."""
-MOST_MISSPELT = 10
+MOST_MISSPELT_FINDINGS = 10
 """Most findings about misspelt names of pods."""
 
 
@@ -49,7 +49,7 @@ def misspelt_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> lis
         for text in pod.misspelt:
             first.setdefault((text, edit_fix("correct the name in the template", pod)), pod)
     found = [error("pods", f"pod {pod.id}", text, fix) for (text, fix), pod in first.items()]
-    return found[:MOST_MISSPELT]
+    return found[:MOST_MISSPELT_FINDINGS]
 
 
 def unreached(pods: Iterable[Pod], rosproxies: Sequence[RosProxy], ready_since: str) -> list[str]:

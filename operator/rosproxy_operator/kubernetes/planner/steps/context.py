@@ -28,7 +28,7 @@ from rosproxy_operator.kubernetes.resources.names import (
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
 
-LOST_FOR = 10.0
+NODE_GONE_AFTER_S = 10.0
 """Seconds that a node must be missing before the operator deletes the node's proxies."""
 TORN_DOWN_WITHIN_S = STOPS_WITHIN + 3.0
 """Seconds in which a kubelet ends a pod that was deleted by force, and removes its hostPort rules.
@@ -80,7 +80,7 @@ class ClusterContext(msgspec.Struct, frozen=True):
 
     def seconds_until_lost(self, node: str) -> float:
         """The seconds until a missing node counts as gone."""
-        return LOST_FOR - (self.now - self.state.lost.get(node, self.now))
+        return NODE_GONE_AFTER_S - (self.now - self.state.lost.get(node, self.now))
 
 
 def master_of(rosproxy: RosProxy, observed: ClusterSnapshot) -> tuple[MasterSpec | None, str]:
