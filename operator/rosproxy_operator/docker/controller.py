@@ -149,7 +149,7 @@ class DockerController:
 
     async def run(self) -> None:
         """Reconcile until cancelled. The proxies go on without the operator."""
-        listen(self._engine, self._hear)
+        listen(self._engine, self._note_event)
         self._tasks.repeat(self._masters.refresh, UNRESOLVED_RETRY_S, "resolving masters")
         try:
             await self._loop.run(self.look)
@@ -161,7 +161,7 @@ class DockerController:
 
         Raises LookFailed if the operator can't reach the engine.
         """
-        listen(self._engine, self._hear)
+        listen(self._engine, self._note_event)
         try:
             await self._loop.run_until(self.look, self._settled, seconds)
             return self._unsolved()
@@ -298,7 +298,7 @@ class DockerController:
     def _port_taken(self, name: str, port: int | None) -> None:
         self._memory = self._memory.port_taken(name, port, time.monotonic())
 
-    def _hear(self, event: Json | None) -> None:
+    def _note_event(self, event: Json | None) -> None:
         """Note an event. None: a new connection to the engine, so earlier events may be missing."""
         if event is None:
             self._observer.note_event(None)

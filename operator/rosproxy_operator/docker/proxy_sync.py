@@ -77,7 +77,7 @@ class ProxyUpdater:
 
     def update(self, network_facts: NetworkFacts) -> None:
         """Store the facts of a look, and wake both tasks."""
-        self._update.look(network_facts, time.monotonic())
+        self._update.record(network_facts, time.monotonic())
         self._looked.set()
         self._selecting.set()
 
@@ -85,10 +85,10 @@ class ProxyUpdater:
         """Send updates until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             if self._has_callers:
-                tasks.create_task(self._keep_selected())
-            tasks.create_task(self._keep_told())
+                tasks.create_task(self._keep_callers_updated())
+            tasks.create_task(self._keep_nodes_updated())
 
-    async def _keep_selected(self) -> None:
+    async def _keep_callers_updated(self) -> None:
         """Send a changed policy and then the allowed addresses, after each look."""
         failures = 0
         logged = ""
@@ -117,7 +117,7 @@ class ProxyUpdater:
                 await asyncio.sleep(RETRY_PAUSES_S[min(failures, len(RETRY_PAUSES_S) - 1)])
                 failures += 1
 
-    async def _keep_told(self) -> None:
+    async def _keep_nodes_updated(self) -> None:
         """Read the status and send all other updates, after each look and when an update is due."""
         failures = 0
         while True:
@@ -128,14 +128,14 @@ class ProxyUpdater:
                 async with asyncio.timeout(pause):
                     await self._looked.wait()
             try:
-                await self._tell()
+                await self._send_updates()
                 failures = 0
             except ProxyError as error:
                 failures += 1
                 # HTTP 503: the proxy answers, but can't reach the master. This is no silence.
-                self._heard(None if error.lacks_master else error)
+                self._note_answer(None if error.lacks_master else error)
 
-    async def _tell(self) -> None:
+    async def _send_updates(self) -> None:
         self._looked.clear()
         refusal: ProxyError | None = await self._policy_refusal()
         try:
@@ -163,7 +163,7 @@ class ProxyUpdater:
             if text := ", ".join(f"{count} {change}" for change, count in counts.items() if count):
                 log.info("nodes updated: %s, %s", self._name, text, extra={"proxy": self._name})
         self._update.mark_delivered(now)
-        self._heard(refusal)
+        self._note_answer(refusal)
 
     async def _policy_refusal(self) -> PolicyRefused | None:
         """Send the policy. Return the refusal, or None if the proxy accepts. Raises ProxyError."""
@@ -173,7 +173,7 @@ class ProxyUpdater:
             return error
         return None
 
-    def _heard(self, error: ProxyError | None) -> None:
+    def _note_answer(self, error: ProxyError | None) -> None:
         """Note that the proxy has answered (None), or why the call failed."""
         self.error = error
         if error is not None:

@@ -25,7 +25,7 @@ from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.kubeconfig import configuration
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
 from rosproxy_operator.kubernetes.planner.pods.labelled import (
-    lonely_findings,
+    missing_rosproxy_findings,
     misspelt_findings,
     unreached,
 )
@@ -63,7 +63,7 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
         findings = [
             *operator_findings(operators),
             *cluster_findings(rosproxies, operators),
-            *lonely_findings(pods, with_rosproxy),
+            *missing_rosproxy_findings(pods, with_rosproxy),
             *misspelt_findings(pods, with_rosproxy),
             *webhook_findings(facts.webhook(operators, cut_off)),
             *event_findings(facts.events(rosproxies, own_pods), ready_pods(own_pods)),

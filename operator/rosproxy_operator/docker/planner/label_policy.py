@@ -33,13 +33,13 @@ def with_bounded_rules(
     common = sum(len(layer.rules) for layer in settings.policy)
     rules: Counter[Key] = Counter()
     layers: Counter[Key] = Counter()
-    crowded: list[Member] = []
+    refused: list[Member] = []
     asking = [member for member in members if member.policy and member.container.alive]
     for member in sorted(asking, key=lambda m: (len(m.policy), m.container.name)):
         key = member.key
-        is_crowded = common + rules[key] + len(member.policy) > MOST_RULES
-        if is_crowded or layers[key] + len(settings.policy) >= MOST_LAYERS:
-            crowded.append(member)
+        is_full = common + rules[key] + len(member.policy) > MOST_RULES
+        if is_full or layers[key] + len(settings.policy) >= MOST_LAYERS:
+            refused.append(member)
             continue
         rules[key] += len(member.policy)
         layers[key] += 1
@@ -49,8 +49,8 @@ def with_bounded_rules(
         "by globs, in this label or in the labels of the other containers"
     )
     return (
-        tuple(member for member in members if member not in crowded),
-        tuple(Problem(f"container {member.container.name}", text) for member in crowded),
+        tuple(member for member in members if member not in refused),
+        tuple(Problem(f"container {member.container.name}", text) for member in refused),
     )
 
 
@@ -75,7 +75,7 @@ class RecentLayers:
     def __init__(self) -> None:
         self._last_seen: dict[tuple[PolicyLayer, str], float] = {}
 
-    def look(
+    def record(
         self, layers: Iterable[PolicyLayer], taken: Collection[str], now: float
     ) -> tuple[PolicyLayer, ...]:
         """Return the ``layers`` of this look, and the remembered layers of earlier looks.

@@ -101,8 +101,8 @@ class AddressHistory:
         self._absent: dict[ContainerNetwork, float] = {}
         self._moves: dict[str, tuple[str, float]] = {}
 
-    def look(self, latest: NetworkFacts, now: float) -> None:
-        """Compare the latest facts with the facts of the last call, and note moves."""
+    def record(self, latest: NetworkFacts, now: float) -> None:
+        """Record the latest facts. Compare them with the facts of the last call, and note moves."""
         missing = [place for place in self._at if place not in latest.addresses]
         self._absent = {place: self._absent.get(place, now) for place in missing}
         for place, since in list(self._absent.items()):
@@ -153,9 +153,9 @@ class AddressHistory:
 
 
 class ProxyUpdate:
-    """The updates that the operator owes a proxy, from the proxy's start to its end.
+    """The updates that the operator still has to send to a proxy.
 
-    ``policy`` is the whole policy of the proxy.
+    An object serves a single run of the proxy. ``policy`` is the whole policy of the proxy.
     """
 
     def __init__(self) -> None:
@@ -167,12 +167,12 @@ class ProxyUpdate:
         self._due: dict[ContainerArrival, list[float]] = {}
         self._moving = False
 
-    def look(self, latest: NetworkFacts, now: float) -> None:
+    def record(self, latest: NetworkFacts, now: float) -> None:
         """Record the facts of a look."""
         self.facts = latest
         common = tuple(layer for layer in latest.policy if layer.addresses is None)
         own = (layer for layer in latest.policy if layer.addresses is not None)
-        self.policy = (*common, *self._layers.look(own, latest.taken, now))
+        self.policy = (*common, *self._layers.record(own, latest.taken, now))
         self._subnets |= set(latest.subnets)
         self._due = {
             arrival: self._due.get(arrival, [now + after for after in ARRIVAL_MESSAGE_TIMES_S])
@@ -185,7 +185,7 @@ class ProxyUpdate:
         The body has the addresses that are ``gone``, that have ``moved``, and at which containers
         have ``arrived``. The body is empty if nothing is due.
         """
-        self._places.look(self.facts, now)
+        self._places.record(self.facts, now)
         body = {
             "gone": sorted(node for node in nodes if self._gone(node)),
             "moved": self._places.moved(nodes),

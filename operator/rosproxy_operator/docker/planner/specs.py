@@ -380,7 +380,7 @@ def container_config(
     The operator makes the token from ``secret``. If ``master_address`` is empty, the proxy itself
     resolves the host name of the master.
     """
-    told = _told(action, settings, secret, master_address)
+    told = _settings_fields(action, settings, secret, master_address)
     variables = environment("docker", told, always=("port_range", "master_port"))
     limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}
     return {
@@ -398,7 +398,7 @@ def container_config(
     }
 
 
-def _told(
+def _settings_fields(
     action: Create, settings: PlanSettings, secret: str, master_address: str
 ) -> dict[str, Any]:
     """The settings of a proxy, by field of the proxy's `Settings`.

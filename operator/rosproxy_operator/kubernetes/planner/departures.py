@@ -29,7 +29,7 @@ The report of a proxy may be older than the look. A node that has just registere
 report.
 """
 SILENT_PROXY_ADDRESS_KEPT_S = 3600.0
-"""The same time, in seconds, while a proxy of the node does not answer."""
+"""The same as `GONE_ADDRESS_KEPT_S`, while a proxy of the node does not answer."""
 DEPARTURE_RECHECK_S = 3.0
 """Seconds to the next look after pods have gone."""
 

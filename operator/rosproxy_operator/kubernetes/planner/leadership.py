@@ -30,7 +30,7 @@ RENEWAL_INTERVAL_S = 2.0
 STANDBY_READ_INTERVAL_S = 1.0
 """Most seconds between two reads of the Lease object by a standby."""
 NEVER = float("-inf")
-NOBODY = "nobody"
+NO_HOLDER = "nobody"
 """Holder of a Lease object that an operator creates because there is none.
 
 This object has to expire before an operator takes it: if a user has deleted the former Lease
@@ -89,7 +89,7 @@ def next_record(candidate: Candidate, now: float) -> LeaseRecord | None:
     record = candidate.record
     since = now if candidate.seen_since is None else candidate.seen_since
     if record is None:  # a user may have deleted the Lease object while an operator acts
-        return LeaseRecord("", NOBODY)
+        return LeaseRecord("", NO_HOLDER)
     if record.holder == candidate.name:
         return replace(record, duration=LEASE_DURATION_S)
     if record.holder and now - since < max(record.duration, LEASE_DURATION_S):

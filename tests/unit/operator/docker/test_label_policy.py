@@ -125,26 +125,26 @@ def test_a_proxy_is_made_with_the_layers_of_its_containers() -> None:
 
 def test_what_a_container_that_has_gone_hid_stays_hidden_until_its_nodes_are_gone() -> None:
     recent = RecentLayers()
-    assert recent.look([layer("a", A)], {A}, 0.0) == (layer("a", A),)
-    assert recent.look([], set(), 1.0) == (layer("a", A),)
-    assert recent.look([], set(), LAYERS_KEPT_S) == ()
-    recent.look([layer("a", A)], {A}, 0.0)
-    assert recent.look([], {A}, 1.0) == ()  # another container has the address
+    assert recent.record([layer("a", A)], {A}, 0.0) == (layer("a", A),)
+    assert recent.record([], set(), 1.0) == (layer("a", A),)
+    assert recent.record([], set(), LAYERS_KEPT_S) == ()
+    recent.record([layer("a", A)], {A}, 0.0)
+    assert recent.record([], {A}, 1.0) == ()  # another container has the address
 
 
 def test_a_container_that_comes_back_elsewhere_has_one_layer() -> None:
     recent = RecentLayers()
-    recent.look([layer("a", A)], {A}, 0.0)
-    assert recent.look([layer("a", B)], {B}, 1.0) == (layer("a", A, B),)
-    assert recent.look([layer("a", B)], {B}, LAYERS_KEPT_S) == (layer("a", B),)
+    recent.record([layer("a", A)], {A}, 0.0)
+    assert recent.record([layer("a", B)], {B}, 1.0) == (layer("a", A, B),)
+    assert recent.record([layer("a", B)], {B}, LAYERS_KEPT_S) == (layer("a", B),)
 
 
 def test_those_of_gone_containers_take_no_room_from_others() -> None:
     many = RULES * (MOST_RULES // 2 + 1)
     recent = RecentLayers()
-    recent.look([layer("a", A, rules=many)], {A}, 0.0)
+    recent.record([layer("a", A, rules=many)], {A}, 0.0)
     new = layer("b", B, rules=many)
-    assert recent.look([new], {B}, 1.0) == (new,)
+    assert recent.record([new], {B}, 1.0) == (new,)
 
 
 def test_the_same_look_is_the_same_policy() -> None:
@@ -154,7 +154,7 @@ def test_the_same_look_is_the_same_policy() -> None:
     for update, order in ((first, layers), (second, layers[::-1])):
         seen = observed(**both())
         facts = replace(network_facts(seen, seen.proxies[0], ()), policy=(*COMMON, *order))
-        update.look(facts, 0.0)
+        update.record(facts, 0.0)
     assert first.policy == second.policy
     assert first.policy[0] == COMMON[0]
 

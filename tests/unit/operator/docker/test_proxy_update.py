@@ -122,7 +122,7 @@ def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
         (replace(told(look(talker())), subnets=()), {}),
     ):
         update = ProxyUpdate()
-        update.look(facts, 0.0)
+        update.record(facts, 0.0)
         assert update.body(nodes, 0.0) == addresses
 
 
@@ -142,7 +142,7 @@ HERE, AWAY, THERE, NOBODY = (
 def places(*looks: tuple[float, NetworkFacts]) -> AddressHistory:
     history = AddressHistory()
     for when, facts in looks:
-        history.look(facts, when)
+        history.record(facts, when)
     return history
 
 
@@ -166,7 +166,7 @@ def test_a_container_off_the_network_for_a_moment_may_come_back_elsewhere() -> N
     assert not history.moved({OLD})
     assert history.reserved_addresses == {OLD}
     assert history.next_expiry == 3.0
-    history.look(THERE, 2.0)
+    history.record(THERE, 2.0)
     assert history.moved({OLD}) == {OLD: NEW}
 
 
@@ -195,7 +195,7 @@ def test_container_that_changes_networks_takes_its_nodes_along() -> None:
 
     assert history.moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
     assert history.reserved_addresses == {"172.18.0.5"}
-    history.look(replace(after, addresses={("t", "other"): "172.19.0.3"}), 1.5)
+    history.record(replace(after, addresses={("t", "other"): "172.19.0.3"}), 1.5)
     assert history.moved({"172.19.0.9"}) == {"172.19.0.9": "172.19.0.3"}
 
 
@@ -211,7 +211,7 @@ def test_container_that_leaves_one_of_two_networks_is_found_on_the_other() -> No
 def test_an_arrival_is_told_again_until_its_nodes_had_time_to_register() -> None:
     update = ProxyUpdate()
     assert update.next_due(0.0) is None
-    update.look(told(look(talker()), member(talker())), 0.0)
+    update.record(told(look(talker()), member(talker())), 0.0)
     (arrived,) = update.body(set(), 0.0)["arrived"]
     assert arrived["address"] == OLD
     assert "talker" in arrived["names"]
@@ -219,7 +219,7 @@ def test_an_arrival_is_told_again_until_its_nodes_had_time_to_register() -> None
     assert update.next_due(0.0) == 1.0
     assert update.body(set(), 0.5) == {}
     for when in (1.0, 3.0, 10.0):
-        update.look(told(look(talker()), member(talker())), when)
+        update.record(told(look(talker()), member(talker())), when)
         assert update.body(set(), when)["arrived"]
         update.mark_delivered(when)
     assert update.next_due(11.0) is None
@@ -227,7 +227,7 @@ def test_an_arrival_is_told_again_until_its_nodes_had_time_to_register() -> None
 
 def test_what_was_not_heard_is_told_again() -> None:
     update = ProxyUpdate()
-    update.look(told(look(talker()), member(talker())), 0.0)
+    update.record(told(look(talker()), member(talker())), 0.0)
     assert update.body(set(), 0.0)["arrived"]
     assert update.next_due(0.1) == 0.0
     assert update.body(set(), 0.1)["arrived"]
@@ -235,17 +235,17 @@ def test_what_was_not_heard_is_told_again() -> None:
 
 def test_nodes_of_a_container_that_is_no_more_are_gone() -> None:
     update = ProxyUpdate()
-    update.look(HERE, 0.0)
+    update.record(HERE, 0.0)
     assert update.body({OLD}, 0.0) == {}
-    update.look(replace(NOBODY, taken=frozenset(), subnets=()), 1.0)
+    update.record(replace(NOBODY, taken=frozenset(), subnets=()), 1.0)
     assert update.body({OLD}, 1.0) == {"gone": [OLD]}  # also on a network that the proxy has left
 
 
 def test_a_move_is_told_until_the_proxy_knows() -> None:
     update = ProxyUpdate()
-    update.look(HERE, 0.0)
+    update.record(HERE, 0.0)
     update.body({OLD}, 0.0)
-    update.look(replace(THERE, taken=frozenset({NEW})), 1.0)  # the old is free, but moved
+    update.record(replace(THERE, taken=frozenset({NEW})), 1.0)  # the old is free, but moved
     assert update.body({OLD}, 1.0) == {"moved": {OLD: NEW}}
     update.mark_delivered(1.0)
     assert update.next_due(1.0) == 1.0

@@ -15,7 +15,7 @@ from rosproxy_operator.kubernetes.api.rbac import missing_right
 from rosproxy_operator.kubernetes.doctor import running_proxies
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
 from rosproxy_operator.kubernetes.planner.pods.labelled import (
-    lonely_findings,
+    missing_rosproxy_findings,
     misspelt_findings,
     unreached,
 )
@@ -140,11 +140,11 @@ async def test_labelled_pods_in_a_namespace_without_a_rosproxy(server: ApiServer
         server.put("pods", pod_obj(name, {"rosproxy.io/inject": "true"}), NAMESPACE)
     server.put("pods", pod_obj("off", {"rosproxy.io/inject": "false"}), NAMESPACE)
     pods = await in_thread(DoctorFacts(api, ()).meant_pods)
-    (finding,) = lonely_findings(pods, frozenset({"other"}))
+    (finding,) = missing_rosproxy_findings(pods, frozenset({"other"}))
     assert (finding.severity, finding.subject) == (Severity.ERROR, f"namespace {NAMESPACE}")
     assert "2 pods with the label rosproxy.io/inject (listener, talker)" in finding.text
     assert "create a RosProxy in the namespace, then run kubectl -n robots delete" in finding.fix
-    assert list(lonely_findings(pods, frozenset({NAMESPACE}))) == []
+    assert list(missing_rosproxy_findings(pods, frozenset({NAMESPACE}))) == []
 
 
 async def test_misspelt_labels_in_a_namespace_without_a_rosproxy(
@@ -166,7 +166,7 @@ async def test_misspelt_labels_in_a_namespace_without_a_rosproxy(
         f"correct the name in the template: kubectl -n {NAMESPACE} edit statefulset/robots"
     )
     assert misspelt_findings(pods, frozenset({NAMESPACE})) == []
-    assert list(lonely_findings(pods, frozenset())) == []
+    assert list(missing_rosproxy_findings(pods, frozenset())) == []
 
 
 CERT_MANAGER = {"cert-manager.io/inject-ca-from": "a/b"}

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rosproxy_operator.kubernetes.planner.leadership import (
     LEASE_DURATION_S,
-    NOBODY,
+    NO_HOLDER,
     RENEWAL_DEADLINE_S,
     Candidate,
     LeaseRecord,
@@ -29,9 +29,9 @@ def test_a_missing_lease_is_made_and_has_to_expire_first() -> None:
     """The former holder may still act."""
     candidate = observe(Candidate("a"), None, 5.0)
     made = next_record(candidate, 5.0)
-    assert made == LeaseRecord("", NOBODY)
+    assert made == LeaseRecord("", NO_HOLDER)
     assert not after_write(candidate, made, 5.0, 5.0).leads(5.0)
-    candidate = observe(candidate, LeaseRecord("1", NOBODY), 6.0)
+    candidate = observe(candidate, LeaseRecord("1", NO_HOLDER), 6.0)
     assert next_record(candidate, 6.0 + LEASE_DURATION_S - 0.1) is None
     assert next_record(candidate, 6.0 + LEASE_DURATION_S) == LeaseRecord("1", "a", transitions=1)
 

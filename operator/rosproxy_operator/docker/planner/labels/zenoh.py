@@ -99,13 +99,13 @@ def with_bounded_containers(
     Only members of the proxy for rmw_zenoh count; all members of other proxies stay.
     """
     every = tuple(members)
-    crowd = [member for member in every if member.key == ZENOH][MOST_ZENOH_PORTS:]
+    excess = [member for member in every if member.key == ZENOH][MOST_ZENOH_PORTS:]
     text = (
         f"a proxy for rmw_zenoh serves at most {MOST_ZENOH_PORTS} containers. Remove labels "
         f"{readers.ENABLE} of other containers"
     )
-    problems = (Problem(f"container {m.container.name}", text) for m in crowd if m.container.alive)
-    return tuple(member for member in every if member not in crowd), tuple(problems)
+    problems = (Problem(f"container {m.container.name}", text) for m in excess if m.container.alive)
+    return tuple(member for member in every if member not in excess), tuple(problems)
 
 
 def _refuse_rules(labels: Labels, settings: PlanSettings) -> None:

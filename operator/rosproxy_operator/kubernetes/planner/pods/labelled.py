@@ -21,13 +21,15 @@ MOST_MISSPELT_FINDINGS = 10
 """Most findings about misspelt names of pods."""
 
 
-def lonely_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> Iterator[DoctorFinding]:
+def missing_rosproxy_findings(
+    pods: Iterable[Pod], with_rosproxy: frozenset[str]
+) -> Iterator[DoctorFinding]:
     """Yield an error for each namespace that has labelled pods, but no RosProxy.
 
     ``with_rosproxy`` has the namespaces with a RosProxy.
     """
-    lonely = (p for p in pods if wants_proxy(p) and p.id.namespace not in with_rosproxy)
-    for namespace, group in sorted(group_by_key((p.id.namespace, p) for p in lonely).items()):
+    unserved = (p for p in pods if wants_proxy(p) and p.id.namespace not in with_rosproxy)
+    for namespace, group in sorted(group_by_key((p.id.namespace, p) for p in unserved).items()):
         names = listed(sorted(p.id.name for p in group))
         text = (
             f"the namespace has no RosProxy, but {plural(len(group), 'pod')} with the label "
@@ -43,9 +45,9 @@ def misspelt_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> lis
 
     In a namespace with a RosProxy, the status of the RosProxy reports the name.
     """
-    lonely = sorted((p for p in pods if p.id.namespace not in with_rosproxy), key=lambda p: p.id)
+    unserved = sorted((p for p in pods if p.id.namespace not in with_rosproxy), key=lambda p: p.id)
     first: dict[tuple[str, str], Pod] = {}
-    for pod in lonely:
+    for pod in unserved:
         for text in pod.misspelt:
             first.setdefault((text, edit_fix("correct the name in the template", pod)), pod)
     found = [error("pods", f"pod {pod.id}", text, fix) for (text, fix), pod in first.items()]

@@ -74,7 +74,7 @@ def reconcile_lan_relays(context: ClusterContext, rosproxy: RosProxy) -> Iterato
         if place not in places or not rosproxy.spec.multicast:
             yield from _delete_lan_relays(context, lan_relays, "no longer needed")
         else:
-            yield from _ensure_lan_relay(context, place, lan_relays)
+            yield from _reconcile_lan_relay(context, place, lan_relays)
 
 
 def lan_relay_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
@@ -89,9 +89,10 @@ def lan_relay_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[
             yield finding(rosproxy, "NoLanAddress", text)
 
 
-def _ensure_lan_relay(
+def _reconcile_lan_relay(
     context: ClusterContext, place: ProxyPlace, lan_relays: tuple[HelperPod, ...]
 ) -> Iterator[Action]:
+    """Yield the next actions for the LAN relay of a place: delete outdated pods, or create one."""
     current = context.view.current.get(place)
     wanted = place in context.view.wanted
     site = site_of(context, place) if wanted else None
