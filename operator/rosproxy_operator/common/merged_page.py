@@ -48,7 +48,7 @@ _LONG_TEXTS = ("text", "fix")
 _MOST_LEFT_OUT = 10**9
 Row = TypeVar("Row", PageNode, PageLink, PageFinding, PageProxy)
 _RANKS = {WARNING: 1, BROKEN: 2}
-"""How bad a state is. All other states have rank 0."""
+"""The severity of a state. All other states have rank 0."""
 
 
 def read_document(text: str) -> Document:
@@ -95,7 +95,7 @@ def merged(
             owner = name if node.lane == CONTAINER else ""
             nodes[names[key]] = replace(node, label=label, proxy=owner)
         for link in _own_links(name, document, names):
-            links[link.key] = max(links.get(link.key, link), link, key=_telling)
+            links[link.key] = max(links.get(link.key, link), link, key=_report_rank)
         findings += ((name, replace(f, subject=f"{name}: {f.subject}")) for f in document.findings)
         left_out += document.left_out
     shown, kept = within_bounds(nodes, links)
@@ -116,15 +116,15 @@ def _shortened(document: Document) -> Document:
     proxy = document.proxy
     return replace(
         document,
-        nodes={shown_name(key): _brief(node) for key, node in nodes},
-        links={shown_name(key): _brief(link) for key, link in links},
-        findings=tuple(_brief(finding) for finding in document.findings[:MOST_FINDINGS]),
-        proxy=_brief(proxy),
+        nodes={shown_name(key): _with_short_texts(node) for key, node in nodes},
+        links={shown_name(key): _with_short_texts(link) for key, link in links},
+        findings=tuple(_with_short_texts(finding) for finding in document.findings[:MOST_FINDINGS]),
+        proxy=_with_short_texts(proxy),
         left_out=min(max(document.left_out, 0), _MOST_LEFT_OUT),
     )
 
 
-def _brief(row: Row) -> Row:
+def _with_short_texts(row: Row) -> Row:
     """Return the row with shortened texts."""
     texts = {
         name: (shown_text if name in _LONG_TEXTS else shown_name)(text)
@@ -147,12 +147,15 @@ def _shares(documents: Mapping[str, Document | str]) -> dict[str, Document | str
 
 
 def _size(document: Document | str) -> int:
-    """The number of nodes and links in a document."""
+    """Return the number of nodes and links in a document."""
     return 0 if isinstance(document, str) else len(document.nodes) + len(document.links)
 
 
-def _telling(link: PageLink) -> tuple[int, bool, bool]:
-    """The rank of a proxy's report of a link: worst state first, OK before unknown, then a port."""
+def _report_rank(link: PageLink) -> tuple[int, bool, bool]:
+    """Return the rank of a proxy's report of a link. The page shows the report with the highest.
+
+    A worse state ranks higher. Otherwise OK ranks above unknown, and then a report with a port.
+    """
     return _RANKS.get(link.state, 0), link.state == OK, link.port is not None
 
 

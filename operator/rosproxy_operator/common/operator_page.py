@@ -22,6 +22,7 @@ from rosproxy_operator.common.merged_page import merged
 ROUND_PAUSE_S = 2.0
 """Seconds from the end of a round to the next round."""
 Documents = Callable[[], Awaitable[Mapping[str, Document | str]]]
+"""Requests the documents of all proxies, by proxy name. Returns a text for a failed request."""
 
 
 def operator_page(documents: Documents, logs: Callable[[str], str]) -> Page:

@@ -12,6 +12,7 @@ from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, Severity,
 from rosproxy.telemetry.text import brief
 
 MOST_FINDINGS = 500
+"""The most findings that the operator reads from a proxy's doctor."""
 MOST_TEXT_CHARACTERS = 2000
 """Characters of a text at most."""
 _SEVERITIES = {severity.name.lower(): severity for severity in Severity}

@@ -16,10 +16,12 @@ from rosproxy.net.addresses import parse_host_port, plain_address
 Leases = Mapping[str, tuple[int, ...]]
 """The ports of participants by GUID prefix, in the order of the participant's locators."""
 MOST_PARTICIPANTS = 512
-"""Participants whose ports the operator keeps. A proxy has no more participants inside
-(docs/reference/limits.md)."""
+"""The most participants whose ports the operator keeps.
+
+A proxy has no more participants inside (docs/reference/limits.md).
+"""
 MOST_PORTS = 16
-"""Ports of a participant that the operator keeps. A proxy gives a participant no more ports."""
+"""The most ports of a participant that the operator keeps. A proxy maps no more ports."""
 _LAST_PORT = 65535
 
 
