@@ -78,5 +78,14 @@ def relabel_configs(endpoint: Json) -> list[Json]:
 
 def scrape_configs() -> list[Any]:
     """The configurations of Prometheus in the guide."""
+    return [block for block in _guide_blocks() if isinstance(block, dict)]
+
+
+def further_relabelings() -> list[Any]:
+    """The rules of the guide to add to the ``relabel_configs`` of the proxies on Docker."""
+    return [rule for block in _guide_blocks() if isinstance(block, list) for rule in block]
+
+
+def _guide_blocks() -> list[Any]:
     blocks = re.findall(r"^```yaml\n(.*?)^```$", GUIDE.read_text(), re.M | re.S)
     return [yaml.safe_load(block) for block in blocks]

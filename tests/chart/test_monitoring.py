@@ -18,6 +18,7 @@ from tests.chart.monitoring import (
     RUNBOOK,
     alerts,
     expressions,
+    further_relabelings,
     metrics,
     panels,
     relabel_configs,
@@ -169,6 +170,16 @@ def test_prometheus_can_read_the_guides_configurations(tmp_path: Path) -> None:
         path.write_text(yaml.safe_dump(config))
         assert "SUCCESS" in promtool("check", "config", path)
     assert number == 1
+
+
+def test_prometheus_can_read_the_guides_relabeling_for_another_admin_port(tmp_path: Path) -> None:
+    (tmp_path / "alerts.yaml").write_text(ALERTS.read_text())
+    (rule,) = further_relabelings()
+    config = scrape_configs()[0]
+    config["scrape_configs"][0]["relabel_configs"].append(rule)
+    path = tmp_path / "prometheus.yaml"
+    path.write_text(yaml.safe_dump(config))
+    assert "SUCCESS" in promtool("check", "config", path)
 
 
 FIRING: dict[str, tuple[dict[str, str], str]] = {
