@@ -144,6 +144,7 @@ def _participant(participant: ParticipantStatus) -> Json:
         "guid_prefix": participant.guid_prefix,
         "vendor": participant.vendor,
         "address": participant.address,
+        "nodes": list(participant.nodes),
         "ports": [lease.port for lease in participant.leases],
         "publishes": list(participant.publishes),
         "subscribes": list(participant.subscribes),

@@ -282,8 +282,9 @@ class ParticipantStatus(msgspec.Struct, frozen=True):
     stand-ins. ``kept``: a participant inside remembers its ports for the next process of the proxy.
     ``proven``: a participant outside reaches ports of the range, or the proxy does not know yet.
     ``problem``: what the participant lacks. ``domain``: the announced domain. ``types``: the types
-    of the topics and services. `rosproxy.ros2.registry.participants` has the values of
-    ``security``, ``locator_fault`` and ``shortage``, which is the kind of ``problem``.
+    of the topics and services. ``nodes``: the ROS nodes that the services of each node name.
+    `rosproxy.ros2.registry.participants` has the values of ``security``, ``locator_fault`` and
+    ``shortage``, which is the kind of ``problem``.
     """
 
     guid_prefix: str = ""
@@ -302,6 +303,7 @@ class ParticipantStatus(msgspec.Struct, frozen=True):
     locator_fault: str = ""
     shortage: str = ""
     types: tuple[NamedTypeStatus, ...] = ()
+    nodes: Names = ()
 
 
 class MismatchStatus(msgspec.Struct, frozen=True):

@@ -85,6 +85,7 @@ def _details(
 
     ports = (f"{lease.port} to {clean(lease.where)}" for lease in participant.leases)
     for label, text in (
+        ("nodes", GAP.join(map(clean, participant.nodes))),
         ("publishes", typed(participant.publishes)),
         ("subscribes", typed(participant.subscribes)),
         ("services", GAP.join(map(clean, participant.services))),

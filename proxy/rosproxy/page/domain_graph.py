@@ -4,7 +4,8 @@ The proxy does not read user data, so a topic has no messages and no rate. The b
 the ports of a participant.
 """
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 
 from msgspec.structs import replace
 
@@ -53,12 +54,13 @@ def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
     links: list[PageLink] = []
     for domain in status.domains:
         problems = {problem.subject: problem for problem in domain_problems(domain)}
+        labels = _labels((*domain.inside, *domain.outside))
         for side in (domain.inside, domain.outside):
             for participant in side:
                 problem = problems.get(participant.guid_prefix)
-                nodes[_key(domain, participant.guid_prefix)] = _node(
-                    domain, participant, side is domain.inside, problem
-                )
+                node = _node(domain, participant, side is domain.inside, problem)
+                node = replace(node, label=labels[participant.guid_prefix])
+                nodes[_key(domain, participant.guid_prefix)] = node
         links += _links(domain, problems)
     return nodes, links
 
@@ -103,23 +105,43 @@ def _node(
     return PageNode(
         CONTAINER if is_inside else outside_lane,
         "participant",
-        shown_name(f"{participant.address} {_distinguishing(participant.guid_prefix)}"),
-        _state(problem),
-        shown_text(problem.text) if problem else "",
-        shown_text(problem.fix) if problem else "",
-        shown_name(f"{participant.address}, {participant.vendor}"),
-        ", ".join(str(lease.port) for lease in participant.leases),
-        rounded(sum(lease.rate for lease in data)) if data else None,
+        detail=_detail(participant),
+        state=_state(problem),
+        text=shown_text(problem.text) if problem else "",
+        fix=shown_text(problem.fix) if problem else "",
+        address=shown_name(f"{participant.address}, {participant.vendor}"),
+        ports=", ".join(str(lease.port) for lease in participant.leases),
+        rate=rounded(sum(lease.rate for lease in data)) if data else None,
     )
 
 
-def _distinguishing(guid_prefix: str) -> str:
-    """The part of a GUID prefix in which participants of a machine differ.
+def _labels(participants: Iterable[ParticipantStatus]) -> dict[str, str]:
+    """The label of each participant of a domain, by GUID prefix: its nodes, else its address.
 
-    The first four bytes have the vendor and, with Fast DDS, the machine. The next four bytes have
-    the process. The last four bytes have the participant in the process, and are 0 for the first.
+    If several participants without known nodes have the same address, they are numbered.
     """
-    return guid_prefix[len("01.0f.aa.bb.") :].removesuffix(".00.00.00.00")
+    participants = sorted(participants, key=lambda participant: participant.guid_prefix)
+    unnamed = Counter(p.address for p in participants if not p.nodes)
+    numbers: Counter[str] = Counter()
+    labels = {}
+    for participant in participants:
+        label = _node_label(participant.nodes) if participant.nodes else participant.address
+        if not participant.nodes and unnamed[participant.address] > 1:
+            numbers[participant.address] += 1
+            label += f" #{numbers[participant.address]}"
+        labels[participant.guid_prefix] = shown_name(label)
+    return labels
+
+
+def _node_label(nodes: Sequence[str]) -> str:
+    first, *others = nodes
+    return f"{first} and {len(others)} more" if len(others) > 1 else " and ".join(nodes)
+
+
+def _detail(participant: ParticipantStatus) -> str:
+    """The text of a chosen participant: its nodes if there are several, and the GUID prefix."""
+    nodes = f"nodes {', '.join(participant.nodes)}; " if len(participant.nodes) > 1 else ""
+    return shown_text(f"{nodes}participant {participant.guid_prefix}")
 
 
 def _state(problem: DomainProblem | None) -> str:

@@ -47,7 +47,8 @@ Row = TypeVar("Row", bound=msgspec.Struct)
 class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
     """A node, participant, master or proxy in its lane.
 
-    ``label``: the text to show if the key is not a name. ``text`` and ``fix``: the problem and what
+    ``label``: the text to show if the key is not a name. ``detail``: the text to show if a user
+    selects the node. ``place``: the name of the container or pod, if known. ``text`` and ``fix``: the problem and what
     to do. ``ports``: the ports of the proxy for this node. ``rate``: forwarded bytes a second, if
     the rates of the links are not known. ``proxy``: the proxy of the node, on an operator's page.
     """
@@ -62,6 +63,8 @@ class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
     ports: str = ""
     rate: float | None = None
     proxy: str = ""
+    detail: str = ""
+    place: str = ""
 
 
 class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):

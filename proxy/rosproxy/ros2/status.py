@@ -18,12 +18,14 @@ from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.ros_names import (
     is_of_service,
     ros_name,
+    ros_node,
     ros_service,
     ros_topic,
     ros_type,
 )
 from rosproxy.ros2.registry.matching import MismatchedPair, compare
 from rosproxy.ros2.registry.participants import (
+    DdsEndpoint,
     EndpointKind,
     InsideParticipant,
     OutsideParticipant,
@@ -192,7 +194,7 @@ class Ros2State(Collector):
         return msgspec.structs.replace(status, proven=participant.comes_in)
 
     def _status_of(self, participant: Participant, most: int) -> document.ParticipantStatus:
-        endpoints = list(islice(participant.endpoints.values(), most))
+        endpoints = _first_endpoints(participant, most)
         writers = {endpoint.topic for endpoint in endpoints if endpoint.kind is EndpointKind.WRITER}
         readers = {endpoint.topic for endpoint in endpoints if endpoint.kind is EndpointKind.READER}
         publishes = sorted(filter(None, map(ros_topic, writers)))
@@ -211,12 +213,28 @@ class Ros2State(Collector):
             publishes=tuple(publishes),
             subscribes=tuple(subscribes),
             services=tuple(services),
+            nodes=tuple(sorted({node for node in map(_node_of, endpoints) if node})),
             left_out=len(participant.endpoints) - len(endpoints) if self.with_names else 0,
             domain=participant.traits.domain,
             security=participant.traits.security.value,
             locator_fault=participant.traits.locator_fault.value,
             types=tuple(document.NamedTypeStatus(name, types[name]) for name in sorted(named)),
         )
+
+
+def _first_endpoints(participant: Participant, most: int) -> list[DdsEndpoint]:
+    """At most ``most`` readers and writers; readers that name a node come first."""
+    endpoints = participant.endpoints.values()
+    if most < len(endpoints):
+        return list(islice(sorted(endpoints, key=lambda e: _node_of(e) is None), most))
+    return list(endpoints)
+
+
+def _node_of(endpoint: DdsEndpoint) -> str | None:
+    """The ROS node that a reader names; None if the reader or writer names none."""
+    if endpoint.kind is not EndpointKind.READER:
+        return None
+    return ros_node(endpoint.topic, endpoint.type_name)
 
 
 def _address_inside(pair: MismatchedPair) -> str:

@@ -26,6 +26,7 @@ INSIDE = ParticipantStatus(
     ),
     publishes=("/chatter", "/evil\x1b[2J"),
     services=("/add",),
+    nodes=("/talker", "/bad\x1b[2J"),
     types=(NamedTypeStatus("/chatter", "std_msgs/msg/String"),),
 )
 OUTSIDE = ParticipantStatus(
@@ -65,6 +66,7 @@ def test_a_domain_and_its_participants_are_shown() -> None:
         "/chatter",
         "/add",
         "/chatter std_msgs/msg/String",
+        "nodes      /talker",
         "2.4 kB  500 B/s",
         "outside?",
     ):

@@ -52,24 +52,35 @@ def test_participants_and_what_crosses_the_boundary() -> None:
     assert "master" not in document["nodes"]
 
 
-def test_participants_of_a_container_have_different_labels() -> None:
-    """In Fast DDS the middle bytes differ between processes. The last bytes may be 0 in all
-    prefixes.
-    """
-    prefixes = [
-        "01.0f.a1.b2.17.00.c3.d4.00.00.00.00",
-        "01.0f.a1.b2.18.00.c3.d5.00.00.00.00",
-        "01.0f.a1.b2.18.00.c3.d5.01.00.00.00",
-        "01.10.5e.92.7c.0d.11.aa.00.00.01.c1",
-    ]
-    inside = tuple(replace(INSIDE, guid_prefix=prefix) for prefix in prefixes)
+def test_a_participant_has_the_names_of_its_nodes_else_its_address() -> None:
+    """The GUID prefix is in the details alone."""
+    names: dict[str, tuple[str, ...]] = {
+        "01.0f.01": ("/talker",),
+        "01.0f.02": ("/arm", "/hand"),
+        "01.0f.03": ("/a", "/b", "/c"),
+        "01.0f.04": (),
+        "01.0f.05": (),
+    }
+    inside = tuple(replace(INSIDE, guid_prefix=key, nodes=nodes) for key, nodes in names.items())
     nodes = made(inside=inside)["nodes"]
-    assert [nodes[f"0 {prefix}"]["label"] for prefix in prefixes] == [
-        "172.30.0.5 17.00.c3.d4",
-        "172.30.0.5 18.00.c3.d5",
-        "172.30.0.5 18.00.c3.d5.01.00.00.00",
-        "172.30.0.5 7c.0d.11.aa.00.00.01.c1",
+    assert [nodes[f"0 {prefix}"]["label"] for prefix in names] == [
+        "/talker",
+        "/arm and /hand",
+        "/a and 2 more",
+        "172.30.0.5 #1",
+        "172.30.0.5 #2",
     ]
+    assert nodes["0 01.10.bb"]["label"] == "10.0.0.9"
+    assert nodes["0 01.0f.01"]["detail"] == "participant 01.0f.01"
+    assert nodes["0 01.0f.03"]["detail"] == "nodes /a, /b, /c; participant 01.0f.03"
+
+
+def test_names_of_hostile_nodes_are_short_and_harmless() -> None:
+    names = tuple(f"/{number}\x1b{'x' * 300}" for number in range(2000))
+    node = made(inside=(replace(INSIDE, nodes=names),))["nodes"]["0 01.0f.aa"]
+    assert len(node["label"]) <= 300
+    assert len(node["detail"]) <= 1000
+    assert "\x1b" not in node["label"] + node["detail"]
 
 
 def test_a_mismatch_is_on_its_link_alone() -> None:

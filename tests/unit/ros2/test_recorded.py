@@ -13,6 +13,7 @@ from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.addressing import may_be_discovery
 from rosproxy.ros2.protocol.parameters import FastDdsPid
+from rosproxy.ros2.protocol.ros_names import ros_node
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_vendor
 from rosproxy.ros2.registry.matching import Comparison, compare
 from rosproxy.ros2.registry.participants import EndpointKind, Participant
@@ -130,17 +131,22 @@ def _network_configurations(told: list[DiscoveryMessage]) -> list[int | None]:
 def test_two_that_meet_through_the_proxy(vendor: str) -> None:
     domain = make_domain(peers=(SUBSCRIBER,), lan_relay=None)
     sent = list[Outgoing]()
+    nodes = set[str | None]()
     inside = set[tuple[EndpointKind, str]]()
     outside = set[tuple[EndpointKind, str]]()
     for datagram in recorded(vendor):
         sent += passed(domain, datagram)
         insiders = domain.inside.by_prefix.values()
         outsiders = domain.outside.by_prefix.values()
+        every = [e for p in (*insiders, *outsiders) for e in p.endpoints.values()]
+        nodes |= {ros_node(e.topic, e.type_name) for e in every if e.kind is EndpointKind.READER}
         inside |= _endpoints(insiders)
         outside |= _endpoints(outsiders)
         assert compare(insiders, outsiders) == Comparison()
     assert (EndpointKind.WRITER, "rt/chatter") in inside
     assert (EndpointKind.READER, "rt/chatter") in outside
+    # The recorded program of Cyclone DDS is no ROS node.
+    assert nodes - {None} == (set() if vendor == "cyclone" else {"/talker", "/listener"})
     assert domain.refused.count == 0
     outwards = [out.datagram for out in sent if out.target.host == SUBSCRIBER]
     assert outwards

@@ -114,6 +114,22 @@ def test_topics_and_their_types() -> None:
     assert told(domain).mismatches == ()
 
 
+def test_a_participant_has_the_names_of_all_its_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the status lists only one reader of the participant, this reader names a node."""
+    domain = make_domain()
+    announce(domain, 1)
+    (stand_in,) = domain.stand_ins.by_port
+    kind = "rcl_interfaces::srv::dds_::GetParameters_Request_"
+    for node in ("driver", "arm/planner"):
+        topic = f"rq/{node}/get_parametersRequest"
+        domain.at_stand_in(stand_in, sedp(A, SUBSCRIPTIONS, topic, kind, 1), INSIDE, NOW)
+    (inside,) = told(domain).inside
+    assert inside.nodes == ("/arm/planner", "/driver")
+    monkeypatch.setattr("rosproxy.ros2.status.MOST_ENDPOINTS", 1)
+    (inside,) = told(domain).inside
+    assert (inside.nodes, inside.services) == (("/driver",), ("/driver/get_parameters",))
+
+
 @pytest.mark.parametrize(("both_ways", "direction"), [(False, "out"), (True, "both")])
 def test_in_which_direction_the_proxy_passes_on(both_ways: bool, direction: str) -> None:
     assert told(make_domain(both_ways=both_ways)).direction == direction

@@ -125,7 +125,7 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
             names = [clean(name) for node in container["nodes"] for name in node["names"]]
             yield from wrap("  ".join(names), columns, INDENT, most=MOST_NODE_LINES)
             for participant in container["participants"]:
-                text = _topics(participant["vendor"], participant)
+                text = _topics(_participant_name(participant), participant)
                 yield from wrap(text, columns, INDENT, most=MOST_NODE_LINES)
             for node in container["zenoh_nodes"]:
                 yield from wrap(_topics(node["name"], node), columns, INDENT, most=MOST_NODE_LINES)
@@ -137,6 +137,12 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
                 (p["text"] for p in status["problems"] if p["subject"] == subject), columns
             )
         reported.add(subject)
+
+
+def _participant_name(participant: Status) -> str:
+    """The nodes of a participant, as far as they are known, and the vendor."""
+    nodes = listed(participant["nodes"])
+    return f"{nodes} ({participant['vendor']})" if nodes else participant["vendor"]
 
 
 def _topics(name: str, row: Status) -> str:

@@ -53,7 +53,7 @@ function placesOf(lane, ids, nodes) {
     const node = nodes.get(id);
     const host = hostOf(node.address);
     const key = `${lane} ${node.proxy || ""} ${host}`;
-    if (!byKey.has(key)) byKey.set(key, { key, label: host, note: node.proxy || "", ids: [] });
+    if (!byKey.has(key)) byKey.set(key, { key, label: node.place || host, note: node.proxy || "", ids: [] });
     byKey.get(key).ids.push(id);
   }
   const places = [...byKey.values()].sort((a, b) => compare(a.key, b.key));

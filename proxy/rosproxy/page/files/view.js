@@ -16,10 +16,11 @@ export function namespaceOf(label) {
   return parts[0] === "" && parts.length > 2 ? `/${parts[1]}` : "";
 }
 
-// What a filter finds of a node: names, the host, and the proxy, master or domain in the key.
+// What a filter finds of a node: names, the host, the container or pod, and the proxy, master or
+// domain in the key.
 function wordsOf(id, node = {}) {
   const domain = node.kind === "participant" ? ` domain ${id.split(" ").at(-2)}` : "";
-  return `${labelOf(id, node)} ${id} ${hostOf(node.address)}${domain}`;
+  return [labelOf(id, node), id, hostOf(node.address), node.place, node.detail].filter(Boolean).join(" ") + domain;
 }
 
 // The links that are wanted, those that are broken first, then by name.

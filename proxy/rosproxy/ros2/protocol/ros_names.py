@@ -9,6 +9,14 @@ _TOPIC = "rt/"
 _REQUEST = "rq/"
 _REPLY = "rr/"
 _DDS_NAMESPACE = "::dds_::"
+_NODE_SERVICES = {
+    "rcl_interfaces::srv::dds_::GetParameters_Request_": "/get_parameters",
+    "type_description_interfaces::srv::dds_::GetTypeDescription_Request_": "/get_type_description",
+}
+"""The DDS types of requests of two services that nodes have by default, and the names of these
+services in the namespace of the node. rclcpp and rclpy start the first without
+``start_parameter_services=False``, and the second since Jazzy (parameter
+``start_type_description_service``)."""
 
 
 def ros_topic(dds_topic: str) -> str | None:
@@ -40,6 +48,18 @@ def is_of_service(dds_topic: str) -> bool:
 def is_of_requests(dds_topic: str) -> bool:
     """Whether a DDS topic carries the requests of a service."""
     return dds_topic.startswith(_REQUEST)
+
+
+def ros_node(dds_topic: str, dds_type: str) -> str | None:
+    """The ROS node that reads a DDS topic as the requests of a service that each node has.
+
+    ``/arm/driver`` reads ``rq/arm/driver/get_parametersRequest``. None for other topics.
+    """
+    ending = _NODE_SERVICES.get(dds_type)
+    service = ros_service(dds_topic) if ending else None
+    if ending is None or service is None or not service.endswith(ending):
+        return None
+    return service.removesuffix(ending) or None
 
 
 def ros_type(dds_type: str) -> str:

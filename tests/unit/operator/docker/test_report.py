@@ -284,6 +284,7 @@ DOMAIN = {**PROXY, "name": "rosproxy-domain-0-7ec54e", "ros": "2", "domain": 0, 
 PARTICIPANT = {
     "guid_prefix": "01.0f.56.e7.01.00.c2.37.00.00.00.00",
     "vendor": "Fast DDS",
+    "nodes": ["/talker", "/bad\x1b[2J"],
     "address": "172.18.0.2",
     "ports": [11433, 11434, 11435],
     "publishes": ["/out", "/rosout"],
@@ -304,13 +305,16 @@ def test_what_leads_to_the_proxy_is_told() -> None:
 
 def test_both_versions_side_by_side() -> None:
     again = {**TALKER, "proxy": DOMAIN["name"], "ros": "2", "nodes": []}
-    again["participants"] = [PARTICIPANT, {**PARTICIPANT, "problem": "no port is free"}]
+    unnamed = {**PARTICIPANT, "nodes": [], "problem": "no port is free"}
+    again["participants"] = [PARTICIPANT, unnamed]
     every = {**STATUS, "proxies": [PROXY, DOMAIN], "containers": [TALKER, again]}
     wrong = {"subject": "container talker", "text": "is odd", "fatal": False}
     text = render({**every, "problems": [wrong]}, 120)
     assert "1 container, 2 proxies" in text
     assert "running  domain 0  " in text
-    assert text.count("Fast DDS: publishes /out  /rosout; serves /talker/get_parameters") == 2
+    topics = "publishes /out  /rosout; serves /talker/get_parameters"
+    assert text.count(f"    Fast DDS: {topics}") == 1
+    assert text.count(f"    /talker, /bad\\x1b[2J (Fast DDS): {topics}") == 1
     assert "talker     running  rosproxy-domain-0-7ec54e  11432-11463  2 participants" in text
     assert (text.count("! no port is free"), text.count("! is odd")) == (1, 1)
     deaf = {**DOMAIN, "lan_relay": None}

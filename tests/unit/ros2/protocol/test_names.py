@@ -1,10 +1,13 @@
 """Names of ROS 2 in DDS."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rosproxy.ros2.protocol.ros_names import (
     is_of_service,
     ros_name,
+    ros_node,
     ros_service,
     ros_topic,
     ros_type,
@@ -54,3 +57,34 @@ def test_what_a_topic_belongs_to(dds: str, name: str, of_service: bool) -> None:
 )
 def test_types(dds: str, ros: str) -> None:
     assert ros_type(dds) == ros
+
+
+PARAMETERS = "rcl_interfaces::srv::dds_::GetParameters_Request_"
+DESCRIPTION = "type_description_interfaces::srv::dds_::GetTypeDescription_Request_"
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "node"),
+    [
+        ("rq/talker/get_parametersRequest", PARAMETERS, "/talker"),
+        ("rq/arm/driver/get_parametersRequest", PARAMETERS, "/arm/driver"),
+        ("rq/_ros2cli_7/get_type_descriptionRequest", DESCRIPTION, "/_ros2cli_7"),
+        ("rq/talker/get_parametersRequest", DESCRIPTION, None),
+        ("rq/talker/get_parametersRequest", "other::srv::dds_::GetParameters_Request_", None),
+        ("rr/talker/get_parametersReply", PARAMETERS, None),
+        ("rt/talker/get_parameters", PARAMETERS, None),
+        ("rq/other_nameRequest", PARAMETERS, None),
+        ("rq/get_parametersRequest", PARAMETERS, None),
+    ],
+)
+def test_a_node_is_known_by_a_service_that_each_node_has(
+    topic: str, kind: str, node: str | None
+) -> None:
+    assert ros_node(topic, kind) == node
+
+
+@given(st.text(), st.sampled_from(["/get_parameters", "/get_type_description", ""]))
+def test_any_topic_names_a_node_by_its_start_or_none(name: str, ending: str) -> None:
+    for kind in (PARAMETERS, DESCRIPTION):
+        node = ros_node(f"rq/{name}{ending}Request", kind)
+        assert node is None or f"/{name}{ending}".startswith(f"{node}/get_")
