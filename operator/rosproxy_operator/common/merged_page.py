@@ -15,13 +15,19 @@ the proxy that reports the link.
 from collections.abc import Callable, Iterator, Mapping, Set
 from itertools import islice
 from operator import itemgetter
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import msgspec
 from msgspec.structs import replace
 
 from rosproxy.admin.status_bounds import fair_choice, fair_shares
-from rosproxy.net.addresses import is_loopback, parse_authority
+from rosproxy.net.addresses import (
+    is_loopback,
+    parse_authority,
+    parse_host_port,
+    plain_address,
+)
 from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
@@ -44,7 +50,7 @@ from rosproxy.page.page_document import (
 Json = dict[str, Any]
 PROXY = "proxy"
 PARTICIPANT = "participant"
-_LONG_TEXTS = ("text", "fix")
+_LONG_TEXTS = ("text", "fix", "detail")
 _MOST_LEFT_OUT = 10**9
 Row = TypeVar("Row", PageNode, PageLink, PageFinding, PageProxy)
 _RANKS = {WARNING: 1, BROKEN: 2}
@@ -61,12 +67,16 @@ def read_document(text: str) -> Document:
 
 
 def merged(
-    documents: Mapping[str, Document | str], version: str, logs: Callable[[str], str]
+    documents: Mapping[str, Document | str],
+    version: str,
+    logs: Callable[[str], str],
+    places: Mapping[str, str] = MappingProxyType({}),
 ) -> Json:
     """Return a single document from the documents of all proxies.
 
     ``documents`` has a document for each proxy name, or a text that says why the proxy does not
-    answer. ``logs`` returns the command that shows the logs of a proxy.
+    answer. ``logs`` returns the command that shows the logs of a proxy. ``places`` has the names of
+    containers or pods inside, by address.
     """
     nodes: dict[str, PageNode] = {}
     links: dict[str, PageLink] = {}
@@ -91,9 +101,7 @@ def merged(
             known = nodes.get(names[key])
             if known and _RANKS.get(known.state, 0) > _RANKS.get(node.state, 0):
                 continue  # an earlier proxy reports a worse state
-            label = name if node.kind == PROXY else node.label or key
-            owner = name if node.lane == CONTAINER else ""
-            nodes[names[key]] = replace(node, label=label, proxy=owner)
+            nodes[names[key]] = _placed(name, key, node, places)
         for link in _own_links(name, document, names):
             links[link.key] = max(links.get(link.key, link), link, key=_report_rank)
         findings += ((name, replace(f, subject=f"{name}: {f.subject}")) for f in document.findings)
@@ -107,6 +115,24 @@ def merged(
         "findings": msgspec.to_builtins([f for _, f in shown_findings]),
         "left_out": left_out + len(nodes) - len(shown) + len(links) - len(kept),
     }
+
+
+def _placed(name: str, key: str, node: PageNode, places: Mapping[str, str]) -> PageNode:
+    """Return a node of the proxy ``name`` with the label, the proxy and the place on the page.
+
+    A participant without known nodes gets the name of its container or pod as its label. The
+    operator ignores places that a proxy reports.
+    """
+    label = name if node.kind == PROXY else node.label or key
+    if node.lane != CONTAINER:
+        return replace(node, label=label, proxy="", place="")
+    text = node.address.partition(",")[0]
+    host_port = parse_host_port(text)
+    address = host_port.host if host_port else text
+    place = shown_name(places.get(plain_address(address), ""))
+    if place and node.kind == PARTICIPANT and label.startswith(address):
+        label = place + label.removeprefix(address)
+    return replace(node, label=label, proxy=name, place=place)
 
 
 def _shortened(document: Document) -> Document:

@@ -25,13 +25,21 @@ Documents = Callable[[], Awaitable[Mapping[str, Document | str]]]
 """Requests the documents of all proxies, by proxy name. Returns a text for a failed request."""
 
 
-def operator_page(documents: Documents, logs: Callable[[str], str]) -> Page:
-    """Return the page. ``documents`` requests the documents of all proxies; ``logs``: `merged`."""
+def operator_page(
+    documents: Documents,
+    logs: Callable[[str], str],
+    places: Callable[[], Mapping[str, str]] = dict,
+) -> Page:
+    """Return the page. ``documents`` requests the documents of all proxies.
+
+    ``logs`` and ``places``: `merged`.
+    """
 
     async def make() -> AsyncGenerator[dict[str, Any]]:
         while True:
             proxy_documents = await documents()
-            yield await asyncio.to_thread(merged, proxy_documents, __version__, logs)
+            named = places()
+            yield await asyncio.to_thread(merged, proxy_documents, __version__, logs, named)
             await asyncio.sleep(ROUND_PAUSE_S)
 
     return Page(Feed(Tasks(), make), Visitors(None, time.monotonic, local=True))

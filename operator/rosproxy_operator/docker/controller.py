@@ -37,7 +37,7 @@ from rosproxy_operator.docker import engine_json
 from rosproxy_operator.docker.engine_client import DockerClient, listen
 from rosproxy_operator.docker.errors import EngineError, FormerSocket, Unavailable
 from rosproxy_operator.docker.executor import DockerActions, Executor
-from rosproxy_operator.docker.host_document import host_document, just_started
+from rosproxy_operator.docker.host_document import container_names, host_document, just_started
 from rosproxy_operator.docker.operator_sign import publish_sign
 from rosproxy_operator.docker.planner.labels.members import LabelReading
 from rosproxy_operator.docker.planner.model import HostState
@@ -96,7 +96,7 @@ async def _run(
 ) -> None:
     metrics = DockerMetrics()
     controller = DockerController(settings, resync, metrics, mistakes=mistakes)
-    page = operator_page(controller.documents, "docker logs {}".format)
+    page = operator_page(controller.documents, "docker logs {}".format, controller.places)
     admin_server = OperatorAdminServer(
         metrics.registry, controller.dead, controller.unready, page, controller.status
     )
@@ -186,6 +186,10 @@ class DockerController:
         silent = {name for name, answer in answers.items() if isinstance(answer, str)}
         starting = silent & just_started(snapshot.state, time.time())
         return stopped | {name: answers[name] for name in answers if name not in starting}
+
+    def places(self) -> dict[str, str]:
+        """Return the names of the containers at each address, as of the last look."""
+        return container_names(self._last[0].state) if self._last else {}
 
     async def status(self) -> Json:
         """Look anew, ask all proxies, and return the status document. Raises LookFailed."""

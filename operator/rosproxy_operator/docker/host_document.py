@@ -4,13 +4,14 @@
 document as text, and the running operator serves the document at ``/status``.
 """
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from datetime import datetime
 
 from rosproxy import __version__
 from rosproxy.admin.status_document import ParticipantStatus, ProxyStatus, ZenohNodeStatus
-from rosproxy.net.addresses import parse_host_port
+from rosproxy.net.addresses import parse_host_port, plain_address
 from rosproxy.telemetry.text import brief, listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json
@@ -180,6 +181,17 @@ def _redirects(
         for member in members
         if member.redirected and member.container.alive
     }
+
+
+def container_names(observed: HostState) -> dict[str, str]:
+    """Return the names of the running containers by address. Several may share an address."""
+    by_id = {container.id: container for container in observed.containers}
+    names: defaultdict[str, dict[str, None]] = defaultdict(dict)
+    for container in observed.containers:
+        for attachment in network_owner(container, by_id).attachments:
+            if container.alive and attachment.address:
+                names[plain_address(attachment.address)][container.name] = None
+    return {address: listed(group) for address, group in names.items()}
 
 
 def just_started(observed: HostState, now: float) -> frozenset[str]:

@@ -157,6 +157,10 @@ class KubernetesController:
         """Return the live page's document of each proxy, or the reason of a failure, by pod."""
         return await self._proxies.documents(self._proxy_sync.admin_endpoints)
 
+    def places(self) -> dict[str, str]:
+        """Return the names of pods by address, in namespaces with a RosProxy."""
+        return self._store.pod_names()
+
     async def look(self) -> float | None:
         """Look and act. Return in how many seconds to look again, or None. Raises LookFailed."""
         try:

@@ -74,7 +74,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     webhook_since = server.serving_since if server else lambda: ""
     controller = KubernetesController(settings, api, metrics, election.term, webhook_since)
     webhook = (Injector(api, settings.plan, metrics, controller.wake), server) if server else None
-    page = operator_page(controller.documents, logs_command)
+    page = operator_page(controller.documents, logs_command, controller.places)
     unready = _first_reason(controller.unready, *([server.unready] if server else []))
     admin_server = OperatorAdminServer(metrics.registry, controller.dead, unready, page)
     await admin_server.start(settings.admin)

@@ -68,6 +68,29 @@ def test_inside_is_apart_and_outside_the_same() -> None:
     assert document["findings"][0]["subject"] == "one: ports"
 
 
+@pytest.mark.parametrize(
+    ("address", "label", "wanted"),
+    [
+        ("172.18.0.5:45000", "/talker", "/talker"),
+        ("172.18.0.5, Fast DDS", "/talker", "/talker"),
+        ("172.18.0.5, Fast DDS", "172.18.0.5", "camera"),
+        ("172.18.0.5, Fast DDS", "172.18.0.5 #2", "camera #2"),
+        ("fd00::5, Fast DDS", "fd00::5", "lidar"),
+    ],
+)
+def test_a_container_gives_its_name_to_what_has_none(address: str, label: str, wanted: str) -> None:
+    """Only the operator names the container."""
+    kind = "participant" if "," in address else "node"
+    row = {"kind": kind, "address": address, "label": label, "place": "of the proxy"}
+    nodes = {"x": {**row, "lane": "container"}, "y": {**row, "lane": "robot"}}
+    places = {"172.18.0.5": "camera", "fd00::5": "lidar"}
+    shown_nodes = merged({"one": shown("a", 0, nodes=nodes)}, "1", LOGS, places)["nodes"]
+    inside = shown_nodes["one x"]
+    assert (inside["label"], inside["place"]) == (wanted, "lidar" if ":5," in address else "camera")
+    (outside,) = (node for node in shown_nodes.values() if node["lane"] == "robot")
+    assert (outside["label"], outside.get("place")) == (label, None)
+
+
 def test_who_is_inside_elsewhere_is_one_box() -> None:
     """A node behind the second proxy is outside for the first, and the other way round."""
     nodes = {

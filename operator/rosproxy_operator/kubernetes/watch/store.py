@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from msgspec.structs import replace
 
-from rosproxy.net.addresses import is_address
+from rosproxy.net.addresses import is_address, plain_address
 from rosproxy_operator.kubernetes.api.api_client import (
     ApiError,
     ApiNotFound,
@@ -180,6 +180,17 @@ class ClusterStore:
             key=key,
         )
         return self._with_pods(snapshot)
+
+    def pod_names(self) -> dict[str, str]:
+        """The names of pods by address, in namespaces with a RosProxy."""
+        return {
+            plain_address(address): pod.id.name
+            for namespace in self._rosproxies
+            for pod in self._pods.get(namespace, {}).values()
+            if not (pod.host_network or pod.ended)
+            for address in pod.ips or (pod.ip,)
+            if address
+        }
 
     def _with_pods(self, snapshot: ClusterSnapshot) -> ClusterSnapshot:
         own = [own_pod for group in self._own_pods.values() for own_pod in group.values()]

@@ -16,7 +16,12 @@ from rosproxy.admin.status_document import (
 )
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.host_document import NODES_STARTING_S, PROXY_STARTING_S, host_document
+from rosproxy_operator.docker.host_document import (
+    NODES_STARTING_S,
+    PROXY_STARTING_S,
+    container_names,
+    host_document,
+)
 from rosproxy_operator.docker.planner.model import ZENOH, Attachment, Key
 from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.planner.specs import proxy_name
@@ -166,6 +171,13 @@ def test_a_container_in_the_network_of_another_has_its_participants() -> None:
     (row,) = host_document(state, made, (), answers, SETTINGS, STARTED)["containers"]
     assert row["name"] == talker.name
     assert [p["guid_prefix"] for p in row["participants"]] == ["01.0f.aa"]
+
+
+def test_addresses_have_the_names_of_their_running_containers() -> None:
+    pause = container("pause", networks=[TALKER])
+    talker = container("talker", networks=(), mode=f"container:{pause.id}")
+    gone = container("gone", networks=[replace(TALKER, address="172.30.0.9")], state="exited")
+    assert container_names(observed(pause, talker, gone)) == {TALKER.address: "pause, talker"}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The snapshot of a cluster after all watches have delivered."""
+"""The store and the snapshot of a cluster after all watches have delivered."""
 
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.records import READERS, key_of
@@ -7,11 +7,15 @@ from tests.unit.operator.kubernetes.api_server import ApiServer
 
 
 def snapshot_of(server: ApiServer, key: bytes = b"") -> ClusterSnapshot:
+    return store_of(server).snapshot(key)
+
+
+def store_of(server: ApiServer) -> ClusterStore:
     store = ClusterStore([(kind, "") for kind in READERS], ("",), _nothing, _nothing)
     for kind, read in READERS.items():
         records = {key_of(obj): read(obj) for obj in server.all(kind)}
         store.listed(kind, "", {uid: r for uid, r in records.items() if r is not None})
-    return store.snapshot(key)
+    return store
 
 
 def _nothing() -> None:

@@ -21,7 +21,7 @@ from tests.unit.operator.kubernetes.objects import (
     told,
     written,
 )
-from tests.unit.operator.kubernetes.snapshots import snapshot_of
+from tests.unit.operator.kubernetes.snapshots import snapshot_of, store_of
 
 LOST = "so outside can't reach the ROS nodes of the pod"
 
@@ -108,3 +108,23 @@ def test_which_pods_are_seen() -> None:
     ended["status"]["phase"] = "Succeeded"
     server.put("pods", ended, NAMESPACE)
     assert [p.id.name for p in snapshot_of(server).unselected_pods] == ["b", "f", "g"]
+
+
+def test_pods_are_known_by_their_addresses() -> None:
+    server = ApiServer()
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    addresses = {"talker": "10.244.1.9", "host": "192.0.2.1", "ended": "10.244.1.8"}
+    for name, address in addresses.items():
+        obj: dict[str, Any] = pod_obj(name, {})
+        obj["status"] |= {
+            "podIP": address,
+            "podIPs": [{"ip": address}, {"ip": f"::ffff:{address}"}],
+        }
+        server.put("pods", obj, NAMESPACE)
+    host = server.get("pods", "host", NAMESPACE)
+    host["spec"]["hostNetwork"] = True
+    server.put("pods", host, NAMESPACE)
+    ended = server.get("pods", "ended", NAMESPACE)
+    ended["status"]["phase"] = "Failed"
+    server.put("pods", ended, NAMESPACE)
+    assert store_of(server).pod_names() == {"10.244.1.9": "talker"}
