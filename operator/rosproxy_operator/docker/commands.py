@@ -48,8 +48,11 @@ def _wait_option(text: str) -> Callable[[Command], Command]:
     "--watch", is_flag=True, help="Draw the status again every two seconds, until Ctrl-C."
 )
 @_wait_option("Longest time to wait until nothing is wrong and no step is left, before printing.")
+@click.option(
+    "--open", "opens", is_flag=True, help="Open the live page of all proxies in a browser instead."
+)
 @click.pass_obj
-def status(context: CommandContext, as_json: bool, watch: bool, wait: float) -> None:
+def status(context: CommandContext, as_json: bool, watch: bool, wait: float, opens: bool) -> None:
     """Show the proxies, the labelled containers, their nodes, and the problems.
 
     The running operator reports the status. If no operator answers at --admin-bind, or if options
@@ -57,17 +60,38 @@ def status(context: CommandContext, as_json: bool, watch: bool, wait: float) -> 
     with 0 if nothing is wrong, no step is left, every proxy answers, and no proxy reports that its
     master or outside can't be reached; else with 1.
     """
-    if as_json and watch:
-        raise click.UsageError("--json and --watch exclude each other. Omit one option")
+    if as_json + watch + opens > 1:
+        raise click.UsageError("--json, --watch and --open exclude each other. Give one option")
     from rosproxy_operator.docker.errors import EngineError
     from rosproxy_operator.docker.host_status import HostStatus, show_status, watch_status
 
+    if opens:
+        _open_page(context.admin)
+        return
     host = HostStatus(context.settings, context.operator)
     if watch:
         watch_status(host)
         return
     with exit_on_error(EngineError):
         sys.exit(show_status(host, as_json, wait))
+
+
+def _open_page(admin: HostPort) -> None:
+    """Open the live page of the operator that runs here; exit if no operator answers."""
+    from rosproxy.cli.browser import open_page
+    from rosproxy_operator.docker.errors import EngineError
+    from rosproxy_operator.docker.host_status import ask_operators
+
+    with exit_on_error(EngineError):
+        document = ask_operators(admin)
+    if document is None:
+        fail(
+            f"no operator answers at http://{admin}, so there is no live page of all proxies. "
+            "Start the operator (docs/guide/docker.md)"
+        )
+    text = "No browser was found here. Open the address on this host. From another machine, "
+    tunnel = f"ssh -L {admin.port}:127.0.0.1:{admin.port} HOST"
+    open_page(f"{document['operator']}/", f"{text}use a tunnel: {tunnel}")
 
 
 @click.command()

@@ -91,16 +91,11 @@ def status(admin: Any, as_json: bool, watch: bool, wait: float, opens: bool) -> 
 
 def _open_page(admin: Any) -> None:
     """Print the address of the live page, and open a browser if there is one."""
-    import webbrowser
+    from rosproxy.cli.browser import open_page
 
-    url = admin.page()
-    click.echo(url)
-    if not webbrowser.open(url):
-        text = (
-            "No browser was found here. In a container, the address leads to the container itself. "
-        )
-        text += "The page of the operator shows all proxies: rosproxy-operator docker status. "
-        click.echo(f"{text}Without an operator, see docs/guide/live-page.md.", err=True)
+    text = "No browser was found here. In a container, the address leads to the container itself. "
+    text += "The page of the operator shows all proxies: rosproxy-operator docker status. "
+    open_page(admin.page(), f"{text}Without an operator, see docs/guide/live-page.md.")
 
 
 def _why_not_ready(admin: Any) -> str:

@@ -169,6 +169,35 @@ def test_uninstall_refuses_beside_an_operator(monkeypatch: pytest.MonkeyPatch) -
     assert "docker rm -f rosproxy-operator" in result.stderr
 
 
+@pytest.mark.parametrize("has_browser", [True, False])
+def test_status_opens_the_page_of_the_operator(
+    monkeypatch: pytest.MonkeyPatch, has_browser: bool
+) -> None:
+    opened: list[str] = []
+    answer = {"operator": "http://127.0.0.1:11313", "version": "another"}
+    monkeypatch.setattr("rosproxy_operator.docker.host_status.ask_operators", lambda _: answer)
+
+    def browse(url: str) -> bool:
+        opened.append(url)
+        return has_browser
+
+    monkeypatch.setattr("webbrowser.open", browse)
+    result = run("docker", "status", "--open")
+    assert (result.exit_code, result.stdout) == (0, "http://127.0.0.1:11313/\n")
+    assert opened == ["http://127.0.0.1:11313/"]
+    assert ("ssh -L 11313:127.0.0.1:11313 HOST" in result.stderr) is not has_browser
+
+
+def test_without_an_operator_there_is_no_page_to_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rosproxy_operator.docker.host_status.ask_operators", lambda _: None)
+    result = run("docker", "status", "--open")
+    assert result.exit_code == 1
+    assert (
+        "no operator answers at http://127.0.0.1:11313, so there is no live page" in result.stderr
+    )
+    assert run("docker", "status", "--open", "--json").exit_code == 2
+
+
 def test_once_is_for_the_controller_itself() -> None:
     result = run("docker", "--once", "status")
     assert result.exit_code == 2
