@@ -556,6 +556,9 @@ def test_notes(option: str, choice: str, chart_with_notes: Path) -> None:
     assert f"helm -n {NAMESPACE} test rosproxy" in text
     assert f"kubectl -n {NAMESPACE} rollout status deployment/" in text
     assert "rosproxy.io/inject" in text
+    port = values.get("metricsPort", 11313)
+    assert f"http://localhost:{port}/ in a browser" in text
+    assert re.search(f"kubectl -n {NAMESPACE} port-forward deployment/\\S+ {port}\n", text)
     assert ("webhook.enabled" in text) == (choice == "off")
     assert ("crds.install" in text) == (option == "crds" and choice == "elsewhere")
     assert ("kubectl delete crd" in text) == (option != "crds" or choice == "installed")

@@ -21,7 +21,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Json,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.names import INJECT, master_uri
+from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, INJECT, master_uri
 from rosproxy_operator.kubernetes.status.findings import (
     CONFLICT,
     EXHAUSTED,
@@ -116,6 +116,7 @@ def status_of(
         "topics": _topics(states, former),
         "addresses": _addresses(wanted),
         "ports": _ports(states),
+        "livePage": _live_page(wanted),
         "perNode": lines,
         "conditions": _conditions(judged, former, rosproxy.generation, stamp),
     }
@@ -241,6 +242,21 @@ def _addresses(wanted: Sequence[RosProxyOnNode]) -> str:
         for name, host in sorted(hosts.items())
     )
     return bounded(", ".join(lines), _BY_NODE)
+
+
+def _live_page(wanted: Sequence[RosProxyOnNode]) -> str:
+    """The command for the live page of the first proxy that works; empty without such a proxy.
+
+    Users of the RosProxy may have rights in its namespace alone. The page of all proxies is in the
+    namespace of the operator.
+    """
+    working = (state for state in wanted if _serving(state))
+    first = min(working, key=lambda state: state.name, default=None)
+    if first is None or first.proxy is None:
+        return ""
+    pod = first.proxy.pod.id
+    forward = f"kubectl -n {pod.namespace} port-forward {pod.name} {ADMIN_PORT}"
+    return f"{forward} # then http://localhost:{ADMIN_PORT}/"
 
 
 def _serving(state: RosProxyOnNode) -> bool:

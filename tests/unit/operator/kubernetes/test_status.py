@@ -41,6 +41,8 @@ from tests.unit.operator.kubernetes.builders_api import (
     stuck_proxy,
 )
 
+POD = proxy("node1").pod.id
+
 
 def test_all_is_well():
     rosproxy_status = status(state("node2", answer=answer("/a", "/b")), state("node1"))
@@ -58,6 +60,8 @@ def test_all_is_well():
         "topics": 1,
         "addresses": "node1: 192.0.2.11, node2: 192.0.2.11",
         "ports": "11400-11431",
+        "livePage": f"kubectl -n {POD.namespace} port-forward {POD.name} 11312"
+        " # then http://localhost:11312/",
     }
     assert [(c["type"], c["status"], c["reason"]) for c in rosproxy_status["conditions"]] == [
         ("Ready", "True", "Serving"),
@@ -69,6 +73,13 @@ def test_all_is_well():
     assert message(rosproxy_status) == "2 of 2 proxies serve 3 ROS nodes"
     assert {c["lastTransitionTime"] for c in rosproxy_status["conditions"]} == {STAMP}
     assert {c["observedGeneration"] for c in rosproxy_status["conditions"]} == {3}
+
+
+def test_the_live_page_is_that_of_a_proxy_that_works():
+    silent = answer(answered=False)
+    first = state("node1", answer=silent)
+    assert proxy("node2").pod.id.name in status(first, state("node2"))["livePage"]
+    assert status(first, state("node2", proxy=None))["livePage"] == ""
 
 
 def test_a_node_in_the_status():
