@@ -253,7 +253,9 @@ class LocatorStatus(msgspec.Struct, frozen=True):
 
     ``kind`` is metatraffic or data. ``plane``: proxy or kernel forwards; ``reason``: why not the
     kernel. ``datagrams`` and ``bytes`` count what the proxy has forwarded, ``kernel_datagrams`` and
-    ``kernel_bytes`` the IP packets that the kernel has forwarded.
+    ``kernel_bytes`` the IP packets that the kernel has forwarded. ``user_datagrams`` counts
+    user data: of the proxy, datagrams with samples; of the kernel, all. ``user_rate`` is in bytes,
+    ``user_datagram_rate`` in datagrams per second.
     """
 
     port: Count = 0
@@ -266,6 +268,9 @@ class LocatorStatus(msgspec.Struct, frozen=True):
     reason: str = ""
     kernel_datagrams: Count = 0
     kernel_bytes: Count = 0
+    user_datagrams: Count = 0
+    user_rate: Rate = 0.0
+    user_datagram_rate: Rate = 0.0
 
 
 class NamedTypeStatus(msgspec.Struct, frozen=True):

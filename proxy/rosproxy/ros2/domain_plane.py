@@ -40,6 +40,9 @@ class DomainPlane(Collector):
             mapping.rate,
             self._plane.user_plane,
             _reason(participant, mapping),
+            user_datagrams=mapping.user_datagrams,
+            user_rate=mapping.user_rate,
+            user_datagram_rate=mapping.user_datagram_rate,
         )
         forwarded = self._forwarded.by_port.get(mapping.port)
         if forwarded is None:
@@ -52,6 +55,9 @@ class DomainPlane(Collector):
             kernel_datagrams=kernel["received_packets"],
             kernel_bytes=kernel["received"],
             rate=mapping.rate + kernel["received_rate"],
+            user_datagrams=mapping.user_datagrams + kernel["received_packets"],
+            user_rate=mapping.user_rate + kernel["received_rate"],
+            user_datagram_rate=mapping.user_datagram_rate + kernel["packet_rate"],
         )
 
     def collect(self) -> Iterator[Metric]:

@@ -73,9 +73,9 @@ def test_bytes_go_to_who_holds_the_port_and_to_its_name() -> None:
     ]
     more = book.count({1002: Counts(600, 40, 3), 1003: Counts(5, 6)}, 12.0)
     assert more == [("/node1", Counts(200, 0, 1))]
-    assert book.account(endpoint) == Account(600, 40, 3, (100.0, 0.0))
+    assert book.account(endpoint) == Account(600, 40, 3, (100.0, 0.0), 0.5)
     book.count({1002: Counts(600, 40, 3)}, 14.0)
-    assert book.account(endpoint).rates == (0.0, 0.0)
+    assert book.account(endpoint) == Account(600, 40, 3)
 
 
 def test_a_port_given_back_stays_its_holders_until_somebody_else_has_it() -> None:

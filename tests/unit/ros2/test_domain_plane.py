@@ -22,6 +22,38 @@ from tests.unit.ros2.discovery.domains import (
 )
 
 
+class KernelForwards:
+    """The part of a plane for ports that the kernel forwards."""
+
+    user_plane = "copy"
+
+    def status_of(self, _: object) -> dict[str, object]:
+        return {
+            "plane": "kernel",
+            "reason": "",
+            "received": 900,
+            "received_packets": 9,
+            "received_rate": 90.0,
+            "packet_rate": 3.0,
+        }
+
+
+def test_user_data_is_what_the_proxy_and_the_kernel_have_passed_on() -> None:
+    domain = make_domain()
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
+    mappings = KernelPorts(PortPool(domain.settings.ports.listen))
+    mappings.domains.append(domain.mappings)
+    participant = domain.inside.by_prefix[A]
+    mapping = participant.mappings[HostPort(INSIDE, 7411)]
+    mapping.sample(NOW)
+    mapping.note_passed(100, has_samples=True)
+    mapping.sample(NOW + 1)
+    plane = cast(KernelPlane, KernelForwards())
+    status = DomainPlane(plane, mappings).locator(participant, mapping)
+    assert status.user_datagrams == 10
+    assert (status.user_rate, status.user_datagram_rate) == (190.0, 4.0)
+
+
 @dataclass
 class Plane:
     """The part of a plane for a port that the kernel may not forward."""

@@ -166,10 +166,13 @@ def test_the_rate_of_a_port() -> None:
     announce(domain, 1)
     (_, mapping), *_ = domain.mappings.by_port.values()
     mapping.sample(NOW)
-    mapping.bytes += 3000
+    mapping.note_passed(1000, has_samples=False)
+    for _ in range(4):
+        mapping.note_passed(500, has_samples=True)
     mapping.sample(NOW + 2)
     (inside,) = told(domain).inside
     assert 1500.0 in {locator.rate for locator in inside.leases}
+    assert (mapping.user_rate, mapping.user_datagram_rate) == (1000.0, 2.0)
 
 
 def test_metrics_tell_the_ports_that_are_left() -> None:

@@ -18,13 +18,14 @@ class Account:
 
     ``sent`` are bytes from inside to outside, ``received`` bytes from outside to inside.
     ``packets``: the packets that peers sent to the port. ``rates``: sent and received bytes per
-    second, as of the last count.
+    second, as of the last count, ``packet_rate`` packets per second.
     """
 
     sent: int = 0
     received: int = 0
     packets: int = 0
     rates: tuple[float, float] = (0.0, 0.0)
+    packet_rate: float = 0.0
 
 
 class CounterDeltas:
@@ -109,6 +110,7 @@ class KernelAccounts:
         self._counted_at = now
         for account in self._accounts.values():
             account.rates = 0.0, 0.0
+            account.packet_rate = 0.0
         by_name = []
         by_port = self._deltas.take(counters)
         self.unanswered = self._silence.look(by_port, now)
@@ -153,3 +155,4 @@ class KernelAccounts:
         sent, received = account.rates
         if elapsed > 0:
             account.rates = sent + delta.sent / elapsed, received + delta.received / elapsed
+            account.packet_rate += delta.packets / elapsed

@@ -156,6 +156,7 @@ class KernelPlane:
             "received_packets": account.packets,
             "sent_rate": round(account.rates[0], 1),
             "received_rate": round(account.rates[1], 1),
+            "packet_rate": round(account.packet_rate, 1),
         }
 
     async def _look(self) -> None:

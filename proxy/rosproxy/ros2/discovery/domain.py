@@ -57,6 +57,7 @@ from rosproxy.ros2.ports.locator_ports import LocatorPorts, NamedBy
 from rosproxy.ros2.ports.mappings import PortMappings
 from rosproxy.ros2.ports.stand_ins import LocatorStandIns, StandInUser
 from rosproxy.ros2.protocol.addressing import (
+    carries_samples,
     destinations,
     for_all,
     may_be_discovery,
@@ -263,18 +264,19 @@ class Domain:
             insider, mapping = mapped
             is_for_data = mapping.kind is TrafficKind.USER_DATA
             if is_for_data and not (mapping.is_read and may_be_discovery(datagram)):
-                return [self._passed(mapping, datagram, True)]
+                return [self._passed(mapping, datagram, True, is_user_data=True)]
             if self.outside.is_strange(source):
                 return []
             passed = [datagram]
             back = list[Outgoing]()
-            if is_for_data or may_be_discovery(datagram):  # Cyclone DDS has one locator for both
+            is_read = is_for_data or may_be_discovery(datagram)
+            if is_read:  # Cyclone DDS has one locator for both
                 if self._is_too_much(datagram, source, now):
                     return []
                 passed, back = self._read_at_range_port(port, source, insider, datagram, now)
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
-        return [self._passed(mapping, d, True) for d in passed] + back
+        return [self._passed(mapping, d, True, is_user_data=not is_read) for d in passed] + back
 
     def at_stand_in(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """Handle a datagram from inside at a stand-in."""
@@ -282,7 +284,7 @@ class Domain:
         sent = list[Outgoing]()
         if not self.is_read_at_stand_in(port, datagram, source):
             is_of_participant = source in self.inside.count_by_address
-            return self._to_outside(users, datagram) if is_of_participant else []
+            return self._to_outside(users, datagram, True) if is_of_participant else []
         if self._is_too_much(datagram, source, now):
             return []
         try:
@@ -623,7 +625,9 @@ class Domain:
         for_outside = ForOutside(self.inside, insider, now)
         passed, questions = self.fragments.rewritten(port, message, reader, for_outside.rewritten)
         back = sent_to(insider.metatraffic, questions) + self._reminders(insider, count, now)
-        return back + [sent for d in passed for sent in self._to_outside(_meant(users, d), d)]
+        return back + [
+            sent for d in passed for sent in self._to_outside(_meant(users, d), d, False)
+        ]
 
     def _reminders(
         self, insider: InsideParticipant, former_count: int, now: float
@@ -700,12 +704,14 @@ class Domain:
             self.disposal.forget_outside(outsider)
         return passed, back
 
-    def _to_outside(self, users: Sequence[StandInUser], datagram: bytes) -> list[Outgoing]:
+    def _to_outside(
+        self, users: Sequence[StandInUser], datagram: bytes, is_user_data: bool
+    ) -> list[Outgoing]:
         """The datagrams for participants outside, as far as their credit allows."""
         sent = list[Outgoing]()
         for target, mapping in users:
             if target.may_be_sent(len(datagram)):
-                sent.append(self._passed(mapping, datagram, False))
+                sent.append(self._passed(mapping, datagram, False, is_user_data))
             else:
                 text = (
                     f"participant {target.guid_prefix} has not shown yet that it receives datagrams"
@@ -713,9 +719,11 @@ class Domain:
                 sent += self._drop("unproven", target.address, text)
         return sent
 
-    def _passed(self, mapping: PortMapping, datagram: bytes, inwards: bool) -> Outgoing:
-        """Count a datagram that passes, and return it for the target of a mapping."""
-        mapping.note_passed(len(datagram))
+    def _passed(
+        self, mapping: PortMapping, datagram: bytes, inwards: bool, is_user_data: bool
+    ) -> Outgoing:
+        """Count a datagram that passes, and return the datagram for the target of a mapping."""
+        mapping.note_passed(len(datagram), is_user_data and carries_samples(datagram))
         self.passed[mapping.kind, inwards] += len(datagram)
         return Outgoing(mapping.target, datagram)
 

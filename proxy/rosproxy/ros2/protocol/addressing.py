@@ -53,6 +53,20 @@ _NAMELESS = frozenset(
 _NAMELESS_OF = {FAST_DDS: _NAMELESS | {STATISTICS}}
 """Submessages without a reader and a writer, by vendor, for vendors with submessages of their
 own."""
+LONGEST_WITHOUT_SAMPLES = 256
+"""Bytes of a message that may be without a sample. So the proxy looks into small messages alone."""
+_WITHOUT_SAMPLES = _NAMELESS | frozenset(
+    kind.value
+    for kind in (
+        SubmessageId.ACKNACK,
+        SubmessageId.HEARTBEAT,
+        SubmessageId.GAP,
+        SubmessageId.NACK_FRAG,
+        SubmessageId.HEARTBEAT_FRAG,
+    )
+)
+_WITHOUT_SAMPLES_OF = {FAST_DDS: _WITHOUT_SAMPLES | {STATISTICS}}
+"""Submessages without a sample, and the same by vendor."""
 _ENTITY_ID = 4
 """Bytes of an entity id."""
 _HEARTBEAT = 28
@@ -149,6 +163,29 @@ def heartbeat_stream(datagram: bytes) -> bytes | None:
     except RtpsError:
         return None
     return datagram[HEADER - PREFIX : HEADER] + stream if len(stream) > PREFIX else None
+
+
+def carries_samples(datagram: bytes) -> bool:
+    """Whether a message has samples, or may have samples that the proxy can't see.
+
+    Messages without samples acknowledge samples, or report the numbers of samples. A reliable
+    subscriber sends such messages to each publisher.
+    """
+    size = len(datagram)
+    if not HEADER < size <= LONGEST_WITHOUT_SAMPLES:
+        return True
+    # The proxy does this for each small datagram. `walk_submessages` takes three times as long.
+    kinds = _WITHOUT_SAMPLES_OF.get(datagram[6:8], _WITHOUT_SAMPLES)
+    offset = HEADER
+    while offset < size:
+        if datagram[offset] not in kinds or offset + 4 > size:
+            return True
+        first = datagram[offset + 2]
+        second = datagram[offset + 3]
+        length = first + (second << 8) if datagram[offset + 1] & 1 else (first << 8) + second
+        # Length 0: the last submessage, up to the end (9.4.5.1.3).
+        offset = offset + 4 + length if length else size
+    return offset > size
 
 
 def may_be_discovery(datagram: bytes) -> bool:

@@ -147,8 +147,11 @@ class PortMapping:
 
     A locator inside has a port of the range. A locator outside has a *stand-in*, a port that inside
     reaches. ``is_read`` (only inside) means that a participant at the locator may act on discovery.
-    ``bytes`` and ``datagrams`` count what the proxy has passed on. ``rate`` is in bytes per second,
-    as of the last `sample`.
+
+    ``bytes`` and ``datagrams`` count what the proxy has passed on. ``user_bytes`` and
+    ``user_datagrams`` count the datagrams with samples of user data among this. ``rate`` and
+    ``user_rate`` are in bytes per second, ``user_datagram_rate`` in datagrams per second, as of the
+    last `sample`.
     """
 
     port: int
@@ -157,20 +160,36 @@ class PortMapping:
     is_read: bool = False
     datagrams: int = 0
     bytes: int = 0
+    user_datagrams: int = 0
+    user_bytes: int = 0
     rate: float = 0.0
-    _sampled: tuple[float, int] = (0.0, 0)
+    user_rate: float = 0.0
+    user_datagram_rate: float = 0.0
+    _sampled_at: float = 0.0
+    _sampled: tuple[int, int, int] = (0, 0, 0)
 
     def sample(self, now: float) -> None:
-        """Compute the rate since the last sample; ``now`` is in seconds."""
-        last_time, last_bytes = self._sampled
-        self._sampled = now, self.bytes
-        if last_time and now > last_time:
-            self.rate = round((self.bytes - last_bytes) / (now - last_time), 1)
+        """Compute the rates since the last sample; ``now`` is in seconds."""
+        counts = self.bytes, self.user_bytes, self.user_datagrams
+        elapsed = now - self._sampled_at
+        if self._sampled_at and elapsed > 0:
+            self.rate, self.user_rate, self.user_datagram_rate = (
+                round((count - last) / elapsed, 1)
+                for count, last in zip(counts, self._sampled, strict=True)
+            )
+        self._sampled_at = now
+        self._sampled = counts
 
-    def note_passed(self, size: int) -> None:
-        """Count a datagram of ``size`` bytes that the proxy passes on."""
+    def note_passed(self, size: int, has_samples: bool) -> None:
+        """Count a datagram of ``size`` bytes that the proxy passes on.
+
+        ``has_samples``: whether the datagram has samples of user data.
+        """
         self.datagrams += 1
         self.bytes += size
+        if has_samples:
+            self.user_datagrams += 1
+            self.user_bytes += size
 
 
 @dataclass(slots=True)

@@ -68,12 +68,19 @@ def make_domain(
 
 
 def spdp(
-    prefix: bytes, address: str, port: int = 7410, lease: float = 20, padding: int = 0
+    prefix: bytes,
+    address: str,
+    port: int = 7410,
+    lease: float = 20,
+    padding: int = 0,
+    data_port: int = 0,
 ) -> bytes:
+    """An announcement. By default the port for user data follows that for discovery."""
+    data_port = data_port or port + 1
     parameters = [
         (Pid.PARTICIPANT_GUID, prefix + bytes([0, 0, 1, 0xC1])),
         (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(address, port), "<")),
-        (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HostPort(address, port + 1), "<")),
+        (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HostPort(address, data_port), "<")),
         (Pid.PARTICIPANT_LEASE_DURATION, struct.pack("<iI", int(lease), 0)),
         *([(Pid.ENTITY_NAME, bytes(padding))] if padding else []),
     ]

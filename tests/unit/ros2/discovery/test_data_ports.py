@@ -278,3 +278,26 @@ def test_the_end_of_one_participant_leaves_the_ports_of_another_read() -> None:
     port = domain.inside.by_prefix[C].mappings[HostPort(INSIDE, 7411)].port
     domain.heard_inside(of_vendor(dispose_message(A)), INSIDE, NOW)
     assert domain.at_range_port(port, sedp(B, ROBOT, 7000), STRANGER, NOW) == []
+
+
+@pytest.mark.parametrize("both_ways", [False, True])
+def test_user_data_is_counted_apart_from_discovery_at_the_same_port(both_ways: bool) -> None:
+    """Cyclone DDS has a single port for both."""
+    domain = make_domain(both_ways=both_ways)
+    domain.heard_inside(of_vendor(spdp(A, INSIDE, data_port=7410)), INSIDE, NOW)
+    domain.heard_outside(of_vendor(spdp(B, ROBOT, data_port=7410)), ROBOT, NOW)
+    (insider,) = domain.inside.by_prefix.values()
+    (outsider,) = domain.outside.by_prefix.values()
+    (mapping,) = insider.mappings.values()
+    (stand_in,) = outsider.mappings.values()
+    from_inside = message(data(bytes(1200), writer=0x00001203), prefix=A)
+    for discovery, user in ((sedp(B, ROBOT, 7000), USER), (sedp(A, INSIDE, 7000), from_inside)):
+        acknowledgement = message(submessage(6, 0, TO_READER + bytes(16)), prefix=user[8:20])
+        for datagram in (discovery, user, acknowledgement, user):
+            if user is USER:
+                assert domain.at_range_port(mapping.port, datagram, ROBOT, NOW)
+            else:
+                assert domain.at_stand_in(stand_in.port, datagram, INSIDE, NOW)
+    for counted, size in ((mapping, len(USER)), (stand_in, len(from_inside))):
+        assert (counted.user_datagrams, counted.user_bytes) == (2, 2 * size)
+        assert counted.datagrams > 3
