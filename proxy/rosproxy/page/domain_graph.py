@@ -1,7 +1,7 @@
 """ROS 2 in the document of a proxy: participants, topics and services of both sides.
 
-The proxy does not read user data, so a topic has no messages and no rate. The bytes are those of
-the ports of a participant.
+The proxy does not read user data, so a topic has no messages and no rate of messages. The measures
+are those of the ports of a participant: all links to this participant share the measures.
 """
 
 from collections import Counter
@@ -19,6 +19,7 @@ from rosproxy.admin.status_document import (
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.doctor.rules.participant import check
 from rosproxy.net.addresses import is_loopback
+from rosproxy.page.measures import FLOWS, Measures
 from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
@@ -44,12 +45,18 @@ _QUIET_ENDINGS = (
 """Services that every node of ROS 2 has."""
 _QUIET_TOPICS = QUIET | {"ros_discovery_info"}
 """On ros_discovery_info, participants announce the ROS 2 nodes that each participant has."""
+KERNEL = "kernel"
 Key = tuple[str, str, str, str]
 """A link: kind, name, GUID prefix of the source, GUID prefix of the target."""
 
 
-def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
-    """The participants of all domains, and the links between them."""
+def graph(
+    status: ProxyStatus, measures: Measures, now: float, epoch: float
+) -> tuple[dict[str, PageNode], list[PageLink]]:
+    """The participants of all domains, and the links between them.
+
+    ``now`` and ``epoch`` as for `rosproxy.page.graph_document.graph_document`.
+    """
     nodes: dict[str, PageNode] = {}
     links: list[PageLink] = []
     for domain in status.domains:
@@ -61,8 +68,25 @@ def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
                 node = _node(domain, participant, side is domain.inside, problem)
                 node = replace(node, label=labels[participant.guid_prefix])
                 nodes[_key(domain, participant.guid_prefix)] = node
-        links += _links(domain, problems)
+        links += _measured(domain, _links(domain, problems), measures, now, epoch)
     return nodes, links
+
+
+def received(status: ProxyStatus) -> dict[str, int]:
+    """The datagrams of user data that the proxy has passed to each participant, by its key.
+
+    Without ``--direction both``, user data to outside does not pass the proxy.
+    """
+    return {
+        _key(domain, participant.guid_prefix): sum(
+            lease.user_datagrams for lease in _user_data_ports(participant)
+        )
+        for domain in status.domains
+        for participant in (
+            *domain.inside,
+            *(domain.outside if domain.direction == "both" else ()),
+        )
+    }
 
 
 def findings(status: ProxyStatus) -> list[DoctorFinding]:
@@ -91,6 +115,51 @@ def _user_data_ports(participant: ParticipantStatus) -> list[LocatorStatus]:
     """
     data = [lease for lease in participant.leases if lease.kind == TrafficKind.USER_DATA.value]
     return data or [*participant.leases]
+
+
+def _measured(
+    domain: DomainStatus, links: Iterable[PageLink], measures: Measures, now: float, epoch: float
+) -> Iterator[PageLink]:
+    """The links, with the measures of the participants to which they lead.
+
+    A datagram to a participant may belong to any of its links. So ``flows`` is set only if all
+    these links come from one participant. The kernel also counts the acknowledgements for what the
+    participant publishes: then all links share the measures with these topics. Quiet and broken
+    links get no measures, and carry little or nothing.
+    """
+    participants = {_key(domain, p.guid_prefix): p for p in (*domain.inside, *domain.outside)}
+    groups: dict[str, list[PageLink]] = {}
+    acknowledged: Counter[str] = Counter()
+    for link in links:
+        is_live = link.kind == "topic" and not link.quiet and link.state != BROKEN
+        acknowledged[link.source] += is_live
+        if is_live and link.port:
+            groups.setdefault(link.target, []).append(link)
+        else:
+            yield link
+    for target, group in groups.items():
+        ports = _user_data_ports(participants[target])
+        services = [name for name in participants[target].services if not _is_quiet_service(name)]
+        by_kernel = any(lease.plane == KERNEL for lease in ports)
+        returned = acknowledged[target] if by_kernel else 0
+        shared = len(group) + len(services) + returned
+        datagrams = sum(lease.user_datagram_rate for lease in ports)
+        last = measures.participant_last(target)
+        is_active = datagrams > 0 or (last is not None and now - last < FLOWS)
+        is_certain = not returned and len({link.source for link in group}) == 1
+        measured = {
+            "rate": rounded(sum(lease.user_rate for lease in ports)),
+            "datagrams": rounded(datagrams),
+            "since": None if is_active or last is None else round(epoch + last),
+            "flows": is_active and is_certain,
+            "shared": shared if shared > 1 else 0,
+        }
+        yield from (replace(link, **measured) for link in group)
+
+
+def _is_quiet_service(name: str) -> bool:
+    """Whether every node of ROS 2 has such a service."""
+    return is_quiet_service(name) or name.endswith(_QUIET_ENDINGS)
 
 
 def _node(
@@ -189,7 +258,7 @@ def _links(domain: DomainStatus, problems: dict[str, DomainProblem]) -> Iterator
                     "service",
                     shown_name(service),
                     _key(domain, participant.guid_prefix),
-                    quiet=is_quiet_service(service) or service.endswith(_QUIET_ENDINGS),
+                    quiet=_is_quiet_service(service),
                 ),
                 problems.get(participant.guid_prefix),
             )

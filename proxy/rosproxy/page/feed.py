@@ -22,6 +22,7 @@ from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.collect import collect_running
 from rosproxy.net.fair_slots import FairSlots
 from rosproxy.net.tasks import Tasks
+from rosproxy.page import domain_graph
 from rosproxy.page.graph_document import graph_document, relayed
 from rosproxy.page.judgement import JudgedFacts, judge, topics_to_ask_about
 from rosproxy.page.measures import Measures
@@ -182,6 +183,7 @@ class PageWatch:
         own_findings = tuple(self._own_findings())
         judged = self._judged
         async with self._counting:
+            self._measures.read_participants(domain_graph.received(status), now)
             if judged:
                 self._measures.read_relays(relayed(status, judged.facts.system), now)
             # In a thread, because the document of a large graph would hold up calls of nodes.

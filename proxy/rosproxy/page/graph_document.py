@@ -73,7 +73,7 @@ def graph_document(
     judged = without_ended(judged or JudgedFacts(DoctorFacts(status=status)), status)
     present = tuple(endpoint for endpoint in status.nodes if not endpoint.has_ended)
     status = msgspec.structs.replace(status, nodes=present)
-    nodes, links = domain_graph.graph(status)
+    nodes, links = domain_graph.graph(status, measures, now, epoch)
     left_out = 0
     if status.settings.for_ros1:
         nodes |= _Ros1Graph(status, judged).nodes()

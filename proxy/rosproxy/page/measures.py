@@ -140,10 +140,24 @@ class Measures:
 
     def __init__(self) -> None:
         self._links: dict[Key, Link] = {}
+        self._participants: dict[str, Counter] = {}
 
     def get(self, key: Key) -> Link:
         """The counters of a link, perhaps empty. Do not change the result."""
         return self._links.get(key, _EMPTY_LINK)
+
+    def participant_last(self, key: str) -> float | None:
+        """When user data last passed to a participant of ROS 2; None: that is not known."""
+        counter = self._participants.get(key)
+        return counter.grew if counter else None
+
+    def read_participants(self, datagrams: Mapping[str, int], now: float) -> None:
+        """Take in the datagrams of user data that passed to each participant, by its key."""
+        former = self._participants
+        self._participants = {}
+        for key, count in datagrams.items():
+            counter = self._participants[key] = former.get(key) or Counter(count, now)
+            counter.read(count, now)
 
     def read_relays(self, relayed: Mapping[Key, int], now: float) -> None:
         """Record the bytes that the proxy has relayed, by link. Other links lose ``relayed``."""

@@ -76,6 +76,9 @@ class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
     ``rate``: bytes a second. ``hz``: messages a second. ``since``: the Unix time in seconds of the
     last message, if nothing flows. None means unknown. ``proxy``: the key of the proxy with the
     ``port``, on an operator's page.
+
+    ``datagrams``: user data of ROS 2 in datagrams per second. If ``shared`` is 2 or more, the
+    measures are the sum of so many links, which lead to the same participant.
     """
 
     kind: str
@@ -93,6 +96,8 @@ class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
     fix: str = ""
     quiet: bool = False
     proxy: str = ""
+    datagrams: float | None = None
+    shared: int = 0
 
     @property
     def key(self) -> str:

@@ -13,6 +13,7 @@ from rosproxy.admin.status_document import (
     ProxyStatus,
     StatusSettings,
 )
+from rosproxy.page.domain_graph import received
 from rosproxy.page.graph_document import graph_document
 from rosproxy.page.measures import Measures
 
@@ -30,12 +31,15 @@ OUTSIDE = ParticipantStatus(
 LINK = "topic /chatter 0 01.10.bb 0 01.0f.aa"
 
 
-def made(**changes: Any) -> dict[str, Any]:
+def status_with(**changes: Any) -> ProxyStatus:
     domain = DomainStatus(
         **{"peers": ("robot",), "inside": (INSIDE,), "outside": (OUTSIDE,), **changes}
     )
-    status = ProxyStatus(settings=StatusSettings(ros=("2",)), domains=(domain,))
-    return graph_document(status, None, Measures(), (), 0.0, 0.0)
+    return ProxyStatus(settings=StatusSettings(ros=("2",)), domains=(domain,))
+
+
+def made(measures: Measures | None = None, now: float = 0.0, **changes: Any) -> dict[str, Any]:
+    return graph_document(status_with(**changes), None, measures or Measures(), (), now, 900.0)
 
 
 def test_participants_and_what_crosses_the_boundary() -> None:
@@ -45,7 +49,7 @@ def test_participants_and_what_crosses_the_boundary() -> None:
     assert document["nodes"]["0 01.0f.aa"]["rate"] == 120.0
     link = document["links"][LINK]
     assert (link["carried"], link["port"], link["state"]) == ("kernel", 11402, "ok")
-    assert not {"hz", "rate", "since"} & link.keys(), "user data is not read"
+    assert not {"hz", "since", "flows"} & link.keys(), "user data is not read"
     for topic in ("/rosout", "ros_discovery_info"):
         assert document["links"][f"topic {topic} 0 01.10.bb 0 01.0f.aa"]["quiet"]
     assert "quiet" not in link
@@ -81,6 +85,86 @@ def test_names_of_hostile_nodes_are_short_and_harmless() -> None:
     assert len(node["label"]) <= 300
     assert len(node["detail"]) <= 1000
     assert "\x1b" not in node["label"] + node["detail"]
+
+
+BUSY = replace(DATA, user_datagrams=7, user_rate=1234.0, user_datagram_rate=5.0)
+
+
+def measures_of(link: dict[str, Any]) -> dict[str, Any]:
+    names = ("rate", "datagrams", "since", "flows", "shared")
+    return {name: link[name] for name in names if name in link}
+
+
+def test_the_data_of_the_only_link_to_a_participant() -> None:
+    """Quiet topics have none: they carry next to nothing."""
+    links = made(inside=(replace(INSIDE, leases=(BUSY,)),))["links"]
+    assert measures_of(links[LINK]) == {"rate": 1200.0, "datagrams": 5.0, "flows": True}
+    quiet = [link for link in links.values() if link.get("quiet")]
+    assert len(quiet) == 2
+    assert not any(map(measures_of, quiet))
+
+
+def test_links_to_one_participant_share_its_data() -> None:
+    """If all come from one participant, data flows between the two, on whichever topic."""
+    near = replace(INSIDE, leases=(BUSY,), subscribes=("/chatter", "/scan"))
+    far = replace(OUTSIDE, publishes=("/chatter", "/scan"))
+    shares = {"rate": 1200.0, "datagrams": 5.0, "shared": 2}
+    links = made(inside=(near,), outside=(far,))["links"]
+    assert [measures_of(link) for link in links.values()] == [shares | {"flows": True}] * 2
+    other = replace(far, guid_prefix="01.10.cc", publishes=("/scan",))
+    links = made(inside=(near,), outside=(replace(far, publishes=("/chatter",)), other))["links"]
+    assert [measures_of(link) for link in links.values()] == [shares] * 2
+    serves = replace(near, subscribes=("/chatter",), services=("/add", "/x/get_parameters"))
+    link = made(inside=(serves,), outside=(far,))["links"][LINK]
+    assert measures_of(link) == shares | {"flows": True}, "requests arrive there, too"
+
+
+@pytest.mark.parametrize(("plane", "is_certain"), [("copy", True), ("kernel", False)])
+def test_the_kernel_counts_acknowledgements_for_what_a_participant_publishes(
+    plane: str, is_certain: bool
+) -> None:
+    near = replace(INSIDE, leases=(replace(BUSY, plane=plane),), publishes=("/plan",))
+    far = replace(OUTSIDE, subscribes=("/plan",))
+    measures = measures_of(made(inside=(near,), outside=(far,))["links"][LINK])
+    assert measures.get("flows", False) is is_certain
+    assert measures.get("shared", 0) == (0 if is_certain else 2)
+
+
+def test_a_port_without_data_has_carried_nothing_since_the_last_datagram() -> None:
+    idle = replace(BUSY, user_rate=0.0, user_datagram_rate=0.0)
+    measures = Measures()
+    nothing = {"rate": 0.0, "datagrams": 0.0}
+    for now, count, expected in (
+        (100.0, 7, nothing),
+        (101.0, 8, nothing | {"flows": True}),
+        (103.0, 8, nothing | {"flows": True}),
+        (104.0, 8, nothing | {"since": 1001}),
+    ):
+        inside = (replace(INSIDE, leases=(replace(idle, user_datagrams=count),)),)
+        measures.read_participants(received(status_with(inside=inside)), now)
+        assert measures_of(made(measures, now, inside=inside)["links"][LINK]) == expected
+
+
+@pytest.mark.parametrize(("direction", "is_counted"), [("out", False), ("both", True)])
+def test_of_data_past_the_proxy_nothing_is_known(direction: str, is_counted: bool) -> None:
+    near = replace(INSIDE, publishes=("/chatter",), subscribes=())
+    far = replace(OUTSIDE, subscribes=("/chatter",), publishes=(), leases=(BUSY,))
+    document = made(inside=(near,), outside=(far,), direction=direction)
+    (link,) = document["links"].values()
+    assert bool(measures_of(link)) is is_counted
+    counted = received(status_with(inside=(near,), outside=(far,), direction=direction))
+    assert ("0 01.10.bb" in counted) is is_counted
+
+
+def test_a_broken_link_has_no_share_in_the_data() -> None:
+    pair = MismatchStatus(
+        "topic", "/scan", "reliability", "BEST_EFFORT", "RELIABLE", "01.10.bb", "01.0f.aa"
+    )
+    near = replace(INSIDE, leases=(BUSY,), subscribes=("/chatter", "/scan"))
+    far = replace(OUTSIDE, publishes=("/chatter", "/scan"))
+    links = made(inside=(near,), outside=(far,), mismatches=(pair,))["links"]
+    assert not measures_of(links[LINK.replace("chatter", "scan")])
+    assert measures_of(links[LINK]) == {"rate": 1200.0, "datagrams": 5.0, "flows": True}
 
 
 def test_a_mismatch_is_on_its_link_alone() -> None:

@@ -5,7 +5,7 @@
 
 import { causesOf, follow, titleOf } from "./findings.js";
 import { boxesOf, DIRECT, hasFix, joined, layout, linesOf, selection } from "./picture.js";
-import { age, apply, duration, hertz, labelOf, megabytes, visibleLinks, visibleNodes, WORDS } from "./view.js";
+import { age, apply, duration, frequency, hertz, labelOf, megabytes, rateOf, visibleLinks, visibleNodes, WORDS } from "./view.js";
 
 const AT_MOST_EVERY = 500;
 const MOST_ROWS = 400;
@@ -312,10 +312,10 @@ function lineTexts(line, now) {
   const count = line.links.length;
   const what = count > 1 ? `${link.name} and ${count - 1} more` : link.name;
   if (hasFix(line)) return [`${WORDS[line.state]}: ${what}`, "", link.fix || link.text || ""];
-  const rates = line.links.flatMap((one) => one.link.rate ?? []);
-  const rate = rates.length ? `${megabytes({ rate: rates.reduce((sum, one) => sum + one, 0) })} MB/s` : "";
+  const sum = rateOf(line.links.map((one) => one.link));
+  const rate = sum.rate === undefined ? "" : `${megabytes(sum)} MB/s`;
   if (count > 1) return [what, rate, ""];
-  const measures = [link.hz === undefined ? "" : `${hertz(link)} Hz`, rate,
+  const measures = [frequency(link), rate,
     link.carried || "", link.flows || link.since === undefined ? "" : age(link, now)];
   return [what, measures.filter(Boolean).join(", "), ""];
 }
@@ -409,7 +409,7 @@ function details(on) {
   }
   const links = [...on.links.values()];
   for (const { link, from, to } of links.slice(0, MOST_CHOSEN)) {
-    parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name} from ${from}${to ? ` to ${to}` : ""}, ${hertz(link)} Hz, ` +
+    parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name} from ${from}${to ? ` to ${to}` : ""}, ${frequency(link) || "– Hz"}, ` +
       `${megabytes(link)} MB/s, last message ${age(link, now)}, carried by ${link.carried || "–"}, port ${link.port || "–"}`],
     ["p", link.text || ""], ["code", link.text && !cause ? link.fix || "" : ""]);
   }

@@ -54,9 +54,11 @@ export function visibleNodes(nodes, { quiet, filter }) {
   return found.sort((a, b) => b.order - a.order || (a.key < b.key ? -1 : 1));
 }
 
-// Whether messages flow through a link now. "still": none; "uncounted": no program tells.
+// Whether messages flow through a link now. "still": none; "uncounted": no program tells. Several
+// links of ROS 2 to one participant share its measures: then data may be of any of them.
 export function flowOf(link) {
   if (link.flows) return "flows";
+  if (link.shared && link.datagrams) return "uncounted";
   return [link.hz, link.rate, link.since].some((one) => one !== undefined && one !== null) ? "still" : "uncounted";
 }
 
@@ -68,21 +70,54 @@ export function hostOf(address = "") {
   return parts.length === 2 ? parts[0] : plain;
 }
 
+// Messages per second; of ROS 2 datagrams per second.
 export function hertz(link) {
-  return link.hz === undefined || link.hz === null ? "–" : String(link.hz);
+  if (isKnown(link.datagrams)) return `${atMost(link, link.datagrams)}${link.datagrams} datagrams/s`;
+  return isKnown(link.hz) ? String(link.hz) : "–";
+}
+
+// The same with the unit; empty if it is not known.
+export function frequency(link) {
+  const text = hertz(link);
+  return text === "–" ? "" : isKnown(link.datagrams) ? text : `${text} Hz`;
 }
 
 export function megabytes(link) {
-  if (link.rate === undefined || link.rate === null) return "–";
+  if (!isKnown(link.rate)) return "–";
   const rate = link.rate / 1e6;
-  return rate === 0 ? "0" : rate < 0.001 ? "<0.001" : String(Number(rate.toPrecision(2)));
+  if (rate > 0 && rate < 0.001) return "<0.001";
+  return `${atMost(link, rate)}${Number(rate.toPrecision(2))}`;
+}
+
+function isKnown(value) {
+  return value !== undefined && value !== null;
+}
+
+// The mark of a measure that a link shares: the link alone has as much or less.
+function atMost(link, value) {
+  return link.shared && value ? "≤ " : "";
+}
+
+// The bytes per second of links together; undefined if they are not known. Links that share their
+// measures count once. The sum is `shared` with others if any of these links is not in the list.
+export function rateOf(links) {
+  const groups = new Map();
+  let rate;
+  for (const link of links.filter((one) => isKnown(one.rate))) {
+    const group = `${link.proxy || ""} ${link.target}`;
+    const count = groups.get(group) || 0;
+    groups.set(group, count + 1);
+    if (!link.shared || !count) rate = (rate || 0) + link.rate;
+  }
+  const shared = links.filter((one) => one.shared > groups.get(`${one.proxy || ""} ${one.target}`)).length;
+  return { rate, shared };
 }
 
 // `now` is in seconds since the epoch, by the proxy's clock as far as is known.
 export function age(link, now) {
-  if (link.flows) return "just now";
-  if (link.since === undefined || link.since === null) return "–";
-  return `${duration(now - link.since)} ago`;
+  if (link.flows) return link.shared ? "–" : "just now";
+  if (!isKnown(link.since)) return "–";
+  return `${link.shared ? "at least " : ""}${duration(now - link.since)} ago`;
 }
 
 export function duration(exact) {
