@@ -37,7 +37,7 @@ const row = [...document.querySelectorAll("#boxes .line")].find((line) =>
 if (!row) return null;
 const ways = [...document.querySelectorAll("#lines g")];
 const way = ways.find((group) => group.dataset.id === row.dataset.id);
-return { colour: getComputedStyle(way).color,
+return { colour: getComputedStyle(way).color, flow: way.getAttribute("class").split(" ")[1],
   label: [...row.children].map((child) => child.textContent).filter(Boolean).join("\\n") };
 """
 CHOOSE = """

@@ -103,14 +103,22 @@ def test_participants_and_their_topics(lab: Lab, browser: Browser) -> None:
     browser.open(URL)
     outwards = row(browser, "/chatter", State="ok", From=talker, To=listener)
     assert (outwards["Carried by"], outwards["Port"]) == ("direct", UNKNOWN)
-    inwards = row(browser, "/scan", State="ok", From=scanner, To=reader)
+    inwards = row(
+        browser, "/scan", State="ok", From=scanner, To=reader, **{"Last message": "just now"}
+    )
     assert inwards["Carried by"] == "copy"
+    assert re.fullmatch(r"[\d.]+ datagrams/s", inwards["Hz"])
+    assert (outwards["Hz"], outwards["MB/s"]) == (UNKNOWN, UNKNOWN), "the data passes no proxy"
     row(browser, "/chatter (service)", State="ok", From=talker, To=UNKNOWN)
     ok = colour(browser, "ok")
     for ends in ((talker, listener), (scanner, reader)):
         drawn = line(browser, *ends)
         assert drawn["colour"] == ok
         assert re.match(r"/(chatter|scan)\n", drawn["label"]), "the line shows several links"
+    assert line(browser, talker, listener)["flow"] == "uncounted"
+    assert line(browser, scanner, reader)["flow"] == "flows"
+    assert talker.startswith("/pub_serve"), "a name of a node, and no GUID prefix"
+    assert reader == lab.place("c2").address, "the program is no ROS node"
     nodes = {cells[1].removesuffix(" (participant)"): cells for cells in browser.run(NODES)}
     for name, where, vendor in (
         (talker, "container, inside", "Fast DDS"),
@@ -128,6 +136,24 @@ def test_participants_and_their_topics(lab: Lab, browser: Browser) -> None:
     assert not quiet & {shown["Name"] for shown in rows(browser)}
     browser.run("document.querySelector('#quiet').click()")
     row(browser, "ros_discovery_info", State="ok", From=talker, To=listener)
+
+
+def test_a_line_is_dashed_once_the_publisher_sends_nothing(lab: Lab, browser: Browser) -> None:
+    lab.node("jazzy", "c1", "sub", name="reader", topic="/scan")
+    publisher = lab.node("jazzy", "out", "pub", name="scanner", topic="/scan")
+    ends = {"From": "/scanner", "To": "/reader"}
+    browser.open(URL)
+    row(browser, "/scan", **ends, **{"Last message": "just now"})
+    assert line(browser, "/scanner", "/reader")["flow"] == "flows"
+    publisher.stop()
+    wait_until("the publisher has gone", lambda: not rows(browser))
+    lab.node("jazzy", "out", "pub", name="scanner", topic="/scan", period=1000)
+    silent = row(browser, "/scan", **ends, **{"Hz": "0 datagrams/s", "MB/s": "0"})
+    wait_until(
+        "the line is dashed", lambda: line(browser, "/scanner", "/reader")["flow"] == "still"
+    )
+    assert silent["Port"] != UNKNOWN
+    assert row(browser, "/scan")["Last message"].endswith(" ago")
 
 
 def test_qos_that_does_not_match_is_red_at_its_pair_and_green_when_mended(
