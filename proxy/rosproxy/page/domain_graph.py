@@ -28,6 +28,7 @@ from rosproxy.page.page_document import (
     QUIET,
     ROBOT,
     WARNING,
+    Json,
     PageLink,
     PageNode,
     is_quiet_service,
@@ -122,39 +123,60 @@ def _measured(
 ) -> Iterator[PageLink]:
     """The links, with the measures of the participants to which they lead.
 
-    A datagram to a participant may belong to any of its links. So ``flows`` is set only if all
-    these links come from one participant. The kernel also counts the acknowledgements for what the
-    participant publishes: then all links share the measures with these topics. Quiet and broken
-    links get no measures, and carry little or nothing.
+    Quiet and broken links get no measures, and carry little or nothing.
     """
-    participants = {_key(domain, p.guid_prefix): p for p in (*domain.inside, *domain.outside)}
     groups: dict[str, list[PageLink]] = {}
-    acknowledged: Counter[str] = Counter()
+    published: Counter[str] = Counter()
     for link in links:
         is_live = link.kind == "topic" and not link.quiet and link.state != BROKEN
-        acknowledged[link.source] += is_live
+        published[link.source] += is_live
         if is_live and link.port:
             groups.setdefault(link.target, []).append(link)
         else:
             yield link
-    for target, group in groups.items():
-        ports = _user_data_ports(participants[target])
-        services = [name for name in participants[target].services if not _is_quiet_service(name)]
-        by_kernel = any(lease.plane == KERNEL for lease in ports)
-        returned = acknowledged[target] if by_kernel else 0
-        shared = len(group) + len(services) + returned
-        datagrams = sum(lease.user_datagram_rate for lease in ports)
-        last = measures.participant_last(target)
-        is_active = datagrams > 0 or (last is not None and now - last < FLOWS)
-        is_certain = not returned and len({link.source for link in group}) == 1
-        measured = {
-            "rate": rounded(sum(lease.user_rate for lease in ports)),
-            "datagrams": rounded(datagrams),
-            "since": None if is_active or last is None else round(epoch + last),
-            "flows": is_active and is_certain,
-            "shared": shared if shared > 1 else 0,
-        }
-        yield from (replace(link, **measured) for link in group)
+    for side, others in ((domain.inside, domain.outside), (domain.outside, domain.inside)):
+        for participant in side:
+            key = _key(domain, participant.guid_prefix)
+            if group := groups.get(key):
+                last = measures.participant_last(key)
+                since = None if last is None else now - last
+                measured = _measures_of(participant, group, published[key], len(others), since)
+                seen = None if measured.pop("is_active") or last is None else round(epoch + last)
+                yield from (replace(link, since=seen, **measured) for link in group)
+
+
+def _measures_of(
+    participant: ParticipantStatus,
+    group: list[PageLink],
+    published: int,
+    others: int,
+    since: float | None,
+) -> Json:
+    """The measures that all links in ``group`` to a participant share; ``is_active``: data comes.
+
+    ``published`` is the number of topics that the participant publishes to the other side. If the
+    kernel forwards, the measures also have the acknowledgements for these topics. ``others`` is the
+    number of participants on the other side. Data came ``since`` seconds ago, None: not known.
+
+    A datagram may belong to any link or service of the participant. So ``flows`` is set only if all
+    data comes from one participant.
+    """
+    ports = _user_data_ports(participant)
+    services = sum(not _is_quiet_service(name) for name in participant.services)
+    acknowledged = published if any(lease.plane == KERNEL for lease in ports) else 0
+    shared = len(group) + services + acknowledged
+    datagrams = sum(lease.user_datagram_rate for lease in ports)
+    is_active = datagrams > 0 or (since is not None and since < FLOWS)
+    sources = others if services else len({link.source for link in group})
+    # Otherwise data has come since the rates were sampled, or comes more seldom.
+    is_sampled = datagrams > 0 or not is_active
+    return {
+        "is_active": is_active,
+        "rate": rounded(sum(lease.user_rate for lease in ports)) if is_sampled else None,
+        "datagrams": rounded(datagrams) if is_sampled else None,
+        "flows": is_active and not acknowledged and sources == 1,
+        "shared": shared if shared > 1 else 0,
+    }
 
 
 def _is_quiet_service(name: str) -> bool:

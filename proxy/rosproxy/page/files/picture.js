@@ -117,15 +117,16 @@ function addBoxes(tree, level, found) {
   const wrong = one.ids.filter((id) => RANK[nodes.get(id).state || "ok"] >= 2).length;
   const rank = worst(one.ids, nodes);
   boxes.push({ id: alone ? one.key : `g:${tree.key}`, key: alone ? "" : tree.key, label: one.label || "address not known",
-    note: alone ? placeNote(tree) : groupNote(tree, wrong), level, place, owner, open,
+    note: alone ? placeNote(tree, one.label) : groupNote(tree, wrong), level, place, owner, open,
     ids: one.ids, kind: alone ? node.kind || "node" : "group", state: Object.keys(RANK).find((state) => RANK[state] === rank) });
   for (const id of one.ids) boxOf.set(id, boxes.at(-1).id);
   if (open) for (const child of tree.children) addBoxes(child, level + 1, found);
 }
 
-// Of a place with a single node, which has no box of its own.
-function placeNote(place) {
-  return place.children ? [place.label, place.note && `of ${place.note}`].filter(Boolean).join(" ") : "";
+// Of a place with a single node, which has no box of its own. The node may have the place's name.
+function placeNote(place, label) {
+  const name = place.label === label ? "" : place.label;
+  return place.children ? [name, place.note && `of ${place.note}`].filter(Boolean).join(" ") : "";
 }
 
 function groupNote(group, wrong) {
