@@ -82,8 +82,10 @@ def _node(proxy: int, domain: str, index: int, is_inside: bool) -> PageNode:
         host = f"10.94.{10 * proxy + place // 250}.{2 + place % 250}"
     lane = CONTAINER if is_inside else ROBOT
     if domain:
-        label = f"{host} 01.00.{index:02x}"
-        return PageNode(lane, "participant", label, address=f"{host}, Fast DDS", ports="11420")
+        label = f"/unit_{index}/driver_of_the_robot"
+        detail = f"participant 01.0f.{index:08x}"
+        node = PageNode(lane, "participant", label, address=f"{host}, Fast DDS", ports="11420")
+        return replace(node, detail=detail)
     port = 35000 + index
     if not is_inside and index % EACH == EACH - 1:
         return PageNode(HOST, address=f"http://laptop:{port}/")
@@ -128,7 +130,9 @@ def _link(domain: str, i: int, source: str, target: str, is_direct: bool = False
         carried="direct" if is_direct else "" if state == BROKEN else "splice",
         port=None if is_direct else 11412 + i % 32,
         hz=None if domain else 5.0 * flows,
-        rate=None if domain else 1200.0 * flows,
+        rate=1200.0 * (i % 3 > 0 if domain else flows),
+        datagrams=5.0 * (i % 3 > 0) if domain else None,
+        shared=2 if domain else 0,
         since=None if domain or flows else SINCE,
         flows=flows,
         state=state,

@@ -169,11 +169,16 @@ def inside(*addresses: str, **more: str) -> list[dict[str, str]]:
 
 def test_few_nodes_are_all_shown_by_container(browser: Browser, tmp_path: Path) -> None:
     nodes = inside("172.18.0.10:1", "172.18.0.9:1", "172.18.0.10:2")
+    nodes += inside("172.18.0.11:1", "172.18.0.11:2", "172.18.0.12:1", place="camera")
     assert places(browser, tmp_path, nodes) == [
         "/n1, 172.18.0.9",
         "172.18.0.10, 2 nodes",
         "  /n0, ",
         "  /n2, ",
+        "camera, 2 nodes",
+        "  /n3, ",
+        "  /n4, ",
+        "/n5, camera",
     ]
 
 

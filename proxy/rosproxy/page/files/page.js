@@ -404,7 +404,7 @@ function details(on) {
     const node = state.nodes.get(id) || {};
     const ports = node.ports ? `ports ${node.ports}` : "";
     const rate = node.rate === undefined ? "" : `${megabytes(node)} MB/s through it`;
-    parts.push(["h3", labelOf(id, node)], ["p", node.detail || ""], ["p", [node.place, node.address, ports, rate].filter(Boolean).join(" · ")],
+    parts.push(["h3", on.title ? "" : labelOf(id, node)], ["p", node.detail || ""], ["p", [node.place, node.address, ports, rate].filter(Boolean).join(" · ")],
       ["p", node.text || ""], ["code", node.fix || ""]);
   }
   const links = [...on.links.values()];
