@@ -16,7 +16,7 @@ from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.proxy_client import ProxyClient
 from tests.integration.conftest import MakeProxy
-from tests.integration.net import until
+from tests.integration.net import NODE, until
 from tests.integration.proxy import Proxy
 
 TOKEN = "0123456789abcdef"
@@ -41,7 +41,7 @@ async def opened(
         CollectorRegistry(),
         lambda: None,
         lambda: None,
-        operator_page(documents, "docker logs {}".format),
+        operator_page(documents, "docker logs {}".format, lambda: {NODE: "talker-1"}),
     )
 
 
@@ -65,6 +65,7 @@ async def test_all_proxies_stand_on_one_page(
             async with session.get(f"http://{address}/graph") as reply:
                 nodes = json.loads(await reply.read())["nodes"]
             assert nodes["one /talker"]["label"] == "/talker"
+            assert nodes["one /talker"]["place"] == "talker-1"
             assert nodes["two rosproxy"]["label"] == "two"
             assert nodes["gone"]["state"] == "broken"
             assert f"{gone} refuses connections" in nodes["gone"]["text"]
