@@ -135,6 +135,64 @@ async def test_a_peer_that_answers_late_finds_its_caller_on_the_connection(clien
     assert len(client.late) == 0
 
 
+@pytest.mark.parametrize("read_before", [b"", REPLY[:30]], ids=["nothing", "a part"])
+async def test_a_connection_of_the_caller_is_closed_after_the_answer(client, peer, read_before):
+    """The peer keeps the connection open, as HTTP/1.1 allows."""
+    is_due = asyncio.Event()
+
+    async def late(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await peer.request(reader)
+        writer.write(read_before)
+        await is_due.wait()
+        writer.write(REPLY[len(read_before) :])
+        await reader.read()
+
+    peer.serve = late
+    loop = asyncio.get_running_loop()
+    sock = socket.socket()
+    sock.setblocking(False)
+    await loop.sock_connect(sock, (peer.address.host, peer.address.port))
+    await loop.sock_sendall(sock, client.request("/", "robot", b"hello"))
+    received = await loop.sock_recv(sock, 100) if read_before else b""
+    client.close_after_answer(sock, received)
+    assert received == read_before
+    await until(lambda: len(peer.heads) == 1, "the peer has the request")
+    assert len(client.late) == 1
+    is_due.set()
+    await until(lambda: not client.late, "the client waits for no answer any more")
+    await until(lambda: peer.open == 0, "the connection closes after the answer")
+
+
+@pytest.mark.parametrize("is_long", [False, True], ids=["short call", "long call"])
+@pytest.mark.parametrize("begun", [b"", REPLY[:-1]], ids=["nothing", "all but the last byte"])
+async def test_a_peer_writes_its_whole_late_answer_before_the_connection_closes(
+    client, peer, begun, is_long
+):
+    is_due = asyncio.Event()
+    ended_early = list[bool]()
+
+    async def late(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await peer.request(reader)
+        writer.write(begun)
+        ended = asyncio.create_task(reader.read())
+        due = asyncio.create_task(is_due.wait())
+        await asyncio.wait([ended, due], return_when=asyncio.FIRST_COMPLETED)
+        ended_early.append(ended.done())
+        due.cancel()
+        writer.write(REPLY[len(begun) :])
+        await ended
+
+    peer.serve = late
+    body = Pieces(1) if is_long else b"hello"
+    with pytest.raises(TimeoutError):
+        await client.pass_on(peer.address, "/", "robot", body, 0.2)
+    assert len(client.late) == 1
+    is_due.set()
+    await until(lambda: peer.open == 0, "the connection closes after the answer")
+    assert ended_early == [False]
+    assert len(client.late) == 0
+
+
 async def test_a_peer_that_never_answers_loses_its_caller_in_the_end(client, peer, answer):
     await give_up(client, peer)
     await pass_time(LATE_TIMEOUT)
@@ -279,6 +337,27 @@ async def test_a_long_reply_comes_piece_by_piece_and_keeps_its_connection(client
     assert isinstance(unread, LongReply)
     unread.close()
     await until(lambda: peer.open == 0, "a connection with an unread reply is closed")
+
+
+async def test_a_peer_can_write_the_whole_long_reply_although_the_caller_has_gone(client, peer):
+    written = list[bool]()
+
+    async def long(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await peer.request(reader)
+        writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: 20000000\r\n\r\n")
+        for _ in range(20):
+            writer.write(b"x" * 1_000_000)
+            await writer.drain()
+        written.append(True)
+        await reader.read()
+
+    peer.serve = long
+    reply = await pass_on(client, peer, b"hello")
+    assert isinstance(reply, LongReply)
+    reply.close()
+    await until(lambda: peer.open == 0, "the connection closes after the reply")
+    assert written == [True]
+    assert len(client.late) == 0
 
 
 async def test_long_replies_do_not_take_the_place_of_short_calls(client, peer):

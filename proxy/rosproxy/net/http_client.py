@@ -76,7 +76,10 @@ class LongReply:
             yield piece
 
     def close(self) -> None:
-        """Keep the connection for other calls if the whole body was read, else close it."""
+        """Keep the connection for other calls if the whole body was read.
+
+        Otherwise the client reads and drops the rest of the body, and then closes the connection.
+        """
         self._finish()
 
 
@@ -237,11 +240,12 @@ class HttpClient:
         try:
             async with asyncio.timeout(LONG_TIMEOUT):
                 await _upload(connection, head, body)
-            async with asyncio.timeout(within):
-                return await self._pass_reply(peer, connection, *await _answer(connection))
         except BaseException:
             self._drop(connection)
             raise
+        async with asyncio.timeout(within):
+            answer = await self._await_answer(connection)
+            return await self._pass_reply(peer, connection, *answer)
 
     def request(self, path: str, host: str, body: bytes) -> bytes:
         """The bytes that `post` would send, for a connection of the caller. Raises ValueError."""
@@ -258,9 +262,13 @@ class HttpClient:
         await self.late.end()
         await asyncio.sleep(0)  # asyncio closes a transport's socket in the loop's next turn
 
-    def leave(self, sock: socket.socket) -> None:
-        """Close a connection of the caller after the peer has closed it, or after LATE_TIMEOUT."""
-        self.late.wait(partial(_drain, sock), sock.close)
+    def close_after_answer(self, sock: socket.socket, received: bytes = b"") -> None:
+        """Close a connection that the caller has made, once the answer on it is complete.
+
+        ``received``: the part of the answer that the caller has read. Without an answer, the
+        connection is closed after LATE_TIMEOUT.
+        """
+        self.late.wait(partial(_drain_socket, sock, received), sock.close)
 
     def _head(self, path: str, host: str, size: int) -> bytes:
         start = _request_start(path, host)
@@ -284,8 +292,13 @@ class HttpClient:
         self, connection: ClientConnection, head: bytes, body: bytes
     ) -> tuple[aiohttp.StreamReader, int | None]:
         self._used.add(connection)
+        connection.write_message(head, body)
+        return await self._await_answer(connection)
+
+    async def _await_answer(
+        self, connection: ClientConnection
+    ) -> tuple[aiohttp.StreamReader, int | None]:
         try:
-            connection.write_message(head, body)
             return await _answer(connection)
         except asyncio.CancelledError:  # timeout, or the caller has gone
             self._used.discard(connection)
@@ -304,6 +317,10 @@ class HttpClient:
     ) -> bytes:
         try:
             reply = await read_bounded(stream, longest)
+        except asyncio.CancelledError:  # the header has come in time, but not the whole body
+            self._used.discard(connection)
+            self.late.wait(partial(_drain_body, stream), connection.close)
+            raise
         except BaseException:
             self._drop(connection)
             raise
@@ -322,11 +339,20 @@ class HttpClient:
         if size > self._longest:
             self._drop(connection)
             raise TooLong(self._longest)
-        return LongReply(size, stream, partial(self._finish, peer, connection))
+        return LongReply(size, stream, partial(self._finish_long, peer, connection, stream))
 
     def _drop(self, connection: ClientConnection) -> None:
         self._used.discard(connection)
         connection.close()
+
+    def _finish_long(
+        self, peer: HostPort, connection: ClientConnection, stream: aiohttp.StreamReader
+    ) -> None:
+        if connection.reusable or connection.gone:
+            self._finish(peer, connection)
+            return
+        self._used.discard(connection)  # the caller has gone, and the peer still writes the reply
+        self.late.wait(partial(_drain_body, stream), connection.close)
 
     def _finish(self, peer: HostPort, connection: ClientConnection) -> None:
         self._used.discard(connection)
@@ -455,14 +481,24 @@ async def _answer(connection: ClientConnection) -> tuple[aiohttp.StreamReader, i
 
 async def _drain_answer(connection: ClientConnection) -> None:
     stream, _ = await _answer(connection)
+    await _drain_body(stream)
+
+
+async def _drain_body(stream: aiohttp.StreamReader) -> None:
     while not stream.at_eof():
         await stream.readany()
 
 
-async def _drain(sock: socket.socket) -> None:
-    """Read and drop all bytes until the peer closes the connection."""
-    while await asyncio.get_running_loop().sock_recv(sock, LONG):
-        pass
+async def _drain_socket(sock: socket.socket, received: bytes) -> None:
+    """Read and drop an answer of which ``received`` has come. Close the socket."""
+    loop = asyncio.get_running_loop()
+    _, connection = await loop.create_connection(ClientConnection, sock=sock)
+    try:
+        if received:
+            connection.data_received(received)
+        await _drain_answer(connection)
+    finally:
+        connection.close()
 
 
 def is_plain(headers: Mapping[str, str]) -> bool:

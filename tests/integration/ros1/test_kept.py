@@ -91,7 +91,7 @@ async def test_a_node_that_hangs_finds_its_caller_when_it_answers(
     kept: Kept, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left = list[socket.socket]()
-    monkeypatch.setattr(NodeClient, "close_after_answer", lambda _nodes, sock: left.append(sock))
+    monkeypatch.setattr(NodeClient, "close_after_answer", lambda _nodes, sock, _: left.append(sock))
     node.hang = True
     ask(kept, node, 20.0)
     await until(lambda: len(node.requests) == 1, "the proxy asks the node")

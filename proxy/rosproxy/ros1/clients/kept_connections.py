@@ -136,7 +136,7 @@ class KeptConnections(Generic[_K]):
         # The socket stays open until the answer arrives. Closed sockets leave epoll by themselves
         # (epoll(7)), but this socket does not.
         self._epoll.unregister(conn.sock)
-        self._nodes.close_after_answer(conn.sock)
+        self._nodes.close_after_answer(conn.sock, conn.received)
 
     def close_all(self) -> None:
         """Close all connections for good."""

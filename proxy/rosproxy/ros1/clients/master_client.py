@@ -252,9 +252,12 @@ class MasterClient:
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
         return read_value(method, await self.post_to_node(slave, body, within), limits)
 
-    def close_after_answer(self, sock: socket.socket) -> None:
-        """Close a connection to a node once the answer that is due has arrived."""
-        self._nodes.leave(sock)
+    def close_after_answer(self, sock: socket.socket, received: bytes) -> None:
+        """Close a connection to a node once the answer that is due has arrived.
+
+        ``received``: the part of the answer that the caller has read.
+        """
+        self._nodes.close_after_answer(sock, received)
 
     def node_request(self, slave: HostPort, body: bytes) -> bytes:
         """A call to a node as an HTTP request, for callers with a connection of their own."""

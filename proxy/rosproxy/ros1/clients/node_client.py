@@ -72,9 +72,12 @@ class NodeClient:
         """Begin a connection to the slave API at an address. Raises OSError."""
         return sockets.begin_to_dial(self._upstream.reach(slave))
 
-    def close_after_answer(self, sock: socket.socket) -> None:
-        """Close a connection from `connect` once the answer that is due has arrived."""
-        self._upstream.close_after_answer(sock)
+    def close_after_answer(self, sock: socket.socket, received: bytes) -> None:
+        """Close a connection from `connect` once the answer that is due has arrived.
+
+        ``received``: the part of the answer that the caller has read.
+        """
+        self._upstream.close_after_answer(sock, received)
 
     def pid_question(self, slave: HostPort) -> bytes:
         """The HTTP request that asks the node at an address for its pid."""
