@@ -241,6 +241,8 @@ class _Ros1Links:
         judged = key in self._judged.pairs or key in self._relayed
         state = _STATES[finding.severity] if finding else OK if judged else UNKNOWN
         last = link.last(self._now)
+        byte_rate = link.byte_rate(self._now)
+        message_rate = link.message_rate(self._now)
         flows = link.flows(self._now) and state != BROKEN
         return PageLink(
             "topic",
@@ -249,8 +251,8 @@ class _Ros1Links:
             subscriber,
             carried="" if state == BROKEN else carried,
             port=port,
-            rate=None if link.rate is None else rounded(link.rate),
-            hz=None if link.hz is None else rounded(link.hz),
+            rate=None if byte_rate is None else rounded(byte_rate),
+            hz=None if message_rate is None else rounded(message_rate),
             since=None if last is None or flows else round(self._epoch + last),
             flows=flows,
             state=state,

@@ -56,6 +56,10 @@ class Counter:
         self.value = value
         self.at = at
 
+    def is_outdated(self, now: float) -> bool:
+        """Whether the next reads are overdue: the node no longer answers."""
+        return now - self.at > LATE_ROUNDS * self.every + FLOWS
+
 
 @dataclass(slots=True)
 class Link:
@@ -77,22 +81,27 @@ class Link:
         else:
             counter.read(value, at)
 
-    @property
-    def hz(self) -> float | None:
-        """Messages a second by the subscriber's count, else by the publisher's count."""
-        return self._first("rate", "taken", "given")
+    def message_rate(self, now: float) -> float | None:
+        """Messages a second by the subscriber's count, else by the publisher's count.
 
-    @property
-    def rate(self) -> float | None:
-        """Bytes a second by the relay, else by the subscriber, else by the publisher."""
-        return self._first("rate", "relayed", "taken bytes", "given bytes")
+        Counts of a node that no longer answers do not count.
+        """
+        return self._rate(now, "taken", "given")
+
+    def byte_rate(self, now: float) -> float | None:
+        """Bytes a second by the relay, else by the subscriber, else by the publisher.
+
+        Counts of a node that no longer answers do not count.
+        """
+        return self._rate(now, "relayed", "taken bytes", "given bytes")
 
     def last(self, now: float) -> float | None:
         """The time of the last message, in monotonic seconds; None if unknown."""
         names = ("taken",) if self.is_stalled(now) else ("taken", "relayed")
         counters = [self.counters[name] for name in names if name in self.counters]
         if not counters:
-            return self._first("grew", "given")
+            given = self.counters.get("given")
+            return given.grew if given else None
         return max((c.grew for c in counters if c.grew is not None), default=None)
 
     def flows(self, now: float) -> bool:
@@ -106,7 +115,7 @@ class Link:
         counter = self.counters.get("taken") or self.counters.get("given")
         if now - last < FLOWS or counter is None or "relayed" in self.counters:
             return now - last < FLOWS
-        if now - counter.at > LATE_ROUNDS * counter.every + FLOWS:
+        if counter.is_outdated(now):
             return False
         return counter.grew == counter.at and (counter.rate or 0.0) * FLOWS >= 1.0
 
@@ -129,10 +138,9 @@ class Link:
         missed = self.counters["given"].value - sent
         return missed >= MISSED and now - since >= STALLED
 
-    def _first(self, attribute: str, *names: str) -> float | None:
-        counters = [self.counters[name] for name in names if name in self.counters]
-        number: float | None = getattr(counters[0], attribute) if counters else None
-        return number
+    def _rate(self, now: float, *names: str) -> float | None:
+        counters = (self.counters[name] for name in names if name in self.counters)
+        return next((c.rate for c in counters if not c.is_outdated(now)), None)
 
 
 class Measures:

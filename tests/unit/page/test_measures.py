@@ -39,28 +39,29 @@ def read(*rounds: tuple[float, int | None, int | None]) -> Measures:
 
 def test_nothing_is_known_at_first() -> None:
     link = Measures().get(KEY)
-    assert (link.hz, link.rate, link.last(9.0), link.is_stalled(100.0)) == (None, None, None, False)
+    assert (link.message_rate(9.0), link.byte_rate(9.0), link.last(9.0)) == (None, None, None)
+    assert not link.is_stalled(100.0)
     once = read((1.0, 5, 5)).get(KEY)
-    assert (once.hz, once.last(9.0)) == (None, None)
+    assert (once.message_rate(9.0), once.last(9.0)) == (None, None)
 
 
 def test_rates_are_those_of_what_arrives() -> None:
     link = read((1.0, 100, 50), (3.0, 140, 70)).get(KEY)
-    assert (link.hz, link.rate, link.last(3.0)) == (10.0, 100.0, 3.0)
+    assert (link.message_rate(3.0), link.byte_rate(3.0), link.last(3.0)) == (10.0, 100.0, 3.0)
 
 
 def test_where_the_subscriber_does_not_count_the_publisher_does() -> None:
-    assert read((1.0, 100, None), (3.0, 140, None)).get(KEY).hz == 20.0
+    assert read((1.0, 100, None), (3.0, 140, None)).get(KEY).message_rate(3.0) == 20.0
 
 
 def test_where_nobody_counts_nothing_is_said() -> None:
-    assert read((1.0, None, None), (3.0, None, None)).get(KEY).hz is None
+    assert read((1.0, None, None), (3.0, None, None)).get(KEY).message_rate(3.0) is None
 
 
 def test_the_age_is_that_of_the_last_message_that_arrived() -> None:
     link = read((1.0, 10, 10), (3.0, 20, 20), (5.0, 30, 20), (7.0, 40, 20)).get(KEY)
     assert link.last(7.0) == 3.0
-    assert link.hz == 0.0
+    assert link.message_rate(7.0) == 0.0
 
 
 def test_a_connection_that_carries_nothing_is_told_after_a_while() -> None:
@@ -82,7 +83,7 @@ def test_one_message_under_way_is_none_that_is_lost() -> None:
 
 def test_a_new_connection_begins_anew() -> None:
     link = read((1.0, 900, 900), (3.0, 2, 2), (5.0, 6, 6)).get(KEY)
-    assert link.hz == 2.0
+    assert link.message_rate(5.0) == 2.0
     assert not link.is_stalled(5.0 + STALLED)
 
 
@@ -90,9 +91,9 @@ def test_what_the_proxy_relays_counts_while_it_does() -> None:
     measures = Measures()
     measures.read_relays({KEY: 1000}, 1.0)
     measures.read_relays({KEY: 3000}, 2.0)
-    assert (measures.get(KEY).rate, measures.get(KEY).last(2.0)) == (2000.0, 2.0)
+    assert (measures.get(KEY).byte_rate(2.0), measures.get(KEY).last(2.0)) == (2000.0, 2.0)
     measures.read_relays({}, 3.0)
-    assert measures.get(KEY).rate is None
+    assert measures.get(KEY).byte_rate(3.0) is None
 
 
 def test_what_the_proxy_relays_is_newer_than_what_nodes_are_asked_for() -> None:
@@ -132,10 +133,27 @@ def test_counts_of_a_node_that_answers_no_more_are_not_shown() -> None:
     assert link.last(95.0) == 31.0
 
 
+def test_a_node_that_answers_no_more_has_no_rate() -> None:
+    measures = read((1.0, 10, 10), (3.0, 30, 30))
+    measures.read_nodes(facts(60, None, 5.0), [KEY])
+    silent = DoctorFacts(nodes={"/talker": NodeFacts("/talker", URI)})
+    measures.read_nodes(silent, [KEY])
+    link = measures.get(KEY)
+    assert (link.message_rate(6.0), link.byte_rate(6.0)) == (15.0, 150.0)
+    assert (link.message_rate(60.0), link.byte_rate(60.0)) == (None, None)
+
+
+def test_the_publisher_counts_if_the_subscriber_answers_no_more() -> None:
+    measures = read((1.0, 10, 10), (3.0, 30, 20))
+    publisher = facts(90, 0, 9.0).nodes["/talker"]
+    measures.read_nodes(DoctorFacts(nodes={**facts(0, 0, 0.0).nodes, "/talker": publisher}), [KEY])
+    assert measures.get(KEY).message_rate(11.0) == 10.0
+
+
 def test_links_that_are_no_more_are_forgotten() -> None:
     measures = read((1.0, 10, 10), (3.0, 20, 20))
     measures.read_nodes(facts(30, 30, 5.0), [])
-    assert measures.get(KEY).hz is None
+    assert measures.get(KEY).message_rate(5.0) is None
 
 
 def test_roscpp_knows_a_publisher_without_the_path_of_its_uri() -> None:
@@ -150,7 +168,7 @@ def test_roscpp_knows_a_publisher_without_the_path_of_its_uri() -> None:
         report = SlaveReport(counts={("i", "/chatter", uri): (10 * got, got)}, at=at)
         nodes = {"/talker": NodeFacts("/talker", URI), "/listener": replace(taker, report=report)}
         measures.read_nodes(DoctorFacts(nodes=nodes), [KEY])
-    assert measures.get(KEY).hz == 10.0
+    assert measures.get(KEY).message_rate(3.0) == 10.0
 
 
 def test_the_report_of_a_node_is_read_once_for_all_its_publishers(
