@@ -212,18 +212,22 @@ class _Ros1Links:
     def _pairs(self) -> set[Key]:
         """The links (topic, publisher, subscriber) with an inside node, and all relayed links.
 
-        Topics with more links than the bound allows are only counted, in ``left_out``: /tf may
-        have very many.
+        Topics with more such links than the bound allows are only counted, in ``left_out``: /tf
+        may have very many.
         """
         pairs = {*self._relayed}
         for topic in sorted(self._graph.topics, key=lambda topic: (topic in QUIET, topic)):
             publishers = self._graph.publishers.get(topic, ())
             subscribers = self._graph.subscribers.get(topic, ())
-            if len(pairs) + len(publishers) * len(subscribers) > 2 * MOST_LINKS:
-                self.left_out += len(publishers) * len(subscribers)
+            inside = [name for name in publishers if name in self._inside]
+            outside = [name for name in publishers if name not in self._inside]
+            inside_subscribers = [name for name in subscribers if name in self._inside]
+            count = len(inside) * len(subscribers) + len(outside) * len(inside_subscribers)
+            if len(pairs) + count > 2 * MOST_LINKS:
+                self.left_out += count
                 continue
-            every_pair = product((topic,), publishers, subscribers)
-            pairs |= {pair for pair in every_pair if not self._inside.keys().isdisjoint(pair[1:])}
+            pairs.update(product((topic,), inside, subscribers))
+            pairs.update(product((topic,), outside, inside_subscribers))
         return pairs
 
     def _has_topic(self, name: str, endpoint: EndpointStatus, topic: str) -> bool:

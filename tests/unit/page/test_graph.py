@@ -311,8 +311,19 @@ def test_a_large_graph_is_cut_and_what_is_broken_stays() -> None:
     silent = by_name(talker(report=SlaveReport(STRING)), listener())
     document = made(judged(status=status, graph=graph, nodes=silent))
     assert len(document["links"]) <= MOST_LINKS
-    assert document["left_out"] >= 80 * 80
+    assert document["left_out"] == 80 * 80 - 10 * 10
     assert document["links"][LINK]["state"] == "broken"
+
+
+def test_links_between_nodes_outside_hide_no_link_of_a_node_inside() -> None:
+    names = [f"/n{number}" for number in range(100)]
+    graph = SystemState({"/pose": ["/talker", *names]}, {"/pose": names}, {})
+    others = [NodeFacts(name, f"http://robot-host:{45100 + n}/") for n, name in enumerate(names)]
+    document = made(judged(graph=graph, nodes=by_name(talker(), *others)))
+    links = [link for link in document["links"].values() if link["name"] == "/pose"]
+    assert {link["source"] for link in links} == {"/talker"}
+    assert len(links) == len(names)
+    assert document["left_out"] == 0
 
 
 def test_of_too_many_nodes_the_broken_ones_stay() -> None:
