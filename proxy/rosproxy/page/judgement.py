@@ -36,7 +36,8 @@ class JudgedFacts(msgspec.Struct, frozen=True):
 def topics_to_ask_about(status: ProxyStatus, graph: SystemState) -> tuple[str, ...]:
     """The topics about which to ask nodes: topics of nodes inside, up to MOST_LINKS links.
 
-    Without the topics that nearly every node has (QUIET).
+    Without the topics that nearly every node has (QUIET). A topic with more links than remain is
+    left out, and the next topics are not.
     """
     inside = inside_nodes(status)
     topics = []
@@ -44,9 +45,10 @@ def topics_to_ask_about(status: ProxyStatus, graph: SystemState) -> tuple[str, .
     for topic in sorted(graph.topics - QUIET):
         if not inside.keys() & {*graph.sides(topic)}:
             continue
-        remaining -= len(graph.publishers.get(topic, ())) * len(graph.subscribers.get(topic, ()))
-        if remaining < 0:
-            break
+        count = len(graph.publishers.get(topic, ())) * len(graph.subscribers.get(topic, ()))
+        if count > remaining:
+            continue
+        remaining -= count
         topics.append(topic)
     return tuple(topics)
 

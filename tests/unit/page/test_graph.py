@@ -267,6 +267,13 @@ def test_two_nodes_outside_are_no_concern_of_the_proxy() -> None:
     assert topics_to_ask_about(make_facts().proxy, graph) == ()
 
 
+def test_a_topic_with_too_many_links_keeps_no_other_topic_from_being_asked_about() -> None:
+    names = ["/talker", *(f"/n{number}" for number in range(MOST_LINKS))]
+    publishers = {"/a": names, "/chatter": ["/talker"]}
+    graph = SystemState(publishers, {"/a": names, "/chatter": ["/listener"]}, {})
+    assert topics_to_ask_about(make_facts().proxy, graph) == ("/chatter",)
+
+
 def test_a_master_that_is_away_is_told() -> None:
     status = make_status(make_node(), master={"up": False, "error": "master is away"})
     facts = make_facts(status=status, graph=None, nodes={}, names=())
