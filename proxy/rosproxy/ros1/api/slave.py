@@ -204,7 +204,9 @@ class SlaveApi:
         node = self._context.caller_at(endpoint)
         view = slave_api.from_outside(node, self._context.settings.master_uri, addressing)
         if self._context.stand_ins.is_bidirectional:
-            body = await self._stand_ins.udpros.lead_outwards(endpoint, parsed, body, call.source)
+            body = await self._stand_ins.udpros.redirect_offers_to_inside(
+                endpoint, parsed, body, call.source
+            )
         else:
             body = self._stand_ins.with_address(body, parsed)
         reply = await self._ask(endpoint, slave_api.rewrite_call(body, parsed, view))

@@ -389,7 +389,7 @@ class StandInPorts:
         view = slave_api.from_inside(caller, master, self._context.addressing)
         body = slave_api.rewrite_call(call.body, parsed, view)
         if not stand_in.is_uri_kept:
-            body = await self.udpros.lead_inwards(stand_in, parsed, body, call.source)
+            body = await self.udpros.redirect_offers_to_outside(stand_in, parsed, body, call.source)
         reply = await self._outside.ask(stand_in, body, call.path)
         if not slave_api.is_rewritten(parsed.method):
             return reply

@@ -5,22 +5,24 @@ A subscriber offers in ``requestTopic`` an address for datagrams
 that it does not announce (transport_udp.cpp). So the proxy only has to rewrite the offer. rospy has
 no UDPROS.
 
-With ``--direction both`` neither side can send to the other:
+``--direction both`` is for networks in which neither side can send to the other. There:
 
-  * The offer to a node inside, from outside or from another inside network, gets a UDP port of the
-    stand-ins on the proxy's inside address. The proxy relays from there to the subscriber
-    (`lead_outwards`).
-  * The offer of a subscriber inside to a node outside gets a UDP port of the range, in the form for
-    outside, if the range is published for UDP (``--udp``). The proxy relays from there to inside
-    (`lead_inwards`).
+  * The proxy redirects an offer to a node inside to a UDP port at the proxy's inside address, with
+    a number from the ports of the stand-ins. The subscriber is outside, or in another inside
+    network. The proxy relays the datagrams from the port to the subscriber
+    (`redirect_offers_to_inside`).
+  * The proxy redirects an offer of a subscriber inside to a node outside to a UDP port of the
+    range, if the range is published for UDP (``--udp``). The offer then names the advertised host
+    and the advertised port. The proxy relays the datagrams from the port to the subscriber
+    (`redirect_offers_to_outside`).
 
 If there is no relay for an offer, the proxy removes the offer from the call. The publisher then
 chooses TCPROS if that was offered, too. The proxy also removes an offer whose connection header
 names another topic than the call. The reason: roscpp serves the topic of the header
 (topic_manager.cpp), but the policy has checked the topic of the call.
 
-A relay lasts until the subscriber refuses datagrams, until one end is no longer registered
-(`sweep`), or until the policy denies the topic (`cut_denied`).
+A relay ends when an ICMP error shows that the subscriber has closed its port, when the end inside
+is no longer registered (`sweep`), or when the policy denies the topic (`cut_denied`).
 """
 
 import logging
@@ -48,18 +50,21 @@ from rosproxy.ros1.stand_ins.outside_nodes import Outside
 log = logging.getLogger(__name__)
 
 MOST_RELAYS = 256
+"""The highest number of relays. A further relay ends the oldest relay of the subscriber address
+with the most relays. So an address with many relays takes none from other addresses."""
 MOST_RELAYS_EACH = 64
-"""Relays of the proxy, and of subscribers at one address. A further relay ends the oldest relay of
-the address with the most relays. So an address with many relays takes none from other addresses."""
-TRIES = 64
+"""The highest number of relays for one subscriber address. A further relay of this address ends the
+oldest."""
+MOST_PORTS_TRIED = 64
 """The highest number of ports that the proxy tries for a relay."""
 
 
 class UdprosSubscription(msgspec.Struct, frozen=True):
     """A subscription by datagrams.
 
-    ``port`` is the lease or stand-in of the publisher, ``peer`` the address of the subscriber,
-    ``target`` where the subscriber receives datagrams. ``inside_asks``: the subscriber is inside.
+    ``port`` is the lease or stand-in of the publisher, ``peer`` the address of the subscriber.
+    ``target`` is the address and port at which the subscriber receives datagrams. ``inside_asks``:
+    the subscriber is inside.
     """
 
     port: int
@@ -72,7 +77,10 @@ class UdprosSubscription(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class _RelayCondition:
-    """Checks anew each time whether both ends are registered, and the policy allows the relay."""
+    """What a relay needs: the end inside is registered, and the policy allows the topic.
+
+    Each call evaluates the present state.
+    """
 
     is_registered: Callable[[], bool]
     is_allowed: Callable[[], bool]
@@ -103,10 +111,10 @@ class UdprosRelays:
         """The publisher's port, the topic and the subscriber's name, of each open relay."""
         return {(s.port, s.topic, s.caller_id) for s in self._open}
 
-    async def lead_outwards(
+    async def redirect_offers_to_inside(
         self, endpoint: Endpoint, call: Call, body: bytes, source: str
     ) -> bytes:
-        """The call of a subscriber to a node inside, with offers that lead to the proxy."""
+        """The call of a subscriber to a node inside; the offers lead to relays."""
         proxy = self._context.caller_at(endpoint).proxy
         topic = call.string(1) or ""
         caller_id = call.string(0) or ""
@@ -121,21 +129,23 @@ class UdprosRelays:
         condition = _RelayCondition(is_registered, is_allowed)
 
         async def redirect(offered: HostPort) -> HostPort | None:
-            target = await self._reachable(offered, source)
+            target = await self._receiver_of(offered, source)
             if target is None:
                 return None
             port = endpoint.port
             sources = [endpoint.location.address]
             subscription = UdprosSubscription(port, topic, caller_id, source, target, False)
-            relay_port = self._relay_port(
+            relay_port = self._open_relay(
                 subscription, condition, proxy, _candidates(subscription, PORTS), sources
             )
             return HostPort(proxy, relay_port) if relay_port else None
 
         return await _rewritten(call, body, condition, redirect)
 
-    async def lead_inwards(self, stand_in: StandIn, call: Call, body: bytes, source: str) -> bytes:
-        """The call of a subscriber inside to a node outside, with offers that lead to the proxy."""
+    async def redirect_offers_to_outside(
+        self, stand_in: StandIn, call: Call, body: bytes, source: str
+    ) -> bytes:
+        """The call of a subscriber inside to a node outside; the offers lead to relays."""
         topic = call.string(1) or ""
         caller_id = call.string(0) or ""
         settings = self._context.settings
@@ -161,13 +171,13 @@ class UdprosRelays:
             publisher = self._context.upstream.reach(stand_in.target).host
             sources = await resolve(publisher, NODES)
             ports = _candidates(subscription, settings.ports.listen.ports())
-            relay_port = self._relay_port(subscription, condition, settings.bind, ports, sources)
+            relay_port = self._open_relay(subscription, condition, settings.bind, ports, sources)
             return self._context.addressing.outside(relay_port) if relay_port else None
 
         return await _rewritten(call, body, condition, redirect)
 
     def sweep(self) -> None:
-        """End relays whose publisher or subscriber is no longer registered."""
+        """End relays whose end inside is no longer registered."""
         for subscription in [s for s, (_, c) in self._open.items() if not c.is_registered()]:
             self._end(subscription)
 
@@ -184,10 +194,10 @@ class UdprosRelays:
         for subscription in list(self._open):
             self._end(subscription)
 
-    async def _reachable(self, offered: HostPort, source: str) -> HostPort | None:
-        """The receiver of datagrams for a subscriber at an address; None if it is unreachable.
+    async def _receiver_of(self, offered: HostPort, source: str) -> HostPort | None:
+        """The address to which the proxy sends the datagrams for an offer; None without a route.
 
-        The receiver is outside or, for a subscriber inside, at the source of the call.
+        For a subscriber inside, this is the offered port at the source of the call.
         """
         if self._context.client_kind(source) is ClientKind.ADMITTED:
             return HostPort(source, offered.port)
@@ -197,7 +207,7 @@ class UdprosRelays:
             log.debug("UDPROS: the subscriber at %s can't be reached: %s", offered, error)
             return None
 
-    def _relay_port(
+    def _open_relay(
         self,
         subscription: UdprosSubscription,
         condition: _RelayCondition,
@@ -205,10 +215,10 @@ class UdprosRelays:
         ports: Iterable[int],
         sources: Collection[str],
     ) -> int | None:
-        """The port of the relay for a subscription, which is opened if necessary; None on failure.
+        """The port of the subscription's relay. Opens the relay if there is none.
 
-        The relay binds ``address`` and one of ``ports``, and accepts datagrams from ``sources``
-        alone.
+        None if no port can be bound. The relay binds ``address`` and one of ``ports``, and accepts
+        datagrams from ``sources`` alone.
         """
         if existing := self._open.get(subscription):
             return existing[0].port
@@ -254,7 +264,7 @@ def _candidates(subscription: UdprosSubscription, ports: range) -> list[int]:
     ).digest()
     first = int.from_bytes(seed, "big")
     count = len(ports)
-    return [ports[(first + number) % count] for number in range(min(TRIES, count))]
+    return [ports[(first + number) % count] for number in range(min(MOST_PORTS_TRIED, count))]
 
 
 async def _rewritten(
@@ -263,7 +273,7 @@ async def _rewritten(
     condition: _RelayCondition,
     redirect: Callable[[HostPort], Awaitable[HostPort | None]],
 ) -> bytes:
-    """A call with redirected offers; offers are removed if no relay is allowed or possible."""
+    """The call with each offer redirected. An offer without a relay is removed."""
     topic = call.string(1) or ""
     edits = list[Edit]()
     for offer in read_offers(call):
