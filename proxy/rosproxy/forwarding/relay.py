@@ -1,8 +1,8 @@
 """Relays: bytes between two sockets, with a blocking thread for each direction.
 
-On Linux large transfers move by splice(2) through a pipe, and never enter Python. For messages
-below some 8 KiB a copy costs the same, and needs no pipe. Back-pressure comes from the kernel: a
-thread that can't write doesn't read. Each call that blocks releases the GIL.
+A direction copies small messages. On Linux a direction with large transfers uses splice(2) and a
+pipe, so the bytes never enter Python. Back-pressure comes from the kernel: a thread that can't
+write doesn't read. Each call that blocks releases the GIL.
 """
 
 import contextlib
@@ -13,37 +13,43 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 from rosproxy.net.sockets import reset_on_close
 
 log = logging.getLogger(__name__)
 
-COPY_SIZE = 16 * 1024
+COPY_BYTES = 16 * 1024
 """Bytes of a read while copying; a full read switches the direction to splice.
 
-From this size on splice costs less, the opening of a pipe included.
+For smaller amounts, splice and the opening of a pipe cost no less than a copy.
 """
-PIPE_SIZE = 1024 * 1024
+PIPE_BYTES = 1024 * 1024
 """Bytes of a splice pipe; the kernel may give an unprivileged process less."""
-LARGE_PIPES = 16
-"""Pipes of PIPE_SIZE at the same time. With more streams the CPU is busy, and turns are shorter."""
-SHARED_PIPE = 256 * 1024
+MOST_LARGE_PIPES = 16
+"""The highest number of pipes of PIPE_BYTES. With more streams the CPU is busy, and each call of
+splice moves less, so large pipes bring nothing."""
+FURTHER_PIPE_BYTES = 256 * 1024
 """Bytes of each further pipe: an unprivileged user has 64 MiB for all pipes together."""
-CROWD = 128
-"""Directions with large transfers at the same time before all of them share memory."""
-SHARED_RECEIVE = 128 * 1024
-"""Bytes of the receive buffer of a socket in a crowd; Linux doubles the value (socket(7)).
+MOST_UNBOUNDED_DIRECTIONS = 128
+"""The highest number of directions with large transfers at the same time. With more, the proxy
+bounds the socket buffers of all these directions."""
+RECEIVE_BUFFER_BYTES = 128 * 1024
+"""The bound of a receive buffer; Linux doubles the value (socket(7)).
 
 By default each buffer grows to several MiB. A thousand such buffers reach the limit for all TCP
-connections of the machine (tcp_mem). From there on Linux drops packets and sends single pages.
+connections of the machine (tcp_mem). Above this limit Linux drops packets, and sends at most a page
+at a time.
 """
-SHARED_SEND = 208 * 1024
-"""Bytes of the send buffer in a crowd: the default of wmem_max, which every process may set."""
-LEAST_PIPE = 64 * 1024
+SEND_BUFFER_BYTES = 208 * 1024
+"""The bound of a send buffer. Any process may set a buffer of this size: it is the default of
+wmem_max."""
+LEAST_PIPE_BYTES = 64 * 1024
 """Bytes of the smallest pipe that a direction uses for splice."""
-BLOCK_SIZE = 128 * 1024
-"""Bytes of a read without a pipe. Each read makes a new buffer: Python would zero a bytearray."""
-RESET_GRACE = 0.1
+BLOCK_BYTES = 128 * 1024
+"""Bytes of a read without a pipe. ``recv`` makes a new buffer for each read. A reused bytearray
+costs more, because Python fills it with zeros."""
+RESET_GRACE_S = 0.1
 """Seconds in which the other direction may end after SHUT_RD, before SHUT_WR follows."""
 
 Finished = Callable[["Relay"], None]
@@ -52,13 +58,25 @@ WhenReadable = Callable[[socket.socket, Callable[[], object]], None]
 """Calls a function once when a socket has bytes, has ended or has failed."""
 
 
+class RelayDirection(IntEnum):
+    """A direction of a relay."""
+
+    OUTWARDS = 0
+    INWARDS = 1
+
+    @property
+    def opposite(self) -> "RelayDirection":
+        """The other direction."""
+        return RelayDirection(1 - self)
+
+
 @dataclass(slots=True, eq=False)
 class Relay:
     """A relayed connection.
 
     ``kind`` (topic or service) and ``name`` say what the connection carries. ``caller_id`` and
     ``peer`` are name and address of the client that has connected to ``port``: outside, or inside
-    if ``inside_asks``. ``client_listens``: the client probably sends nothing more.
+    if ``inside_asks``. ``client_is_silent``: the client probably sends nothing more.
     ``sent`` are bytes towards outside, ``received`` bytes towards inside. ``sent_rate`` and
     ``received_rate`` are in bytes per second, as of the last `sample`. Without ``splice`` all bytes
     are copied.
@@ -73,7 +91,7 @@ class Relay:
     inside: socket.socket
     splice: bool = True
     inside_asks: bool = False
-    client_listens: bool = False
+    client_is_silent: bool = False
     sent: int = 0
     received: int = 0
     failed: bool = False
@@ -86,16 +104,16 @@ class Relay:
     _ended: bool = False
 
     def start(self, finished: Finished, when_readable: WhenReadable) -> None:
-        """Relay both directions in the background; ``finished`` is called from any thread.
+        """Relay both directions in threads; one of these threads calls ``finished``.
 
-        If ``client_listens``, the direction from the client gets a thread once the client sends.
+        If ``client_is_silent``, the direction from the client gets a thread once the client sends.
         """
         for sock in (self.outside, self.inside):
             _prepare(sock)
         client = self.inside if self.inside_asks else self.outside
-        request, reply = (0, 1) if self.inside_asks else (1, 0)
-        if self._start_direction(reply, finished):
-            if self.client_listens:
+        request = RelayDirection.OUTWARDS if self.inside_asks else RelayDirection.INWARDS
+        if self._start_direction(request.opposite, finished):
+            if self.client_is_silent:
                 # The end of the connection starts the thread, too: the socket is then readable.
                 when_readable(client, lambda: self._start_direction(request, finished, second=True))
             else:
@@ -116,13 +134,15 @@ class Relay:
             self.sent_rate = round((self.sent - sent) / elapsed, 1)
             self.received_rate = round((self.received - received) / elapsed, 1)
 
-    def _start_direction(self, index: int, finished: Finished, second: bool = False) -> bool:
+    def _start_direction(
+        self, direction: RelayDirection, finished: Finished, second: bool = False
+    ) -> bool:
         """Start the thread of a direction; on failure, reset both sides and return False.
 
         ``second``: the other direction already runs.
         """
         thread = threading.Thread(
-            target=self._direction, args=(index, finished), name=f"relay {self.name}", daemon=True
+            target=self._run, args=(direction, finished), name=f"relay {self.name}", daemon=True
         )
         try:
             thread.start()
@@ -130,24 +150,27 @@ class Relay:
             log.error("relay of %s: %s; raise the limit of processes and threads", self.name, error)
             self.failed = True
             if second:
-                self._pass_reset_on(index)
-            for direction in (index,) if second else (0, 1):
-                self._finish(direction, finished)
+                self._pass_reset_on(direction)
+            for ended in (direction,) if second else RelayDirection:
+                self._finish(ended, finished)
             return False
         return True
 
-    def _direction(self, index: int, finished: Finished) -> None:
-        pair = (self.inside, self.outside) if index == 0 else (self.outside, self.inside)
-        count = self._count_sent if index == 0 else self._count_received
+    def _run(self, direction: RelayDirection, finished: Finished) -> None:
+        if direction is RelayDirection.OUTWARDS:
+            pump = _Pump(self.inside, self.outside, self._count_sent, self.splice)
+        else:
+            pump = _Pump(self.outside, self.inside, self._count_received, self.splice)
         try:
-            _Pump(*pair, count, self.splice).run()
-            # After `_pass_reset_on` the source seems to have ended: send no FIN before the reset.
+            pump.run()
+            # SHUT_RD in `_pass_reset_on` also ends the last read. Then the sockets are about to be
+            # reset, so send no FIN.
             if not self.failed:
-                pair[1].shutdown(socket.SHUT_WR)
+                pump.target.shutdown(socket.SHUT_WR)
         except OSError as error:
             log.debug("relay of %s: %s", self.name, error)
-            self._pass_reset_on(index)
-        self._finish(index, finished)
+            self._pass_reset_on(direction)
+        self._finish(direction, finished)
 
     def _count_sent(self, size: int) -> None:
         self.sent += size
@@ -155,8 +178,11 @@ class Relay:
     def _count_received(self, size: int) -> None:
         self.received += size
 
-    def _pass_reset_on(self, index: int) -> None:
-        """Wake the other direction without a FIN on the wire, so that the close sends a reset."""
+    def _pass_reset_on(self, direction: RelayDirection) -> None:
+        """Wake the other direction, if possible without a FIN, so that the close sends a reset.
+
+        ``direction``: the direction that has failed.
+        """
         self.failed = True
         # SHUT_RD wakes a thread that reads, and sends nothing. Only SHUT_WR wakes a thread that
         # can't write, but SHUT_WR sends a FIN, so SHUT_WR comes last.
@@ -164,14 +190,17 @@ class Relay:
             for sock in (self.outside, self.inside):
                 with contextlib.suppress(OSError):
                     sock.shutdown(how)
-            if self._done[1 - index].wait(RESET_GRACE):
+            if self._done[direction.opposite].wait(RESET_GRACE_S):
                 return
 
-    def _finish(self, index: int, finished: Finished) -> None:
-        """Note the end of a direction; the first thread that sees both ends closes the sockets."""
-        self._done[index].set()
-        with _END:
-            if self._ended or not self._done[1 - index].is_set():
+    def _finish(self, direction: RelayDirection, finished: Finished) -> None:
+        """Note the end of a direction.
+
+        The first thread that finds both directions ended closes the sockets.
+        """
+        self._done[direction].set()
+        with _end_lock:
+            if self._ended or not self._done[direction.opposite].is_set():
                 return
             self._ended = True
         for sock in (self.outside, self.inside):
@@ -181,7 +210,8 @@ class Relay:
         finished(self)
 
 
-_END = threading.Lock()
+_end_lock = threading.Lock()
+"""Guards ``Relay._ended`` of all relays."""
 
 
 def _prepare(sock: socket.socket) -> None:
@@ -209,68 +239,69 @@ class _Pump:
         may_splice: bool,
     ) -> None:
         self._source = source
-        self._target = target
+        self.target = target
         self._count = count
         self._may_splice = may_splice and hasattr(os, "splice")
-        self._shares = False
+        self._is_bounded = False
 
     def run(self) -> None:
         while self._copy() and self._bulk():
             pass
 
     def _copy(self) -> bool:
-        """Copy until a read is full; False at the end."""
+        """Copy; return True after a full read, False if the source has ended."""
         receive = self._source.recv
-        send = self._target.sendall
+        send = self.target.sendall
         count = self._count
-        while data := receive(COPY_SIZE):
+        while data := receive(COPY_BYTES):
             send(data)
             count(len(data))
-            if len(data) == COPY_SIZE:
+            if len(data) == COPY_BYTES:
                 return True
         return False
 
     def _bulk(self) -> bool:
-        """Move large amounts until a read is small; False at the end.
+        """Move large amounts; return True after a small read, False if the source has ended.
 
-        Then the pipe is closed: an unprivileged user may have few pages of pipes.
+        The pipe is closed on return: an unprivileged user may have few pages of pipes.
         """
-        with _CROWD.joined(self) as size:
+        with _busy_directions.joined(self) as count:
             if not self._may_splice:
                 return self._copy_blocks()
-            with _pipe(PIPE_SIZE if size <= LARGE_PIPES else SHARED_PIPE) as pipe:
+            is_large = count <= MOST_LARGE_PIPES
+            with _pipe(PIPE_BYTES if is_large else FURTHER_PIPE_BYTES) as pipe:
                 return self._splice(*pipe) if pipe else self._copy_blocks()
 
-    def share_memory(self) -> None:
+    def bound_buffers(self) -> None:
         """Bound the socket buffers of this direction, until the end of the connection."""
-        if self._shares:
+        if self._is_bounded:
             return
-        self._shares = True
+        self._is_bounded = True
         with contextlib.suppress(OSError):  # called by another thread: may be closed by now
-            self._source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SHARED_RECEIVE)
-            self._target.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SHARED_SEND)
+            self._source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+            self.target.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
 
     def _splice(self, read_end: int, write_end: int) -> bool:
         source = self._source.fileno()
-        target = self._target.fileno()
+        target = self.target.fileno()
         splice = os.splice
         count = self._count
         while True:
-            size = remaining = splice(source, write_end, PIPE_SIZE)
+            size = remaining = splice(source, write_end, PIPE_BYTES)
             while remaining:
                 remaining -= splice(read_end, target, remaining)
             count(size)
-            if size < COPY_SIZE:
+            if size < COPY_BYTES:
                 return size > 0
 
     def _copy_blocks(self) -> bool:
         receive = self._source.recv
-        send = self._target.sendall
+        send = self.target.sendall
         count = self._count
-        while data := receive(BLOCK_SIZE):
+        while data := receive(BLOCK_BYTES):
             send(data)
             count(len(data))
-            if len(data) < COPY_SIZE:
+            if len(data) < COPY_BYTES:
                 return True
         return False
 
@@ -279,8 +310,8 @@ class _Pump:
 def _pipe(size: int) -> Iterator[tuple[int, int] | None]:
     """A pipe of ``size`` bytes if possible; None if the pipe is too small for splice.
 
-    An unprivileged user has a number of pages for pipes (pipe-user-pages-soft, pipe(7)). Further
-    pipes get two pages each, and then copying is faster.
+    An unprivileged user has a limited number of pages for pipes (pipe-user-pages-soft, pipe(7)).
+    Further pipes get two pages each, and then copying is faster.
     """
     try:
         ends = os.pipe()
@@ -291,7 +322,7 @@ def _pipe(size: int) -> Iterator[tuple[int, int] | None]:
     try:
         with contextlib.suppress(OSError):
             fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, size)
-        yield ends if fcntl.fcntl(ends[1], fcntl.F_GETPIPE_SZ) >= LEAST_PIPE else None
+        yield ends if fcntl.fcntl(ends[1], fcntl.F_GETPIPE_SZ) >= LEAST_PIPE_BYTES else None
     finally:
         for end in ends:
             os.close(end)
@@ -306,19 +337,23 @@ class _BusyDirections:
 
     @contextlib.contextmanager
     def joined(self, pump: _Pump) -> Iterator[int]:
-        """Add a direction for the context; return the number. In a crowd all share memory."""
+        """Add a direction for the context; yield the number of directions.
+
+        Above MOST_UNBOUNDED_DIRECTIONS, bound the socket buffers of all directions.
+        """
         with self._lock:
             self._pumps.add(pump)
-            size = len(self._pumps)
-            # The first direction beyond CROWD makes all share, each later direction only itself.
-            sharers = list(self._pumps) if size == CROWD + 1 else [pump] * (size > CROWD)
+            count = len(self._pumps)
+            excess = count - MOST_UNBOUNDED_DIRECTIONS
+            # The first direction beyond the limit bounds all, each later direction only itself.
+            unbounded = list(self._pumps) if excess == 1 else [pump] if excess > 0 else []
         try:
-            for sharer in sharers:
-                sharer.share_memory()
-            yield size
+            for direction in unbounded:
+                direction.bound_buffers()
+            yield count
         finally:
             with self._lock:
                 self._pumps.discard(pump)
 
 
-_CROWD = _BusyDirections()
+_busy_directions = _BusyDirections()

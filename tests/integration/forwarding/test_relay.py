@@ -27,7 +27,7 @@ from tests.integration.net import (
 )
 
 BOTH_LOOPS = True
-THRESHOLDS = [relay.COPY_SIZE, 4 * relay.COPY_SIZE, relay.BLOCK_SIZE, relay.PIPE_SIZE]
+THRESHOLDS = [relay.COPY_BYTES, 4 * relay.COPY_BYTES, relay.BLOCK_BYTES, relay.PIPE_BYTES]
 
 
 class Ends:
@@ -154,11 +154,11 @@ async def digest(wire: Wire) -> str:
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("least_pipe", [relay.LEAST_PIPE, 1 << 40], ids=["splice", "copies"])
+@pytest.mark.parametrize("least_pipe", [relay.LEAST_PIPE_BYTES, 1 << 40], ids=["splice", "copies"])
 async def test_bytes_arrive_intact_both_ways_at_once(
     proxy, node, lease, seed, least_pipe, monkeypatch
 ):
-    monkeypatch.setattr(relay, "LEAST_PIPE", least_pipe)
+    monkeypatch.setattr(relay, "LEAST_PIPE_BYTES", least_pipe)
     outward = random.Random(seed).randbytes(3_000_001)
     inward = os.urandom(2_000_003)
     async with relayed(node, lease) as ends, asyncio.timeout(PATIENCE):
@@ -304,7 +304,7 @@ async def test_in_copy_mode_nothing_is_spliced(make_proxy, node, monkeypatch):
     proxy = await make_proxy(data_plane="copy")
     await node.publish(proxy.master)
     async with relayed(node, proxy.lease(node)) as ends:
-        data = random.Random(8).randbytes(3 * relay.BLOCK_SIZE + 17)
+        data = random.Random(8).randbytes(3 * relay.BLOCK_BYTES + 17)
         for sender, receiver in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
             _, got = await asyncio.gather(sender.send(data), receiver.exactly(len(data)))
             assert got == data
@@ -337,9 +337,9 @@ async def test_many_subscribers_that_leave_at_once_are_all_noticed(proxy, node, 
     await proxy.quiet()
 
 
-async def test_many_streams_at_once_share_small_pipes(node, lease, monkeypatch):
+async def test_further_streams_have_smaller_pipes(node, lease, monkeypatch):
     """The user's pages for pipes are not used up by the first streams."""
-    monkeypatch.setattr(relay, "LARGE_PIPES", 1)
+    monkeypatch.setattr(relay, "MOST_LARGE_PIPES", 1)
     sizes: list[int] = []
     real = os.splice
 
@@ -358,15 +358,15 @@ async def test_many_streams_at_once_share_small_pipes(node, lease, monkeypatch):
         for flood in floods:
             flood.cancel()
         await asyncio.gather(*floods, return_exceptions=True)
-    assert set(sizes) == {relay.PIPE_SIZE, relay.SHARED_PIPE}
+    assert set(sizes) == {relay.PIPE_BYTES, relay.FURTHER_PIPE_BYTES}
 
 
 @pytest.mark.parametrize("plane", ["splice", "copy"])
-async def test_a_crowd_of_streams_does_not_exhaust_the_memory_of_tcp(
+async def test_many_streams_do_not_exhaust_the_memory_of_tcp(
     make_proxy, node, monkeypatch, plane
 ):
     """At 1,000 saturated streams Linux dropped packets, and some streams got nothing."""
-    monkeypatch.setattr(relay, "CROWD", 1)
+    monkeypatch.setattr(relay, "MOST_UNBOUNDED_DIRECTIONS", 1)
     proxy = await make_proxy(data_plane=plane)
     await node.publish(proxy.master)
     async with AsyncExitStack() as stack:
@@ -374,17 +374,17 @@ async def test_a_crowd_of_streams_does_not_exhaust_the_memory_of_tcp(
         read_on = asyncio.Event()
         floods = [asyncio.create_task(flood(streams[0], read_on))]
         await streams[0].inside.stalls()
-        assert buffers(streams) != {SHARED}
+        assert buffers(streams) != {BOUNDED}
         streams.append(await stack.enter_async_context(relayed(node, proxy.lease(node))))
         floods.append(asyncio.create_task(flood(streams[1], read_on)))
         await streams[1].inside.stalls()
         read_on.set()
-        await until(lambda: buffers(streams) == {SHARED}, "both share")
+        await until(lambda: buffers(streams) == {BOUNDED}, "both are bounded")
         assert await asyncio.gather(*floods) == [FLOOD, FLOOD]
     await proxy.quiet()
 
 
-SHARED = (2 * relay.SHARED_RECEIVE, 2 * relay.SHARED_SEND)
+BOUNDED = (2 * relay.RECEIVE_BUFFER_BYTES, 2 * relay.SEND_BUFFER_BYTES)
 """Linux doubles what is asked for."""
 FLOOD = 100_000_000
 
@@ -424,8 +424,8 @@ def peer_option(wire: Wire, option: int) -> int:
 
 async def test_without_large_pipes_bulk_is_copied(proxy, node, lease, monkeypatch):
     """An unprivileged user's pipes may shrink to two pages, and splicing would be slow."""
-    monkeypatch.setattr(relay, "LEAST_PIPE", 2 * relay.PIPE_SIZE)
-    payload = random.Random(7).randbytes(3 * relay.BLOCK_SIZE + 17)
+    monkeypatch.setattr(relay, "LEAST_PIPE_BYTES", 2 * relay.PIPE_BYTES)
+    payload = random.Random(7).randbytes(3 * relay.BLOCK_BYTES + 17)
     async with relayed(node, lease) as ends:
         sending = asyncio.create_task(ends.inside.send(payload))
         assert await ends.outside.exactly(len(payload)) == payload

@@ -127,7 +127,8 @@ class TcprosServer:
         outside, inside = (conn, node) if target.inside else (node, conn)
         relay = Relay(
             target.port, kind, target.label(kind, name), caller_id, peer, outside, inside,
-            splice=self._may_splice, inside_asks=not target.inside, client_listens=kind == "topic",
+            splice=self._may_splice, inside_asks=not target.inside,
+            client_is_silent=kind == "topic",
         )  # fmt: skip
         target.note_connection()
         self._context.gate.enter(peer, target.port)  # the acceptor counts until `serve` ends
