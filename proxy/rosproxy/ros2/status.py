@@ -162,7 +162,9 @@ class Ros2State(Collector):
             mismatches_left_out=len(pairs) - len(shown_pairs),
             not_compared=comparison.left_out,
             inside=tuple(
-                self._inside(p, most, shortages.get(p.prefix, _NO_SHORTAGE), domain.is_kept(p))
+                self._inside(
+                    p, most, shortages.get(p.prefix, _NO_SHORTAGE), domain.has_confirmed_ports(p)
+                )
                 for p, most in self._shares(domain.inside.by_prefix.values())
             ),
             outside=tuple(

@@ -1,13 +1,17 @@
 """A DDS domain: what the proxy does with each datagram of discovery, and as time passes.
 
-Participants inside announce themselves to a multicast group, or to the well-known port of a peer
-(SPDP). The proxy maps a port of the range to each of their locators (`PortMappings`), and announces
-the participants to outside with these ports (`AnnouncementsToOutside`). An announcement that
-outside sends to a port for metatraffic goes on to the participant inside, with a *stand-in* in
-place of the locator for metatraffic (`AnnouncementsToInside`). So all discovery passes the proxy,
-in both directions, and the proxy can rewrite all of it. User data passes unread: to inside through
-the range, to outside without the proxy. If the receiver would read discovery at a port for user
-data, the proxy reads discovery there, too (`Participant.reads_discovery_at`).
+Participants inside announce themselves (SPDP) to a multicast group, or to the proxy's well-known
+port if ROS_STATIC_PEERS names the proxy. The proxy maps a port of the range to each of their
+locators (`PortMappings`), and announces the participants to outside with these ports
+(`AnnouncementsToOutside`). An announcement that outside sends to a port for metatraffic goes on to
+the participant inside, with a *stand-in* in place of the locator for metatraffic
+(`AnnouncementsToInside`). So all discovery goes through the proxy, in both directions, and the
+proxy can rewrite all of it.
+
+User data to inside goes through the range. User data to outside goes directly or, with
+``--direction both``, through stand-ins. The proxy forwards user data unread, with one exception:
+some implementations act on discovery that arrives at a port for user data. So the proxy also reads
+discovery at such a port (`Participant.reads_discovery_at`).
 
 This module does no I/O: each method takes a datagram, the source and the time, and returns the
 datagrams to send. After each call, `stand_ins` has the ports that have to be open.
@@ -16,18 +20,21 @@ Each datagram may be forged. So these rules hold:
 
 - A participant inside has an address inside. Only locators at this address get a port: no
   announcement makes the proxy a way to another host.
-- While a participant has a GUID prefix, no participant at another address or on the other side gets
-  this prefix (`PrefixOwners` has the exceptions).
-- The proxy accepts three kinds of participants outside: those at the address of a peer, those that
-  the LAN relay has heard, and those that answer the discovery participant from an address at which
-  a participant is known. The proxy sends only to locators at the participant's own address.
+- The proxy refuses a participant with the GUID prefix of a participant at another address, or on
+  the other side (`PrefixOwners` has the exceptions).
+- The proxy accepts a participant outside in three cases: its address is that of a peer, the LAN
+  relay has heard it, or it answers the discovery participant. In the third case, another
+  participant must be known at the same address. The proxy sends only to locators at the
+  participant's own address.
 - A proof with a shared secret identifies the LAN relay. The address that the relay states for a
   participant must neither be inside nor belong to the proxy.
-- A participant outside gets no more bytes than came from its address, until the participant names
-  the secret GUID prefix of a question (`OutsideParticipant` has the details). So no sender can make
-  the proxy flood another machine.
-- Each source has an allowance for discovery, which includes the datagrams that the proxy sends in
-  consequence.
+- Until the address of a participant outside is proven, the proxy sends the participant no more
+  bytes than came from it, or ANSWERED_FACTOR times as many after an answer (`OutsideParticipant`).
+  A *question* of the proxy has a secret GUID prefix, and an answer with this prefix proves the
+  address (`AddressProofs`). So no sender can make the proxy flood another machine.
+- Each source has an allowance for discovery. At the discovery port and inside, the charge includes
+  the datagrams that the proxy sends in consequence. At range ports and stand-ins, the proxy charges
+  only the received datagram. An answer that proves an address is free.
 """
 
 from collections import Counter
@@ -87,7 +94,7 @@ from rosproxy.ros2.sources.address_proofs import AddressProofs, is_question_of_p
 from rosproxy.ros2.sources.claimed_addresses import claim_fault
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing, cost
 
-ENDED_AT_ONCE = 64
+MOST_ENDED_PER_CALL = 64
 """Participants of a side that `Domain.expire` ends in one call. Calls come twice a second."""
 
 _Passing = tuple[list[bytes], list[Outgoing]]
@@ -97,20 +104,20 @@ _Passing = tuple[list[bytes], list[Outgoing]]
 class Domain:
     """A domain with its participants.
 
-    A domain starts without participants. ``own`` is the random GUID prefix of the discovery
-    participant. ``secret`` are random bytes. ``now`` is the clock in seconds, and ``when`` is Unix
-    time at that moment. ``passed`` counts bytes that passed, by kind and by whether they went
-    inwards.
+    A domain starts without participants. ``discovery_prefix`` is the random GUID prefix of the
+    discovery participant. ``secret`` is the random key of the questions that prove addresses.
+    ``monotonic_s`` and ``unix_s`` are the present time, by the monotonic clock and since 1970.
+    ``passed`` counts bytes that passed, by kind and by whether they went inwards.
     """
 
     def __init__(
         self,
         settings: DomainSettings,
         pool: PortPool,
-        own: bytes,
+        discovery_prefix: bytes,
         secret: bytes,
-        now: float,
-        when: float = 0.0,
+        monotonic_s: float,
+        unix_s: float = 0.0,
     ) -> None:
         pool.claim(settings.discovery_port)  # never for a locator: outside announces itself there
         self.settings = settings
@@ -118,7 +125,7 @@ class Domain:
         self.proofs = proofs = AddressProofs(secret)
         self.rates = DiscoveryRates()
         self.passed = Counter[tuple[TrafficKind, bool]]()
-        self.ports = LocatorPorts(pool, now)
+        self.ports = LocatorPorts(pool, monotonic_s)
         self.mappings = PortMappings(settings, self.ports, refused, proofs)
         self.stand_ins = LocatorStandIns(settings, refused)
         verdicts = Verdicts(settings.judge)
@@ -129,13 +136,19 @@ class Domain:
         settings.participants_at = outside.count_by_address.__getitem__
         self.to_inside = AnnouncementsToInside(settings, inside, outside)
         self.to_outside = AnnouncementsToOutside(settings, outside)
-        former_ports = FormerPorts.starting(settings, self.ports, proofs, when - now)
+        former_ports = FormerPorts.starting(settings, self.ports, proofs, unix_s - monotonic_s)
         self.former_ports = former_ports
         self.owners = PrefixOwners(settings, inside, outside, former_ports, proofs)
         self.rediscovery = Rediscovery(settings, inside, outside, self.to_inside)
         self.fragments = fragments = FragmentStores()
         self.proxy_participants = ProxyParticipants(
-            settings, DiscoveryParticipant(own), inside, outside, former_ports, fragments, proofs
+            settings,
+            DiscoveryParticipant(discovery_prefix),
+            inside,
+            outside,
+            former_ports,
+            fragments,
+            proofs,
         )
         self.disposal = Disposal(
             settings,
@@ -151,13 +164,16 @@ class Domain:
 
     @property
     def is_busy(self) -> bool:
-        """Whether `Domain.go_on` has more to do: hundreds may have to discover hundreds."""
+        """Whether a rediscovery has further parts for `go_on`.
+
+        Hundreds of participants may have to rediscover hundreds, so the work has parts.
+        """
         return self.rediscovery.is_busy
 
     def heard_inside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """Handle a datagram from inside, at the multicast group or at the well-known port."""
         is_answer = self.proofs.is_answer(source, datagram)
-        if not is_answer and self._is_too_much(datagram, source, now):
+        if not is_answer and not self._take_allowance(datagram, source, now):
             return []
         sent = list[Outgoing]()
         try:
@@ -175,10 +191,12 @@ class Domain:
         participants send their answers to the discovery participant there.
         """
         relay = self.settings.relay
-        # Other programs have the relay's address, too. Their datagrams have no proof.
+        # No datagram of the LAN relay starts with RTPS. Such a datagram is from another program at
+        # the relay's address.
         if relay and source == relay.address.host and not datagram.startswith(MAGIC):
             return self._heard_by_relay(relay, datagram, now)
-        # A flood may have taken the place of the participant. Its answer counts all the same.
+        # A flood may have taken the participant's place in the table. The proxy accepts the answer
+        # of this participant nevertheless.
         if not self.proofs.is_answer(source, datagram) and self.outside.is_strange(source):
             return []
         return self._heard_at_discovery(datagram, source, False, now)
@@ -208,7 +226,7 @@ class Domain:
         self.rediscovery.lan_relay_heard = True
         if fault := claim_fault(source, self.settings):
             # With IPv6 the relay may receive from the inside network (groups.py,
-            # _IP_MULTICAST_ALL).
+            # _IP_MULTICAST_ALL). So the announcement of a participant inside is no fault.
             return [] if is_known else self._drop("claimed_address", source, fault)
         return self._heard_at_discovery(announcement, source, True, now)
 
@@ -216,7 +234,7 @@ class Domain:
         self, datagram: bytes, source: str, by_relay: bool, now: float
     ) -> list[Outgoing]:
         is_answer = self.proofs.is_answer(source, datagram)
-        if not is_answer and self._is_too_much(datagram, source, now):
+        if not is_answer and not self._take_allowance(datagram, source, now):
             return []
         sent = list[Outgoing]()
         try:
@@ -229,18 +247,24 @@ class Domain:
         self._charge(source, sent)
         return sent
 
-    def is_read_at_discovery(self, datagram: bytes, source: str) -> bool:
-        """Whether `heard_outside` parses a datagram, so that the datagram has to wait."""
+    def must_queue_discovery(self, datagram: bytes, source: str) -> bool:
+        """Whether a datagram at the discovery port must wait in the queue of discovery.
+
+        A datagram waits if parsing takes time. Answers that prove an address do not wait.
+        """
         if self.proofs.is_answer(source, datagram):
             return False
         return self.outside.is_met(source) or self.source_of(datagram, source) != source
 
-    def is_read_of_inside(self, datagram: bytes, source: str) -> bool:
-        """Whether `heard_inside` parses a datagram, so that the datagram has to wait."""
+    def must_queue_inside(self, datagram: bytes, source: str) -> bool:
+        """Whether a datagram for `heard_inside` must wait in the queue of discovery.
+
+        Answers that prove an address do not wait.
+        """
         return not self.proofs.is_answer(source, datagram)
 
-    def is_read_at_range_port(self, port: int, datagram: bytes, source: str) -> bool:
-        """Whether `at_range_port` parses a datagram, so that the datagram has to wait."""
+    def must_queue_at_range_port(self, port: int, datagram: bytes, source: str) -> bool:
+        """Whether a datagram for `at_range_port` must wait in the queue of discovery."""
         mapped = self.mappings.by_port.get(port)
         if mapped is None:
             return False
@@ -248,8 +272,8 @@ class Domain:
         may_be_read = mapping.is_read and self.outside.is_met(source)
         return may_be_read and may_be_discovery(datagram)
 
-    def is_read_at_stand_in(self, port: int, datagram: bytes, _: str) -> bool:
-        """Whether `at_stand_in` parses a datagram, so that the datagram has to wait."""
+    def must_queue_at_stand_in(self, port: int, datagram: bytes, _: str) -> bool:
+        """Whether a datagram for `at_stand_in` must wait in the queue of discovery."""
         users = self.stand_ins.by_port.get(port, ())
         may_be_read = any(outsider.reads_discovery_at(mapping) for outsider, mapping in users)
         return may_be_read and may_be_discovery(datagram)
@@ -271,7 +295,7 @@ class Domain:
             back = list[Outgoing]()
             is_read = is_for_data or may_be_discovery(datagram)
             if is_read:  # Cyclone DDS has one locator for both
-                if self._is_too_much(datagram, source, now):
+                if not self._take_allowance(datagram, source, now):
                     return []
                 passed, back = self._read_at_range_port(port, source, insider, datagram, now)
         except RtpsError as error:
@@ -282,10 +306,10 @@ class Domain:
         """Handle a datagram from inside at a stand-in."""
         users = list(self.stand_ins.by_port.get(port, ()))
         sent = list[Outgoing]()
-        if not self.is_read_at_stand_in(port, datagram, source):
+        if not self.must_queue_at_stand_in(port, datagram, source):
             is_of_participant = source in self.inside.count_by_address
             return self._to_outside(users, datagram, True) if is_of_participant else []
-        if self._is_too_much(datagram, source, now):
+        if not self._take_allowance(datagram, source, now):
             return []
         try:
             for message in read_messages(datagram):
@@ -294,7 +318,7 @@ class Domain:
             sent += self._drop("malformed", source, str(error))
         return sent
 
-    def settle(self, now: float) -> list[Outgoing]:
+    def continue_pending(self, now: float) -> list[Outgoing]:
         """Repeat questions about former ports, and continue rediscoveries."""
         sent = self.former_ports.repeated_questions(now)
         for insider in list(self.inside.by_prefix.values()):
@@ -305,11 +329,14 @@ class Domain:
         return sent + self.rediscovery.next_datagrams(now)
 
     def go_on(self, now: float) -> list[Outgoing]:
-        """Do the next part of a rediscovery, which takes some milliseconds; see `is_busy`."""
+        """Do the next part of a rediscovery; see `is_busy`. A part takes some milliseconds."""
         return self.rediscovery.next_datagrams(now)
 
     def admit(self, prefix: bytes, now: float) -> list[Outgoing]:
-        """Serve a participant that has waited for the answer about its former ports."""
+        """Serve a participant inside that has waited because of its former ports.
+
+        The participant has answered, or the time for the answer is over.
+        """
         waited = self.former_ports.end_wait(prefix)
         if waited is None:
             return []  # the participant has ended meanwhile
@@ -320,13 +347,13 @@ class Domain:
             return self._drop("malformed", source, str(error))
 
     def apply_policy(self, now: float) -> list[Outgoing]:
-        """Start the rediscovery of the participants for which a verdict has changed."""
-        self.fragments.clear()  # the former policy has judged these
+        """Start the rediscovery of the participants for which the policy now decides otherwise."""
+        self.fragments.clear()  # received under the former policy
         self.rediscovery.review()
         return self.rediscovery.next_datagrams(now)
 
     def move_to(self, hosts: tuple[str, ...], now: float) -> list[Outgoing]:
-        """Announce the participants inside at other addresses of the advertised host.
+        """Announce the participants inside with other addresses of the advertised host.
 
         Fast DDS accepts no new locators of a known participant (PDPListener.cpp). So all
         participants outside rediscover the participants inside and the discovery participant.
@@ -343,10 +370,10 @@ class Domain:
         return sent + self.rediscovery.next_datagrams(now)
 
     def retire(self, now: float) -> list[Outgoing]:
-        """End all participants inside on both sides, because no proxy takes over.
+        """Let the participants of both sides forget each other, because no proxy takes over.
 
-        The participants may live on, and a proxy that is started later may serve them. Then they
-        have to rediscover each other, so both sides have to forget (`Rediscovery`).
+        A proxy that is started later may serve the participants that live on. For a rediscovery
+        then, both sides have to forget now (`Rediscovery`).
         """
         sent = list[Outgoing]()
         self.former_ports.forget({insider.address for insider in self.inside.by_prefix.values()})
@@ -362,29 +389,33 @@ class Domain:
         is_proven = self.proofs.has(source)
         if self.settings.is_inside(source):
             return Standing.PROVEN if is_proven else Standing.INSIDE
-        return Standing.STRANGER if is_proven else Standing.OUTSIDE
+        return Standing.PROVEN_OUTSIDE if is_proven else Standing.OUTSIDE
 
-    def is_kept(self, participant: InsideParticipant) -> bool:
-        """Whether a participant inside has confirmed that it keeps all its ports."""
+    def has_confirmed_ports(self, participant: InsideParticipant) -> bool:
+        """Whether a participant inside has confirmed that it remembers all its ports.
+
+        It remembers the ports for the next process of the proxy.
+        """
         return self.proxy_participants.port_store.keeps(participant.prefix, participant.ports)
 
     def expire(self, now: float) -> list[Outgoing]:
         """End participants whose lease duration is over. Return the datagrams for outside.
 
-        If a participant on two networks has lost the network on which the proxy served the
-        participant, its next announcement on the other network is accepted.
+        A participant on two networks may have lost the network on which the proxy served the
+        participant. After the end of its lease duration, the proxy accepts its announcement on the
+        other network.
         """
         sent = list[Outgoing]()
         insiders = [p for p in self.inside.by_prefix.values() if p.until < now]
-        for insider in insiders[:ENDED_AT_ONCE]:
+        for insider in insiders[:MOST_ENDED_PER_CALL]:
             sent += self.disposal.end_inside(insider)
         outsiders = [p for p in self.outside.by_prefix.values() if p.until < now]
-        for outsider in outsiders[:ENDED_AT_ONCE]:
+        for outsider in outsiders[:MOST_ENDED_PER_CALL]:
             self.disposal.forget_outside(outsider)
         self.proofs.expire(now, self.inside, self.outside)
         return sent
 
-    def gone(self, addresses: Collection[str]) -> list[Outgoing]:
+    def end_participants_at(self, addresses: Collection[str]) -> list[Outgoing]:
         """End the participants at inside addresses that are gone. Return the datagrams for outside.
 
         Without this, outside would keep these participants until the end of their lease durations.
@@ -450,7 +481,7 @@ class Domain:
                 self.proxy_participants.discovery_participant.prefix, message, source
             )
         if message.of_participant is None:
-            return self._told_outside(message, source, received, now)
+            return self._handle_message_from_outside(message, source, received, now)
         if not by_relay and not self.outside.may_announce(
             message, source, self.proxy_participants.discovery_participant.prefix
         ):
@@ -476,7 +507,7 @@ class Domain:
         self.refused("prefix", source, text)
         return self.proxy_participants.question_to_outside(claimant)
 
-    def _told_outside(
+    def _handle_message_from_outside(
         self, message: DiscoveryMessage, source: str, received: int, now: float
     ) -> list[Outgoing]:
         """Handle a message from outside to a participant of the proxy. Raises RtpsError."""
@@ -505,7 +536,7 @@ class Domain:
         sent += self.to_inside.of_outside([outsider], self.inside.by_prefix.values(), now)
         if message.of_participant is None or not message.of_participant.ended:
             return sent + self.proxy_participants.question_to_outside(outsider)
-        self.disposal.forget_outside(outsider)  # inside has just got this end as an announcement
+        self.disposal.forget_outside(outsider)  # inside has just been told
         return sent
 
     def _meet_outside(
@@ -515,10 +546,10 @@ class Domain:
 
         The other participant ends to make room.
         """
-        made_room = self._make_room(message, source)
+        made_room = self._end_one_for_place(message, source)
         return self.outside.meet(message, source, now), made_room
 
-    def _make_room(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
+    def _end_one_for_place(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
         """End a participant outside in favour of a new one, if necessary."""
         spdp = message.of_participant
         if spdp is None or spdp.ended or message.prefix in self.outside.by_prefix:
@@ -543,26 +574,28 @@ class Domain:
         sent = self.disposal.end_inside(gives_place) if gives_place else []
         insider = self.inside.meet(message, source, now)
         if insider is None:
-            if prefix not in self.inside.by_prefix:  # its answer may give the participant a place
+            if prefix not in self.inside.by_prefix:
+                # An answer proves the address, and the next announcement may get a place.
                 sent += self.proxy_participants.question_to_announced(message, source)
             return sent
         if is_new:
-            sent += self._make_way(insider, now)
+            sent += self._end_former_users_of_ports(insider, now)
         mapping_count = len(insider.mappings)
         for_outside = ForOutside(self.inside, insider, now, self.former_ports.of(prefix))
         exported = for_outside.rewritten(message)
         sent += self.to_inside.of_neighbour(insider, message)
         # Outside knows former ports of the participant, so all participants outside have to
-        # rediscover it. The participant also has to forget the port store, perhaps at a former
-        # address of the proxy.
+        # rediscover it. The participant may know the port store at a former address of the proxy,
+        # so the port store also ends for this participant.
         if is_new and self.former_ports.must_be_rediscovered(prefix):
             sent += self.proxy_participants.port_store_dispose_message(insider)
             insider.separation_due_from = now
         else:
-            sent += self._reminders(insider, mapping_count, now)
+            sent += self._port_reminders(insider, mapping_count, now)
         if not is_new and len(insider.mappings) > mapping_count:
             insider.separation_due_from = now  # Fast DDS outside accepts no new locators
-        # `for_all`, because the message may be an answer to the discovery participant.
+        # An answer names the discovery participant as its destination. `for_all` makes it a message
+        # for all participants outside.
         sent += self.to_outside.of_inside(insider, for_all(exported), now)
         if is_new:
             sent += self.to_inside.of_outside(self.outside.by_prefix.values(), [insider], now)
@@ -571,10 +604,11 @@ class Domain:
         )
         return sent + self.proxy_participants.first_questions(insider)
 
-    def _make_way(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
-        """End former processes at the port of a new participant inside, and holders of its ports.
+    def _end_former_users_of_ports(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
+        """End the former users of the ports of a new participant inside.
 
-        Return the datagrams for outside.
+        These are participants of crashed processes that had the same socket, and participants that
+        hold its ports of the range. Return the datagrams for outside.
         """
         prefix = insider.prefix
         # The participant may have answered while it waited.
@@ -605,7 +639,7 @@ class Domain:
     ) -> list[Outgoing]:
         """Rewrite discovery from inside for outside.
 
-        Return the rewritten datagrams, and the requests to inside. Raises RtpsError.
+        Return the rewritten datagrams, and the questions to inside. Raises RtpsError.
         """
         insider = self.inside.find(message.prefix, source)
         if insider is None:
@@ -624,18 +658,19 @@ class Domain:
         count = len(insider.mappings)
         for_outside = ForOutside(self.inside, insider, now)
         passed, questions = self.fragments.rewritten(port, message, reader, for_outside.rewritten)
-        back = sent_to(insider.metatraffic, questions) + self._reminders(insider, count, now)
+        back = sent_to(insider.metatraffic, questions) + self._port_reminders(insider, count, now)
         return back + [
             sent for d in passed for sent in self._to_outside(_meant(users, d), d, False)
         ]
 
-    def _reminders(
+    def _port_reminders(
         self, insider: InsideParticipant, former_count: int, now: float
     ) -> list[Outgoing]:
-        """The datagrams with which a participant keeps new ports at once.
+        """The datagrams with which the port store tells a participant its new ports.
 
-        Empty if the participant has no more than ``former_count`` ports. The proxy may be killed
-        before the next regular reminders, which repeat lost datagrams.
+        Empty if the participant has no more than ``former_count`` ports, or can't remember ports
+        (`FormerPorts.keepers`). `FormerPorts` repeats these datagrams regularly, but the proxy may
+        be killed before.
         """
         has_more = len(insider.mappings) > former_count
         if not has_more or insider not in self.former_ports.keepers(
@@ -670,17 +705,17 @@ class Domain:
     ) -> _Passing:
         """Rewrite discovery from outside for a participant inside.
 
-        Return the rewritten datagrams, and the requests to outside. Raises RtpsError.
+        Return the rewritten datagrams, and the questions to outside. Raises RtpsError.
         """
         outsider = self.outside.find(message.prefix, source)
         spdp = message.of_participant
         if outsider is not None:
             outsider.has_come_in = True
-        is_anothers = (
+        belongs_to_other = (
             message.prefix in self.inside.by_prefix
             or self.proxy_participants.is_of_proxy(message.prefix)
         )
-        if is_anothers or insider.is_separated:
+        if belongs_to_other or insider.is_separated:
             return [], []
         back = list[Outgoing]()
         if spdp is not None:
@@ -713,9 +748,7 @@ class Domain:
             if target.may_be_sent(len(datagram)):
                 sent.append(self._passed(mapping, datagram, False, is_user_data))
             else:
-                text = (
-                    f"participant {target.guid_prefix} has not shown yet that it receives datagrams"
-                )
+                text = f"participant {target.guid_prefix} has not yet answered the proxy's question"
                 sent += self._drop("unproven", target.address, text)
         return sent
 
@@ -731,24 +764,24 @@ class Domain:
         """Note the destination of a datagram at a port without a mapping. Raises RtpsError."""
         if not self.ports.is_restoring(now):
             return
-        if may_be_discovery(datagram) and self._is_too_much(datagram, source, now):
+        if may_be_discovery(datagram) and not self._take_allowance(datagram, source, now):
             return
-        self.ports.note_use(port, datagram, self._named_by(source), now)
+        self.ports.note_use(port, datagram, self._reliability_of(source), now)
 
     def _charge(self, source: str, sent: Sequence[Outgoing]) -> None:
         """Charge a source for the datagrams that the proxy sends in consequence."""
         total = sum(cost(len(out.datagram)) for out in sent)
         self.rates.charge(source, total, self.standing(source))
 
-    def _is_too_much(self, datagram: bytes, source: str, now: float) -> bool:
-        """Charge a source for a datagram. Return whether the allowance is used up."""
+    def _take_allowance(self, datagram: bytes, source: str, now: float) -> bool:
+        """Charge a source for a datagram. If the allowance is used up, refuse and return False."""
         if self.rates.take(source, len(datagram), now, self.standing(source)):
-            return False
+            return True
         text = "the source sends more discovery in a second than one source may send"
         self.refused("rate", source, text)
-        return True
+        return False
 
-    def _named_by(self, source: str) -> NamedBy:
+    def _reliability_of(self, source: str) -> NamedBy:
         """How reliable a source is when it names a participant at a port."""
         if self.settings.is_peer(source):
             return NamedBy.PEER
@@ -762,9 +795,10 @@ class Domain:
 
 
 def _meant(users: Sequence[StandInUser], datagram: bytes) -> Sequence[StandInUser]:
-    """The users of a stand-in that a message names; all users if the message names none.
+    """The participants outside behind a stand-in that a message is for.
 
-    A single user gets all messages, and ignores messages for other participants. Raises RtpsError.
+    All of them if the message names none. A single participant gets all messages, and ignores
+    messages for other participants. Raises RtpsError.
     """
     named = destinations(datagram) if len(users) > 1 else None
     return [user for user in users if user[0].prefix in named] if named else users

@@ -65,7 +65,7 @@ faster. Otherwise the kernel would drop datagrams, without fairness to the sourc
 
 Take = Callable[[bytes, str, float], list[Outgoing]]
 """Handles a datagram with its source and the time, and returns the datagrams to send."""
-MustRead = Callable[[bytes, str], bool]
+MustQueue = Callable[[bytes, str], bool]
 """Whether a datagram from a source is discovery that has to wait in the queue."""
 
 
@@ -120,7 +120,7 @@ class DomainServer:
         domain = self.domain
         self._groups.open(_families(self._bind))
         well_known = datagrams.bind(self._bind, settings.unicast_port)
-        self._read(well_known, self._heard_at_well_known, self._is_read_of_inside)
+        self._read(well_known, self._heard_at_well_known, self._must_queue_inside)
         taken_ports = []
         for port in settings.ports.listen.ports():
             try:
@@ -131,12 +131,12 @@ class DomainServer:
                 taken_ports.append(port)
                 continue
             if port == settings.discovery_port:
-                self._read(sock, self._at_discovery, self._is_read_at_discovery)
+                self._read(sock, self._at_discovery, self._must_queue_discovery)
             else:
                 self._read(
                     sock,
                     partial(domain.at_range_port, port),
-                    partial(domain.is_read_at_range_port, port),
+                    partial(domain.must_queue_at_range_port, port),
                 )
         return taken_ports
 
@@ -191,7 +191,7 @@ class DomainServer:
     def end(self, addresses: Collection[str]) -> int:
         """End the participants at addresses that are gone. Return the number of participants."""
         before = len(self.domain.inside.by_prefix)
-        self._send(self.domain.gone(addresses))
+        self._send(self.domain.end_participants_at(addresses))
         return before - len(self.domain.inside.by_prefix)
 
     def retire(self) -> int:
@@ -215,7 +215,7 @@ class DomainServer:
         """
         self._release()
         self._admit_waiting()
-        self._send_and_go_on(self.domain.settle(self._now()))
+        self._send_and_go_on(self.domain.continue_pending(self._now()))
         self._send(self.domain.expire(self._now()))
         self._sync_stand_ins()
         self._tell_changes()
@@ -329,23 +329,23 @@ class DomainServer:
         self._send(Outgoing(HostPort(group, port), datagram) for group in groups_of(near))
 
     def _read_group(self, sock: socket.socket) -> None:
-        must_read = self._is_read_of_inside
-        self._loop.add_reader(sock, self._take_in, sock, self._heard_in_group, must_read)
+        must_queue = self._must_queue_inside
+        self._loop.add_reader(sock, self._take_in, sock, self._heard_in_group, must_queue)
 
     def _stop_reading(self, sock: socket.socket) -> None:
         self._loop.remove_reader(sock)
         sock.close()
 
-    def _read(self, sock: socket.socket, take: Take, must_read: MustRead) -> None:
+    def _read(self, sock: socket.socket, take: Take, must_queue: MustQueue) -> None:
         self._sockets.append(sock)
-        self._loop.add_reader(sock, self._take_in, sock, take, must_read)
+        self._loop.add_reader(sock, self._take_in, sock, take, must_queue)
 
-    def _is_read_of_inside(self, datagram: bytes, source: str) -> bool:
-        return self._is_inside(source) and self.domain.is_read_of_inside(datagram, source)
+    def _must_queue_inside(self, datagram: bytes, source: str) -> bool:
+        return self._is_inside(source) and self.domain.must_queue_inside(datagram, source)
 
-    def _is_read_at_discovery(self, datagram: bytes, source: str) -> bool:
+    def _must_queue_discovery(self, datagram: bytes, source: str) -> bool:
         is_own = self._secret and datagram == self._secret
-        return not is_own and self.domain.is_read_at_discovery(datagram, source)
+        return not is_own and self.domain.must_queue_discovery(datagram, source)
 
     def _heard_at_well_known(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         if not self._is_let_in(datagram, source, now):
@@ -384,7 +384,7 @@ class DomainServer:
             return []
         return self.domain.heard_outside(datagram, source, now)
 
-    def _take_in(self, sock: socket.socket, take: Take, must_read: MustRead) -> None:
+    def _take_in(self, sock: socket.socket, take: Take, must_queue: MustQueue) -> None:
         """Receive the datagrams at a socket: queue discovery, and pass all others at once.
 
         A turn ends after `PER_TURN` datagrams, or after half the bytes of the longest datagram.
@@ -402,7 +402,7 @@ class DomainServer:
                 key = self._replaceable_as(take, datagram, source)
                 if self._replaces(key, take, datagram, source):
                     weight = 1 / QUEUED_FOR_PASSED
-                elif must_read(datagram, source):
+                elif must_queue(datagram, source):
                     weight = 1 / QUEUED_FOR_PASSED
                     self._read_in_turn(take, datagram, source, key)
                 else:
@@ -505,8 +505,8 @@ class DomainServer:
                 continue
             self._stand_ins[port] = sock
             take = partial(self.domain.at_stand_in, port)
-            must_read = partial(self.domain.is_read_at_stand_in, port)
-            self._loop.add_reader(sock, self._take_in, sock, take, must_read)
+            must_queue = partial(self.domain.must_queue_at_stand_in, port)
+            self._loop.add_reader(sock, self._take_in, sock, take, must_queue)
         return closed
 
 

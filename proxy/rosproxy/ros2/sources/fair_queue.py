@@ -172,7 +172,9 @@ class DiscoveryQueue(Generic[Item]):
     def __init__(self) -> None:
         self._queues = {
             standing: FairQueue[Item](
-                MOST_KNOWN if standing in (Standing.PROVEN, Standing.STRANGER) else MOST_UNKNOWN,
+                MOST_KNOWN
+                if standing in (Standing.PROVEN, Standing.PROVEN_OUTSIDE)
+                else MOST_UNKNOWN,
             )
             for standing in Standing
         }

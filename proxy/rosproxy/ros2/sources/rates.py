@@ -30,12 +30,13 @@ MOST_SOURCES = 4096
 class Standing(IntEnum):
     """The kinds of sources.
 
-    PROVEN: the address of a peer, or a proven address inside. STRANGER: another proven address
-    outside. A single machine may have thousands of these. INSIDE and OUTSIDE: all other addresses.
+    PROVEN: the address of a peer, or a proven address inside. PROVEN_OUTSIDE: another proven
+    address outside. A single machine may have thousands of these. INSIDE and OUTSIDE: all other
+    addresses.
     """
 
     PROVEN = auto()
-    STRANGER = auto()
+    PROVEN_OUTSIDE = auto()
     INSIDE = auto()
     OUTSIDE = auto()
 

@@ -180,7 +180,7 @@ def finished(domain: Domain, sent: Sequence[Outgoing], now: float = NOW) -> list
 def settle(domain: Domain, now: float) -> list[Outgoing]:
     """Admit participants that waited long enough, and end their separations."""
     admitted = [out for p in domain.former_ports.ready(now) for out in domain.admit(p, now)]
-    return admitted + finished(domain, domain.settle(now), now)
+    return admitted + finished(domain, domain.continue_pending(now), now)
 
 
 def to(outgoing: Sequence[Outgoing], host: str) -> list[bytes]:

@@ -90,7 +90,7 @@ def test_a_change_of_policy_reads_no_announcement_again(monkeypatch: pytest.Monk
     for insider in domain.inside.by_prefix.values():
         domain.rediscovery.separate(insider)
     finished(domain, [])
-    sent = finished(domain, domain.settle(NOW + SEPARATION_S), NOW + SEPARATION_S)
+    sent = finished(domain, domain.continue_pending(NOW + SEPARATION_S), NOW + SEPARATION_S)
     told = [source_prefix(datagram) for datagram in to(sent, INSIDE)]
     assert set(told) == {named(0), named(1)}
     assert not calls

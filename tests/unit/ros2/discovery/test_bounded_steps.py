@@ -91,7 +91,7 @@ def test_a_change_of_the_policy_is_applied_in_parts() -> None:
     every_pair = {INSIDE: INSIDE_COUNT * OUTSIDE_COUNT, OTHER: OUTSIDE_COUNT}
     assert told([*chain(*parting)], ended=True) == every_pair
     later = NOW + SEPARATION_S
-    meeting = parts(domain, domain.settle(later), later)
+    meeting = parts(domain, domain.continue_pending(later), later)
     assert told([*chain(*meeting)], ended=False) == every_pair
     assert not any(insider.is_separated for insider in domain.inside.by_prefix.values())
     most = PAIRS_AT_ONCE + 3 * (INSIDE_COUNT + 1)  # three for outside, of each inside
@@ -104,7 +104,7 @@ def test_addresses_take_turns() -> None:
     policy.allows = False
     finished(domain, domain.apply_policy(NOW))
     later = NOW + SEPARATION_S
-    sent = domain.settle(later)
+    sent = domain.continue_pending(later)
     while told(sent, ended=False)[OTHER] < OUTSIDE_COUNT:
         sent += domain.go_on(later)
     assert told(sent, ended=False)[INSIDE] < 2 * OUTSIDE_COUNT
@@ -117,7 +117,7 @@ def test_a_participant_stays_apart_until_it_has_all_dispose_messages() -> None:
     domain.apply_policy(NOW)
     assert domain.is_busy
     later = NOW + SEPARATION_S
-    assert not told(domain.settle(later), ended=False)
+    assert not told(domain.continue_pending(later), ended=False)
     finished(domain, [], later)
     assert all(insider.is_separated for insider in domain.inside.by_prefix.values())
 
@@ -143,5 +143,5 @@ def test_a_participant_that_has_gone_is_not_parted() -> None:
         insider.verdicts = {(RuleKind.PUBLISH, f"/t{number}"): False for number in range(100)}
     domain.apply_policy(NOW)
     policy.allows = True
-    domain.gone({INSIDE})
+    domain.end_participants_at({INSIDE})
     assert not told(finished(domain, []), ended=True)[INSIDE]

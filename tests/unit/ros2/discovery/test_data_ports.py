@@ -110,7 +110,7 @@ def test_a_peers_discovery_is_policed_and_led_elsewhere(vendor: bytes) -> None:
     domain = met(vendor, both_ways=True)
     port = data_port(domain)
     announced = sedp(B, ROBOT, 7000)
-    assert domain.is_read_at_range_port(port, announced, ROBOT)
+    assert domain.must_queue_at_range_port(port, announced, ROBOT)
     assert kinds(domain.at_range_port(port, announced, ROBOT, NOW)) == [GAP]
     domain = met(vendor, both_ways=True, is_denied=False)
     (sent,) = domain.at_range_port(data_port(domain), announced, ROBOT, NOW)
@@ -157,7 +157,7 @@ def test_discovery_is_charged_and_user_data_is_not() -> None:
 def test_user_data_passes_unread(source: str) -> None:
     domain = met()
     port = data_port(domain)
-    assert not domain.is_read_at_range_port(port, USER, source)
+    assert not domain.must_queue_at_range_port(port, USER, source)
     assert domain.at_range_port(port, USER, source, NOW) == [Outgoing(HostPort(INSIDE, 7411), USER)]
 
 
@@ -167,7 +167,7 @@ def test_fast_dds_ignores_discovery_there_and_nothing_is_read(source: str) -> No
     port = data_port(domain)
     before = allowance_left(domain, source)
     announced = sedp(B, ROBOT, 7000)
-    assert not domain.is_read_at_range_port(port, announced, source)
+    assert not domain.must_queue_at_range_port(port, announced, source)
     assert domain.at_range_port(port, announced, source, NOW) == [
         Outgoing(HostPort(INSIDE, 7411), announced)
     ]
@@ -209,7 +209,7 @@ def test_what_inside_announces_at_a_stand_in_for_user_data_is_policed(vendor: by
     domain = met(vendor, both_ways=True)
     port = data_stand_in(domain)
     announced = of_vendor(sedp(A, INSIDE, 7000), vendor)
-    assert domain.is_read_at_stand_in(port, announced, INSIDE)
+    assert domain.must_queue_at_stand_in(port, announced, INSIDE)
     assert kinds(domain.at_stand_in(port, announced, INSIDE, NOW)) == [GAP]
     first, second = in_fragments(A)
     assert domain.at_stand_in(port, first, INSIDE, NOW) == []
@@ -222,7 +222,7 @@ def test_nothing_is_read_at_a_stand_in_for_user_data_of_fast_dds() -> None:
     domain = met(FAST_DDS, both_ways=True)
     port = data_stand_in(domain)
     announced = sedp(A, INSIDE, 7000)
-    assert not domain.is_read_at_stand_in(port, announced, INSIDE)
+    assert not domain.must_queue_at_stand_in(port, announced, INSIDE)
     assert domain.at_stand_in(port, announced, INSIDE, NOW) == [
         Outgoing(HostPort(ROBOT, 7411), announced)
     ]
@@ -237,10 +237,10 @@ def test_one_participant_that_reads_discovery_has_a_shared_stand_in_read(
     )
     domain = met(FAST_DDS, both_ways=True)
     announced = sedp(A, INSIDE, 7000)
-    assert not domain.is_read_at_stand_in(20_001, announced, INSIDE)
+    assert not domain.must_queue_at_stand_in(20_001, announced, INSIDE)
     domain.heard_outside(of_vendor(spdp(C, ROBOT, 7420)), ROBOT, NOW)
     assert {data_stand_in(domain), data_stand_in(domain, C)} == {20_001}
-    assert domain.is_read_at_stand_in(20_001, announced, INSIDE)
+    assert domain.must_queue_at_stand_in(20_001, announced, INSIDE)
     assert kinds(domain.at_stand_in(20_001, announced, INSIDE, NOW)) == [GAP, GAP]
 
 

@@ -551,7 +551,7 @@ def test_who_is_gone_is_ended_outside_on_his_behalf() -> None:
     taken = domain.ports.pool.free
     announced = domain.inside.by_prefix[A].announcement
 
-    sent = domain.gone({INSIDE})
+    sent = domain.end_participants_at({INSIDE})
 
     assert [out.target for out in sent] == [out.target for out in domain.settings.to_outside(b"")]
     (ended,) = to(sent, LAN_RELAY.host)
@@ -564,7 +564,7 @@ def test_who_is_gone_is_ended_outside_on_his_behalf() -> None:
     assert source_vendor(ended) == A[:2]
     assert [*domain.inside.by_prefix] == [B]
     assert domain.ports.pool.free == taken + 2
-    assert domain.gone({INSIDE}) == []
+    assert domain.end_participants_at({INSIDE}) == []
 
 
 @pytest.mark.parametrize("is_told", [False, True], ids=["expires", "told"])
@@ -580,7 +580,7 @@ def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
     elsewhere = spdp(A, OTHER)
     assert not to(domain.heard_inside(elsewhere, OTHER, NOW), ROBOT), "served at the first"
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 15)
-    ended = domain.gone({INSIDE}) if is_told else domain.expire(NOW + 21)
+    ended = domain.end_participants_at({INSIDE}) if is_told else domain.expire(NOW + 21)
     (dispose_message_of_first,) = to(ended, ROBOT)
     (announcement,) = read_discovery(dispose_message_of_first).announcements
     assert announcement.ended
@@ -651,7 +651,7 @@ def test_who_is_gone_gets_no_port_any_more() -> None:
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     assert domain.former_ports.waiting
 
-    domain.gone({INSIDE})
+    domain.end_participants_at({INSIDE})
     settle(domain, SETTLING + ANSWER_TIME + 1)
 
     assert not domain.inside.by_prefix

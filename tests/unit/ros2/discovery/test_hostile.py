@@ -11,7 +11,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.announcements.to_outside import ForOutside
-from rosproxy.ros2.discovery.domain import ENDED_AT_ONCE
+from rosproxy.ros2.discovery.domain import MOST_ENDED_PER_CALL
 from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS, MOST_PER_HOST, MOST_WAITING
 from rosproxy.ros2.ports import locator_ports
@@ -307,7 +307,7 @@ def test_one_host_outside_does_not_keep_others_from_being_met() -> None:
     assert len(domain.outside.by_prefix) == MOST_PER_HOST
     domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
     assert B in domain.outside.by_prefix
-    for _ in range(MOST_PER_HOST // ENDED_AT_ONCE + 1):
+    for _ in range(MOST_PER_HOST // MOST_ENDED_PER_CALL + 1):
         domain.expire(NOW + 21)
     assert not domain.outside.count_by_address
 

@@ -126,7 +126,11 @@ def test_the_relay_is_known_by_its_proof(late: float) -> None:
 
 def test_what_the_relay_is_told_has_a_proof() -> None:
     domain = make_domain(peers=())
-    told = [*meet(domain), *domain.proxy_participants.announced_outside(), *domain.gone({INSIDE})]
+    told = [
+        *meet(domain),
+        *domain.proxy_participants.announced_outside(),
+        *domain.end_participants_at({INSIDE}),
+    ]
     sealed = [sent.datagram for sent in told if sent.target == LAN_RELAY]
     assert len(sealed) == 3
     assert all(PROOF.opened(Direction.TO_LAN, datagram) for datagram in sealed)

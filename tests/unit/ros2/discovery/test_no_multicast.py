@@ -148,7 +148,7 @@ def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
         assert [is_dispose_message(datagram) for datagram in told] == [True]
     for told in (by(C, to(meeting, INSIDE)), by(A, to(meeting, ROBOT))):
         assert [is_dispose_message(datagram) for datagram in told] == [False]
-    assert not domain.is_kept(domain.inside.by_prefix[A])
+    assert not domain.has_confirmed_ports(domain.inside.by_prefix[A])
     again = domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
     assert [is_dispose_message(datagram) for datagram in by(C, to(again, INSIDE))] == [False]
 

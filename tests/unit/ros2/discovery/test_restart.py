@@ -274,9 +274,9 @@ def test_a_participant_keeps_its_ports_and_their_proof() -> None:
         kept_answer(domain, A, number_of(ports)),
         proof_answer(domain, A, proof_of(A, ports)),
     ):
-        assert not domain.is_kept(domain.inside.by_prefix[A])
+        assert not domain.has_confirmed_ports(domain.inside.by_prefix[A])
         domain.heard_inside(answer, INSIDE, NOW)
-    assert domain.is_kept(domain.inside.by_prefix[A])
+    assert domain.has_confirmed_ports(domain.inside.by_prefix[A])
     assert domain.proxy_participants.port_reminders(NOW) == []
 
 

@@ -164,5 +164,5 @@ def test_verdicts_of_one_address_are_bounded(monkeypatch: pytest.MonkeyPatch) ->
     assert first.has_more_verdicts
     announced_topics(domain, A, [b"rt/0"])
     assert first.verdicts == {(RuleKind.PUBLISH, "/0"): True}
-    domain.gone({INSIDE})
+    domain.end_participants_at({INSIDE})
     assert domain.inside.verdicts.count_by_address.total() == 0

@@ -383,7 +383,7 @@ def test_a_source_is_known_once_it_has_proved_to_receive() -> None:
     domain.expire(NOW + 22 + KEPT)
     assert domain.standing(INSIDE) is Standing.INSIDE
     prove(domain, LAPTOP, ROBOT)
-    assert domain.standing(LAPTOP) is Standing.STRANGER
+    assert domain.standing(LAPTOP) is Standing.PROVEN_OUTSIDE
     assert domain.standing(ROBOT) is Standing.PROVEN
 
 
@@ -402,11 +402,11 @@ def test_a_flood_of_forged_sources_holds_up_no_answer() -> None:
     forge(domain, 0, 1)
     domain.rates.charge("10.1.0.1", int(BURST), Standing.OUTSIDE)
     said = answer(asked, B)
-    assert not domain.is_read_at_discovery(said, LAPTOP)
+    assert not domain.must_queue_discovery(said, LAPTOP)
     domain.heard_outside(said, LAPTOP, NOW)
     assert domain.outside.by_prefix[B].proven
-    assert domain.is_read_at_discovery(said, STRANGER) is domain.outside.is_met(STRANGER)
-    assert domain.is_read_at_discovery(said + bytes(300), LAPTOP)
+    assert domain.must_queue_discovery(said, STRANGER) is domain.outside.is_met(STRANGER)
+    assert domain.must_queue_discovery(said + bytes(300), LAPTOP)
 
 
 def test_a_proven_address_repeats_no_answer_at_any_rate() -> None:
@@ -416,9 +416,9 @@ def test_a_proven_address_repeats_no_answer_at_any_rate() -> None:
     (asked,) = questions(hear(domain, B, LAPTOP), LAPTOP)
     said = answer(asked, B)
     behind = said + spdp(B, LAPTOP)[HEADER:]
-    assert domain.is_read_at_discovery(behind, LAPTOP)
+    assert domain.must_queue_discovery(behind, LAPTOP)
     domain.heard_outside(said, LAPTOP, NOW)
-    assert domain.is_read_at_discovery(said, LAPTOP)
+    assert domain.must_queue_discovery(said, LAPTOP)
     domain.rates.charge(LAPTOP, 2 * int(BURST))
     assert not domain.heard_outside(behind, LAPTOP, NOW)
 
@@ -444,9 +444,9 @@ def test_an_announcement_beside_an_answer_is_charged(speaks_another: bool) -> No
     domain = make_domain()
     prove(domain, INSIDE, ROBOT)
     meet(domain)
-    for address, hear_it, must_read in (
-        (INSIDE, domain.heard_inside, domain.is_read_of_inside),
-        (ROBOT, domain.heard_outside, domain.is_read_at_discovery),
+    for address, hear_it, must_queue in (
+        (INSIDE, domain.heard_inside, domain.must_queue_inside),
+        (ROBOT, domain.heard_outside, domain.must_queue_discovery),
     ):
         asked = domain.proofs.question(address, B, [])
         ends = submessage(0x0E, 0, bytes(PREFIX))
@@ -454,7 +454,7 @@ def test_an_announcement_beside_an_answer_is_charged(speaks_another: bool) -> No
         told = spdp(NEIGHBOUR if speaks_another else B, address)[HEADER:]
         hidden = answer(asked, B) + (ends + info_src if speaks_another else b"") + told
         assert len(hidden) <= LONGEST_ANSWER
-        assert must_read(hidden, address)
+        assert must_queue(hidden, address)
         domain.rates.take(address, 0, NOW)
         domain.rates.charge(address, int(BURST))
         assert hear_it(hidden, address, NOW) == []
