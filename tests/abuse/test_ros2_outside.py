@@ -15,7 +15,7 @@ from examples.demo.fake_http import free_ports
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.protocol.rtps import FAST_DDS, HEADER, VERSION, source_prefix
+from rosproxy.ros2.protocol.rtps import FAST_DDS, HEADER_BYTES, VERSION, source_prefix
 from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES
 from tests.abuse.conftest import Abused
 from tests.abuse.ros2_neighbours import WELL_KNOWN, Flood, Participant
@@ -96,7 +96,7 @@ def speaking(count: int) -> bytes:
     for number in range(count):
         prefix = bytes([1, 15, 8, number]) + bytes(8)
         parts.append(submessage(0x0C, 0, bytes(4) + VERSION + FAST_DDS + prefix))
-        parts.append(spdp(prefix, PEER, 9000 + number)[HEADER:])
+        parts.append(spdp(prefix, PEER, 9000 + number)[HEADER_BYTES:])
     return message(*parts, prefix=EVIL_PREFIX)
 
 

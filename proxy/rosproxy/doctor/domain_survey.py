@@ -28,7 +28,7 @@ from rosproxy.ros2.domain_settings import (
 )
 from rosproxy.ros2.protocol.announcement import SPDP_ENDPOINTS, announcement, dispose_message
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError, source_vendor
+from rosproxy.ros2.protocol.rtps import PREFIX_BYTES, RtpsError, source_vendor
 from rosproxy.ros2.registry.participants import Participant
 from rosproxy.ros2.rewriting.announced_participant import traits
 from rosproxy.ros2.rewriting.discovery import Announcement, read_discovery
@@ -81,7 +81,7 @@ def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
     with contextlib.closing(datagrams.bind(own_address, 0)) as sock:
         # Without multicast loop: the proxy on this machine would count the doctor as a participant.
         send_through(sock, own_address, loop=False)
-        prefix = os.urandom(PREFIX)
+        prefix = os.urandom(PREFIX_BYTES)
         targets = list(_targets(own_address, domains))
         own_locator = HostPort(own_address, sock.getsockname()[1])
         _send(sock, announcement(prefix, [own_locator], LEASE, SPDP_ENDPOINTS), targets)

@@ -23,7 +23,7 @@ import msgspec
 
 from rosproxy.ros2.protocol.reliable import nack_frag, withheld
 from rosproxy.ros2.protocol.rtps import (
-    HEADER,
+    HEADER_BYTES,
     Fragments,
     Overwrite,
     RtpsError,
@@ -51,7 +51,7 @@ OVERHEAD = 1024
 Rewrite = Callable[[DiscoveryMessage], bytes]
 """Rewrites the whole announcements in a message. The length of the message stays."""
 
-_PAYLOAD_AT = HEADER + 24
+_PAYLOAD_AT = HEADER_BYTES + 24
 """Offset of the payload of a DATA without inline QoS that is the first submessage of a message."""
 
 _Key = tuple[int, bytes, int, int]
@@ -260,7 +260,7 @@ class FragmentStore:
         payload = b"".join(gathered.fragments[number] for number in sorted(gathered.fragments))
         edited = rewrite(read_discovery(_as_data(message.datagram, sample, payload)))
         # `rewrite` has turned a hidden announcement into a GAP (`withheld`).
-        hidden = edited[HEADER] == SubmessageId.GAP
+        hidden = edited[HEADER_BYTES] == SubmessageId.GAP
         gathered.whole = b"" if hidden else edited[_PAYLOAD_AT:]
         gathered.fragments.clear()
         return True
@@ -333,4 +333,4 @@ def _as_data(datagram: bytes, sample: Sample, payload: bytes) -> bytes:
     head = struct.pack("<BBHHH", SubmessageId.DATA, 0x01 | payload_flag, 0, 0, 16)
     head += struct.pack(">II", sample.reader, sample.writer)
     head += struct.pack("<iI", sample.sequence >> 32, sample.sequence & 0xFFFFFFFF)
-    return datagram[:HEADER] + head + payload
+    return datagram[:HEADER_BYTES] + head + payload

@@ -69,7 +69,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.announcement import PORT_STORE_ENDPOINTS, announcement, dispose_message
 from rosproxy.ros2.protocol.reliable import acknowledged, heartbeat
-from rosproxy.ros2.protocol.rtps import HEADER, NO_VENDOR, PREFIX
+from rosproxy.ros2.protocol.rtps import HEADER_BYTES, NO_VENDOR, PREFIX_BYTES
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 COUNTS_EACH_SECOND = 4
@@ -130,7 +130,7 @@ class PortStore:
     ) -> "PortStore":
         """Return the port store of a host, a range and a domain, the same in each process."""
         identity = f"{host} {ports.first} {_width(ports)} {domain}"
-        digest = blake2b(identity.encode(), digest_size=PREFIX - 2).digest()
+        digest = blake2b(identity.encode(), digest_size=PREFIX_BYTES - 2).digest()
         # A GUID prefix begins with the vendor's id (DDSI 2.2; so in Cyclone DDS, ddsi_init.c).
         return cls(NO_VENDOR + digest, ports, key, unix_offset)
 
@@ -139,7 +139,7 @@ class PortStore:
         """The GUID prefix of the port proof; empty without a key."""
         if not self.key:
             return b""
-        return NO_VENDOR + blake2b(self.prefix, key=self.key, digest_size=PREFIX - 2).digest()
+        return NO_VENDOR + blake2b(self.prefix, key=self.key, digest_size=PREFIX_BYTES - 2).digest()
 
     @property
     def prefixes(self) -> Iterable[bytes]:
@@ -307,7 +307,7 @@ class PortStore:
                 for writer in WRITERS
             ]
             sent.append(announcement(own, [reached_at], LEASE_DURATION_S, PORT_STORE_ENDPOINTS))
-            sent.append(beats[0] + b"".join(beat[HEADER:] for beat in beats[1:]))
+            sent.append(beats[0] + b"".join(beat[HEADER_BYTES:] for beat in beats[1:]))
         return sent
 
 

@@ -7,9 +7,9 @@ the participant that is to receive it.
 
 from rosproxy.ros2.protocol.rtps import (
     FAST_DDS,
-    HEADER,
+    HEADER_BYTES,
     INFO_DST,
-    PREFIX,
+    PREFIX_BYTES,
     STATISTICS,
     Overwrite,
     RtpsError,
@@ -83,7 +83,7 @@ def destination(datagram: bytes) -> bytes | None:
     """
     for kind, _, body in submessages(datagram):
         if kind == INFO_DST:
-            prefix = datagram[body.start : body.start + PREFIX]
+            prefix = datagram[body.start : body.start + PREFIX_BYTES]
             return prefix if any(prefix) else None
     return None
 
@@ -94,7 +94,7 @@ def is_destination(datagram: bytes, prefix: bytes) -> bool:
     Cyclone DDS puts submessages for several participants at the same locator into one message.
     """
     info_dst = (body.start for kind, _, body in submessages(datagram) if kind == INFO_DST)
-    return any(datagram[start : start + PREFIX] == prefix for start in info_dst)
+    return any(datagram[start : start + PREFIX_BYTES] == prefix for start in info_dst)
 
 
 def destinations(datagram: bytes) -> set[bytes]:
@@ -104,10 +104,10 @@ def destinations(datagram: bytes) -> set[bytes]:
     Raises RtpsError.
     """
     prefixes = set[bytes]()
-    prefix = bytes(PREFIX)
+    prefix = bytes(PREFIX_BYTES)
     for kind, _, body in submessages(datagram):
         if kind == INFO_DST:
-            prefix = datagram[body.start : body.start + PREFIX]
+            prefix = datagram[body.start : body.start + PREFIX_BYTES]
         elif kind in _WRITER_AT:
             if not any(prefix):
                 return set()
@@ -122,7 +122,7 @@ def for_all(datagram: bytes) -> bytes:
     """
     destinations = [body for kind, _, body in submessages(datagram) if kind == INFO_DST]
     # GUIDPREFIX_UNKNOWN, which is all zero, addresses all participants.
-    return apply(datagram, [Overwrite(body.start, bytes(PREFIX)) for body in destinations])
+    return apply(datagram, [Overwrite(body.start, bytes(PREFIX_BYTES)) for body in destinations])
 
 
 def of_built_in_writer(datagram: bytes) -> bool | None:
@@ -153,16 +153,20 @@ def heartbeat_stream(datagram: bytes) -> bytes | None:
         nameless = _NAMELESS_OF.get(source_vendor(datagram), _NAMELESS)
         for kind, flags, body in walk_submessages(datagram):
             if kind == INFO_DST and not stream:
-                stream = datagram[body.start : body.start + PREFIX]
-            elif kind == SubmessageId.HEARTBEAT and len(stream) <= PREFIX:
+                stream = datagram[body.start : body.start + PREFIX_BYTES]
+            elif kind == SubmessageId.HEARTBEAT and len(stream) <= PREFIX_BYTES:
                 require_size(body, _HEARTBEAT)
                 entities = datagram[body.start : body.start + 2 * _ENTITY_ID]
-                stream = stream.ljust(PREFIX, b"\0") + entities + bytes([flags])
+                stream = stream.ljust(PREFIX_BYTES, b"\0") + entities + bytes([flags])
             elif kind not in nameless or kind == SubmessageId.INFO_SRC:
                 return None
     except RtpsError:
         return None
-    return datagram[HEADER - PREFIX : HEADER] + stream if len(stream) > PREFIX else None
+    return (
+        datagram[HEADER_BYTES - PREFIX_BYTES : HEADER_BYTES] + stream
+        if len(stream) > PREFIX_BYTES
+        else None
+    )
 
 
 def carries_samples(datagram: bytes) -> bool:

@@ -84,9 +84,9 @@ class Parameter(msgspec.Struct, frozen=True):
 
 
 class ParameterList(msgspec.Struct, frozen=True):
-    """The parameters of a list in a datagram; ``little`` means little-endian."""
+    """The parameters of a list in a datagram; ``is_little_endian`` is its byte order."""
 
-    little: bool
+    is_little_endian: bool
     parameters: tuple[Parameter, ...]
 
     def all(self, *pids: int) -> list[Parameter]:
@@ -127,7 +127,7 @@ class ParameterList(msgspec.Struct, frozen=True):
     @property
     def order(self) -> str:
         """The byte order in the notation of `struct`."""
-        return "<" if self.little else ">"
+        return "<" if self.is_little_endian else ">"
 
     def removed(self, parameter: Parameter) -> Overwrite:
         """The edit that removes a parameter."""
@@ -157,13 +157,15 @@ def payload_parameters(datagram: bytes, sample: Sample) -> ParameterList | None:
 
 def inline_parameters(datagram: bytes, sample: Sample) -> ParameterList | None:
     """The inline QoS of a sample; None if the sample has none. Raises RtpsError."""
-    return _read(datagram, sample.inline_qos, sample.little) if sample.inline_qos else None
+    return (
+        _read(datagram, sample.inline_qos, sample.is_little_endian) if sample.inline_qos else None
+    )
 
 
-def _read(datagram: bytes, span: Span, little: bool) -> ParameterList:
+def _read(datagram: bytes, span: Span, is_little_endian: bool) -> ParameterList:
     parameters = tuple(
         Parameter(pid, offset, Span(offset + 4, end))
-        for pid, offset, end in walk_parameters(datagram, span, little)
+        for pid, offset, end in walk_parameters(datagram, span, is_little_endian)
         if pid != SENTINEL
     )
-    return ParameterList(little, parameters)
+    return ParameterList(is_little_endian, parameters)

@@ -17,8 +17,8 @@ from collections.abc import Collection, Iterator, Sequence
 import msgspec
 
 from rosproxy.ros2.protocol.rtps import (
-    LAST_NUMBER,
-    PREFIX,
+    LAST_SEQUENCE_NUMBER,
+    PREFIX_BYTES,
     Overwrite,
     RtpsError,
     Sample,
@@ -54,7 +54,7 @@ def heartbeats(datagram: bytes) -> Iterator[Heartbeat]:
             writer = int.from_bytes(datagram[body.start + 4 : body.start + 8], "big")
             first = _number(*numbers[:2])
             last = _number(*numbers[2:])
-            if last > LAST_NUMBER:
+            if last > LAST_SEQUENCE_NUMBER:
                 raise RtpsError(f"a heartbeat has the impossible last number {last}")
             yield Heartbeat(writer, first, last)
 
@@ -82,7 +82,7 @@ def acknowledged(datagram: bytes, prefix: bytes, writer: int) -> list[int]:
     addressee = b""
     for kind, flags, body in submessages(datagram):
         if kind == SubmessageId.INFO_DST:
-            addressee = datagram[body.start : body.start + PREFIX]
+            addressee = datagram[body.start : body.start + PREFIX_BYTES]
         is_answer = kind == SubmessageId.ACKNACK and addressee == prefix
         if is_answer and body.end - body.start >= 16:
             acked_writer = int.from_bytes(datagram[body.start + 4 : body.start + 8], "big")
@@ -128,7 +128,7 @@ def withheld(sample: Sample) -> Overwrite:
     The other bytes of the submessage become a PAD of zeros. Raises RtpsError if the submessage is
     too short for a GAP. Announcements of readers and writers are long enough.
     """
-    order, flag = ("<", _LITTLE) if sample.little else (">", 0)
+    order, flag = ("<", _LITTLE) if sample.is_little_endian else (">", 0)
     size = sample.body.end - sample.body.start
     next_sequence = sample.sequence + 1
     if size < _GAP_SIZE + 4:

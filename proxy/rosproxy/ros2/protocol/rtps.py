@@ -6,10 +6,13 @@ other submessages unchanged: heartbeats, acknowledgements, and submessages of a 
 
 The proxy never encodes a received message anew. This module returns positions, and an edit
 (`Overwrite`) keeps the length of the datagram. So all bytes outside the edits stay, also those of
-unknown versions and vendors.
+unknown versions and vendors. With one exception, `by_source` splits a message of several
+participants into a message for each.
+
+The numbers are bytes:
 
     header      "RTPS", version 2, vendor 2, GUID prefix 12
-    submessage  id 1, flags 1, length 2, then so many bytes; bit 0 of flags: little-endian
+    submessage  id 1, flags 1, length 2, body of that length; bit 0 of flags: little-endian
     DATA        extra flags 2, octets to inline QoS 2, reader 4, writer 4, sequence number 8,
                 inline QoS if flag 2, payload if flag 4 (or 8: the key alone)
     DATA_FRAG   as DATA up to the sequence number, then first fragment 4, fragments 2,
@@ -30,22 +33,23 @@ NO_VENDOR = b"\x00\x00"
 RTI = b"\x01\x01"
 FAST_DDS = b"\x01\x0f"
 CYCLONE_DDS = b"\x01\x10"
-HEADER = 20
+HEADER_BYTES = 20
 """Bytes of a message's header."""
-ALIGNMENT = 4
-"""The length of each parameter is a multiple of these bytes (9.4.2.11), and so is the length of
-each submessage but the last (9.4.1). Fast DDS rounds other lengths up (ParameterList.cpp,
+ALIGNMENT_BYTES = 4
+"""The length of each parameter is a multiple of 4 bytes (9.4.2.11), and so is the length of each
+submessage but the last (9.4.1). Fast DDS rounds other lengths up (ParameterList.cpp,
 MessageReceiver.cpp). So Fast DDS would find the next parameter at another place than other
 implementations."""
-PREFIX = 12
+PREFIX_BYTES = 12
 """Bytes of a GUID prefix."""
-VERSION_TO_PREFIX = HEADER - len(MAGIC)
+VERSION_TO_PREFIX_BYTES = HEADER_BYTES - len(MAGIC)
 """Bytes of version, vendor and GUID prefix, which both a header and an INFO_SRC contain."""
 MOST_SUBMESSAGES = 256
 """Submessages of a datagram that the proxy accepts; real datagrams have a dozen."""
 
-LAST_NUMBER = 2**63 - 2
-"""The greatest sequence number that the proxy accepts: it still has a successor. The least is 1."""
+LAST_SEQUENCE_NUMBER = 2**63 - 2
+"""The greatest sequence number that the proxy accepts. The proxy can still send the next number.
+The least sequence number is 1."""
 
 SENTINEL = 1
 """The id that ends a parameter list. Its length field has no meaning."""
@@ -91,7 +95,7 @@ class SubmessageId(IntEnum):
 STATISTICS = 0x80
 RTI_CRC = 0x80
 """The meaning of submessages from 0x80 on depends on the vendor. Fast DDS ends each message with
-the destination and byte counts; RTI Connext sends a checksum."""
+a submessage for statistics: the destination, and counts of bytes. RTI Connext sends a checksum."""
 
 # Plain numbers, because members of an enumeration are slow to look up for each datagram.
 _INFO_SRC = SubmessageId.INFO_SRC.value
@@ -127,7 +131,7 @@ class Sample(msgspec.Struct, frozen=True):
 
     ``body`` is the submessage without its header. ``prefix`` is the GUID prefix of the participant
     that has written the sample. ``writer`` and ``reader`` are entity ids (0: any reader).
-    ``little`` tells whether the submessage and ``inline_qos`` are little-endian; the payload states
+    ``is_little_endian`` is the byte order of the submessage and ``inline_qos``; the payload states
     its own byte order. ``is_key_only`` tells whether the payload is the key alone, which names an
     instance that has ended. ``fragments`` is None for DATA.
     """
@@ -136,7 +140,7 @@ class Sample(msgspec.Struct, frozen=True):
     reader: int
     writer: int
     sequence: int
-    little: bool
+    is_little_endian: bool
     body: Span
     inline_qos: Span | None
     payload: Span | None
@@ -152,12 +156,15 @@ class Overwrite(msgspec.Struct, frozen=True):
 
 
 def source_prefix(datagram: bytes) -> bytes:
-    """The GUID prefix in the header of a message. Raises RtpsError for other datagrams."""
-    if len(datagram) < HEADER or datagram[:4] != MAGIC:
+    """The GUID prefix in the header of a message.
+
+    Raises RtpsError if the datagram is no message of RTPS version 2.
+    """
+    if len(datagram) < HEADER_BYTES or datagram[:4] != MAGIC:
         raise RtpsError("the datagram is not an RTPS message")
     if datagram[4] != 2:
         raise RtpsError(f"the message has RTPS version {datagram[4]}.{datagram[5]}, not 2")
-    return datagram[8:HEADER]
+    return datagram[8:HEADER_BYTES]
 
 
 def message_header(prefix: bytes, vendor: bytes = NO_VENDOR) -> bytes:
@@ -166,7 +173,7 @@ def message_header(prefix: bytes, vendor: bytes = NO_VENDOR) -> bytes:
 
 
 def source_vendor(datagram: bytes) -> bytes:
-    """The vendor id in the header of a message. Raises RtpsError for other datagrams."""
+    """The vendor id in the header of a message. Raises RtpsError as `source_prefix` does."""
     source_prefix(datagram)
     return datagram[6:8]
 
@@ -175,9 +182,9 @@ def has_checksum(datagram: bytes) -> bool:
     """Whether a message contains a checksum of the message. Raises RtpsError."""
     is_of_rti = source_vendor(datagram) == RTI
     return any(
-        (kind == SubmessageId.HEADER_EXTENSION and flags & _CHECKSUM)
-        or (kind == RTI_CRC and is_of_rti)
-        for kind, flags, _ in submessages(datagram)
+        (submessage_id == SubmessageId.HEADER_EXTENSION and flags & _CHECKSUM)
+        or (submessage_id == RTI_CRC and is_of_rti)
+        for submessage_id, flags, _ in submessages(datagram)
     )
 
 
@@ -190,15 +197,16 @@ def samples(datagram: bytes) -> list[Sample]:
     all_samples = list[Sample]()
     prefix = source_prefix(datagram)
     inline_bytes = 0
-    for kind, flags, body in submessages(datagram):
-        if kind == _INFO_SRC:
+    for submessage_id, flags, body in submessages(datagram):
+        if submessage_id == _INFO_SRC:
             require_size(body, 20)
             prefix = datagram[body.start + 8 : body.start + 20]
-        elif kind in _WITH_SAMPLE:
-            sample = _sample(datagram, prefix, flags, body, kind == _DATA_FRAG)
+        elif submessage_id in _WITH_SAMPLE:
+            sample = _sample(datagram, prefix, flags, body, submessage_id == _DATA_FRAG)
             if sample.inline_qos is not None:
                 inline_bytes += sample.inline_qos.end - sample.inline_qos.start
-            # Reading a parameter takes a microsecond, and the shortest has four bytes.
+            # Reading a parameter takes a microsecond, and the shortest has four bytes. So the
+            # inline QoS of a datagram takes at most 4 ms.
             if inline_bytes > MOST_INLINE_BYTES:
                 raise RtpsError(
                     f"the datagram has more than {MOST_INLINE_BYTES} bytes of inline QoS"
@@ -208,37 +216,40 @@ def samples(datagram: bytes) -> list[Sample]:
 
 
 def by_source(datagram: bytes) -> list[bytes]:
-    """Split a message into one for each source participant, in their order.
+    """Split a message at each INFO_SRC, so that each part has a single source participant.
 
     With Cyclone DDS, the participants of a process share a message (INFO_SRC, 8.3.8.9). A
-    destination holds until the message names another one. So each part repeats the destination in
-    16 bytes, in place of an INFO_SRC of 24 bytes with its header. All parts together are at most
-    half as long again as the message. Raises RtpsError if a length leads outside the datagram.
+    destination holds until the message names another one, so each part repeats the destination. A
+    part has 36 bytes of header and destination in place of an INFO_SRC of 24 bytes. All parts
+    together are at most 1.5 times as long as the message. Raises RtpsError if a length leads
+    outside the datagram.
     """
     source_prefix(datagram)
-    header = datagram[:HEADER]
-    start = HEADER
+    header = datagram[:HEADER_BYTES]
+    start = HEADER_BYTES
     info_dst = b""
     messages = list[bytes]()
-    for kind, _, body in submessages(datagram):
-        if kind == _INFO_SRC:
-            require_size(body, 4 + VERSION_TO_PREFIX)
+    for submessage_id, _, body in submessages(datagram):
+        if submessage_id == _INFO_SRC:
+            require_size(body, 4 + VERSION_TO_PREFIX_BYTES)
             if body.start - 4 > start:
                 messages.append(header + datagram[start : body.start - 4])
             source_offset = body.start + 4
-            header = MAGIC + datagram[source_offset : source_offset + VERSION_TO_PREFIX] + info_dst
+            header = (
+                MAGIC + datagram[source_offset : source_offset + VERSION_TO_PREFIX_BYTES] + info_dst
+            )
             start = body.end
-        elif kind == INFO_DST:
+        elif submessage_id == INFO_DST:
             # Only the prefix: an INFO_DST may be longer, and each part repeats this submessage.
-            info_dst = _info_dst(datagram[body.start : body.start + PREFIX])
-    if not messages and start == HEADER:
+            info_dst = _info_dst(datagram[body.start : body.start + PREFIX_BYTES])
+    if not messages and start == HEADER_BYTES:
         return [datagram]
     return [*messages, header + datagram[start:]] if start < len(datagram) else messages
 
 
 def _info_dst(prefix: bytes) -> bytes:
     """The submessage that names the destination of the next submessages."""
-    return struct.pack("<BBH", INFO_DST, _LITTLE, PREFIX) + prefix
+    return struct.pack("<BBH", INFO_DST, _LITTLE, PREFIX_BYTES) + prefix
 
 
 def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:
@@ -247,7 +258,9 @@ def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:
     for edit in edits:
         end = edit.offset + len(edit.replacement)
         if not 0 <= edit.offset <= end <= len(changed):
-            raise ValueError(f"an edit of bytes {edit.offset} to {end} of {len(changed)}")
+            raise ValueError(
+                f"edit of bytes {edit.offset} to {end}: the datagram has only {len(changed)} bytes"
+            )
         changed[edit.offset : end] = edit.replacement
     return bytes(changed)
 
@@ -265,11 +278,11 @@ def submessages(datagram: bytes) -> tuple[tuple[int, int, Span], ...]:
 def walk_submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
     """Yield the id, flags and body of each submessage.
 
-    Raises RtpsError if a length leads outside the datagram, if implementations may read a length
-    differently, or if an INFO_DST is too short. So the proxy can keep a message and read it again
-    without an error.
+    Raises RtpsError if a length leads outside the datagram, if an INFO_DST is too short, or if a
+    length is no multiple of 4, which implementations read differently. If one call raises nothing
+    for a message, later calls raise nothing either.
     """
-    offset = HEADER
+    offset = HEADER_BYTES
     count = 0
     size = len(datagram)
     while offset < size:
@@ -278,44 +291,49 @@ def walk_submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
             raise RtpsError("the message ends inside a submessage's header")
         if (count := count + 1) > MOST_SUBMESSAGES:
             raise RtpsError(f"the message has more than {MOST_SUBMESSAGES} submessages")
-        kind, flags, first, second = datagram[offset:body]
+        submessage_id, flags, first, second = datagram[offset:body]
         length = first + (second << 8) if flags & _LITTLE else (first << 8) + second
         offset = body + length
-        if length == 0 and kind not in _MAY_BE_EMPTY:
+        if length == 0 and submessage_id not in _MAY_BE_EMPTY:
             offset = size  # length 0: the last submessage, up to the end (9.4.5.1.3)
         if offset > size:
-            raise RtpsError(f"submessage {kind:#x} is longer than the message")
-        if (offset - body) % ALIGNMENT and offset < size:
-            text = f"submessage {kind:#x} has {offset - body} bytes, no multiple of {ALIGNMENT}"
-            raise RtpsError(f"{text}, and is not the last")
-        if kind == INFO_DST and offset - body < PREFIX:
-            raise RtpsError(f"a destination has {offset - body} bytes and needs {PREFIX}")
-        yield kind, flags, Span(body, offset)
+            raise RtpsError(f"submessage {submessage_id:#x} is longer than the message")
+        if (offset - body) % ALIGNMENT_BYTES and offset < size:
+            text = f"submessage {submessage_id:#x} has {offset - body} bytes, no multiple of"
+            raise RtpsError(f"{text} {ALIGNMENT_BYTES}, and is not the last")
+        if submessage_id == INFO_DST and offset - body < PREFIX_BYTES:
+            raise RtpsError(f"a destination has {offset - body} bytes and needs {PREFIX_BYTES}")
+        yield submessage_id, flags, Span(body, offset)
 
 
-def walk_parameters(datagram: bytes, span: Span, little: bool) -> Iterator[tuple[int, int, int]]:
-    """Yield the id, the offset and the end of the value of each parameter in a list.
+def walk_parameters(
+    datagram: bytes, span: Span, is_little_endian: bool
+) -> Iterator[tuple[int, int, int]]:
+    """Yield the id, the offset of the header, and the end of each parameter in a list.
 
-    The last parameter is the sentinel, which ends after its header. Raises RtpsError if the list
-    has no sentinel or more than MOST_PARAMETERS, if a length leads outside the list, or if
-    implementations may read a length differently.
+    The value begins 4 bytes after the offset. The last parameter is the sentinel, which ends after
+    its header. Raises RtpsError if the list has no sentinel or more than MOST_PARAMETERS, if a
+    length leads outside the list, or if a length is no multiple of 4.
     """
-    unpack = (_LITTLE_HEADER if little else _BIG_HEADER).unpack_from
+    unpack = (_LITTLE_HEADER if is_little_endian else _BIG_HEADER).unpack_from
     offset = span.start
     last = span.end - 4
     for _ in range(MOST_PARAMETERS):
         if offset > last:
-            raise RtpsError("a parameter list has no end")
-        pid, length = unpack(datagram, offset)
-        if pid == SENTINEL:
-            yield pid, offset, offset + 4
+            raise RtpsError("a parameter list has no sentinel")
+        parameter_id, length = unpack(datagram, offset)
+        if parameter_id == SENTINEL:
+            yield parameter_id, offset, offset + 4
             return
         end = offset + 4 + length
         if end > span.end:
-            raise RtpsError(f"parameter {pid:#x} is longer than its list")
-        if length % ALIGNMENT:
-            raise RtpsError(f"parameter {pid:#x} has {length} bytes, no multiple of {ALIGNMENT}")
-        yield pid, offset, end
+            raise RtpsError(f"parameter {parameter_id:#x} is longer than its list")
+        if length % ALIGNMENT_BYTES:
+            text = (
+                f"parameter {parameter_id:#x} has {length} bytes, no multiple of {ALIGNMENT_BYTES}"
+            )
+            raise RtpsError(text)
+        yield parameter_id, offset, end
         offset = end
     raise RtpsError(f"a list has more than {MOST_PARAMETERS} parameters")
 
@@ -324,19 +342,21 @@ def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment:
     fixed_size = 32 if is_fragment else 20
     require_size(body, fixed_size)
     start = body.start
-    little = bool(flags & _LITTLE)
+    is_little_endian = bool(flags & _LITTLE)
     to_qos = _unpack("H", datagram, start + 2, flags)
     high = _unpack("i", datagram, start + 12, flags)
     low = _unpack("I", datagram, start + 16, flags)
     sequence = (high << 32) + low
-    if not 0 < sequence <= LAST_NUMBER:
-        raise RtpsError(f"a sample has the impossible number {sequence}")
+    if not 0 < sequence <= LAST_SEQUENCE_NUMBER:
+        raise RtpsError(
+            f"a sample has the sequence number {sequence}, not 1 to {LAST_SEQUENCE_NUMBER}"
+        )
     offset = start + 4 + to_qos
     if not start + fixed_size <= offset <= body.end:
-        raise RtpsError(f"the inline QoS is {to_qos} octets on, outside of the submessage")
+        raise RtpsError(f"octetsToInlineQos is {to_qos}, which leads outside the submessage")
     qos = None
     if flags & _QOS:
-        *_, (_, _, end) = walk_parameters(datagram, Span(offset, body.end), little)
+        *_, (_, _, end) = walk_parameters(datagram, Span(offset, body.end), is_little_endian)
         qos = Span(offset, end)
         offset = end
     key = bool(flags & (_FRAGMENT_KEY if is_fragment else _KEY))
@@ -348,7 +368,7 @@ def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment:
         reader=int.from_bytes(datagram[start + 4 : start + 8], "big"),
         writer=int.from_bytes(datagram[start + 8 : start + 12], "big"),
         sequence=sequence,
-        little=little,
+        is_little_endian=is_little_endian,
         body=body,
         inline_qos=qos,
         payload=Span(offset, body.end) if has_payload and offset < body.end else None,

@@ -32,9 +32,9 @@ from rosproxy.ros2.protocol.parameters import (
 from rosproxy.ros2.protocol.reliable import withheld
 from rosproxy.ros2.protocol.rtps import (
     FAST_DDS,
-    HEADER,
+    HEADER_BYTES,
     NO_VENDOR,
-    PREFIX,
+    PREFIX_BYTES,
     Fragments,
     Overwrite,
     RtpsError,
@@ -249,7 +249,7 @@ def participant_alone(message: DiscoveryMessage) -> bytes:
     """
     datagram = message.datagram
     spdp = message.of_participant
-    kept = datagram[:HEADER]
+    kept = datagram[:HEADER_BYTES]
     if spdp is None:
         return kept
     stamp = b""
@@ -301,7 +301,7 @@ def _announcement(datagram: bytes, sample: Sample) -> Announcement:
     # another participant (`_require_own`).
     if parameters is None and (sample.payload or not ended):
         raise RtpsError("an announcement is not a parameter list")
-    parameters = parameters or ParameterList(sample.little, ())
+    parameters = parameters or ParameterList(sample.is_little_endian, ())
     _require_own(datagram, sample, parameters)
     topics = parameters.all(Pid.TOPIC_NAME)
     # The policy judges the first topic, and a receiver may use another one.
@@ -320,7 +320,7 @@ def _require_own(datagram: bytes, sample: Sample, parameters: ParameterList | No
     for parameter in parameters.all(*_IDENTITIES) if parameters else ():
         start = parameter.value.start
         end = parameter.value.end
-        if datagram[start : min(start + PREFIX, end)] != sample.prefix:
+        if datagram[start : min(start + PREFIX_BYTES, end)] != sample.prefix:
             raise RtpsError(_OF_ANOTHER)
 
 

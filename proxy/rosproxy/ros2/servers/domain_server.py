@@ -45,7 +45,7 @@ from rosproxy.ros2.domain_settings import (
 from rosproxy.ros2.protocol.addressing import heartbeat_stream
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.relay_envelope import address_lists
-from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError
+from rosproxy.ros2.protocol.rtps import PREFIX_BYTES, RtpsError
 from rosproxy.ros2.rewriting.discovery import read_messages
 from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
@@ -94,7 +94,9 @@ class DomainServer:
         pool = PortPool(settings.ports.listen)
         # A new prefix for each process: participants announce themselves at once only to an
         # unknown discovery participant, and repeat all announcements for this participant.
-        self.domain = Domain(settings, pool, os.urandom(PREFIX), os.urandom(32), now(), time.time())
+        self.domain = Domain(
+            settings, pool, os.urandom(PREFIX_BYTES), os.urandom(32), now(), time.time()
+        )
         self._selected = SelectedAddresses(now() + awaited)
         self._loop = asyncio.get_running_loop()
         self._sockets: list[socket.socket] = []

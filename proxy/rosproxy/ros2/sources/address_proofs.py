@@ -21,9 +21,9 @@ from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.announcement import WRITER_ENDPOINTS, announcement
 from rosproxy.ros2.protocol.reliable import heartbeat, heartbeats
 from rosproxy.ros2.protocol.rtps import (
-    HEADER,
+    HEADER_BYTES,
     NO_VENDOR,
-    PREFIX,
+    PREFIX_BYTES,
     RtpsError,
     SubmessageId,
     source_prefix,
@@ -85,7 +85,9 @@ class AddressProofs:
         own = self._prefix(address)
         self._count += 1
         asks = heartbeat(own, prefix, BuiltinWriter.PUBLICATIONS, 1, self._count)
-        return announcement(own, reached_at, LEASE_DURATION_S, WRITER_ENDPOINTS) + asks[HEADER:]
+        return (
+            announcement(own, reached_at, LEASE_DURATION_S, WRITER_ENDPOINTS) + asks[HEADER_BYTES:]
+        )
 
     def is_answer(self, address: str, datagram: bytes) -> bool:
         """Return whether a datagram is the first answer of a participant, and nothing else.
@@ -98,10 +100,11 @@ class AddressProofs:
         answered = self._answered.get(address, {})
         return (
             len(answered) < MOST_ANSWERED
-            and datagram[HEADER - PREFIX : HEADER] not in answered
+            and datagram[HEADER_BYTES - PREFIX_BYTES : HEADER_BYTES] not in answered
             and len(datagram) <= LONGEST_ANSWER
-            and datagram[HEADER : HEADER + 1] == _INFO_DST
-            and datagram[HEADER + 4 : HEADER + 4 + PREFIX] == self._prefix(address)
+            and datagram[HEADER_BYTES : HEADER_BYTES + 1] == _INFO_DST
+            and datagram[HEADER_BYTES + 4 : HEADER_BYTES + 4 + PREFIX_BYTES]
+            == self._prefix(address)
             and _announces_nothing(datagram)
         )
 
@@ -152,7 +155,7 @@ class AddressProofs:
         self._until[address] = now + KEPT
 
     def _prefix(self, address: str) -> bytes:
-        size = PREFIX - len(NO_VENDOR)
+        size = PREFIX_BYTES - len(NO_VENDOR)
         return NO_VENDOR + blake2b(address.encode(), key=self.secret, digest_size=size).digest()
 
 

@@ -15,7 +15,7 @@ from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.relay_envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
-from rosproxy.ros2.protocol.rtps import HEADER, source_prefix
+from rosproxy.ros2.protocol.rtps import HEADER_BYTES, source_prefix
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
 from rosproxy.ros2.sources.rates import BURST
 from tests.unit.ros2.protocol.messages import data, message, parameter_list, payload, submessage
@@ -138,7 +138,7 @@ def kept_halves(own: bytes, prefix: bytes, number: int, bits: int) -> bytes:
     """A participant's answer to both writers of the port store, or of the port proof."""
     pairs = zip(WRITERS, halves(number, bits), strict=True)
     lower, upper = (kept_number(own, prefix, half, writer) for writer, half in pairs)
-    return lower + upper[HEADER:]
+    return lower + upper[HEADER_BYTES:]
 
 
 def kept_answer(domain: Domain, prefix: bytes, number: int) -> bytes:

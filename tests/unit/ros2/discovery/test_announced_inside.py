@@ -11,7 +11,7 @@ from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.protocol.rtps import FAST_DDS, HEADER, VERSION, source_prefix
+from rosproxy.ros2.protocol.rtps import FAST_DDS, HEADER_BYTES, VERSION, source_prefix
 from rosproxy.ros2.rewriting.discovery import MOST_ANNOUNCED, read_discovery
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
@@ -68,7 +68,7 @@ def speaking(count: int) -> bytes:
     for number in range(count):
         source = bytes(4) + VERSION + FAST_DDS + named(number)
         parts.append(submessage(0x0C, 0, source))
-        parts.append(spdp(named(number), ROBOT, 9000 + number)[HEADER:])
+        parts.append(spdp(named(number), ROBOT, 9000 + number)[HEADER_BYTES:])
     return message(*parts, prefix=B)
 
 
@@ -128,8 +128,8 @@ def test_inside_is_told_what_a_participant_announces_of_itself_alone() -> None:
     heartbeat = submessage(0x07, 0, bytes(28))
     datagram = message(meant, heartbeat, stamp, announced, heartbeat, prefix=B)
     (told,) = to(domain.heard_outside(datagram, ROBOT, NOW), INSIDE)
-    assert len(told) == HEADER + len(stamp) + len(announced)
-    assert told[HEADER : HEADER + len(stamp)] == stamp
+    assert len(told) == HEADER_BYTES + len(stamp) + len(announced)
+    assert told[HEADER_BYTES : HEADER_BYTES + len(stamp)] == stamp
     assert read_discovery(told).of_participant is not None
 
 

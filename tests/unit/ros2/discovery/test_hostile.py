@@ -18,7 +18,7 @@ from rosproxy.ros2.ports import locator_ports
 from rosproxy.ros2.ports.former_ports import ANSWER_TIME
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.protocol.rtps import LAST_NUMBER, RtpsError
+from rosproxy.ros2.protocol.rtps import LAST_SEQUENCE_NUMBER, RtpsError
 from rosproxy.ros2.registry import participants
 from rosproxy.ros2.registry.participants import (
     DdsEndpoint,
@@ -68,15 +68,15 @@ def test_a_number_that_has_no_next_one_is_malformed() -> None:
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     (stand_in,) = domain.stand_ins.by_port
-    last = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=LAST_NUMBER)
-    over = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=LAST_NUMBER + 1)
+    last = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=LAST_SEQUENCE_NUMBER)
+    over = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=LAST_SEQUENCE_NUMBER + 1)
     below = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=-1)
     assert domain.at_stand_in(stand_in, message(last, prefix=A), INSIDE, NOW)
-    for bad in (over, below, heartbeat(1, LAST_NUMBER + 1)):
+    for bad in (over, below, heartbeat(1, LAST_SEQUENCE_NUMBER + 1)):
         before = domain.refused.count
         assert domain.heard_inside(message(bad, prefix=A), INSIDE, NOW) == []
         assert domain.refused.count == before + 1
-    assert domain.heard_inside(message(heartbeat(1, LAST_NUMBER), prefix=A), INSIDE, NOW)
+    assert domain.heard_inside(message(heartbeat(1, LAST_SEQUENCE_NUMBER), prefix=A), INSIDE, NOW)
     assert to(domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW), ROBOT)
 
 

@@ -16,7 +16,7 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.discovery import fragments
 from rosproxy.ros2.domain_settings import MOST_MAPPINGS, Outgoing
 from rosproxy.ros2.ports.stand_ins import MOST_SHARING, STAND_INS
-from rosproxy.ros2.protocol.rtps import LAST_NUMBER, source_prefix
+from rosproxy.ros2.protocol.rtps import LAST_SEQUENCE_NUMBER, source_prefix
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from rosproxy.ros2.sources.rates import BURST, MOST_SOURCES
 from tests.unit.ros2.discovery.domains import (
@@ -43,14 +43,14 @@ from tests.unit.ros2.protocol.messages import data, fragment, message, payload, 
 PREFIXES = [A, B, bytes([9]) * 12]
 NEAR_BY = [INSIDE, OTHER]
 FAR = [ROBOT, STRANGER]
-PREFIX = st.sampled_from(PREFIXES)
+PREFIX_BYTES = st.sampled_from(PREFIXES)
 ADDRESS = st.sampled_from(NEAR_BY + FAR)
 PORT = st.integers(7410, 7440)
 OWN = bytes([5]) * 12
 MEANT = st.sampled_from([OWN, *PREFIXES])
-TOLD_BEHIND = st.builds(sedp, PREFIX, ADDRESS, PORT)
+TOLD_BEHIND = st.builds(sedp, PREFIX_BYTES, ADDRESS, PORT)
 DESCRIBED = payload([(5, b"\x0b\0\0\0rt/chatter\0\0"), (0x8000, bytes(300))])
-NUMBER = st.sampled_from([-(2**63), -1, 0, 1, 2, 3, LAST_NUMBER, LAST_NUMBER + 1])
+NUMBER = st.sampled_from([-(2**63), -1, 0, 1, 2, 3, LAST_SEQUENCE_NUMBER, LAST_SEQUENCE_NUMBER + 1])
 
 
 def pack(number: int) -> bytes:
@@ -75,18 +75,20 @@ def told(prefix: bytes, sequence: int) -> bytes:
 
 
 SAID = st.one_of(
-    st.builds(spdp, PREFIX, ADDRESS, PORT, st.sampled_from([-1, 2, 20])),
-    st.builds(spdp, PREFIX, ADDRESS),
-    st.builds(dispose_message, PREFIX),
-    st.builds(sedp, PREFIX, ADDRESS, PORT, MEANT),
+    st.builds(spdp, PREFIX_BYTES, ADDRESS, PORT, st.sampled_from([-1, 2, 20])),
+    st.builds(spdp, PREFIX_BYTES, ADDRESS),
+    st.builds(dispose_message, PREFIX_BYTES),
+    st.builds(sedp, PREFIX_BYTES, ADDRESS, PORT, MEANT),
     st.builds(
         lambda announcement, behind: announcement + behind[20:],
-        st.builds(spdp, PREFIX, ADDRESS),
+        st.builds(spdp, PREFIX_BYTES, ADDRESS),
         TOLD_BEHIND,
     ),
-    st.builds(heartbeat, PREFIX, MEANT, NUMBER),
-    st.builds(fragmented, PREFIX, st.integers(1, 4), NUMBER, st.sampled_from([100, 128, 300])),
-    st.builds(told, PREFIX, NUMBER),
+    st.builds(heartbeat, PREFIX_BYTES, MEANT, NUMBER),
+    st.builds(
+        fragmented, PREFIX_BYTES, st.integers(1, 4), NUMBER, st.sampled_from([100, 128, 300])
+    ),
+    st.builds(told, PREFIX_BYTES, NUMBER),
 )
 """Messages of participants, true or false."""
 
@@ -154,14 +156,14 @@ class Neighbours(RuleBasedStateMachine):
         assert not sent or source in self.domain.inside.count_by_address
         self.check(sent)
 
-    @rule(prefix=PREFIX, address=ADDRESS)
+    @rule(prefix=PREFIX_BYTES, address=ADDRESS)
     def somebody_announces_himself(self, prefix: bytes, address: str) -> None:
         if address in NEAR_BY:
             self.inside_announces(spdp(prefix, address), address)
         else:
             self.the_lan_relay_tells(spdp(prefix, address), address)
 
-    @rule(prefix=PREFIX, address=ADDRESS, is_true=st.booleans())
+    @rule(prefix=PREFIX_BYTES, address=ADDRESS, is_true=st.booleans())
     def somebody_answers_a_question(self, prefix: bytes, address: str, is_true: bool) -> None:
         asked = self.domain.proofs.question(address if is_true else OTHER, prefix, [])
         named = submessage(0x0E, 0, source_prefix(asked))
@@ -178,7 +180,9 @@ class Neighbours(RuleBasedStateMachine):
         )
         self.asked |= {address} if is_true else set()
 
-    @rule(prefix=PREFIX, address=ADDRESS, ports=st.lists(st.integers(45000, 45015), max_size=3))
+    @rule(
+        prefix=PREFIX_BYTES, address=ADDRESS, ports=st.lists(st.integers(45000, 45015), max_size=3)
+    )
     def a_participant_tells_which_ports_it_had(
         self, prefix: bytes, address: str, ports: list[int]
     ) -> None:

@@ -17,7 +17,7 @@ from rosproxy.ros2.ports.store import (
 )
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import heartbeats
-from rosproxy.ros2.protocol.rtps import HEADER, source_prefix
+from rosproxy.ros2.protocol.rtps import HEADER_BYTES, source_prefix
 from tests.unit.ros2.discovery.domains import kept_halves, kept_number
 
 RANGE = PortRange(11400, 11463)
@@ -260,7 +260,7 @@ def test_answers_to_both_in_one_message(is_first: bool) -> None:
         kept_halves(port_store.proof_prefix, PEER, port_store.proof(PEER, ports), HALF_BITS),
     ]
     first, second = answers if is_first else answers[::-1]
-    assert port_store.take(PEER, first + second[HEADER:])
+    assert port_store.take(PEER, first + second[HEADER_BYTES:])
     assert port_store.keeps(PEER, ports)
     assert port_store.former_ports(PEER) == ports
     assert port_store.proven_count(PEER) == 1

@@ -36,7 +36,7 @@ def test_a_list_is_read_as_it_was_written(
 ) -> None:
     datagram = message(data(payload(parameters, little), little=not little))
     _, parsed = read(datagram)
-    assert parsed.little is little
+    assert parsed.is_little_endian is little
     values = [(p.pid, datagram[p.value.start : p.value.end]) for p in parsed.parameters]
     assert values == parameters
 

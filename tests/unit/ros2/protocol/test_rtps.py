@@ -46,7 +46,7 @@ def test_a_sample_is_found_with_its_writer_and_its_place(little: bool) -> None:
     )
     (sample,) = samples(whole)
     assert (sample.prefix, sample.writer, sample.sequence) == (PREFIX, SPDP_WRITER, 2**33 + 5)
-    assert (sample.little, sample.inline_qos, sample.is_key_only) == (little, None, False)
+    assert (sample.is_little_endian, sample.inline_qos, sample.is_key_only) == (little, None, False)
     assert sample.payload is not None
     assert whole[sample.payload.start : sample.payload.end] == content
 
@@ -186,7 +186,7 @@ def test_the_inline_qos_of_a_datagram_has_a_length() -> None:
 
 def test_an_edit_outside_is_an_error() -> None:
     for edit in (Overwrite(3, b"ab"), Overwrite(-1, b"a")):
-        with pytest.raises(ValueError, match="an edit of bytes"):
+        with pytest.raises(ValueError, match="edit of bytes"):
             apply(b"abcd", [edit])
 
 

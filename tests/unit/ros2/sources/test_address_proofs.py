@@ -23,7 +23,7 @@ from rosproxy.ros2.ports.former_ports import ANSWER_TIME
 from rosproxy.ros2.ports.mappings import PART_FOR_PROVEN
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknowledged
-from rosproxy.ros2.protocol.rtps import HEADER, PREFIX, source_prefix
+from rosproxy.ros2.protocol.rtps import HEADER_BYTES, PREFIX_BYTES, source_prefix
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
 from rosproxy.ros2.sources.address_proofs import (
@@ -303,7 +303,7 @@ def test_two_proxies_do_not_ask_each_other_without_end(peer_of_second: str) -> N
         domain.settings.hosts = (host,)
         domain.settings.peers = (HostPort(peer, RANGE.advertised(RANGE.listen.first)),)
         domain.proxy_participants.discovery_participant.prefix = domain.proofs.secret = (
-            host.encode().ljust(PREFIX, b"-")
+            host.encode().ljust(PREFIX_BYTES, b"-")
         )
         meet(domain, A if host == HOST else B)
     exchange(proxies)
@@ -415,7 +415,7 @@ def test_a_proven_address_repeats_no_answer_at_any_rate() -> None:
     meet(domain)
     (asked,) = questions(hear(domain, B, LAPTOP), LAPTOP)
     said = answer(asked, B)
-    behind = said + spdp(B, LAPTOP)[HEADER:]
+    behind = said + spdp(B, LAPTOP)[HEADER_BYTES:]
     assert domain.must_queue_discovery(behind, LAPTOP)
     domain.heard_outside(said, LAPTOP, NOW)
     assert domain.must_queue_discovery(said, LAPTOP)
@@ -449,9 +449,9 @@ def test_an_announcement_beside_an_answer_is_charged(speaks_another: bool) -> No
         (ROBOT, domain.heard_outside, domain.must_queue_discovery),
     ):
         asked = domain.proofs.question(address, B, [])
-        ends = submessage(0x0E, 0, bytes(PREFIX))
+        ends = submessage(0x0E, 0, bytes(PREFIX_BYTES))
         info_src = submessage(0x0C, 0, bytes(4) + b"\2\3\1\x0f" + NEIGHBOUR)
-        told = spdp(NEIGHBOUR if speaks_another else B, address)[HEADER:]
+        told = spdp(NEIGHBOUR if speaks_another else B, address)[HEADER_BYTES:]
         hidden = answer(asked, B) + (ends + info_src if speaks_another else b"") + told
         assert len(hidden) <= LONGEST_ANSWER
         assert must_queue(hidden, address)
