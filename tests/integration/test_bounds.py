@@ -225,7 +225,7 @@ async def test_a_call_that_only_the_master_may_make_is_not_parsed(make_proxy, no
         xml("paramUpdate", "/m", "/p", LONG),
     ):
         reply = await exchange(proxy.lease(node), post(body))
-        text = "rosproxy: only the master's host may call this method (slave control: master)"
+        text = "rosproxy: only the master's host may call this method (--slave-control master)"
         assert reply.value[:2] == [-1, text]
     monkeypatch.undo()
     assert (await exchange(proxy.lease(node), pid())).value[0] == 1

@@ -11,7 +11,7 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import HttpClient, LongReply
-from rosproxy.net.late_answers import LATE_TIMEOUT
+from rosproxy.net.late_answers import LATE_TIMEOUT_S
 from tests.clock import pass_time
 from tests.integration.net import MASTER, until
 
@@ -152,7 +152,7 @@ async def test_a_connection_of_the_caller_is_closed_after_the_answer(client, pee
     sock = socket.socket()
     sock.setblocking(False)
     await loop.sock_connect(sock, (peer.address.host, peer.address.port))
-    await loop.sock_sendall(sock, client.request("/", "robot", b"hello"))
+    await loop.sock_sendall(sock, client.encoded_request("/", "robot", b"hello"))
     received = await loop.sock_recv(sock, 100) if read_before else b""
     client.close_after_answer(sock, received)
     assert received == read_before
@@ -195,7 +195,7 @@ async def test_a_peer_writes_its_whole_late_answer_before_the_connection_closes(
 
 async def test_a_peer_that_never_answers_loses_its_caller_in_the_end(client, peer, answer):
     await give_up(client, peer)
-    await pass_time(LATE_TIMEOUT)
+    await pass_time(LATE_TIMEOUT_S)
     await until(lambda: not peer.open, "the connection is closed")
     assert len(client.late) == 0
     peer.serve = peer.answer_always
@@ -398,7 +398,7 @@ async def test_a_long_body_that_fails_is_cut_before_its_end(client, peer):
 
 
 async def test_a_peer_that_does_not_read_holds_a_long_body_up(client, peer, monkeypatch):
-    monkeypatch.setattr("rosproxy.net.http_client.PIECE_TIMEOUT", 0.3)
+    monkeypatch.setattr("rosproxy.net.http_client.PIECE_TIMEOUT_S", 0.3)
     over = asyncio.Event()
 
     async def idle(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -2,8 +2,9 @@
 
 aiohttp's parser (llhttp) reads the responses. The client does not use aiohttp's ClientSession. A
 call through ClientSession takes twice as long, because of cookies, redirects and proxies. A
-cancelled call of ClientSession closes the connection, and that ends roslisp nodes
-(`rosproxy.net.late_answers`). The client refuses compressed bodies: ROS does not compress, and a
+cancelled call of ClientSession closes the connection, and that ends roslisp nodes. This client
+leaves such a connection open until the answer has arrived (`rosproxy.net.late_answers`). The client
+also refuses compressed bodies: ROS does not compress, and a
 small body could become huge.
 
 Long bodies that the proxy need not read pass piece by piece, in requests and replies. The proxy
@@ -31,22 +32,22 @@ from rosproxy.net.late_answers import LateAnswers
 from rosproxy.net.sockets import dial
 from rosproxy.net.time_limits import TimeLimit, TimeLimits
 
-MAX_BODY = 64 * 1024 * 1024
+MOST_BODY_BYTES = 64 * 1024 * 1024
 """Default bound of an XML-RPC body in bytes."""
-LONG = 64 * 1024
+LONG_BODY_BYTES = 64 * 1024
 """Bytes. A longer reply passes piece by piece if the proxy need not read the reply."""
-PIECE_TIMEOUT = 30.0
+PIECE_TIMEOUT_S = 30.0
 """Seconds within which the next piece of a long body must arrive, or leave."""
-LONG_TIMEOUT = 600.0
+LONG_BODY_TIMEOUT_S = 600.0
 """Seconds for a whole long body: 64 MiB at 0.9 Mbit/s."""
-CONNECT_TIMEOUT = 2.0
-"""Seconds to connect to each address of a peer.
+CONNECT_TIMEOUT_S = 2.0
+"""Seconds for the attempt to connect to one address of a peer.
 
-Short, because rosmaster calls all subscribers from three threads (master_api.py, NUM_WORKERS). Each
-subscriber that does not answer blocks a thread.
+This time is short, because rosmaster calls all subscribers from three threads (master_api.py,
+NUM_WORKERS). Each subscriber that does not answer blocks a thread.
 """
 
-_SENDABLE = re.compile(r"[^\x00-\x20\x7f]+")
+_NO_CONTROL_OR_SPACE = re.compile(r"[^\x00-\x20\x7f]+")
 
 
 class LongBody(Protocol):
@@ -69,9 +70,9 @@ class LongReply:
     async def pieces(self) -> AsyncIterator[bytes]:
         """The pieces, once. Raises aiohttp.ClientError, TimeoutError."""
         loop = asyncio.get_running_loop()
-        end = loop.time() + LONG_TIMEOUT
+        end = loop.time() + LONG_BODY_TIMEOUT_S
         while not self._stream.at_eof():
-            async with asyncio.timeout_at(min(end, loop.time() + PIECE_TIMEOUT)):
+            async with asyncio.timeout_at(min(end, loop.time() + PIECE_TIMEOUT_S)):
                 piece = await self._stream.readany()
             yield piece
 
@@ -84,7 +85,7 @@ class LongReply:
 
 
 class ClientConnection(HttpProtocol):
-    """A connection to a peer, for a single call at a time."""
+    """A connection to a peer, an HTTP server, for a single call at a time."""
 
     def __init__(self) -> None:
         loop = asyncio.get_running_loop()
@@ -92,7 +93,7 @@ class ClientConnection(HttpProtocol):
         self._responses = HttpResponseParser(
             self,
             loop,
-            LONG,
+            LONG_BODY_BYTES,
             payload_exception=aiohttp.ClientPayloadError,
             read_until_eof=True,
             auto_decompress=False,
@@ -103,14 +104,14 @@ class ClientConnection(HttpProtocol):
         """The body of the latest response."""
         self._arrival: asyncio.Future[None] | None = None
         self._failure: Exception | None = None
-        self._lasts = True
+        self._is_persistent = True
 
     @property
     def reusable(self) -> bool:
         """Whether the connection can carry another call."""
         is_read = self._content is None or self._content.is_eof()
         is_open = self.transport is not None and not self.transport.is_closing()
-        return self._lasts and is_read and is_open and not self._messages
+        return self._is_persistent and is_read and is_open and not self._messages
 
     def data_received(self, data: bytes) -> None:
         """Parse received bytes. aiohttp passes no bytes when the parser may go on."""
@@ -124,7 +125,7 @@ class ClientConnection(HttpProtocol):
         for message, content in messages:
             self._messages.append((message, content))
             self._content = content
-            self._lasts = self._lasts and not message.should_close
+            self._is_persistent = self._is_persistent and not message.should_close
         if messages:
             wake(self._arrival)
 
@@ -153,24 +154,24 @@ class ClientConnection(HttpProtocol):
 
     def close(self) -> None:
         """Close the connection."""
-        self._lasts = False
+        self._is_persistent = False
         if self.transport is not None:
             self.transport.close()
 
     def _fail(self, error: Exception) -> None:
-        self._lasts = False
+        self._is_persistent = False
         self._failure = self._failure or error
         wake(self._arrival)
 
 
 class HttpClient:
-    """Calls peers of a single kind: the master, or nodes.
+    """Sends XML-RPC calls to peers, either to the master or to nodes.
 
     ``headers``: sent with each call. ``keepalive``: seconds until an idle connection is closed; the
     check may come half that time later. ``most``: connections in use at once, without long bodies
-    and without the cancelled calls in ``late``. ``longest``: bound of a reply body in bytes.
-    ``source``: the source of the peers' names (see `resolver`). ``last_address``: the address of
-    the latest new connection.
+    and without the connections in ``late``, whose callers have given up. ``longest``: bound of a
+    reply body in bytes. ``source``: the source of the peers' names (see `resolver`).
+    ``last_address``: the address of the latest new connection.
     """
 
     def __init__(
@@ -178,7 +179,7 @@ class HttpClient:
         headers: Mapping[str, str],
         keepalive: float,
         most: int,
-        longest: int = MAX_BODY,
+        longest: int = MOST_BODY_BYTES,
         source: str = "",
     ) -> None:
         self.last_address: str | None = None
@@ -220,12 +221,13 @@ class HttpClient:
     async def pass_on(
         self, peer: HostPort, path: str, host: str, body: bytes | LongBody, within: float
     ) -> bytes | LongReply:
-        """Send a request; return the body of the reply. Beyond LONG bytes the body is a LongReply.
+        """Send a request; return the body of the reply.
 
-        A body without ``Content-Length`` is never a LongReply. ``within``: seconds until a long
-        reply begins, or a short reply ends. For a LongBody the time counts from the end of the
-        body, and connecting has the same time. A LongBody uses a new connection, because the client
-        can't send the pieces twice. Raises the errors of `post` and of the body.
+        A body of more than LONG_BODY_BYTES is a LongReply, except a body without
+        ``Content-Length``. ``within``: seconds until a long reply begins, or a short reply ends.
+        For a LongBody the time counts from the end of the body, and connecting has the same time. A
+        LongBody uses a new connection, because the client can't send the pieces twice. Raises the
+        errors of `post` and of ``body.pieces``.
         """
         if isinstance(body, bytes):
             head = self._head(path, host, len(body))
@@ -238,7 +240,7 @@ class HttpClient:
             connection = await self._connect(peer)
         self._used.add(connection)
         try:
-            async with asyncio.timeout(LONG_TIMEOUT):
+            async with asyncio.timeout(LONG_BODY_TIMEOUT_S):
                 await _upload(connection, head, body)
         except BaseException:
             self._drop(connection)
@@ -247,8 +249,8 @@ class HttpClient:
             answer = await self._await_answer(connection)
             return await self._pass_reply(peer, connection, *answer)
 
-    def request(self, path: str, host: str, body: bytes) -> bytes:
-        """The bytes that `post` would send, for a connection of the caller. Raises ValueError."""
+    def encoded_request(self, path: str, host: str, body: bytes) -> bytes:
+        """The bytes of a call, for a connection that the caller has made. Raises ValueError."""
         return self._head(path, host, len(body)) + body
 
     async def close(self) -> None:
@@ -266,7 +268,7 @@ class HttpClient:
         """Close a connection that the caller has made, once the answer on it is complete.
 
         ``received``: the part of the answer that the caller has read. Without an answer, the
-        connection is closed after LATE_TIMEOUT.
+        connection is closed after LATE_TIMEOUT_S.
         """
         self.late.wait(partial(_drain_socket, sock, received), sock.close)
 
@@ -334,7 +336,7 @@ class HttpClient:
         stream: aiohttp.StreamReader,
         size: int | None,
     ) -> bytes | LongReply:
-        if size is None or size <= LONG:
+        if size is None or size <= LONG_BODY_BYTES:
             return await self._read_whole(peer, connection, stream, self._longest)
         if size > self._longest:
             self._drop(connection)
@@ -366,7 +368,7 @@ class HttpClient:
         failure = OSError(None, f"host name {peer.host} can't be resolved")
         for address in await resolver.resolve(peer.host, self._source):
             try:
-                sock = await dial(HostPort(address, peer.port), CONNECT_TIMEOUT)
+                sock = await dial(HostPort(address, peer.port), CONNECT_TIMEOUT_S)
             except OSError as error:
                 failure = error
                 continue
@@ -410,7 +412,7 @@ class HttpClient:
 
 @lru_cache
 def _request_start(path: str, host: str) -> str:
-    if not (_SENDABLE.fullmatch(path) and _SENDABLE.fullmatch(host)):
+    if not (_NO_CONTROL_OR_SPACE.fullmatch(path) and _NO_CONTROL_OR_SPACE.fullmatch(host)):
         raise ValueError(
             f"{host}{path} can't be requested: "
             "the host or the path is empty, or has spaces or control characters"
@@ -458,7 +460,7 @@ async def _upload(connection: ClientConnection, head: bytes, body: LongBody) -> 
     """Send a long body as fast as the peer reads. Raises TimeoutError if the peer stalls."""
     connection.write(head)
     async for piece in body.pieces():
-        async with asyncio.timeout(PIECE_TIMEOUT):
+        async with asyncio.timeout(PIECE_TIMEOUT_S):
             connection.write(piece)
             await connection.drain()
 

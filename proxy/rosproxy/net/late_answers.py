@@ -3,17 +3,17 @@
 A node of roslisp ends when it can't write its reply (programs run with SBCL's debugger disabled).
 So a caller that stops waiting does not close the connection, but leaves the connection here. The
 connection is closed when the answer has arrived, when the peer has closed the connection, or after
-LATE_TIMEOUT.
+LATE_TIMEOUT_S.
 """
 
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
 
-LATE_TIMEOUT = 60.0
+LATE_TIMEOUT_S = 60.0
 """Seconds in which a late answer must arrive."""
 MOST_LATE = 256
-"""Connections that a LateAnswers keeps; for a further connection the oldest is closed."""
+"""The highest number of connections that wait. For a further connection the oldest is closed."""
 
 
 class LateAnswers:
@@ -56,5 +56,5 @@ class LateAnswers:
 
 async def _await_late(answer: Callable[[], Awaitable[object]]) -> None:
     with contextlib.suppress(Exception):  # no caller waits for the answer or the error
-        async with asyncio.timeout(LATE_TIMEOUT):
+        async with asyncio.timeout(LATE_TIMEOUT_S):
             await answer()

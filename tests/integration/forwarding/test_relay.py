@@ -362,9 +362,7 @@ async def test_further_streams_have_smaller_pipes(node, lease, monkeypatch):
 
 
 @pytest.mark.parametrize("plane", ["splice", "copy"])
-async def test_many_streams_do_not_exhaust_the_memory_of_tcp(
-    make_proxy, node, monkeypatch, plane
-):
+async def test_many_streams_do_not_exhaust_the_memory_of_tcp(make_proxy, node, monkeypatch, plane):
     """At 1,000 saturated streams Linux dropped packets, and some streams got nothing."""
     monkeypatch.setattr(relay, "MOST_UNBOUNDED_DIRECTIONS", 1)
     proxy = await make_proxy(data_plane=plane)

@@ -1,9 +1,9 @@
 """The slave API of inside nodes, which outside and the master reach through leases.
 
-The port of a connection decides which endpoint a call is for. The proxy imports the addresses in
-the call, forwards the call to the endpoint, and exports the addresses in the reply
-(`rosproxy.ros1.rewriting.slave_api`). The proxy also records the TCPROS port that a node names in a
-reply, and whether the node answers.
+Each endpoint has a port, and a call that arrives at the port is for this endpoint. The proxy
+imports the addresses in the call, forwards the call to the endpoint, and exports the addresses in
+the reply (`rosproxy.ros1.rewriting.slave_api`). The proxy also records the TCPROS port that a node
+names in a reply, and whether the node answers.
 """
 
 import asyncio
@@ -35,9 +35,10 @@ log = logging.getLogger(__name__)
 
 _Answer = TypeVar("_Answer")
 NO_CALLER_ID = (
-    "the proxy can't read the caller_id of this call, and needs the caller_id to apply the policy"
+    "the proxy can't read the caller_id of this call, and needs the caller_id to apply the policy. "
+    "Send the caller_id as the first parameter, a string"
 )
-NOT_THE_MASTER = "only the master's host may call this method (slave control: master)"
+NOT_THE_MASTER = "only the master's host may call this method (--slave-control master)"
 
 
 class SlaveApi:
@@ -75,7 +76,7 @@ class SlaveApi:
         endpoint = self._endpoint(call)
         method = passing.method_of(call.body)
         if method is not None and not await self._may_call(method, call.source):
-            return self._refuse(method, NOT_THE_MASTER)  # before parsing
+            return self._refuse(method, NOT_THE_MASTER)  # before parsing, which takes time
         try:
             parsed = xmlrpc.parse_call(call.body, self._context.lease_call)
         except xmlrpc.XmlRpcError:
@@ -89,7 +90,8 @@ class SlaveApi:
                 raise Unreachable("the caller has closed the connection")
             results.append(await self._multicall_result(endpoint, inner, call))
             call.charge(len(results[-1]))
-            await asyncio.sleep(0)  # refused and absorbed calls wait for no node
+            # A call that the proxy refuses or keeps back waits for no node.
+            await asyncio.sleep(0)
         return multicall.results_reply(results)
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
@@ -108,7 +110,7 @@ class SlaveApi:
             reason = await self._not_subscribed(endpoint, parameter)
         if reason is not None:
             return self._refuse(method, reason)
-        reply = self._pass(endpoint, long_call)
+        reply = self._forward_unchanged(endpoint, long_call)
         return await count_reply(self._context.metrics, "slave", method, reply)
 
     def _endpoint(self, call: IncomingCall) -> Endpoint:
@@ -135,7 +137,7 @@ class SlaveApi:
     async def _multicall_result(
         self, endpoint: Endpoint, inner: xmlrpc.Call | None, call: IncomingCall
     ) -> bytes:
-        """The result of a call in a multicall; the node gets a single call.
+        """The result of one call in a multicall. The node gets only single calls.
 
         Several client libraries lack system.multicall (docs/architecture.md, Client libraries).
         """
@@ -174,7 +176,7 @@ class SlaveApi:
             if denial is not None:
                 self._context.metrics.count("slave", parsed.method, "refused")
                 return xmlrpc.dump_reply(denial.answer.triple())
-        reply = self._forward(endpoint, parsed, body, call)
+        reply = self._forward_allowed(endpoint, parsed, body, call)
         return await count_reply(self._context.metrics, "slave", parsed.method, reply)
 
     def _refuse(self, method: str, reason: str) -> bytes:
@@ -182,13 +184,18 @@ class SlaveApi:
         self._context.metrics.count("slave", method, "refused")
         return xmlrpc.dump_reply([-1, f"rosproxy: {reason}", 0])
 
-    async def _forward(
+    async def _forward_allowed(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
     ) -> bytes | LongReply:
-        if await self._is_absorbed(endpoint, parsed):
+        """The node's reply to an allowed call.
+
+        Imports the addresses in the call, and exports the addresses in the reply. Before a
+        ``publisherUpdate``, opens stand-ins for the publishers and adds hidden publishers.
+        """
+        if await self._absorb(endpoint, parsed):
             return xmlrpc.dump_reply([1, "", 0])
         if not slave_api.is_rewritten(parsed.method):
-            return await self._pass(endpoint, body)
+            return await self._forward_unchanged(endpoint, body)
         if parsed.method == "publisherUpdate":
             await self._context.wait_for_registration(endpoint)
             topic = parsed.string(1) or ""
@@ -197,7 +204,7 @@ class SlaveApi:
             await self._stand_ins.listen_for_announced(topic, announced, node)
             if len(announced) > MANY_VALUES:
                 await self._context.yield_to_others()
-            body, parsed = self._with_hidden(endpoint, parsed, body)
+            body, parsed = self._with_allowed_publishers(endpoint, parsed, body)
         self._context.refresh_networks()
         addressing = self._context.addressing
         is_local = call.reached_locally
@@ -209,7 +216,7 @@ class SlaveApi:
             )
         else:
             body = self._stand_ins.with_address(body, parsed)
-        reply = await self._ask(endpoint, slave_api.rewrite_call(body, parsed, view))
+        reply = await self._forward_rewritten(endpoint, slave_api.rewrite_call(body, parsed, view))
         # Only this reply names the TCPROS port of the node. The relay and the kernel plane lead the
         # next connections to the port that the proxy records here.
         port = endpoint.port
@@ -221,12 +228,12 @@ class SlaveApi:
         reached = HostPort(call.local.host, port) if is_local else addressing.outside(port)
         return slave_api.rewrite_reply(parsed, reply, reached, view)
 
-    def _with_hidden(
+    def _with_allowed_publishers(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes
     ) -> tuple[bytes, xmlrpc.Call]:
-        """A publisherUpdate with all publishers for the node, and the parsed call.
+        """The body and the parsed call of a publisherUpdate with all publishers for the node.
 
-        Hidden publishers are added (`publishers_for`). Unchanged if the publishers are the same.
+        `publishers_for` chooses the publishers. Unchanged if the publishers are the same.
         """
         topic = parsed.string(1) or ""
         announced = slave_api.announced_publishers(parsed)
@@ -236,8 +243,12 @@ class SlaveApi:
         body = xmlrpc.dump_call(parsed.method, parsed.string(0) or "", topic, publishers)
         return body, xmlrpc.parse_call(body)
 
-    async def _is_absorbed(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
-        """Whether to keep back a call: a needless ``shutdown`` or outdated ``publisherUpdate``."""
+    async def _absorb(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
+        """Keep a needless ``shutdown`` or an outdated ``publisherUpdate`` from the node.
+
+        Return whether the call is kept from the node. `Adopter.absorb_shutdown` may also register
+        the node again.
+        """
         if parsed.method == "shutdown":
             caller_id = parsed.string(0) or ""
             reason = parsed.string(1) or ""
@@ -246,23 +257,27 @@ class SlaveApi:
             return False
         return slave_api.is_outdated(parsed, self._context.addressing, self._context.now())
 
-    async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
-        return await self._note_health(
+    async def _forward_rewritten(self, endpoint: Endpoint, body: bytes) -> bytes:
+        return await self._await_and_note_health(
             endpoint, self._context.upstream.post_to_node(endpoint.slave, body)
         )
 
-    async def _pass(self, endpoint: Endpoint, body: bytes | LongCall) -> bytes | LongReply:
-        return await self._note_health(
+    async def _forward_unchanged(
+        self, endpoint: Endpoint, body: bytes | LongCall
+    ) -> bytes | LongReply:
+        return await self._await_and_note_health(
             endpoint, self._context.upstream.pass_to_node(endpoint.slave, body)
         )
 
-    async def _note_health(self, endpoint: Endpoint, answer: Awaitable[_Answer]) -> _Answer:
+    async def _await_and_note_health(
+        self, endpoint: Endpoint, answer: Awaitable[_Answer]
+    ) -> _Answer:
         """Await the answer of a node, and record whether the node answers. Raises Unreachable."""
         health = endpoint.health
         try:
             reply = await answer
         except Unreachable as error:
-            if error.probe is ProbeResult.ANSWERED:  # an HTTP status, so the node lives
+            if error.probe is ProbeResult.ANSWERED:  # by an HTTP error status
                 health.note(error.probe, self._context.now())
             if error.refused and health.note(error.probe, self._context.now()):
                 # With this refusal the node counts as ended, so the port refuses at once, too.
@@ -296,7 +311,7 @@ class SlaveApi:
 
     async def _may_call(self, method: str, source: str) -> bool:
         """Whether ``--slave-control`` allows a source to call a method."""
-        anybody = self._context.settings.slave_control == "any"
-        if anybody or method not in slave_api.MASTER_ONLY:
+        all_may_call = self._context.settings.slave_control == "any"
+        if all_may_call or method not in slave_api.MASTER_ONLY:
             return True
         return source in await self._context.upstream.master_addresses()

@@ -23,7 +23,7 @@ import msgspec
 
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy.net.http_client import (
-    MAX_BODY,
+    MOST_BODY_BYTES,
     BadResponse,
     CallFailed,
     HttpClient,
@@ -95,7 +95,7 @@ class MasterClient:
         instance: str,
         metrics: Metrics,
         master_address: str | None = None,
-        longest: int = MAX_BODY,
+        longest: int = MOST_BODY_BYTES,
     ) -> None:
         self.master_uri = master_uri
         self.master_address = master_address
@@ -261,7 +261,7 @@ class MasterClient:
 
     def node_request(self, slave: HostPort, body: bytes) -> bytes:
         """A call to a node as an HTTP request, for callers with a connection of their own."""
-        return self._nodes.request("/", str(slave), body)
+        return self._nodes.encoded_request("/", str(slave), body)
 
 
 _FAILURES = (aiohttp.ClientError, OSError, TimeoutError, ValueError)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from aiohttp import StreamReader
 
-from rosproxy.net.http_client import PIECE_TIMEOUT, LongReply
+from rosproxy.net.http_client import PIECE_TIMEOUT_S, LongReply
 from rosproxy.net.http_server import BadBody
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.protocol.xmlrpc.passing import CallWatch, cut
@@ -47,7 +47,7 @@ class LongCall:
         previous = self._head
         while not self._rest.at_eof():
             try:
-                async with asyncio.timeout(PIECE_TIMEOUT):
+                async with asyncio.timeout(PIECE_TIMEOUT_S):
                     piece = await self._rest.readany()
             except (OSError, BadBody) as error:  # a TimeoutError is an OSError
                 raise Unreachable(f"the caller did not send the whole body: {error}") from error
