@@ -112,7 +112,7 @@ class App:
         self.runtime.refusals.end_old()
         status = replace(common_status(self.runtime), range_probe=self._check.result)
         for stack in self.stacks:
-            status = stack.add_to(status)
+            status = stack.extended_status(status)
         return bounded(status)
 
     def _actions(self) -> dict[str, Action]:

@@ -169,4 +169,4 @@ class SelfCheck:
             level = logging.ERROR if finding.severity is Severity.ERROR else logging.WARNING
             log.log(level, "%s: %s", subject, text)
         if previous and not wrong:
-            log.info("%s: nothing is wrong any more", subject)
+            log.info("%s: the fault is over", subject)

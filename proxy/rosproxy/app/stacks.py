@@ -52,7 +52,7 @@ class Stack(Protocol):
     def unready(self) -> str | None:
         """The reason why nodes can't use the stack now; None if nodes can."""
 
-    def add_to(self, status: ProxyStatus) -> ProxyStatus:
+    def extended_status(self, status: ProxyStatus) -> ProxyStatus:
         """The status of the proxy, with the parts of this stack."""
 
 

@@ -218,9 +218,9 @@ class Ros1:
         """Enforce the policy now. Raises Unreachable, MasterError."""
         return await self._enforcer.enforce()
 
-    def add_to(self, status: ProxyStatus) -> ProxyStatus:
+    def extended_status(self, status: ProxyStatus) -> ProxyStatus:
         """The status of the proxy, with the part for ROS 1."""
-        return self._state.add_to(status)
+        return self._state.extended_status(status)
 
     def unready(self) -> str | None:
         """Why nodes cannot use the proxy now; None if nodes can."""

@@ -41,7 +41,7 @@ class Ros1State(Collector):
     _messages: MessageCounter
     _down: NamedNodes = field(default_factory=NamedNodes)
 
-    def add_to(self, status: document.ProxyStatus) -> document.ProxyStatus:
+    def extended_status(self, status: document.ProxyStatus) -> document.ProxyStatus:
         """The state, with what ``rosproxy status`` and ``doctor`` show of ROS 1."""
         context = self._context
         relays: dict[int, list[Relay]] = {}

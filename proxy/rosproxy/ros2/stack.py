@@ -279,7 +279,7 @@ class Ros2:
         """Return None: ROS 2 needs no master, and is ready after `start`."""
         return None
 
-    def add_to(self, status: ProxyStatus) -> ProxyStatus:
+    def extended_status(self, status: ProxyStatus) -> ProxyStatus:
         """Add the domains of ROS 2 to the status of the proxy.
 
         If the proxy also serves ROS 1, networks, ports and data plane in the status are those of

@@ -1,7 +1,7 @@
 """The program that runs the proxy's zenoh routers, as a child of the proxy.
 
 The routers are a library in Rust. A crash or a hang of the library ends this process, and leaves
-the proxy alone. The proxy then starts the process again (`rosproxy.zenoh.router_keeper`).
+the proxy alone. The proxy then starts the process again (`rosproxy.zenoh.router_supervisor`).
 
 Standard input has a line of JSON, a list of `RouterConfig`. Standard output gets a `Report` each
 second. The process ends with an error in the last report if a router cannot be opened, or does not

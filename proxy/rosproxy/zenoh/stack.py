@@ -23,7 +23,7 @@ from rosproxy.zenoh.link_probe import try_link
 from rosproxy.zenoh.links import Link
 from rosproxy.zenoh.protocol.report import Report
 from rosproxy.zenoh.router_configs import router_configs
-from rosproxy.zenoh.router_keeper import RouterKeeper, RoutersFailed
+from rosproxy.zenoh.router_supervisor import RoutersFailed, RouterSupervisor
 from rosproxy.zenoh.status import ZenohState
 
 log = logging.getLogger(__name__)
@@ -31,7 +31,8 @@ log = logging.getLogger(__name__)
 LINK_INTERVAL_S = 5.0
 """Seconds between look-ups of the peers' addresses, and between tries of links that are down."""
 FAULT_INTERVAL_S = 1.0
-_OPTION = "--ros zenoh"
+"""Seconds between two searches for faults."""
+_ROS_OPTION = "--ros zenoh"
 
 
 class Zenoh:
@@ -45,29 +46,29 @@ class Zenoh:
         configs = router_configs(
             settings.bind, settings.zenoh_ports, settings.zenoh_listen, settings.zenoh_peer
         )
-        self.keeper = RouterKeeper(runtime.tasks, configs, self._take_report)
-        self.state = ZenohState(settings, self.keeper, runtime.now)
+        self.supervisor = RouterSupervisor(runtime.tasks, configs, self._take_report)
+        self.state = ZenohState(settings, self.supervisor, runtime.now)
 
     async def start(self) -> None:
-        """Start the routers, and look for faults from now on. Raises SettingError."""
+        """Start the routers and the periodic checks. Raises SettingError."""
         _check_package()
         _check_ports(self._settings)
         try:
-            await self.keeper.start()
+            await self.supervisor.start()
         except RoutersFailed as error:
-            raise SettingError(_OPTION, f"the routers do not run: {error}") from None
+            raise SettingError(_ROS_OPTION, f"the routers do not run: {error}") from None
         self._runtime.metrics.registry.register(self.state)
         tasks = self._runtime.tasks
         tasks.repeat(self._look_at_links, LINK_INTERVAL_S, "looking at zenoh links")
         tasks.repeat(self._look_for_faults, FAULT_INTERVAL_S, "looking for faults of zenoh")
 
     async def stop(self) -> None:
-        """End everything, and the routers."""
+        """Cancel all tasks. This also stops the routers."""
         await self._runtime.tasks.cancel()
 
     @property
     def greeting(self) -> str:
-        """How nodes reach the routers, for the log."""
+        """The text for the log: the ports for nodes inside, and the ways to outside."""
         settings = self._settings
         outside = [f"peers {listed(map(str, settings.zenoh_peer))}"] if settings.zenoh_peer else []
         if settings.zenoh_listen is not None:
@@ -76,12 +77,12 @@ class Zenoh:
         return ", ".join([ports, *outside])
 
     actions: Mapping[str, Action] = {}
-    """No action of an operator concerns rmw_zenoh."""
+    """Empty: no POST request of an operator concerns rmw_zenoh."""
     retired = False
-    """The routers have no registrations, so an operator retires nothing."""
+    """Always False: the routers have no registrations that the proxy could take back."""
 
     async def settle(self) -> None:
-        """Return at once: no port for rmw_zenoh is probed."""
+        """Return at once: the proxy probes no port for rmw_zenoh."""
 
     async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
         """No results: rmw_zenoh has no ports of the range."""
@@ -94,15 +95,15 @@ class Zenoh:
         return ()
 
     async def apply_policy(self) -> EnforcementCounts:
-        """No counts: rmw_zenoh has no policy, and `Settings` refuses rules."""
+        """Zero counts: rmw_zenoh has no policy, and `Settings` refuses rules."""
         return EnforcementCounts()
 
     def unready(self) -> str | None:
         """Why nodes can't use the routers now; None if the routers run."""
-        failure = self.keeper.failure
+        failure = self.supervisor.failure
         return f"{findings.ROUTERS}: do not run: {failure}" if failure else None
 
-    def add_to(self, status: ProxyStatus) -> ProxyStatus:
+    def extended_status(self, status: ProxyStatus) -> ProxyStatus:
         """The status of the proxy, with the routers."""
         return replace(status, zenoh=self.state.status())
 
@@ -117,12 +118,12 @@ class Zenoh:
 
     async def _look_at(self, link: Link) -> None:
         """Look up the addresses of a peer, and record why the link to the peer is down."""
-        # If the name server does not answer, the former addresses stay.
+        # If the name does not resolve now, the former addresses stay.
         link.addresses = tuple(await resolve(link.peer.host)) or link.addresses
         fault = None
         if not self.state.is_up(link):
             fault = await try_link(link.addresses, link.peer.port)
-        if self.keeper.failure:  # no router dials the peer
+        if self.supervisor.failure:  # the routers do not run, so the fault of the link is unknown
             return
         # The link may have come up during the try, which takes some seconds.
         fault = None if self.state.is_up(link) else fault
@@ -133,7 +134,7 @@ class Zenoh:
     async def _look_for_faults(self) -> None:
         """Log each fault once, and report the fault as a problem while the fault lasts."""
         current = {fault.subject: fault for fault in findings.faults(self.state.status())}
-        if self.keeper.failure:  # former faults stay, because nothing else is known
+        if self.supervisor.failure:  # other faults are unknown meanwhile, and stay
             current = self._faults | current
         for subject in self._faults.keys() | current.keys():
             fault = current.get(subject)
@@ -141,7 +142,7 @@ class Zenoh:
                 continue
             self._runtime.problems.solved(subject)
             if fault is None:
-                log.info("%s: nothing is wrong any more", subject)
+                log.info("%s: the fault is over", subject)
             else:
                 text = f"{fault.text}. Fix: {fault.fix}"
                 self._runtime.problems.add(subject, text, holds=True)
@@ -150,12 +151,12 @@ class Zenoh:
 
 
 def _check_package() -> None:
-    """Raises SettingError without the library of the routers."""
+    """Raises SettingError if eclipse-zenoh, the library of the routers, is not installed."""
     try:
         metadata.distribution("eclipse-zenoh")
     except metadata.PackageNotFoundError:
         text = "needs the package eclipse-zenoh. Install rosproxy[zenoh]"
-        raise SettingError(_OPTION, text) from None
+        raise SettingError(_ROS_OPTION, text) from None
 
 
 def _check_ports(settings: Settings) -> None:

@@ -24,7 +24,7 @@ _PlacedSession = tuple[int | None, RouterSession, Ends]
 
 
 class RouterProcess(Protocol):
-    """What the status tells of the process of the routers (`RouterKeeper`)."""
+    """What the status tells of the process of the routers (`RouterSupervisor`)."""
 
     failure: str
     restarts: int

@@ -48,7 +48,7 @@ async def make(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> AsyncIterator
     def make(**options: object) -> Zenoh:
         given = {"ros": ("zenoh",), "zenoh_ports": "47448-47448", "bind": HOST, **options}
         zenoh = Zenoh(Runtime(parse_settings(given)))
-        zenoh.keeper.program = (sys.executable, "-c", REPORTS, str(tmp_path / "linked"))
+        zenoh.supervisor.program = (sys.executable, "-c", REPORTS, str(tmp_path / "linked"))
         made.append(zenoh)
         return zenoh
 
@@ -100,7 +100,7 @@ async def test_a_fault_is_told_until_it_is_over(
     router.close()
     (tmp_path / "linked").touch()
     await until(lambda: not problems.all(), told)
-    status = zenoh.add_to(ProxyStatus()).zenoh
+    status = zenoh.extended_status(ProxyStatus()).zenoh
     assert status is not None
     assert status.links[0].up
     assert caplog.text.count("zenoh opens no session") == 1

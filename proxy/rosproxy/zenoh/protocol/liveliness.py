@@ -16,33 +16,35 @@ from typing import NamedTuple
 ALL_TOKENS = "@ros2_lv/**"
 """The key expression of all tokens."""
 LONGEST_TOKEN = 1024
-"""Characters of a token that is read. A name of ROS 2 has 255 at most, a type some tens."""
+"""Characters. The proxy ignores longer tokens. A name of ROS 2 has at most 255 characters, a type
+some tens."""
 MOST_TOKENS = 8192
-"""Tokens in a report. A host with fifty nodes has some 1,000."""
+"""The highest number of tokens that the router process reports. A host with fifty nodes has some
+1,000."""
 _NODE_PARTS = 9
-_TOPIC_PARTS = 13
+_TOPIC_OR_SERVICE_PARTS = 13
 _NUMBER = re.compile(r"[0-9]{1,9}")
 _SESSION = re.compile(r"[0-9a-f]{1,32}")
 
 
 class EntityKind(Enum):
-    """What a token stands for."""
+    """The kind of entity that a token announces."""
 
     NODE = "NN"
     PUBLISHER = "MP"
     SUBSCRIPTION = "MS"
     SERVICE = "SS"
-    CLIENT = "SC"
+    SERVICE_CLIENT = "SC"
 
 
 _KINDS = {kind.value: kind for kind in EntityKind}
 
 
 class Entity(NamedTuple):
-    """A node, or a publisher, subscription, service or client of a node.
+    """A node, or a publisher, subscription, service or service client of a node.
 
     ``session`` is the zenoh ID of the session that has the node. ``node`` is the full name of the
-    node, ``name`` that of the topic or service; a node has none.
+    node. ``name`` is the full name of the topic or service, and empty for a node.
     """
 
     domain: int
@@ -54,7 +56,10 @@ class Entity(NamedTuple):
 
 
 class ZenohNode(NamedTuple):
-    """A ROS node with its publishers, subscriptions and services, by sorted full names."""
+    """A ROS node with its publishers, subscriptions and services, but without service clients.
+
+    The full names of topics and services are sorted.
+    """
 
     domain: int
     session: str
@@ -67,7 +72,7 @@ class ZenohNode(NamedTuple):
 def parse_token(key: str) -> Entity | None:
     """The entity of a token; None if the key is no token of rmw_zenoh."""
     parts = key.split("/") if len(key) <= LONGEST_TOKEN else []
-    kind = _KINDS.get(parts[5]) if len(parts) in (_NODE_PARTS, _TOPIC_PARTS) else None
+    kind = _KINDS.get(parts[5]) if len(parts) in (_NODE_PARTS, _TOPIC_OR_SERVICE_PARTS) else None
     if kind is None or parts[0] != "@ros2_lv" or not all(parts):
         return None
     if (kind is EntityKind.NODE) != (len(parts) == _NODE_PARTS):

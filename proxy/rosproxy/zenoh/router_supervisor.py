@@ -1,4 +1,4 @@
-"""Keeps the router process alive: starts the process, reads reports, restarts the process.
+"""Supervises the router process: starts the process, reads reports, restarts the process.
 
 Nodes of rmw_zenoh dial a router again 1, 3, 7 and 11 seconds after the connection has ended. So if
 the routers are back within a second, the first of these tries succeeds. The proxy kills a process
@@ -31,6 +31,7 @@ LEAST_START_INTERVAL_S = 1.0
 MOST_LOG_LINES = 20
 """Lines of the library's own log that the proxy logs, for each process."""
 LONGEST_LOG_LINE = 300
+"""Characters of such a line that the proxy logs."""
 LAST_LINES_TIMEOUT_S = 0.2
 """Time to read such lines after the end of the process."""
 _Stream = TypeVar("_Stream")
@@ -41,8 +42,8 @@ class RoutersFailed(Exception):
     """The routers do not run; the text says why."""
 
 
-class RouterKeeper:
-    """The router process of a proxy.
+class RouterSupervisor:
+    """Runs the router process of a proxy.
 
     ``failure``: why no routers run; empty while the routers run. ``restarts``: the number of
     processes that have ended.

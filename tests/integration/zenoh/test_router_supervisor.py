@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from rosproxy.net.tasks import Tasks
-from rosproxy.zenoh import router_keeper
+from rosproxy.zenoh import router_supervisor
 from rosproxy.zenoh.protocol.report import Report
-from rosproxy.zenoh.router_keeper import RouterKeeper, RoutersFailed
+from rosproxy.zenoh.router_supervisor import RoutersFailed, RouterSupervisor
 from tests.integration.net import until
 
 REPORTS = """
@@ -34,12 +34,12 @@ ENDS = "import sys; sys.stderr.write('thread panicked\\n'); sys.exit(3)"
 
 
 class Kept:
-    """A keeper with a small program as the router process."""
+    """A supervisor with a small program as the router process."""
 
     def __init__(self, tasks: Tasks, program: str) -> None:
         self.reports: list[Report] = []
-        self.keeper = RouterKeeper(tasks, [{"mode": '"router"'}], self.reports.append)
-        self.keeper.program = (sys.executable, "-c", program)
+        self.supervisor = RouterSupervisor(tasks, [{"mode": '"router"'}], self.reports.append)
+        self.supervisor.program = (sys.executable, "-c", program)
 
     @property
     def pid(self) -> int:
@@ -57,8 +57,8 @@ async def tasks() -> AsyncIterator[Tasks]:
 
 async def test_reports_are_taken_and_the_process_ends_with_the_tasks(tasks: Tasks) -> None:
     kept = Kept(tasks, REPORTS)
-    await kept.keeper.start()
-    assert (kept.keeper.failure, kept.keeper.restarts) == ("", 0)
+    await kept.supervisor.start()
+    assert (kept.supervisor.failure, kept.supervisor.restarts) == ("", 0)
     pid = kept.pid
     await tasks.cancel()
     assert not Path(f"/proc/{pid}").exists()
@@ -68,12 +68,12 @@ async def test_a_process_that_is_killed_starts_again(
     tasks: Tasks, caplog: pytest.LogCaptureFixture
 ) -> None:
     kept = Kept(tasks, REPORTS)
-    await kept.keeper.start()
+    await kept.supervisor.start()
     first = kept.pid
     os.kill(first, signal.SIGKILL)
     await until(lambda: kept.pid != first, "another process reports")
-    assert kept.keeper.restarts == 1
-    assert kept.keeper.failure == ""
+    assert kept.supervisor.restarts == 1
+    assert kept.supervisor.failure == ""
     assert "zenoh routers ended: the process was ended by SIGKILL" in caplog.text
 
 
@@ -94,9 +94,9 @@ async def test_the_reason_of_a_failed_start_is_told(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     if program is HANGS:
-        monkeypatch.setattr(router_keeper, "START_TIMEOUT_S", 0.2)
+        monkeypatch.setattr(router_supervisor, "START_TIMEOUT_S", 0.2)
     with pytest.raises(RoutersFailed, match=reason):
-        await Kept(tasks, program).keeper.start()
+        await Kept(tasks, program).supervisor.start()
     if program is ENDS:
         assert "zenoh: thread panicked" in caplog.text
 
@@ -104,9 +104,9 @@ async def test_the_reason_of_a_failed_start_is_told(
 async def test_a_process_that_falls_silent_is_killed(
     tasks: Tasks, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(router_keeper, "REPORT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(router_supervisor, "REPORT_TIMEOUT_S", 0.5)
     kept = Kept(tasks, REPORTS)
-    await kept.keeper.start()
+    await kept.supervisor.start()
     first = kept.pid
     os.kill(first, signal.SIGSTOP)
     await until(lambda: kept.pid != first, "another process reports")
@@ -116,10 +116,10 @@ async def test_a_process_that_falls_silent_is_killed(
 
 async def test_a_process_that_can_not_start_is_told(tasks: Tasks) -> None:
     kept = Kept(tasks, REPORTS)
-    kept.keeper.program = ("/nothing/here",)
+    kept.supervisor.program = ("/nothing/here",)
     with pytest.raises(RoutersFailed, match="can't be started: No such file or directory"):
-        await kept.keeper.start()
-    kept.keeper.program = (sys.executable, "-c", REPORTS)
+        await kept.supervisor.start()
+    kept.supervisor.program = (sys.executable, "-c", REPORTS)
     await until(lambda: kept.reports, "the next start succeeds")
 
 
@@ -127,8 +127,8 @@ async def test_what_the_library_prints_is_logged_up_to_a_bound(
     tasks: Tasks, caplog: pytest.LogCaptureFixture
 ) -> None:
     program = "import sys\nfor _ in range(99): print('panic\\x1b', file=sys.stderr)\n" + REPORTS
-    await Kept(tasks, program).keeper.start()
+    await Kept(tasks, program).supervisor.start()
     await until(lambda: "zenoh: panic" in caplog.text, "a line is logged")
     await asyncio.sleep(0.1)
-    assert caplog.text.count("zenoh: panic") == router_keeper.MOST_LOG_LINES
+    assert caplog.text.count("zenoh: panic") == router_supervisor.MOST_LOG_LINES
     assert "\x1b" not in caplog.text
