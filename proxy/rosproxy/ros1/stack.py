@@ -46,8 +46,8 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
-from rosproxy.ros1.upkeep.message_counter import COUNT_TICK, MessageCounter
-from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_TICK, PolicyEnforcer
+from rosproxy.ros1.upkeep.message_counter import COUNT_INTERVAL_S, MessageCounter
+from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_INTERVAL_S, PolicyEnforcer
 from rosproxy.ros1.upkeep.prober import PROBE_TICK, Prober
 from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 from rosproxy.ros1.upkeep.recovery import Recovery
@@ -155,9 +155,9 @@ class Ros1:
         repeat(self.leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
         repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "checking subscribers")
         repeat(self.stand_ins.tidy, TIDY_INTERVAL, "checking stand-ins for nodes outside")
-        repeat(self._messages.look, COUNT_TICK, "counting messages")
+        repeat(self._messages.ask_due_nodes, COUNT_INTERVAL_S, "counting messages")
         repeat(self.tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
-        repeat(self._enforcer.look, ENFORCE_TICK, "enforcing the policy")
+        repeat(self._enforcer.enforce_if_changed, ENFORCE_INTERVAL_S, "enforcing the policy")
 
     @property
     def actions(self) -> Mapping[str, Action]:

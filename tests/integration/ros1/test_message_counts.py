@@ -7,17 +7,17 @@ import pytest
 from examples.demo.fake_http import End, value
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.upkeep import message_counter
-from rosproxy.ros1.upkeep.message_counter import EVERY
+from rosproxy.ros1.upkeep.message_counter import ASK_INTERVAL_S
 from tests.clock import pass_time
 from tests.integration.conftest import MakeNode
 from tests.integration.proxy import Proxy
 
 PUBLISHED = {"name": "/chatter", "side": "published"}
-READ_LATELY = 15.0
-PATIENCE = 40.0
-AFTER_SILENCE = 12.0
+ASK_AFTER_READ_S = 15.0
+INTERVAL_AFTER_ERROR_S = 40.0
+INTERVAL_AFTER_SILENCE_S = 12.0
 """Shorter than the proxy's own."""
-ROUND = EVERY + 2
+ROUND = ASK_INTERVAL_S + 2
 """Seconds in which each of few nodes is asked once more."""
 
 
@@ -38,9 +38,9 @@ class Counts:
 
 @pytest.fixture(autouse=True)
 def _shorter(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(message_counter, "READ_LATELY", READ_LATELY)
-    monkeypatch.setattr(message_counter, "PATIENCE", PATIENCE)
-    monkeypatch.setattr(message_counter, "AFTER_SILENCE", AFTER_SILENCE)
+    monkeypatch.setattr(message_counter, "ASK_AFTER_READ_S", ASK_AFTER_READ_S)
+    monkeypatch.setattr(message_counter, "INTERVAL_AFTER_ERROR_S", INTERVAL_AFTER_ERROR_S)
+    monkeypatch.setattr(message_counter, "INTERVAL_AFTER_SILENCE_S", INTERVAL_AFTER_SILENCE_S)
 
 
 def times_asked(node: FakeNode) -> int:
@@ -79,11 +79,11 @@ async def test_without_readers_no_node_is_asked(
     await pass_time(ROUND)
     assert not counts.asked()
     read(proxy)
-    await pass_time(READ_LATELY + ROUND)
+    await pass_time(ASK_AFTER_READ_S + ROUND)
     asked = counts.asked()
     assert asked
     counts.messages += 50
-    await pass_time(2 * EVERY)
+    await pass_time(2 * ASK_INTERVAL_S)
     assert counts.asked() == asked
     read(proxy)
     await pass_time(ROUND)
@@ -99,12 +99,12 @@ async def test_who_does_not_count_is_left_alone(
     await other.publish(proxy.master)
     for _ in range(3):
         read(proxy)
-        await pass_time(EVERY)
+        await pass_time(ASK_INTERVAL_S)
     assert times_asked(other) == 1
     assert counts.asked() >= 2
     for _ in range(2):
         read(proxy)
-        await pass_time(EVERY)
+        await pass_time(ASK_INTERVAL_S)
     assert times_asked(other) == 2
 
 
@@ -123,7 +123,7 @@ async def test_who_does_not_answer_once_loses_nothing(
     assert counts.asked() > asked
     assert read(proxy) == 0
     node.answers["getBusStats"] = answer
-    await pass_time(AFTER_SILENCE + 2)
+    await pass_time(INTERVAL_AFTER_SILENCE_S + 2)
     assert read(proxy) == 50
 
 

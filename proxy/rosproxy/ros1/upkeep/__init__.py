@@ -19,13 +19,13 @@ port opens or refuses connections.
     after an outage                            nodes'                             to subscribers
                                                connections                        without
                                                                                   connection
-    ENFORCE_TICK, after a   policy_enforcer    the registry,      Ros1Policy      registrations
-    change of the policy                       connections                        hidden or shown,
+    ENFORCE_INTERVAL_S and  policy_enforcer    the registry,      Ros1Policy      registrations
+    a changed policy                           connections                        hidden or shown,
                                                                                   connections cut
     TIDY_INTERVAL           stand_in_ports     problems with                      problems of ended
                                                nodes outside                      nodes removed
-    COUNT_TICK, while the   message_counter    the nodes' counts  topic_growth    sums in the
-    metrics are read                                                              metrics
+    COUNT_INTERVAL_S, if    message_counter    the nodes' counts  topic_growth    sums in the
+    the metrics are read                                                          metrics
     RETRY_BLOCKED           leases             ports that other                   ports open
                                                programs held
     POST /containers        containers         the nodes there    liveness        nodes

@@ -1,9 +1,9 @@
-"""Messages by topic, for the metrics: the proxy asks the nodes for their own counts.
+"""Count messages by topic, for the metrics: the proxy asks the nodes for their counts.
 
 Neither the relay nor the kernel reads messages, but nodes count the messages of their connections.
 While a program reads the metrics, the proxy asks the healthy nodes for these counts
-(``getBusStats``), at most `MOST_ASKED` nodes a second. Messages before the first answer of a node
-do not count.
+(``getBusStats``), at most `MOST_ASKED_NODES` a second. The count of a node begins with its first
+answer after a start or an error: messages before this answer do not count.
 """
 
 import asyncio
@@ -26,25 +26,26 @@ from rosproxy.ros1.upkeep.decisions.topic_growth import (
 
 log = logging.getLogger(__name__)
 
-COUNT_TICK = 1.0
+COUNT_INTERVAL_S = 1.0
 """Seconds between two rounds of questions."""
-MOST_ASKED = 20
+MOST_ASKED_NODES = 20
 """The highest number of nodes that the proxy asks in a round."""
-AT_ONCE = 4
-"""Answers that the proxy awaits at the same time. All may arrive at once, and be long."""
-EVERY = 10.0
+MOST_PARALLEL_QUESTIONS = 4
+"""The highest number of nodes that the proxy asks at the same time. The number is low, because
+all answers may be long and arrive together."""
+ASK_INTERVAL_S = 10.0
 """Seconds after which the proxy asks a node again."""
-AFTER_SILENCE = 30.0
+INTERVAL_AFTER_SILENCE_S = 30.0
 """Seconds after which the proxy asks a node again that gave no answer."""
-PATIENCE = 300.0
+INTERVAL_AFTER_ERROR_S = 300.0
 """Seconds after which the proxy asks a node again that answered with an error or too much."""
-READ_LATELY = 180.0
+ASK_AFTER_READ_S = 180.0
 """Seconds for which the questions go on after a read: Prometheus reads about once a minute."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Answer:
-    """The last answer of a node, and the time of the next question."""
+class _Record:
+    """The time of the next question to a node, and the last counts of the node, if any."""
 
     ask_at: float
     stats: BusStats | None = None
@@ -56,35 +57,38 @@ class MessageCounter:
     def __init__(self, context: Context) -> None:
         self._context = context
         self._sums = TopicSums()
-        self._answers: dict[Endpoint, _Answer] = {}
+        self._records: dict[Endpoint, _Record] = {}
         self._read_at = -math.inf
-        self._limit = asyncio.Semaphore(AT_ONCE)
+        self._limit = asyncio.Semaphore(MOST_PARALLEL_QUESTIONS)
 
     def read(self) -> TopicSums:
-        """The sums, for a program that reads the metrics. Keeps the questions going."""
+        """The sums, for a program that reads the metrics.
+
+        The proxy then asks the nodes for another `ASK_AFTER_READ_S` seconds.
+        """
         self._read_at = self._context.now()
         return self._sums
 
-    async def look(self) -> None:
+    async def ask_due_nodes(self) -> None:
         """Ask the nodes that are due, if a program has read the metrics lately."""
         now = self._context.now()
-        if self._context.retired or now - self._read_at > READ_LATELY:
-            self._answers.clear()
+        if self._context.retired or now - self._read_at > ASK_AFTER_READ_S:
+            self._records.clear()
             return
         endpoints = {*self._context.registry}
-        self._answers = {e: a for e, a in self._answers.items() if e in endpoints}
-        due = sorted(filter(self._is_well, endpoints), key=self._ask_at)[:MOST_ASKED]
+        self._records = {e: r for e, r in self._records.items() if e in endpoints}
+        due = sorted(filter(self._may_be_asked, endpoints), key=self._ask_at)[:MOST_ASKED_NODES]
         await asyncio.gather(*(self._ask(e) for e in due if self._ask_at(e) <= now))
 
-    def _is_well(self, endpoint: Endpoint) -> bool:
+    def _may_be_asked(self, endpoint: Endpoint) -> bool:
         return endpoint.trusted and endpoint.health.steady and bool(endpoint.registrations)
 
     def _ask_at(self, endpoint: Endpoint) -> float:
-        answer = self._answers.get(endpoint)
-        return answer.ask_at if answer else 0.0
+        record = self._records.get(endpoint)
+        return record.ask_at if record else 0.0
 
     async def _ask(self, endpoint: Endpoint) -> None:
-        former = self._answers.get(endpoint, _Answer(0.0))
+        former = self._records.get(endpoint, _Record(0.0))
         slave = endpoint.slave
         within = self._context.settings.probe_timeout
         try:
@@ -94,20 +98,24 @@ class MessageCounter:
                 )
         except (Unreachable, MasterError) as error:
             log.debug("%s gives no message counts: %s", endpoint.label, error)
-            self._answers[endpoint] = self._after_failure(former, error)
+            self._records[endpoint] = self._after_failure(former, error)
             return
         if endpoint.slave != slave:
             return  # the node has moved meanwhile: another node may have answered
         stats = registered_stats(endpoint, read_bus_stats(reply))
-        self._answers[endpoint] = _Answer(self._context.now() + EVERY, stats)
-        # The proxy does not know since when the first answer counts, so the sums start there.
+        self._records[endpoint] = _Record(self._context.now() + ASK_INTERVAL_S, stats)
+        # The first answer also counts messages from before the proxy started, so the growth begins
+        # with this answer.
         since = stats if former.stats is None else former.stats
         for (direction, topic), count in growth(since, stats).items():
             self._sums.add(topic, SIDES[direction], count)
 
-    def _after_failure(self, former: _Answer, error: Exception) -> _Answer:
-        """The record of a node without counts. After silence, the last counts stay the base."""
+    def _after_failure(self, former: _Record, error: Exception) -> _Record:
+        """The record after a failed question.
+
+        If the node was only silent, its last counts remain the base of the next growth.
+        """
         now = self._context.now()
         if isinstance(error, Unreachable) and error.probe is not ProbeResult.ANSWERED:
-            return _Answer(now + AFTER_SILENCE, former.stats)
-        return _Answer(now + PATIENCE)
+            return _Record(now + INTERVAL_AFTER_SILENCE_S, former.stats)
+        return _Record(now + INTERVAL_AFTER_ERROR_S)

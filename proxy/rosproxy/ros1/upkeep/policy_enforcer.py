@@ -1,16 +1,16 @@
 """Enforce a changed policy: hide and show registrations, and cut connections.
 
-- The proxy takes back denied registrations at the master, and hides these registrations. Nodes
-  inside that use a hidden registration stay connected.
-- The proxy registers what the policy allows again.
+- The proxy takes back denied registrations at the master, and hides these registrations.
+  Connections between nodes inside stay.
+- The proxy registers hidden registrations at the master once the policy allows them.
 - The proxy cuts connections to denied topics and services: connections from outside, and
   connections from inside through stand-ins.
-- A node loses its fast port if the policy may deny a part of the node, because the proxy does not
-  check what the kernel forwards. If a rule concerns nodes outside, all stand-ins lose their fast
-  ports.
+- A node loses its fast port if the policy may deny one of its topics, because the proxy does not
+  check what the kernel forwards. If a rule concerns nodes outside, all stand-ins lose the second
+  port that the kernel forwards.
 
-All other connections and registrations stay. So the proxy may enforce a policy at any time, and
-repeats this until all steps have worked.
+All other connections and registrations stay, so the proxy can repeat the enforcement. The proxy
+does so until all steps have worked.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ from rosproxy.ros1.upkeep.registrar import Registrar
 
 log = logging.getLogger(__name__)
 
-ENFORCE_TICK = 0.5
+ENFORCE_INTERVAL_S = 0.5
 """Seconds between two checks whether the policy has changed."""
 
 
@@ -49,7 +49,7 @@ class PolicyEnforcer:
     _enforced_version: int = -1
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
-    async def look(self) -> None:
+    async def enforce_if_changed(self) -> None:
         """Enforce the policy if the policy has changed since the last time."""
         policy = self._context.policy
         if policy.must_enforce or self._enforced_version != policy.rules.version:
@@ -59,13 +59,17 @@ class PolicyEnforcer:
                 log.debug("the proxy could not enforce the policy yet: %s", error)
 
     async def enforce(self) -> EnforcementCounts:
-        """Hide, show and cut. Raises Unreachable, MasterError; cut connections stay cut."""
+        """Hide and show registrations, and cut connections. Return the counts.
+
+        Raises Unreachable, MasterError; cut connections stay cut.
+        """
         async with self._lock:
-            # Before the first await: the next look handles changes that happen meanwhile.
+            # Before the first await: the next check handles changes that happen meanwhile.
             policy = self._context.policy
             version = policy.rules.version
             policy.must_enforce = False
-            cut = self._cut_relays() + self._stand_ins.udpros.cut_denied() + self._take_fast_ports()
+            cut = self._cut_relays() + self._stand_ins.udpros.cut_denied()
+            cut += self._withdraw_fast_ports()
             try:
                 await self._recovery.ensure()
                 has_changed = version != self._enforced_version
@@ -81,10 +85,10 @@ class PolicyEnforcer:
         return enforced
 
     def _cut_relays(self) -> int:
-        """End the connections that the policy denies; return the number of these connections.
+        """End the relays that the policy denies. Return their number.
 
-        The name of an unregistered topic or service is unknown, so the policy may deny such a
-        connection as well.
+        The name of an unregistered topic or service is unknown. So the proxy ends the relay of such
+        a topic or service if any rule could deny it.
         """
         policy = self._context.policy
         count = 0
@@ -102,11 +106,15 @@ class PolicyEnforcer:
         policy = self._context.policy
         return policy.check_outside(relay.kind, relay.name, endpoint, relay.peer) is not None
 
-    def _take_fast_ports(self) -> int:
-        """Take fast ports from nodes that the policy may deny in part; the cut connections."""
+    def _withdraw_fast_ports(self) -> int:
+        """Withdraw the fast ports of nodes with a topic that the policy may deny.
+
+        Return the number of cut connections.
+        """
         policy = self._context.policy
         count = 0 if policy.inside_may_bypass() else self._stand_ins.close_fast_ports()
-        # Nodes inside have lost connections, and may need the publishers once more.
+        # Nodes inside have lost connections. If a node does not reconnect, the proxy sends the
+        # publishers to this node again.
         if count:
             self._leases.watch(self._context.registry)
         for endpoint in self._context.registry:
