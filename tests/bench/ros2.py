@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from rosproxy.ros2.ports.locator_ports import REMEMBERED
+from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S
 from tests.bench.book import DIRECT, Book, in_turn, loss, percentile
 from tests.bench.nodes import busy
 from tests.bench.ros import RosNode, running_node, wait_for_rest
@@ -191,7 +191,7 @@ def discovered(size: int) -> float:
 def measure_crowd(book: Book, size: int, idle: float) -> None:
     """Measure the same through the proxy, with the proxy's costs."""
     with world() as place, proxy(place, "auto") as pid:
-        time.sleep(REMEMBERED)  # now the proxy no longer waits for former participants
+        time.sleep(EVIDENCE_PERIOD_S)  # now the proxy no longer waits for former participants
         before = anonymous(pid)
         book.add("discovery, s", PATH, crowded(place, size), size)
         book.add("CPU when idle, ms/s", PATH, busy(pid, idle) * 1000, size)

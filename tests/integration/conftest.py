@@ -106,7 +106,7 @@ async def make_proxy(
 
     The proxies stop before the nodes: a node cannot close connections that are just being made.
     """
-    monkeypatch.setattr("rosproxy.ros1.stack.PROBE_TICK", 0.03)
+    monkeypatch.setattr("rosproxy.ros1.stack.PROBE_CHECK_INTERVAL_S", 0.03)
     made: list[Proxy] = []
 
     async def make(**options: Any) -> Proxy:

@@ -255,7 +255,7 @@ async def test_over_the_byte_budget_is_503_and_told(make_proxy, node):
 async def test_an_idle_reader_is_cut_and_a_slow_reader_is_not(proxy, master, monkeypatch):
     def cut_soon(sock: socket.socket) -> None:
         idles = sock.getpeername()[0] == NODE
-        sockets.end_if_stalled(sock, 1.0 if idles else sockets.WRITE_TIMEOUT)
+        sockets.end_if_stalled(sock, 1.0 if idles else sockets.WRITE_TIMEOUT_S)
 
     monkeypatch.setattr("rosproxy.ros1.servers.xmlrpc_server.end_if_stalled", cut_soon)
     master.answers["getParam"] = value("x" * 20_000_000)

@@ -8,7 +8,7 @@ import pytest
 from rosproxy.net import http_server
 from rosproxy.net.http_server import (
     IDLE_TIMEOUT_S,
-    MAX_QUEUED,
+    MOST_QUEUED_REQUESTS,
     REST_TIMEOUT_S,
     HttpConnection,
     HttpReply,
@@ -57,7 +57,7 @@ async def echo() -> AsyncIterator[Echo]:
 
 
 async def test_more_pipelined_requests_than_are_read_at_once_are_answered_in_order(echo):
-    count = 5 * MAX_QUEUED
+    count = 5 * MOST_QUEUED_REQUESTS
     async with connect(echo.address) as wire:
         await wire.send(b"".join(post(b"%d" % number) for number in range(count)))
         bodies = [(await wire.reply()).body for _ in range(count)]
@@ -70,7 +70,7 @@ async def test_while_requests_wait_no_more_are_read(echo):
         sending = asyncio.create_task(wire.send(post(b"x" * 1000) * 20_000))
         await wire.stalls()
         (connection,) = echo._connections
-        assert len(connection._requests) <= MAX_QUEUED
+        assert len(connection._requests) <= MOST_QUEUED_REQUESTS
         sending.cancel()
         wire.reset()
 
@@ -187,7 +187,7 @@ async def test_a_shutdown_waits_for_answers_and_cancels_late_ones(
 
 
 async def test_a_long_header_is_refused(echo):
-    long = "X-Long: " + "a" * 2 * http_server.MAX_LINE_BYTES
+    long = "X-Long: " + "a" * 2 * http_server.MOST_LINE_BYTES
     async with connect(echo.address) as wire:
         await wire.send(post(b"x", long))
         assert (await wire.reply()).status == 400

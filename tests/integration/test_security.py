@@ -152,7 +152,9 @@ async def test_the_master_can_not_redirect_the_proxy(proxy, master, victim):
 
 @pytest.mark.usefixtures("_as_if_not_loopback")
 async def test_the_proxys_own_ports_do_not_pass_for_nodes(make_proxy, master, node, monkeypatch):
-    monkeypatch.setattr("rosproxy.ros1.stack.PROBE_TICK", 60)  # a second probe would close the port
+    monkeypatch.setattr(
+        "rosproxy.ros1.stack.PROBE_CHECK_INTERVAL_S", 60
+    )  # a second probe would close the port
     proxy = await make_proxy()
     uri = f"http://{PROXY}:{proxy.settings.master_port}/"
     await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri)

@@ -20,7 +20,7 @@ from rosproxy.admin.replies import send_shared
 from rosproxy.admin.shared_document import SharedDocument
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.bounded_server import BoundedServer
-from rosproxy.net.sockets import BACKLOG
+from rosproxy.net.sockets import MOST_BACKLOG
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
 from rosproxy.setting_kinds import SettingError
@@ -73,7 +73,7 @@ class OperatorAdminServer:
         """Start to listen. Raises SettingError if the address can't be bound."""
         await self._runner.setup()
         try:
-            site = web.TCPSite(self._runner, listener.host, listener.port, backlog=BACKLOG)
+            site = web.TCPSite(self._runner, listener.host, listener.port, backlog=MOST_BACKLOG)
             await site.start()
         except OSError as error:
             text = f"{listener} can't be bound: {error.strerror}"

@@ -20,7 +20,7 @@ import kopf
 from aiohttp import web
 
 from rosproxy.net.bounded_server import BoundedServer
-from rosproxy.net.sockets import BACKLOG
+from rosproxy.net.sockets import MOST_BACKLOG
 from rosproxy_operator.common.operator_admin import MOST_CONNECTIONS
 from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.resources.names import INJECT
@@ -144,7 +144,7 @@ class ClusterServing:
         await liveness.setup()
         try:
             bind = self._settings.liveness
-            await web.TCPSite(liveness, bind.host, bind.port, backlog=BACKLOG).start()
+            await web.TCPSite(liveness, bind.host, bind.port, backlog=MOST_BACKLOG).start()
             started = time.monotonic()
             await self._run_kopf()
             failures = 1 if time.monotonic() - started > WELL else failures + 1

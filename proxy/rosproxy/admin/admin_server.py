@@ -39,7 +39,7 @@ from rosproxy.net.addresses import HostPort, is_loopback, plain_address
 from rosproxy.net.bounded_server import BoundedServer
 from rosproxy.net.fair_slots import FairSlots, NoSlot
 from rosproxy.net.http_client import CallFailed, TooLong, read_bounded
-from rosproxy.net.sockets import BACKLOG
+from rosproxy.net.sockets import MOST_BACKLOG
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +102,7 @@ class AdminServer:
         self._runner = web.ServerRunner(BoundedServer(self._answer, MOST_CONNECTIONS))
         await self._runner.setup()
         # With a full queue, TCP tries to connect again after 1 s: too late for a health check.
-        await web.TCPSite(self._runner, listener.host, listener.port, backlog=BACKLOG).start()
+        await web.TCPSite(self._runner, listener.host, listener.port, backlog=MOST_BACKLOG).start()
 
     async def stop(self) -> None:
         """Stop listening, and end all replies."""

@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 DATAGRAMS_PER_TURN = 64
 """Datagrams that a relay forwards in a round of the event loop."""
 LARGEST_DATAGRAM = 65_536
-RECEIVE_BUFFER = 1024 * 1024
+RECEIVE_BUFFER_BYTES = 1024 * 1024
 """Bytes that wait while the event loop is busy; Linux grants rmem_max at most."""
 
 
@@ -26,7 +26,7 @@ def bind(address: str, port: int) -> socket.socket:
     """A bound, non-blocking UDP socket; port 0 stands for any free port. Raises OSError."""
     sock = _socket(address)
     try:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         if sock.family == socket.AF_INET6:
             # `::` accepts IPv4, too, with any value of net.ipv6.bindv6only (ipv6(7)).
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)

@@ -11,7 +11,7 @@ from rosproxy.forwarding.relay import Relay
 
 log = logging.getLogger(__name__)
 
-STOP_TIMEOUT = 1.0
+STOP_TIMEOUT_S = 1.0
 """Seconds in which the relays may end when the server stops."""
 STARTS_PER_TURN = 64
 """Threads that start in a round of the event loop, if many subscribers leave at once."""
@@ -51,11 +51,11 @@ class OpenRelays:
         relay.start(finished, self._quiet_sockets.when_readable)
 
     async def stop(self) -> None:
-        """End all relays, and wait for STOP_TIMEOUT at most."""
+        """End all relays, and wait for STOP_TIMEOUT_S at most."""
         for relay in self:
             relay.end()
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(STOP_TIMEOUT):
+            async with asyncio.timeout(STOP_TIMEOUT_S):
                 await self._none_open.wait()
         if self._quiet_sockets is not None:
             self._quiet_sockets.close()

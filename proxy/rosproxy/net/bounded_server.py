@@ -9,12 +9,12 @@ from aiohttp import web
 
 from rosproxy.net.sockets import end_if_stalled
 
-SEND_BUFFER = 64 * 1024
+SEND_BUFFER_BYTES = 64 * 1024
 """Bytes of a reply that the kernel buffers; Linux doubles the value (socket(7), SO_SNDBUF).
 
 By default the kernel buffers up to 4 MB, even for a reader that takes nothing.
 """
-IDLE_TIMEOUT = 75.0
+IDLE_TIMEOUT_S = 75.0
 """Seconds in which the first request, and after a reply the next request, must arrive."""
 
 Answer = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
@@ -26,7 +26,7 @@ class BoundedServer(web.Server):
     def __init__(self, answer: Answer, most: int) -> None:
         # Compressed bodies stay compressed: a small body could expand to a very large body.
         super().__init__(
-            answer, access_log=None, keepalive_timeout=IDLE_TIMEOUT, auto_decompress=False
+            answer, access_log=None, keepalive_timeout=IDLE_TIMEOUT_S, auto_decompress=False
         )
         self.most = most
 
@@ -35,7 +35,7 @@ class BoundedServer(web.Server):
         sock = transport.get_extra_info("socket")
         end_if_stalled(sock)
         with contextlib.suppress(OSError):
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         source = _source(handler)
         same_source = [c for c in self.connections if _source(c) == source]
         open_connections = [c for c in same_source if c.transport is not None]

@@ -18,7 +18,7 @@ MOST_WAITING = 512
 """Waiting connections of a source at most. In ROS 1 the client sends first, at once."""
 LEAST_PER_SOURCE = 64
 """Connections that each source may have, even if there are few file descriptors."""
-SHARE = 4
+FILES_PER_CONNECTION = 4
 """A source may have a connection for every 4 file descriptors that the process may open. A relay
 takes two file descriptors, and up to four more for large transfers."""
 
@@ -44,7 +44,7 @@ class Gate:
 
     def bound(self, files: int) -> None:
         """Lower the bound of a source if the process may open only so many ``files``."""
-        most = max(files // SHARE, LEAST_PER_SOURCE)
+        most = max(files // FILES_PER_CONNECTION, LEAST_PER_SOURCE)
         if most < self.per_source:
             self.per_source = most
             self._few_files = files

@@ -31,10 +31,10 @@ REST_TIMEOUT_S = 10.0
 
 If the server closed the connection while the client still writes, the client would lose the reply.
 """
-MAX_LINE_BYTES = 4096
-MAX_HEADERS = 64
+MOST_LINE_BYTES = 4096
+MOST_HEADERS = 64
 """Most header lines of a request. ROS clients send five."""
-MAX_QUEUED = 8
+MOST_QUEUED_REQUESTS = 8
 """Most requests of a connection that wait for the reply to an earlier request."""
 
 
@@ -145,12 +145,12 @@ class HttpConnection(HttpProtocol):
             self,
             loop,
             READ_AHEAD_BYTES,
-            max_line_size=MAX_LINE_BYTES,
-            max_field_size=MAX_LINE_BYTES,
-            max_headers=MAX_HEADERS,
+            max_line_size=MOST_LINE_BYTES,
+            max_field_size=MOST_LINE_BYTES,
+            max_headers=MOST_HEADERS,
             payload_exception=BadBody,
             auto_decompress=False,
-            max_msg_queue_size=MAX_QUEUED,
+            max_msg_queue_size=MOST_QUEUED_REQUESTS,
         )
         super().__init__(loop, self._requests_parser)
         self.source = HostPort("", 0)
@@ -198,7 +198,7 @@ class HttpConnection(HttpProtocol):
             self._has_last = is_upgrade  # the server has no other protocol
         if messages or self._has_last:
             wake(self._arrival)
-        if len(self._requests) >= MAX_QUEUED and not self._buffer_paused:
+        if len(self._requests) >= MOST_QUEUED_REQUESTS and not self._buffer_paused:
             self._pause_reading_for_buffer()
 
     def eof_received(self) -> None:
@@ -265,9 +265,9 @@ class HttpConnection(HttpProtocol):
             return None
         message, content = self._requests.popleft()
         self._requests_parser.message_consumed()
-        if self._buffer_paused and len(self._requests) <= MAX_QUEUED // 2:
+        if self._buffer_paused and len(self._requests) <= MOST_QUEUED_REQUESTS // 2:
             self.data_received(b"")
-            if len(self._requests) < MAX_QUEUED:
+            if len(self._requests) < MOST_QUEUED_REQUESTS:
                 self._resume_reading_for_buffer()
         return HttpRequest(self, message, content)
 

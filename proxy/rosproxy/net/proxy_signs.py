@@ -13,7 +13,7 @@ from itertools import islice
 from rosproxy.net import signs
 from rosproxy.net.addresses import HostPort, is_address, parse_host_port
 
-MOST = 8
+MOST_SIGNS = 8
 """Proxies that a message names at most."""
 _SIGN = r"rosproxy/([12]{1,2})/(\d{1,5})-(\d{1,5})/([0-9A-Fa-z.:\[\]-]{1,60})"
 
@@ -52,7 +52,7 @@ def overlapping_proxies(
 
     ``admin``: the own admin endpoint, to leave the own sign out; None before the own sign exists.
     Before that, a sign with the same admin endpoint is of the same proxy, started twice. At most
-    MOST signs, and only signs with an IP address, where users can ask.
+    MOST_SIGNS signs, and only signs with an IP address, where users can ask.
     """
     proxies = (Sign(m[1], int(m[2]), int(m[3]), m[4]) for m in signs.read_all(_SIGN))
     overlapping = (
@@ -60,7 +60,9 @@ def overlapping_proxies(
         for s in proxies
         if ros in s.ros and s.first <= last and first <= s.last and s.admin != str(admin)
     )
-    return list(islice(dict.fromkeys(s for s in overlapping if _is_at_address(s.admin)), MOST))
+    return list(
+        islice(dict.fromkeys(s for s in overlapping if _is_at_address(s.admin)), MOST_SIGNS)
+    )
 
 
 def _is_at_address(admin: str) -> bool:

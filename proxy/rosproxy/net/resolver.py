@@ -19,7 +19,7 @@ from rosproxy.net.addresses import is_address, plain_address
 
 log = logging.getLogger(__name__)
 
-RESOLVE_TIMEOUT = 1.0
+RESOLVE_TIMEOUT_S = 1.0
 """Seconds after which a name counts as unresolvable."""
 MOST_LOOKUPS = 64
 """Look-ups that may be under way at once; above the bound a name counts as unresolvable."""
@@ -37,7 +37,7 @@ _running: dict[str, tuple[str, Future[list[str]]]] = {}
 
 
 async def resolve(host: str, source: str = "") -> list[str]:
-    """The addresses of a host name, IPv4 first; empty if unresolvable in RESOLVE_TIMEOUT.
+    """The addresses of a host name, IPv4 first; empty if unresolvable in RESOLVE_TIMEOUT_S.
 
     ``source``: the address of the node that gave the name, or NODES; empty for the proxy's names.
     """
@@ -45,7 +45,7 @@ async def resolve(host: str, source: str = "") -> list[str]:
         return [plain_address(host)]
     _, lookup = _running.get(host) or ("", _start(host, source))
     try:
-        async with asyncio.timeout(RESOLVE_TIMEOUT):
+        async with asyncio.timeout(RESOLVE_TIMEOUT_S):
             # Shielded: other callers may wait for the same look-up.
             return await asyncio.shield(asyncio.wrap_future(lookup))
     except TimeoutError:

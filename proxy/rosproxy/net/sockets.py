@@ -20,14 +20,14 @@ from rosproxy.net.tasks import Tasks
 
 log = logging.getLogger(__name__)
 
-BACKLOG = 1024
+MOST_BACKLOG = 1024
 """Connections that wait to be accepted at most. The next client tries again after a second."""
 ACCEPTS_PER_TURN = 64
-CONNECT_TIMEOUT = 5.0
+CONNECT_TIMEOUT_S = 5.0
 """Seconds in which a peer must accept a connection."""
-WRITE_TIMEOUT = 30.0
+WRITE_TIMEOUT_S = 30.0
 """Seconds in which a reader must take some of the bytes that wait for the reader."""
-SILENCE_TIMEOUT = 30.0
+SILENCE_TIMEOUT_S = 30.0
 """Seconds in which a client must send the expected bytes; then the proxy closes the connection."""
 
 Handler = Callable[[socket.socket, str], Awaitable[None]]
@@ -84,13 +84,13 @@ def listen_on(sock: socket.socket) -> None:
     such a connection still exists.
     """
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    sock.listen(BACKLOG)
+    sock.listen(MOST_BACKLOG)
 
 
 def listen(address: str, port: int) -> socket.socket:
     """A listening, non-blocking TCP socket. Raises OSError."""
     sock = bind(address, port)
-    sock.listen(BACKLOG)
+    sock.listen(MOST_BACKLOG)
     return sock
 
 
@@ -187,7 +187,7 @@ def begin_to_dial(target: HostPort) -> socket.socket:
     return sock
 
 
-async def dial(target: HostPort, within: float = CONNECT_TIMEOUT) -> socket.socket:
+async def dial(target: HostPort, within: float = CONNECT_TIMEOUT_S) -> socket.socket:
     """Connect to an IP address and port, non-blocking. Raises OSError, TimeoutError."""
     sock = socket.socket(_family(target.host), socket.SOCK_STREAM)
     sock.setblocking(False)
@@ -204,10 +204,10 @@ async def peek(conn: socket.socket, size: int) -> bytes:
     """The first ``size`` bytes of a connection, which stay in the buffer; fewer at an early end.
 
     The kernel wakes the reader only once ``size`` bytes have arrived (SO_RCVLOWAT), even if the
-    bytes arrive one by one. Raises TimeoutError after SILENCE_TIMEOUT, OSError.
+    bytes arrive one by one. Raises TimeoutError after SILENCE_TIMEOUT_S, OSError.
     """
     conn.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, size)
-    async with asyncio.timeout(SILENCE_TIMEOUT):
+    async with asyncio.timeout(SILENCE_TIMEOUT_S):
         await _readable(conn)
         first = conn.recv(size, socket.MSG_PEEK)
     conn.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, 1)
@@ -249,7 +249,7 @@ def hang_up(sock: socket.socket) -> None:
         sock.shutdown(socket.SHUT_RDWR)
 
 
-def end_if_stalled(sock: socket.socket, after: float = WRITE_TIMEOUT) -> None:
+def end_if_stalled(sock: socket.socket, after: float = WRITE_TIMEOUT_S) -> None:
     """Have the kernel end a connection whose peer takes no bytes for ``after`` seconds.
 
     A slow reader keeps the connection (tcp(7), TCP_USER_TIMEOUT). Only the kernel notices a reply

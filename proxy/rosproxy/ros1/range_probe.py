@@ -25,10 +25,10 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 
 log = logging.getLogger(__name__)
 
-TIMEOUT = 3.0
-MASTER_WAIT = 4.0
+PROBE_TIMEOUT_S = 3.0
+MASTER_TIMEOUT_S = 4.0
 """Seconds within which the master must call back. rosmaster calls back from three threads."""
-MAX_REQUEST = 65536
+MOST_REQUEST_BYTES = 65536
 
 
 @dataclass(slots=True, eq=False)
@@ -43,8 +43,8 @@ class _PortTrial:
         """Answer a caller that knows one of the secrets, in the way of a node."""
         loop = asyncio.get_running_loop()
         request = b""
-        async with asyncio.timeout(TIMEOUT):
-            while not self._recognize(request) and len(request) < MAX_REQUEST:
+        async with asyncio.timeout(PROBE_TIMEOUT_S):
+            while not self._recognize(request) and len(request) < MOST_REQUEST_BYTES:
                 chunk = await loop.sock_recv(conn, 4096)
                 if not chunk:
                     break
@@ -101,7 +101,7 @@ async def _dial(context: Context, trial: _PortTrial, target: HostPort) -> str:
     if not addresses:
         return "unresolvable"
     try:
-        async with asyncio.timeout(TIMEOUT):
+        async with asyncio.timeout(PROBE_TIMEOUT_S):
             reader, writer = await asyncio.open_connection(addresses[0], target.port)
     except TimeoutError:
         return "silent"
@@ -117,9 +117,9 @@ async def _await_greeting(
 ) -> str:
     answer = b""
     try:
-        async with asyncio.timeout(TIMEOUT):
+        async with asyncio.timeout(PROBE_TIMEOUT_S):
             writer.write(f"GET /{trial.proxy_secret} HTTP/1.0\r\n\r\n".encode())
-            while len(answer) < MAX_REQUEST and (chunk := await reader.read(4096)):
+            while len(answer) < MOST_REQUEST_BYTES and (chunk := await reader.read(4096)):
                 answer += chunk
     except TimeoutError:
         return "stranger"
@@ -135,7 +135,7 @@ async def _await_greeting(
 async def _ask_master(context: Context, trial: _PortTrial, target: HostPort) -> str:
     """Make the master call the port, as if the port were a node with a changed parameter."""
     try:
-        async with _subscribed(context, trial, target), asyncio.timeout(MASTER_WAIT):
+        async with _subscribed(context, trial, target), asyncio.timeout(MASTER_TIMEOUT_S):
             await trial.reached.wait()
     except TimeoutError:
         return "missed"

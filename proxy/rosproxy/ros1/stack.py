@@ -40,7 +40,7 @@ from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros_server import RATE_INTERVAL, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer
-from rosproxy.ros1.stand_ins.stand_in_ports import TIDY_INTERVAL, StandInPorts
+from rosproxy.ros1.stand_ins.stand_in_ports import TIDY_INTERVAL_S, StandInPorts
 from rosproxy.ros1.status import Ros1State
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
@@ -48,11 +48,11 @@ from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 from rosproxy.ros1.upkeep.message_counter import COUNT_INTERVAL_S, MessageCounter
 from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_INTERVAL_S, PolicyEnforcer
-from rosproxy.ros1.upkeep.prober import PROBE_TICK, Prober
+from rosproxy.ros1.upkeep.prober import PROBE_CHECK_INTERVAL_S, Prober
 from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
-from rosproxy.ros1.upkeep.resubscriber import RESUBSCRIBE_TICK, Resubscriber
+from rosproxy.ros1.upkeep.resubscriber import RESUBSCRIBE_INTERVAL_S, Resubscriber
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
 
@@ -151,10 +151,10 @@ class Ros1:
         context.metrics.registry.register(self._state)
         repeat = context.tasks.repeat
         repeat(self.master_monitor.look, settings.master_interval, "watching the master")
-        repeat(self.prober.look, PROBE_TICK, "probing nodes")
+        repeat(self.prober.look, PROBE_CHECK_INTERVAL_S, "probing nodes")
         repeat(self.leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
-        repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "checking subscribers")
-        repeat(self.stand_ins.tidy, TIDY_INTERVAL, "checking stand-ins for nodes outside")
+        repeat(self._resubscriber.look, RESUBSCRIBE_INTERVAL_S, "checking subscribers")
+        repeat(self.stand_ins.tidy, TIDY_INTERVAL_S, "checking stand-ins for nodes outside")
         repeat(self._messages.ask_due_nodes, COUNT_INTERVAL_S, "counting messages")
         repeat(self.tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         repeat(self._enforcer.enforce_if_changed, ENFORCE_INTERVAL_S, "enforcing the policy")

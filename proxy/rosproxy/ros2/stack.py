@@ -36,16 +36,16 @@ from rosproxy.net.interfaces import (
     interface_networks,
 )
 from rosproxy.net.resolver import resolve
-from rosproxy.ros2.discovery.discovery_participant import ANNOUNCE_INTERVAL
+from rosproxy.ros2.discovery.discovery_participant import ANNOUNCE_INTERVAL_S
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.domain_watch import DomainWatch
 from rosproxy.ros2.ports.kernel_ports import KernelPorts
-from rosproxy.ros2.ports.locator_ports import REMEMBERED
+from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S
 from rosproxy.ros2.ports.store import port_store_key
 from rosproxy.ros2.protocol.relay_proof import RelayProof
-from rosproxy.ros2.servers.domain_server import EXPIRY_INTERVAL, DomainServer
-from rosproxy.ros2.sources.selected import UPDATE_TIMEOUT
+from rosproxy.ros2.servers.domain_server import EXPIRY_INTERVAL_S, DomainServer
+from rosproxy.ros2.sources.selected import UPDATE_TIMEOUT_S
 from rosproxy.ros2.status import Ros2State
 from rosproxy.ros2.udp_probe import try_ports, try_udp
 from rosproxy.runtime import Runtime
@@ -55,11 +55,11 @@ from rosproxy.telemetry.text import listed
 
 log = logging.getLogger(__name__)
 
-REFRESH_INTERVAL = 5.0
+REFRESH_INTERVAL_S = 5.0
 """Seconds between checks of the networks, the addresses of peers, and the domain problems."""
-POLICY_INTERVAL = 0.5
+POLICY_INTERVAL_S = 0.5
 """Seconds between checks of the policy for changes."""
-RATE_INTERVAL = 2.0
+RATE_INTERVAL_S = 2.0
 """Seconds between samples of the rates."""
 
 
@@ -105,13 +105,13 @@ class Ros2:
         await self._refresh()
         if self._awaiting:
             tasks.spawn(self._await_policy(), "waiting for an operator's policy")
-        tasks.repeat(self._look_at_policy, POLICY_INTERVAL, "applying the policy")
+        tasks.repeat(self._look_at_policy, POLICY_INTERVAL_S, "applying the policy")
         for server in self.servers:
-            tasks.repeat(server.expire, EXPIRY_INTERVAL, "ending participants")
-            tasks.repeat(server.announce, ANNOUNCE_INTERVAL, "announcing the proxy")
-        tasks.repeat(self._refresh, REFRESH_INTERVAL, "checking networks and peers")
-        tasks.repeat(self._watch.look, REFRESH_INTERVAL, "checking connections of participants")
-        tasks.repeat(self._sample_rates, RATE_INTERVAL, "sampling rates")
+            tasks.repeat(server.expire, EXPIRY_INTERVAL_S, "ending participants")
+            tasks.repeat(server.announce, ANNOUNCE_INTERVAL_S, "announcing the proxy")
+        tasks.repeat(self._refresh, REFRESH_INTERVAL_S, "checking networks and peers")
+        tasks.repeat(self._watch.look, REFRESH_INTERVAL_S, "checking connections of participants")
+        tasks.repeat(self._sample_rates, RATE_INTERVAL_S, "sampling rates")
 
     def _start_servers(self) -> None:
         """Start a server for each domain. Raises SettingError."""
@@ -140,7 +140,7 @@ class Ros2:
                 self._is_inside,
                 self.plane.syncer.note_change,
                 # With a token an operator is expected, which selects addresses.
-                UPDATE_TIMEOUT if settings.admin_token_hash else 0.0,
+                UPDATE_TIMEOUT_S if settings.admin_token_hash else 0.0,
             )
             server.domain.ports.note_forwarded(self.plane.forwards)
             self.servers.append(server)
@@ -231,7 +231,7 @@ class Ros2:
 
     async def _forget_former(self) -> None:
         """End former forwards of the kernel that no participant has claimed since the start."""
-        await asyncio.sleep(REMEMBERED)
+        await asyncio.sleep(EVIDENCE_PERIOD_S)
         self._kernel_ports.note_former({})
         self.plane.syncer.note_change()
 

@@ -19,7 +19,7 @@ from rosproxy.runtime import Runtime
 
 ATTEMPTS = 3
 """Datagrams that the proxy sends, because UDP may lose some."""
-WITHIN = 1.0
+ARRIVAL_TIMEOUT_S = 1.0
 """Seconds in which each of these datagrams may arrive."""
 
 
@@ -36,7 +36,7 @@ async def try_udp(target: HostPort, secret: bytes, heard: asyncio.Event) -> str:
             except OSError:
                 return "unreachable"
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(WITHIN):
+                async with asyncio.timeout(ARRIVAL_TIMEOUT_S):
                     await heard.wait()
                 return "ok"
     return "silent"

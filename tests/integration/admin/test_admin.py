@@ -251,7 +251,7 @@ async def test_probe_while_the_master_is_away(proxy: Proxy, master: FakeMaster) 
 async def test_probe_tells_that_the_master_does_not_get_through(
     make_proxy: MakeProxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 0.3)
+    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_TIMEOUT_S", 0.3)
     master.calls_back = False
     proxy = await make_proxy()
     (attempt,) = await probe(proxy)  # the master is not sent into the void twice
@@ -277,7 +277,7 @@ async def test_probe_of_one_free_port(make_proxy: MakeProxy) -> None:
 async def test_probe_finds_an_address_where_nobody_listens(
     make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 0.3)
+    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_TIMEOUT_S", 0.3)
     proxy = await make_proxy(advertise_host=DEAD_HOST, bind="127.0.2.1")
     assert {p["from_proxy"] for p in await probe(proxy)} == {"refused"}
 
@@ -285,7 +285,7 @@ async def test_probe_finds_an_address_where_nobody_listens(
 async def test_probe_finds_a_name_that_nobody_knows(
     make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 0.3)
+    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_TIMEOUT_S", 0.3)
     proxy = await make_proxy(advertise_host="nobody.invalid")
     assert {p["from_proxy"] for p in await probe(proxy)} == {"unresolvable"}
 
@@ -298,8 +298,8 @@ async def test_probe_finds_somebody_else(
     make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch, answer: bytes | None, outcome: str
 ) -> None:
     """The advertised port leads elsewhere: to a program that talks, hangs up, or says nothing."""
-    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 0.2)
-    monkeypatch.setattr("rosproxy.ros1.range_probe.TIMEOUT", 0.5)
+    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("rosproxy.ros1.range_probe.PROBE_TIMEOUT_S", 0.5)
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(answer or b"")
@@ -317,8 +317,8 @@ async def test_probe_is_not_deceived_by_who_knows_no_secret(
     make_proxy: MakeProxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stranger that calls the port under test does not count for the master."""
-    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 0.6)
-    monkeypatch.setattr("rosproxy.ros1.range_probe.TIMEOUT", 0.5)
+    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_TIMEOUT_S", 0.6)
+    monkeypatch.setattr("rosproxy.ros1.range_probe.PROBE_TIMEOUT_S", 0.5)
     master.calls_back = False
     proxy = await make_proxy(ports=1)
     trying = asyncio.create_task(probe(proxy))

@@ -215,7 +215,7 @@ async def test_a_node_that_hangs_is_not_waited_for(
     make_proxy: MakeProxy, node: FakeNode, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "rosproxy.ros1.upkeep.containers.YOUNG_NODE_AGE", -1.0
+        "rosproxy.ros1.upkeep.containers.YOUNG_NODE_AGE_S", -1.0
     )  # the node is not young
     proxy = await make_proxy(**PATIENT, probe_timeout=10.0)
     await node.publish(proxy.master)
@@ -232,7 +232,7 @@ async def test_a_node_that_has_just_registered_may_take_its_time(
     make_proxy: MakeProxy, node: FakeNode, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A restarted container has its address again before the update that it was gone."""
-    monkeypatch.setattr("rosproxy.ros1.upkeep.containers.SECOND_CHANCE", 0.6)
+    monkeypatch.setattr("rosproxy.ros1.upkeep.containers.SECOND_PROBE_DELAY_S", 0.6)
     proxy = await make_proxy(**PATIENT)
     await node.publish(proxy.master)
     node.hang = True

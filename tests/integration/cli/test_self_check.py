@@ -334,7 +334,7 @@ async def test_a_node_gets_a_port_during_its_trial(
 ) -> None:
     """The proxy tries its range just when nodes start, and roscpp never registers again."""
     monkeypatch.setattr(master, "_notify", lambda *_: None)  # its call does not arrive
-    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 1.0)
+    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_TIMEOUT_S", 1.0)
     proxy = await make_proxy(ports=1)
     leases = proxy.ros1.leases
     context = proxy.ros1.context

@@ -124,7 +124,7 @@ async def test_a_range_full_of_fast_ports_is_probed_through_one_of_them(
     make_proxy, make_node, kernel, monkeypatch
 ):
     """Fast ports count as free for the probe."""
-    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 0.3)
+    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_TIMEOUT_S", 0.3)
     proxy = await make_proxy(data_plane="auto", ports=4)
     nodes = [await make_node("/a"), await make_node("/b", OTHER_NODE)]
     for node in nodes:

@@ -237,7 +237,7 @@ async def test_what_somebody_else_changed_is_put_right(bench: Bench) -> None:
 async def test_a_plane_that_is_lost_is_told_and_comes_back(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(syncer, "RETRY_LOST", 0.0)
+    monkeypatch.setattr(syncer, "LOST_TABLE_RETRY_S", 0.0)
     endpoint = await bench.forwarded()
     endpoint.fast_peers = {"198.51.100.2": 1}
     bench.tools.failing = 2
@@ -268,7 +268,7 @@ async def test_who_is_not_answered_gets_back_to_user_space(bench: Bench) -> None
     bench.tools.flows = bench.flow(45002, "SYN_SENT")
     await bench.plane.look()
     assert bench.plane.syncer.may_forward(endpoint)
-    bench.later = kernel_plane.UNANSWERED_PATIENCE
+    bench.later = kernel_plane.UNANSWERED_TIMEOUT_S
     await bench.plane.look()
     assert bench.tools.forwards == {}
     waiting = False, ("--mark", Marks(11311).port_selector(45002), "--state", "SYN_SENT")

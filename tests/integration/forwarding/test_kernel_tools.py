@@ -145,7 +145,7 @@ async def test_a_long_list_keeps_the_loop_for_one_piece_at_a_time(programs: Path
     text = "".join(pieces)
     assert text.splitlines()[-1] == f"line {count:08} of a flood of connections"
     assert text.count("\n") == count
-    assert max(map(len, pieces)) < kernel_tools.PIECE + 100
+    assert max(map(len, pieces)) < kernel_tools.PIECE_BYTES + 100
     assert all(piece.endswith("\n") for piece in pieces)
     assert len(set(turns_before)) == len(turns_before), "other tasks have a turn between two pieces"
 
@@ -153,7 +153,7 @@ async def test_a_long_list_keeps_the_loop_for_one_piece_at_a_time(programs: Path
 async def test_a_list_without_end_is_read_in_part(
     programs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(kernel_tools, "LONGEST_LIST", 100_000)
+    monkeypatch.setattr(kernel_tools, "LONGEST_LIST_BYTES", 100_000)
     program(programs, "conntrack", "exec /usr/bin/yes connection")
     pieces: list[str] = []
     await Tools().list_flows(pieces.append, False)
@@ -169,7 +169,7 @@ async def test_a_list_that_fails_says_what_to_do(
     (programs / "conntrack").write_text("#!/no/such/shell\n")
     with pytest.raises(ToolError, match="can't run"):
         await Tools().list_flows(print, False)
-    monkeypatch.setattr(kernel_tools, "TIMEOUT", 0.2)
+    monkeypatch.setattr(kernel_tools, "RUN_TIMEOUT_S", 0.2)
     program(programs, "conntrack", "exec /bin/sleep 30")
     with pytest.raises(ToolError, match="did not end"):
         await Tools().list_flows(print, False)
@@ -186,7 +186,7 @@ async def test_deleting_nothing_is_no_failure(programs: Path) -> None:
 async def test_a_program_that_hangs_is_ended(
     programs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(kernel_tools, "TIMEOUT", 0.2)
+    monkeypatch.setattr(kernel_tools, "RUN_TIMEOUT_S", 0.2)
     program(programs, "nft", "exec /bin/sleep 30")
     with pytest.raises(ToolError, match="did not end"):
         await Tools().nft("list", "chains")

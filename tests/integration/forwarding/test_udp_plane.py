@@ -136,7 +136,7 @@ async def test_another_address_of_the_proxy_is_followed(
     bench.map()
     await bench.forwarding({45001: LOCATOR})
     monkeypatch.setattr(syncer, "route_towards", lambda address: Route("192.0.2.9", 1500))
-    bench.later = syncer.ROUTE_TTL
+    bench.later = syncer.ROUTE_AGE_S
     await bench.plane.look()
     await until(lambda: set(bench.sources.values()) == {"192.0.2.9"}, "the source is replaced")
 

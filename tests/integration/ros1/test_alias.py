@@ -378,7 +378,7 @@ async def test_the_problem_of_a_node_that_has_ended_is_forgotten(
         await robot.stop()
         await proxy.ros1.stand_ins.tidy()
         assert set(problems(proxy)) == {robot.service_api}
-        monkeypatch.setattr("rosproxy.ros1.stand_ins.stand_in_ports.SERVICE_PROBLEM", 0.0)
+        monkeypatch.setattr("rosproxy.ros1.stand_ins.stand_in_ports.SERVICE_PROBLEM_KEPT_S", 0.0)
         await proxy.ros1.stand_ins.tidy()
         assert problems(proxy) == {}
 

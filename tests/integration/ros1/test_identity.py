@@ -413,7 +413,7 @@ async def test_stale_claims_do_not_keep_a_port_from_a_node_that_lives(
     kind: str,
 ) -> None:
     """Eight registrations of dead nodes held eight ports; the next node got none, for ever."""
-    monkeypatch.setattr("rosproxy.ros1.upkeep.recovery.CLAIM_GRACE", 0.2)
+    monkeypatch.setattr("rosproxy.ros1.upkeep.recovery.CLAIM_GRACE_S", 0.2)
     former = await make_proxy()
     await former.stop()
     ports = former.settings.ports.listen

@@ -116,7 +116,7 @@ async def test_a_malformed_header_is_answered_with_an_error(proxy, node, header)
 
 
 async def test_a_header_that_never_ends_costs_a_time_out(proxy, node, monkeypatch):
-    monkeypatch.setattr("rosproxy.net.sockets.SILENCE_TIMEOUT", 0.2)
+    monkeypatch.setattr("rosproxy.net.sockets.SILENCE_TIMEOUT_S", 0.2)
     await node.publish(proxy.master)
     for sent in (b"", b"\x01\0", topic_header()[:-1]):
         async with connect(proxy.lease(node)) as wire:

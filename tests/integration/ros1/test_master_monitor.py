@@ -66,7 +66,7 @@ async def test_a_proxy_that_is_its_own_master_says_so(make_proxy, caplog):
 async def test_a_master_that_hangs_is_noticed_long_before_its_calls_time_out(
     master, make_proxy, monkeypatch
 ):
-    monkeypatch.setattr("rosproxy.ros1.upkeep.master_monitor.LOOK_TIMEOUT", 0.2)
+    monkeypatch.setattr("rosproxy.ros1.upkeep.master_monitor.PID_TIMEOUT_S", 0.2)
     proxy = await make_proxy(master_interval=0.05)
     await until(lambda: proxy.app.status()["master"]["up"], "the master is up")
     master.answers["getPid"] = End.HANG

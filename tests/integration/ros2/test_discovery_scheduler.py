@@ -7,8 +7,12 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import Outgoing
-from rosproxy.ros2.servers.discovery_scheduler import LONGEST_ROUND, ROUND, DiscoveryScheduler
-from rosproxy.ros2.sources.fair_queue import MOST_OF_SOURCE, OVERHEAD
+from rosproxy.ros2.servers.discovery_scheduler import (
+    LONGEST_ROUND_BYTES,
+    ROUND_BYTES,
+    DiscoveryScheduler,
+)
+from rosproxy.ros2.sources.fair_queue import MOST_OF_SOURCE, OVERHEAD_BYTES
 from rosproxy.ros2.sources.rates import Standing
 
 
@@ -31,7 +35,7 @@ async def test_something_else_runs_between_two_long_datagrams() -> None:
     reader = DiscoveryScheduler()
     names = list[str]()
     for _ in range(3):
-        reader.put("robot", Standing.PROVEN, ROUND, reading(names, "robot"))
+        reader.put("robot", Standing.PROVEN, ROUND_BYTES, reading(names, "robot"))
     for count in (1, 2, 3):
         asyncio.get_running_loop().call_soon(names.append, f"else {count}")
         await until_read(names, 2 * count)
@@ -74,16 +78,16 @@ async def test_a_round_is_longer_after_much_has_come() -> None:
     """With rounds of the same length, receiving from a crowd takes all the time."""
     reader = DiscoveryScheduler()
     names = list[str]()
-    count = ROUND // OVERHEAD
+    count = ROUND_BYTES // OVERHEAD_BYTES
     for _ in range(4 * count):
         reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
     await asyncio.sleep(0)
     assert len(names) == 4 * count
-    for _ in range(2 * LONGEST_ROUND // OVERHEAD):
+    for _ in range(2 * LONGEST_ROUND_BYTES // OVERHEAD_BYTES):
         reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
     names.clear()
     await asyncio.sleep(0)
-    assert len(names) == LONGEST_ROUND // OVERHEAD
+    assert len(names) == LONGEST_ROUND_BYTES // OVERHEAD_BYTES
 
 
 async def test_what_comes_while_none_waits_is_read_at_once() -> None:
@@ -150,11 +154,11 @@ async def test_nothing_is_read_after_the_end() -> None:
 
 
 async def test_what_has_no_room_is_told() -> None:
-    count = MOST_OF_SOURCE // (ROUND + OVERHEAD)
+    count = MOST_OF_SOURCE // (ROUND_BYTES + OVERHEAD_BYTES)
     reader = DiscoveryScheduler()
     names = list[str]()
     has_room = [
-        reader.put("many", Standing.PROVEN, ROUND, reading(names, "many")) for _ in range(200)
+        reader.put("many", Standing.PROVEN, ROUND_BYTES, reading(names, "many")) for _ in range(200)
     ]
     assert has_room == [True] * count + [False] * (200 - count)
     await until_read(names, count)

@@ -14,12 +14,12 @@ from rosproxy.forwarding.datagrams import bind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import DomainSettings, Outgoing
-from rosproxy.ros2.ports.former_ports import ANSWER_TIME
-from rosproxy.ros2.ports.locator_ports import REMEMBERED, SETTLING
+from rosproxy.ros2.ports.former_ports import ANSWER_TIMEOUT_S
+from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S, SETTLING_PERIOD_S
 from rosproxy.ros2.ports.stand_ins import stand_in_port
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
-from rosproxy.ros2.servers.domain_server import ADMISSION_TIMEOUT, DomainServer
+from rosproxy.ros2.servers.domain_server import ADMISSION_TIMEOUT_S, DomainServer
 from rosproxy.ros2.sources.fair_queue import DiscoveryQueue
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing
 from tests.integration.net import PATIENCE, until
@@ -59,7 +59,7 @@ def settings_of(count: int = 16) -> DomainSettings:
 @pytest.fixture
 async def server() -> AsyncIterator[DomainServer]:
     """A server that has been running for a long time."""
-    times = chain([0.0], repeat(REMEMBERED + 1))
+    times = chain([0.0], repeat(EVIDENCE_PERIOD_S + 1))
     started = DomainServer(
         settings_of(), PROXY, times.__next__, lambda address: address == INSIDE, lambda: None
     )
@@ -152,7 +152,7 @@ async def test_an_unselected_source_has_an_allowance_of_discovery(
 
 async def test_participants_that_have_waited_are_admitted_in_turn() -> None:
     """Admitting 64 participants with claims at once blocks the event loop for 0.6 s."""
-    times = chain([0.0], repeat(SETTLING + ANSWER_TIME))
+    times = chain([0.0], repeat(SETTLING_PERIOD_S + ANSWER_TIMEOUT_S))
     server = DomainServer(
         settings_of(64), PROXY, times.__next__, lambda address: address == INSIDE, lambda: None
     )
@@ -164,7 +164,7 @@ async def test_participants_that_have_waited_are_admitted_in_turn() -> None:
     table = server.domain.inside.by_prefix
     await server.expire()
     assert not table
-    server.domain.heard_inside(dispose_message(prefixes[-1]), INSIDE, SETTLING)
+    server.domain.heard_inside(dispose_message(prefixes[-1]), INSIDE, SETTLING_PERIOD_S)
     counts = list[int]()
     while len(table) < len(prefixes) - 1:
         await asyncio.sleep(0)
@@ -184,13 +184,13 @@ async def test_a_participant_whose_turn_is_lost_gets_another_one() -> None:
     )
     server.start()
     server.domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
-    now = SETTLING + ANSWER_TIME
+    now = SETTLING_PERIOD_S + ANSWER_TIMEOUT_S
     await server.expire()
     server._scheduler._queue = DiscoveryQueue()
     for _ in range(3):
         await asyncio.sleep(0)
     assert not server.domain.inside.by_prefix
-    now += ADMISSION_TIMEOUT
+    now += ADMISSION_TIMEOUT_S
     await server.expire()
     for _ in range(3):
         await asyncio.sleep(0)

@@ -20,7 +20,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.lan_relay import sources
 from rosproxy.ros2.lan_relay.relay import LanRelay, LanRelaySettings
-from rosproxy.ros2.ports.locator_ports import REMEMBERED
+from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S
 from rosproxy.ros2.protocol.relay_envelope import address_lists
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import source_prefix
@@ -69,7 +69,7 @@ class Boundary:
             is_inside=lambda address: address == INSIDE,
             relay=LanRelayLink(self.bind, RelayProof(secret, time.time)),
         )
-        times = chain([0.0], count(REMEMBERED + 1))  # each datagram comes a second later
+        times = chain([0.0], count(EVIDENCE_PERIOD_S + 1))  # each datagram comes a second later
         self.server = DomainServer(
             settings,
             PROXY,

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.forwarding.kernel.decisions import (
-    LONGEST_PAUSE,
+    LONGEST_PAUSE_S,
     HostForwarding,
     Pauses,
     changes,
@@ -153,7 +153,7 @@ def test_a_forward_without_answer_is_not_made_for_longer_each_time() -> None:
             now += 2.5
         lasted.append(now - start)
     assert lasted[:3] == [5.0, 10.0, 20.0]
-    assert lasted[-2:] == [LONGEST_PAUSE] * 2
+    assert lasted[-2:] == [LONGEST_PAUSE_S] * 2
     assert pauses.why(45050, HostPort(NODE, 50001), now) is None
 
 

@@ -40,7 +40,7 @@ class NameServer:
 async def server(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[NameServer]:
     made = NameServer()
     monkeypatch.setattr(socket, "getaddrinfo", made.getaddrinfo)
-    monkeypatch.setattr(resolver, "RESOLVE_TIMEOUT", 0.01)
+    monkeypatch.setattr(resolver, "RESOLVE_TIMEOUT_S", 0.01)
     monkeypatch.setattr(resolver, "_running", {})
     yield made
     made.ended.set()

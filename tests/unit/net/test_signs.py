@@ -3,7 +3,7 @@
 from contextlib import ExitStack, closing
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.net.proxy_signs import MOST, Sign, overlapping_proxies, publish_sign
+from rosproxy.net.proxy_signs import MOST_SIGNS, Sign, overlapping_proxies, publish_sign
 
 
 def test_a_sign_is_read_while_it_stands_and_where_the_ports_overlap() -> None:
@@ -30,11 +30,11 @@ def test_a_sign_is_read_while_it_stands_and_where_the_ports_overlap() -> None:
 
 def test_whoever_puts_up_many_signs_is_not_told_at_length() -> None:
     with ExitStack() as stack:
-        for number in range(MOST + 3):
+        for number in range(MOST_SIGNS + 3):
             for host in ("127.0.0.1", "ask.me.example"):
                 sign = publish_sign(("1",), 61100, 61109, HostPort(host, 61400 + number))
                 assert sign
                 stack.enter_context(closing(sign))
         proxies = overlapping_proxies("1", 61100, 61109, HostPort("127.0.0.1", 1))
-        assert len(proxies) == MOST
+        assert len(proxies) == MOST_SIGNS
         assert {proxy.admin.partition(":")[0] for proxy in proxies} == {"127.0.0.1"}

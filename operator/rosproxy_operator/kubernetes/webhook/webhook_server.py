@@ -15,7 +15,7 @@ import kopf
 from aiohttp import web
 
 from rosproxy.net.addresses import HostPort, plain_address
-from rosproxy.net.bounded_server import IDLE_TIMEOUT
+from rosproxy.net.bounded_server import IDLE_TIMEOUT_S
 from rosproxy.net.budget import Budget, Charge, OverBudget
 from rosproxy.net.http_client import TooLong, read_bounded
 from rosproxy_operator.kubernetes.status.events import stamp
@@ -94,7 +94,7 @@ class WebhookServer:
             application,
             access_log=None,
             shutdown_timeout=END_TIMEOUT_S,
-            keepalive_timeout=IDLE_TIMEOUT,
+            keepalive_timeout=IDLE_TIMEOUT_S,
             # A small compressed body may become a very large body.
             auto_decompress=False,
         )

@@ -8,7 +8,7 @@ from rosproxy.forwarding.kernel.conntrack import OpenConnections
 from rosproxy.forwarding.kernel.nft import Counters, Counts
 from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
 
-SILENCE_WINDOW = 2.0
+SILENCE_WINDOW_S = 2.0
 """Seconds at least in which the proxy waits for bytes from the node behind a port."""
 
 
@@ -67,7 +67,7 @@ class UnansweredPorts:
         for port, (sent, received, _) in deltas.items():
             total_sent, total_received = self._bytes.get(port, (0, 0))
             self._bytes[port] = total_sent + sent, total_received + received
-        if now - self._window_start < SILENCE_WINDOW:
+        if now - self._window_start < SILENCE_WINDOW_S:
             return []
         silent = {port for port, (sent, received) in self._bytes.items() if received and not sent}
         unanswered = silent & self._silent_before

@@ -15,9 +15,9 @@ from rosproxy.net.addresses import HostPort, Route, is_loopback
 Forwards = Mapping[int, HostPort]
 """The address and port of the target for each forwarded port."""
 
-FIRST_PAUSE = 5.0
+FIRST_PAUSE_S = 5.0
 """Seconds of the first pause of a forward whose node has not answered; each failure doubles it."""
-LONGEST_PAUSE = 3600.0
+LONGEST_PAUSE_S = 3600.0
 """Seconds of a pause at most."""
 
 
@@ -134,8 +134,8 @@ class Pauses:
 
     def note(self, port: int, target: HostPort, why: str, now: float) -> None:
         """Note a failure at the time ``now``; each further pause is twice as long."""
-        _, pause, _ = self._until.get((port, target), (0.0, FIRST_PAUSE / 2, ""))
-        pause = min(2 * pause, LONGEST_PAUSE)
+        _, pause, _ = self._until.get((port, target), (0.0, FIRST_PAUSE_S / 2, ""))
+        pause = min(2 * pause, LONGEST_PAUSE_S)
         self._until[port, target] = now + pause, pause, why
 
     def why(self, port: int, target: HostPort, now: float) -> str | None:

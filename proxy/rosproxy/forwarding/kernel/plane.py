@@ -32,9 +32,9 @@ from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
 
-LOOK_INTERVAL = 3.0
+READ_INTERVAL_S = 3.0
 """Seconds between readings of the kernel's counters and connections."""
-UNANSWERED_PATIENCE = 3.0
+UNANSWERED_TIMEOUT_S = 3.0
 """Seconds after which user space takes over a connection that the node does not answer."""
 
 
@@ -64,7 +64,7 @@ class KernelPlane:
         self._table = table
         self._accounts = KernelAccounts()
         self.syncer = ForwardSyncer(endpoints, table, self._accounts, problems, clock, near)
-        self._unanswered = conntrack.Watch(UNANSWERED_PATIENCE)
+        self._unanswered = conntrack.Watch(UNANSWERED_TIMEOUT_S)
         self.traffic = Traffic()
         self.total = Counts()
         self._is_wanted = settings.data_plane in ("auto", "kernel")
@@ -90,7 +90,7 @@ class KernelPlane:
         self._report()
         if self.syncer.usable:
             self._tasks.repeat(self.syncer.run_once, 0, f"forwarding {self.syncer.traffic}")
-            self._tasks.repeat(self.look, LOOK_INTERVAL, "reading the kernel's counters")
+            self._tasks.repeat(self.look, READ_INTERVAL_S, "reading the kernel's counters")
 
     async def stop(self) -> None:
         """Remove the table, and the tracked connections. Call this after the end of all tasks."""

@@ -36,12 +36,12 @@ log = logging.getLogger(__name__)
 Clock = Callable[[], float]
 """Seconds of the monotonic clock."""
 SUBJECT = "data plane"
-RETRY_LOST = 30.0
+LOST_TABLE_RETRY_S = 30.0
 """Seconds between attempts to make a lost table again."""
 
-SYNC_PATIENCE = 1.0
+FORWARD_TIMEOUT_S = 1.0
 """Seconds for which the requestTopic of a subscriber waits for the forward at most."""
-ROUTE_TTL = 60.0
+ROUTE_AGE_S = 60.0
 """Seconds after which the routes to nodes are read again."""
 
 
@@ -102,11 +102,11 @@ class ForwardSyncer:
                 self.why_not = None
 
     async def regain(self) -> bool:
-        """Make a lost table again, if RETRY_LOST is over; return whether that succeeded."""
+        """Make a lost table again, if LOST_TABLE_RETRY_S is over; return whether that succeeded."""
         if self._clock() < self._retry_at:
             return False
         await self.begin()
-        self._retry_at = float("inf") if self.usable else self._clock() + RETRY_LOST
+        self._retry_at = float("inf") if self.usable else self._clock() + LOST_TABLE_RETRY_S
         return self.usable
 
     def look_around(self) -> None:
@@ -116,7 +116,7 @@ class ForwardSyncer:
         self._host = read_forwarding()
         if self._clock() > self._routes_until:
             self._routes = {}
-            self._routes_until = self._clock() + ROUTE_TTL
+            self._routes_until = self._clock() + ROUTE_AGE_S
 
     def note_change(self, endpoint: LeaseHolder | None = None) -> None:
         """Note that an endpoint may have changed; None: any endpoint."""
@@ -157,7 +157,7 @@ class ForwardSyncer:
     async def forwards(self, endpoint: LeaseHolder, node_port: int) -> bool:
         """Whether the fast port of an endpoint leads to a TCPROS port of the node.
 
-        Waits for the forward for SYNC_PATIENCE at most.
+        Waits for the forward for FORWARD_TIMEOUT_S at most.
         """
 
         def leads() -> bool:
@@ -171,7 +171,7 @@ class ForwardSyncer:
         return leads()
 
     async def cleared(self, port: int) -> None:
-        """Wait until the kernel no longer forwards a port, for SYNC_PATIENCE at most."""
+        """Wait until the kernel no longer forwards a port, for FORWARD_TIMEOUT_S at most."""
         await self._wait_until(lambda: not self.usable or port not in self._table.forwards)
 
     async def read_kernel(self) -> tuple[Counters, Survey | None] | None:
@@ -230,9 +230,9 @@ class ForwardSyncer:
         return Surroundings(self._near(), {host: self._route(host).source for host in hosts})
 
     async def _wait_until(self, condition: Callable[[], bool]) -> None:
-        """Wait until the worker has made a condition true, for SYNC_PATIENCE at most."""
+        """Wait until the worker has made a condition true, for FORWARD_TIMEOUT_S at most."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(SYNC_PATIENCE):
+            async with asyncio.timeout(FORWARD_TIMEOUT_S):
                 while not condition():
                     await self._synced.wait()
 
@@ -262,7 +262,7 @@ class ForwardSyncer:
         except ToolError as error:
             self._all_changed = True
             self.why_not = str(error)
-            self._retry_at = self._clock() + RETRY_LOST
+            self._retry_at = self._clock() + LOST_TABLE_RETRY_S
             self._accounts.note_peers({})
             text = f"the kernel no longer forwards {self.traffic}: {error}"
             log.error("%s", text)

@@ -10,7 +10,7 @@ from rosproxy.forwarding.kernel.decisions import Changes, Forwards, changes
 from rosproxy.forwarding.kernel.nft import Counters, NftError, Surroundings, Table, TableState
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 
-RESET_TIME = 0.3
+RESET_PERIOD_S = 0.3
 """Seconds for which the table resets connections before the kernel forgets these connections."""
 
 log = logging.getLogger(__name__)
@@ -144,15 +144,15 @@ class TrackedTable(KernelTable):
     async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
         """End the connections through ports with resets.
 
-        ``ports`` are pairs of a port and True for IPv6. For RESET_TIME, the next packet of the peer
-        gets a reset. A mere acknowledgement is enough: a subscriber sends nothing else, and rospy
-        connects again only after the end of its connection. Then the kernel forgets the
+        ``ports`` are pairs of a port and True for IPv6. For RESET_PERIOD_S, the next packet of the
+        peer gets a reset. A mere acknowledgement is enough: a subscriber sends nothing else, and
+        rospy connects again only after the end of its connection. Then the kernel forgets the
         connections, and a packet from either end gets a reset.
         """
         numbers = {port for port, _ in ports}
         try:
             await self.tools.nft("-f", "-", document=self._connections.cut(numbers))
-            await asyncio.sleep(RESET_TIME)
+            await asyncio.sleep(RESET_PERIOD_S)
             await self.forget(ports)
             await self.tools.nft("-f", "-", document=self._connections.cut(numbers, "delete"))
         except ToolError as error:
@@ -163,7 +163,7 @@ class TrackedTable(KernelTable):
         if self.forwards:
             try:
                 await self.tools.nft("-f", "-", document=self._connections.ended())
-                await asyncio.sleep(RESET_TIME)
+                await asyncio.sleep(RESET_PERIOD_S)
             except ToolError as error:
                 log.warning("the connections through the kernel can't be ended: %s", error)
         await super().remove()

@@ -16,11 +16,11 @@ IMAGE_FOLDER = Path("/usr/libexec/rosproxy")
 """The folder of the programs in the image; searched before the PATH."""
 SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
 """Folders of the programs that are not in the PATH of an unprivileged user."""
-TIMEOUT = 5.0
+RUN_TIMEOUT_S = 5.0
 """Seconds that a run of a program may take."""
-LONGEST_LIST = 16 * 1024 * 1024
+LONGEST_LIST_BYTES = 16 * 1024 * 1024
 """Bytes of a list of connections that the proxy reads: some 95,000 lines."""
-PIECE = 16 * 1024
+PIECE_BYTES = 16 * 1024
 """Bytes of a list that the proxy reads at once: some hundred lines."""
 ENVIRONMENT = {"LC_ALL": "C"}
 """English messages of the programs: the proxy looks for words in these messages."""
@@ -53,8 +53,8 @@ class Tools:
     async def list_flows(self, take: Callable[[str], None], ipv6: bool, *options: str) -> None:
         """Pass the tracked TCP connections that options select to ``take``. Raises ToolError.
 
-        ``take`` gets whole lines in pieces of some PIECE bytes, so that other tasks run in between,
-        and at most LONGEST_LIST bytes in all. The program ends with the calling task.
+        ``take`` gets whole lines in pieces of some PIECE_BYTES, so that other tasks run in between,
+        and at most LONGEST_LIST_BYTES in all. The program ends with the calling task.
         """
         command = [_find("conntrack"), "-L", *_selection(ipv6), *options]
         try:
@@ -64,7 +64,7 @@ class Tools:
         except OSError as error:
             raise _start_error(command[0], error) from None
         try:
-            async with asyncio.timeout(TIMEOUT):
+            async with asyncio.timeout(RUN_TIMEOUT_S):
                 if not await _pass_lines(cast(asyncio.StreamReader, process.stdout), take):
                     return
                 _, complaint = await process.communicate()
@@ -128,7 +128,7 @@ def _run(command: list[str], document: str) -> str:
             capture_output=True,
             text=True,
             errors="replace",
-            timeout=TIMEOUT,
+            timeout=RUN_TIMEOUT_S,
             check=False,
             env=ENVIRONMENT,
         )
@@ -142,12 +142,12 @@ def _run(command: list[str], document: str) -> str:
 
 
 async def _pass_lines(stream: asyncio.StreamReader, take: Callable[[str], None]) -> bool:
-    """Pass lines to ``take`` as they arrive; False if the list is longer than LONGEST_LIST."""
+    """Pass lines to ``take`` as they arrive; False beyond LONGEST_LIST_BYTES."""
     rest = b""
     count = 0
-    while piece := await stream.read(PIECE):
+    while piece := await stream.read(PIECE_BYTES):
         count += len(piece)
-        if count > LONGEST_LIST:
+        if count > LONGEST_LIST_BYTES:
             return False
         lines, newline, rest = (rest + piece).rpartition(b"\n")
         take((lines + newline).decode("utf-8", "replace"))
@@ -157,7 +157,7 @@ async def _pass_lines(stream: asyncio.StreamReader, take: Callable[[str], None])
 
 
 def _timeout_error(program: str) -> ToolError:
-    return ToolError(f"{program} did not end in {TIMEOUT:g} s")
+    return ToolError(f"{program} did not end in {RUN_TIMEOUT_S:g} s")
 
 
 def _start_error(program: str, error: OSError) -> ToolError:

@@ -26,7 +26,7 @@ from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.registry.node_health import ProbeResult
 
-LONGEST_ANSWER = 4096
+LONGEST_ANSWER_BYTES = 4096
 """Most bytes of an answer with header. Answers of rospy have 400 bytes."""
 
 _OK = b"HTTP/1.1 200 "
@@ -171,10 +171,10 @@ class KeptConnections(Generic[_K]):
 
         Raises BlockingIOError until the whole answer has arrived, and OSError.
         """
-        chunk = conn.sock.recv(LONGEST_ANSWER)
+        chunk = conn.sock.recv(LONGEST_ANSWER_BYTES)
         conn.received += chunk
         head, end, body = conn.received.partition(b"\r\n\r\n")
-        if chunk and not end and len(head) < LONGEST_ANSWER:
+        if chunk and not end and len(head) < LONGEST_ANSWER_BYTES:
             raise BlockingIOError
         length = _length(head)
         if not chunk or not head.startswith(_OK) or len(body) > length:
@@ -197,4 +197,4 @@ class KeptConnections(Generic[_K]):
 def _length(head: bytes) -> int:
     """The length of the body from the header; -1 if there is none or it is too long."""
     match = _LENGTH.search(head)
-    return int(match[1]) if match and int(match[1]) <= LONGEST_ANSWER else -1
+    return int(match[1]) if match and int(match[1]) <= LONGEST_ANSWER_BYTES else -1

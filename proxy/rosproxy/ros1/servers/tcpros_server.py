@@ -331,7 +331,7 @@ async def read_header(context: Context, peer: str, conn: socket.socket) -> bytes
     """
     charge = Charge(context.buffered, peer)
     with context.gate.waiting(peer, partial(sockets.hang_up, conn)), charge:
-        async with asyncio.timeout(sockets.SILENCE_TIMEOUT):
+        async with asyncio.timeout(sockets.SILENCE_TIMEOUT_S):
             first = await sockets.read_exactly(conn, 4)
             size = header_length(first)
             try:
@@ -353,7 +353,7 @@ async def _dial(address: str, port: int | None) -> socket.socket | None:
 async def hand_on(header: bytes, inside: socket.socket) -> bool:
     """Send a node the header of a client; close the connection to the node if that fails."""
     try:
-        async with asyncio.timeout(sockets.CONNECT_TIMEOUT):
+        async with asyncio.timeout(sockets.CONNECT_TIMEOUT_S):
             await asyncio.get_running_loop().sock_sendall(inside, header)
     except BaseException as error:
         inside.close()

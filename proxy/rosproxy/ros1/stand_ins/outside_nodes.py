@@ -24,8 +24,8 @@ from rosproxy.ros1.registry.stand_ins import StandIn
 
 log = logging.getLogger(__name__)
 
-CONNECT_TIMEOUT = 2.0
-LOOK_TIMEOUT = 1.0
+CONNECT_TIMEOUT_S = 2.0
+RETRY_TIMEOUT_S = 1.0
 """Seconds that a node inside waits at most while the proxy tries a node that has refused."""
 
 
@@ -45,9 +45,9 @@ class Outside:
         try:
             reached = await self.reach(target)
             if not parse_service_uri(uri):
-                answer = await self._context.nodes.probe(reached, LOOK_TIMEOUT)
+                answer = await self._context.nodes.probe(reached, RETRY_TIMEOUT_S)
                 return answer.probe is ProbeResult.REFUSED
-            (await sockets.dial(reached, LOOK_TIMEOUT)).close()
+            (await sockets.dial(reached, RETRY_TIMEOUT_S)).close()
         except ConnectionRefusedError:
             return True
         except OSError as error:
@@ -89,7 +89,7 @@ class Outside:
             return None
         target = HostPort(stand_in.target.host, port)
         try:
-            return await self._dial(target, CONNECT_TIMEOUT)
+            return await self._dial(target, CONNECT_TIMEOUT_S)
         except OSError as error:  # a TimeoutError is an OSError
             log.debug("%s: %s", target, error)
             # Only the port of the URI counts: a node that has closed a TCPROS port may live.

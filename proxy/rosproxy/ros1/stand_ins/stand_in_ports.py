@@ -51,8 +51,8 @@ MOST_RETRIES = 32
 """Nodes that have refused and that the proxy tries again at the same time."""
 PORTS_PER_TURN = 50
 """Ports that the proxy opens before the event loop does other work."""
-TIDY_INTERVAL = 30.0
-SERVICE_PROBLEM = 600.0
+TIDY_INTERVAL_S = 30.0
+SERVICE_PROBLEM_KEPT_S = 600.0
 """Seconds to keep a problem with a service: each call of a client looks the service up anew."""
 LONGEST_SHOWN_URI = 200
 """Characters of a URI in the status."""
@@ -140,7 +140,7 @@ class StandInPorts:
             uri = problem.subject
             for target in self._targets([uri]).values():
                 if parse_service_uri(uri):
-                    ended = time.time() - problem.when > SERVICE_PROBLEM
+                    ended = time.time() - problem.when > SERVICE_PROBLEM_KEPT_S
                 else:
                     ended = await self._outside.refuses(uri, target)
                 if ended:

@@ -12,17 +12,17 @@ port opens or refuses connections.
     new pid, or every       registrar          the master's       registration    lost
     fifth look                                 graph                              registrations
                                                                                   made again
-    PROBE_TICK; each node:  prober             the node's pid     liveness        ports refuse,
-    --probe-interval                                                              nodes and leases
+    PROBE_CHECK_INTERVAL_S  prober             the node's pid     liveness        ports refuse,
+    and --probe-interval                                                          nodes and leases
                                                                                   end
-    RESUBSCRIBE_TICK,       resubscriber       the graph, the     resubscription  publisherUpdate
-    after an outage                            nodes'                             to subscribers
+    RESUBSCRIBE_INTERVAL_S  resubscriber       the graph, the     resubscription  publisherUpdate
+    and after an outage                        nodes'                             to subscribers
                                                connections                        without
                                                                                   connection
     ENFORCE_INTERVAL_S and  policy_enforcer    the registry,      Ros1Policy      registrations
     a changed policy                           connections                        hidden or shown,
                                                                                   connections cut
-    TIDY_INTERVAL           stand_in_ports     problems with                      problems of ended
+    TIDY_INTERVAL_S         stand_in_ports     problems with                      problems of ended
                                                nodes outside                      nodes removed
     COUNT_INTERVAL_S, if    message_counter    the nodes' counts  topic_growth    sums in the
     the metrics are read                                                          metrics

@@ -35,7 +35,7 @@ from rosproxy.ros1.upkeep.verifier import Verifier
 
 log = logging.getLogger(__name__)
 
-SHUTDOWN_TIMEOUT = 2.0
+SHUTDOWN_LOOKUP_TIMEOUT_S = 2.0
 """Seconds within which the master must tell the URI of a node for a ``shutdown``."""
 NO_PORT = "registered directly at the master, and can't be adopted: no port of the range is left"
 
@@ -108,7 +108,7 @@ class Adopter:
         if name not in endpoint.callers:
             return name not in endpoint.former_callers
         try:
-            async with asyncio.timeout(SHUTDOWN_TIMEOUT):
+            async with asyncio.timeout(SHUTDOWN_LOOKUP_TIMEOUT_S):
                 uri = await self._look_up(name)
         except (TimeoutError, Unreachable):
             return False  # the call may be justified, so it is passed on

@@ -32,13 +32,13 @@ from rosproxy.ros1.upkeep.verifier import Verifier
 
 log = logging.getLogger(__name__)
 
-GONE_TIMEOUT = 0.5
+GONE_PROBE_TIMEOUT_S = 0.5
 """Seconds within which a node must answer at an address that the operator reports as gone."""
-YOUNG_NODE_AGE = 3.0
+YOUNG_NODE_AGE_S = 3.0
 """Age of the last registration, in seconds, up to which a silent node gets a second chance."""
-SECOND_CHANCE = 1.0
+SECOND_PROBE_DELAY_S = 1.0
 """Seconds after which the proxy probes a silent node a second time."""
-RETIRE_TIMEOUT = 3.0
+RETIRE_TIMEOUT_S = 3.0
 """Seconds that the proxy waits for pending registrations before it retires."""
 
 
@@ -92,7 +92,7 @@ class ContainerEvents:
         self.context.retired = True  # before the wait: no node registers meanwhile
         async with self._lock:
             await self.recovery.ensure()
-            end = self.context.now() + RETIRE_TIMEOUT
+            end = self.context.now() + RETIRE_TIMEOUT_S
             registry = self.context.registry
             while any(e.pending for e in registry) and self.context.now() < end:  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
@@ -107,7 +107,7 @@ class ContainerEvents:
     async def _remove(self, addresses: Collection[str]) -> int:
         """Unregister the nodes at addresses that are gone, unless the nodes answer."""
         endpoints = [e for e in self.context.registry if e.location.address in addresses]
-        return await self._remove_dead(endpoints, self.context.now() - YOUNG_NODE_AGE)
+        return await self._remove_dead(endpoints, self.context.now() - YOUNG_NODE_AGE_S)
 
     async def _remove_dead(self, endpoints: Sequence[Endpoint], since: float) -> int:
         """Unregister nodes that do not answer; probe silent nodes with newer registrations later.
@@ -115,7 +115,7 @@ class ContainerEvents:
         ``since``: the time from which registrations count as new.
         """
         probe = self.context.nodes.probe
-        answers = await asyncio.gather(*(probe(e.slave, GONE_TIMEOUT) for e in endpoints))
+        answers = await asyncio.gather(*(probe(e.slave, GONE_PROBE_TIMEOUT_S) for e in endpoints))
         outcomes = {e: answer.probe for e, answer in zip(endpoints, answers, strict=True)}
         dead = liveness.dead_endpoints(outcomes, since)
         for endpoint in dead:
@@ -130,7 +130,7 @@ class ContainerEvents:
 
     async def _remove_later(self, silent: Sequence[Endpoint]) -> None:
         """Probe silent nodes again. If this fails, the prober unregisters the nodes later."""
-        await asyncio.sleep(SECOND_CHANCE)
+        await asyncio.sleep(SECOND_PROBE_DELAY_S)
         async with self._lock:
             current = [e for e in silent if self.context.registry.by_port.get(e.port) is e]
             with contextlib.suppress(Unreachable, MasterError):

@@ -20,9 +20,9 @@ from rosproxy.ros1.upkeep.registrar import Registrar
 
 log = logging.getLogger(__name__)
 
-LOOK_TIMEOUT = 5.0
+PID_TIMEOUT_S = 5.0
 """Seconds within which a healthy master answers getPid."""
-LOOKS_PER_CHECK = 5
+PID_CALLS_PER_CHECK = 5
 """Looks at the master from one check of the registrations to the next."""
 
 
@@ -56,7 +56,7 @@ class MasterMonitor:
         """Ask the master for its pid; recover the registry or restore registrations if due."""
         started = self._context.now()
         try:
-            async with asyncio.timeout(LOOK_TIMEOUT):
+            async with asyncio.timeout(PID_TIMEOUT_S):
                 pid = await self._context.upstream.call_master("getPid")
             self.round_trip = self._context.now() - started
             await self._recovery.ensure()
@@ -64,7 +64,7 @@ class MasterMonitor:
             self.pid = pid
             self._looks += 1
             await self._memory.write()
-            if restarted or self._looks % LOOKS_PER_CHECK == 0:
+            if restarted or self._looks % PID_CALLS_PER_CHECK == 0:
                 await self._memory.look()  # first: `register_lost` needs the parameter
                 await self._registrar.register_lost()
             self._mark(True)
@@ -72,7 +72,7 @@ class MasterMonitor:
             self._mark(False, f"{error}{self._path_hint(error)}{_port_hint(error)}")
         except TimeoutError:
             uri = self._context.settings.master_uri
-            self._mark(False, f"master {uri}: no answer in {LOOK_TIMEOUT:g} s")
+            self._mark(False, f"master {uri}: no answer in {PID_TIMEOUT_S:g} s")
 
     def _path_hint(self, error: Exception) -> str:
         """What to do if a program answers, but not at the path of the master URI."""

@@ -64,7 +64,7 @@ class MessageCounter:
     def read(self) -> TopicSums:
         """The sums, for a program that reads the metrics.
 
-        The proxy then asks the nodes for another `ASK_AFTER_READ_S` seconds.
+        The proxy then asks the nodes for `ASK_AFTER_READ_S` from now.
         """
         self._read_at = self._context.now()
         return self._sums

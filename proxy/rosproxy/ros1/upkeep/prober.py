@@ -33,11 +33,11 @@ from rosproxy.ros1.upkeep.resubscriber import Resubscriber
 
 log = logging.getLogger(__name__)
 
-PROBE_TICK = 0.25
+PROBE_CHECK_INTERVAL_S = 0.25
 """Seconds between two looks at all endpoints."""
-PARALLEL_PROBES = 64
+MOST_PARALLEL_PROBES = 64
 OVERDUE = "no answer in time"
-SWEEP_INTERVAL = 5.0
+SWEEP_INTERVAL_S = 5.0
 """Seconds between two searches for kept connections whose endpoint has gone."""
 
 
@@ -53,7 +53,9 @@ class Prober:
     kept_connections: KeptConnections[Endpoint] = field(init=False)
     _probing: set[Endpoint] = field(default_factory=set)
     _sweep_at: float = 0.0
-    _limit: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(PARALLEL_PROBES))
+    _limit: asyncio.Semaphore = field(
+        default_factory=lambda: asyncio.Semaphore(MOST_PARALLEL_PROBES)
+    )
 
     def __post_init__(self) -> None:
         """Create the set of kept connections."""
@@ -76,7 +78,7 @@ class Prober:
                 self._ask(endpoint, now)
             self._end_if_unused(endpoint)
         if now >= self._sweep_at:
-            self._sweep_at = now + SWEEP_INTERVAL
+            self._sweep_at = now + SWEEP_INTERVAL_S
             self.kept_connections.keep(set(context.registry))
 
     def _ask(self, endpoint: Endpoint, now: float) -> None:

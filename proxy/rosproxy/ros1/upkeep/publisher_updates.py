@@ -24,8 +24,8 @@ from rosproxy.ros1.upkeep.decisions import registration as decisions
 
 log = logging.getLogger(__name__)
 
-PARALLEL_CALLS = 32
-RETRY = 2.0
+MOST_PARALLEL_CALLS = 32
+MASTER_RETRY_INTERVAL_S = 2.0
 """Seconds after which the proxy tries again to reach the master."""
 
 
@@ -35,7 +35,7 @@ class PublisherUpdates:
     def __init__(self, context: Context, stand_ins: StandInPorts) -> None:
         self._context = context
         self._stand_ins = stand_ins
-        self._limit = asyncio.Semaphore(PARALLEL_CALLS)
+        self._limit = asyncio.Semaphore(MOST_PARALLEL_CALLS)
         self._topics_underway: set[str] = set()
         self._changed_topics: dict[str, bool] = {}
 
@@ -97,7 +97,7 @@ class PublisherUpdates:
                     )
                     log.debug(text, topic, error)
                     self._changed_topics[topic] = True
-                    await asyncio.sleep(RETRY)
+                    await asyncio.sleep(MASTER_RETRY_INTERVAL_S)
         finally:
             self._topics_underway.discard(topic)
 

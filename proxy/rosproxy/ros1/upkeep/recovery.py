@@ -45,8 +45,8 @@ from rosproxy.ros1.upkeep.verifier import Verifier
 
 log = logging.getLogger(__name__)
 
-PARALLEL_INSPECTIONS = 64
-CLAIM_GRACE = 1.0
+MOST_PARALLEL_INSPECTIONS = 64
+CLAIM_GRACE_S = 1.0
 """Seconds that a node has to confirm its claim once a live node waits for the port."""
 DOUBT = (
     "answers, but the proxy can't tell whether this is the node that the master has at this port: "
@@ -79,7 +79,7 @@ class Recovery:
         self._resubscriber = resubscriber
         self.verifying: set[Endpoint] = set()
         self._inspecting: set[Endpoint] = set()
-        self._limit = asyncio.Semaphore(PARALLEL_INSPECTIONS)
+        self._limit = asyncio.Semaphore(MOST_PARALLEL_INSPECTIONS)
         self._recovered = asyncio.Event()
         self._lock = asyncio.Lock()
         self._failures = 0
@@ -132,11 +132,11 @@ class Recovery:
                 await self._resubscriber.announce(endpoints)
 
     async def wait_for_dead_claim(self) -> None:
-        """Wait up to `CLAIM_GRACE` until a node under verification turns out dead.
+        """Wait up to `CLAIM_GRACE_S` until a node under verification turns out dead.
 
         Nodes that were silent during the whole wait count as failing afterwards.
         """
-        end = self._context.now() + CLAIM_GRACE
+        end = self._context.now() + CLAIM_GRACE_S
         awaited = set(self.verifying)
         inspected = set(self._inspecting)
         while awaited & self.verifying and self._context.now() < end:

@@ -33,9 +33,9 @@ log = logging.getLogger(__name__)
 
 FormerUris = Mapping[str, tuple[Endpoint, str]]
 """For each name its endpoint, and the former URI that the master has for the name."""
-CHECKED_AT_ONCE = 100
+MOST_CHECKS_PER_TURN = 100
 """Registrations that the proxy checks before other tasks run: a policy may have many rules."""
-SETTLE_TIME = 2.0
+UPDATE_ARRIVAL_S = 2.0
 """Seconds within which the master's updates about a newly registered publisher arrive."""
 
 
@@ -237,7 +237,7 @@ class Registrar:
                 (to_show if registration.hidden else to_hide).append((endpoint, registration))
             elif verdict.allowed and has_changed:
                 policy.report_registration(endpoint, registration)
-            if not count % CHECKED_AT_ONCE:
+            if not count % MOST_CHECKS_PER_TURN:
                 await asyncio.sleep(0)
         await self._conceal(to_hide)
         alive = [(e, r) for e, r in to_show if e.answers and not e.health.cleaned]
@@ -351,7 +351,7 @@ class Registrar:
             endpoint.former_uris.add(uri)
             if addressing.lease_of(uri) is None:
                 direct[name] = endpoint, uri
-                endpoint.settles_at = self._context.now() + SETTLE_TIME
+                endpoint.settles_at = self._context.now() + UPDATE_ARRIVAL_S
             else:
                 service = addressing.advertised_service(endpoint)
                 shown = [r for r in _registrations_of(endpoint, name) if not r.hidden]

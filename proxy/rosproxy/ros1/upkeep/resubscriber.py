@@ -34,7 +34,7 @@ from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.decisions import resubscription as decisions
 from rosproxy.ros1.upkeep.decisions.registration import one_publisher_per_topic
 from rosproxy.ros1.upkeep.decisions.resubscription import BusRow, TopicSubscription
-from rosproxy.ros1.upkeep.publisher_updates import PARALLEL_CALLS, PublisherUpdates
+from rosproxy.ros1.upkeep.publisher_updates import MOST_PARALLEL_CALLS, PublisherUpdates
 from rosproxy.ros1.upkeep.registrar import Registrar
 
 log = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ Before the first look, a proxy that is replaced by force has ended, and roscpp's
 over. Before the last two looks, rospy gives up a connection to a vanished peer: TCP keep-alive
 probes begin after 60 seconds. Then a reset answers, or no answer comes for 90 seconds.
 """
-RESUBSCRIBE_TICK = 1.0
+RESUBSCRIBE_INTERVAL_S = 1.0
 """Seconds between two checks which looks are due."""
 MissedPublisher = tuple[str, str, str]
 """A topic, a subscriber's name, and the master's URI of a publisher that is not connected."""
@@ -72,7 +72,7 @@ class Resubscriber:
         self._tcpros = tcpros
         self._plane = plane
         self._stand_ins = stand_ins
-        self._limit = asyncio.Semaphore(PARALLEL_CALLS)
+        self._limit = asyncio.Semaphore(MOST_PARALLEL_CALLS)
         self._look_times: dict[Endpoint, list[float]] = {}
 
     def watch(self, endpoints: Iterable[Endpoint]) -> None:

@@ -21,7 +21,7 @@ from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 LEASE_DURATION_S = 12.0
 """Seconds after the last announcement until other participants forget the discovery participant. It
 is short because the proxy may be killed."""
-ANNOUNCE_INTERVAL = 3.0
+ANNOUNCE_INTERVAL_S = 3.0
 """Seconds between announcements of the discovery participant."""
 SEDP_WRITERS = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
 

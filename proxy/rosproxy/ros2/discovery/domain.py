@@ -437,7 +437,7 @@ class Domain:
             sent = self.disposal.end_former_processes(prefix, source)
             return sent + [out for p in self.inside.prove() for out in self.disposal.end_inside(p)]
         if spdp is None:
-            return self.proxy_participants.told_inside(message, source, now)
+            return self.proxy_participants.handle_from_inside(message, source, now)
         if spdp.ended:
             return self._end_inside(message, source, now)
         is_new = prefix not in self.inside.by_prefix
@@ -520,7 +520,7 @@ class Domain:
                 out for outsider in ended for out in self.disposal.end_outside(outsider, inside)
             ]
             sent += self.to_inside.of_outside(told, inside, now)
-        return sent + self.proxy_participants.told_outside(message, source, received)
+        return sent + self.proxy_participants.handle_from_outside(message, source, received)
 
     def _announced_outside(
         self, message: DiscoveryMessage, source: str, received: int, now: float

@@ -33,10 +33,10 @@ from rosproxy.ros2.protocol.rtps import (
 )
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 
-LONGEST = 60_000
+LONGEST_ANNOUNCEMENT_BYTES = 60_000
 """Bytes of the longest announcement that the proxy accepts in fragments. Real ones have some
 thousand."""
-SHORTEST = 128
+SHORTEST_FRAGMENT_BYTES = 128
 """Bytes of the shortest fragment that the proxy accepts. Real ones have some thousand."""
 MOST_BYTES = 1024 * 1024
 """Bytes of a participant's announcements in a store, and bytes of its datagrams that wait. Beyond
@@ -45,7 +45,7 @@ MOST_OF_ALL = 16 * 1024 * 1024
 """Bytes of all stores together."""
 MOST_FRAGMENTS = 64
 """DATA_FRAG in a datagram. A datagram of 64 KB holds fewer than 50 of Cyclone DDS."""
-OVERHEAD = 1024
+OVERHEAD_BYTES = 1024
 """Bytes that are added to the length of each announcement, and of each DATA_FRAG that waits."""
 
 Rewrite = Callable[[DiscoveryMessage], bytes]
@@ -80,7 +80,7 @@ class _PendingSample:
     @property
     def cost(self) -> int:
         """The bytes that the sample counts for."""
-        return self.total + OVERHEAD
+        return self.total + OVERHEAD_BYTES
 
 
 class _WaitingDatagram(msgspec.Struct, frozen=True):
@@ -96,7 +96,7 @@ class _WaitingDatagram(msgspec.Struct, frozen=True):
     @property
     def cost(self) -> int:
         """The bytes that the datagram counts for."""
-        return len(self.datagram) + len(self.fragments) * OVERHEAD
+        return len(self.datagram) + len(self.fragments) * OVERHEAD_BYTES
 
     @property
     def keys(self) -> set[_Key]:
@@ -271,7 +271,10 @@ class FragmentStore:
         Raises RtpsError if the size is outside the limits, or differs from that of a former
         fragment.
         """
-        if frags.size < SHORTEST or not 0 < frags.total <= LONGEST:
+        if (
+            frags.size < SHORTEST_FRAGMENT_BYTES
+            or not 0 < frags.total <= LONGEST_ANNOUNCEMENT_BYTES
+        ):
             text = f"an announcement has {frags.total} bytes in fragments of {frags.size} bytes"
             raise RtpsError(f"{text}, which is outside the limits")
         gathered = self._samples.get(_key(port, sample))

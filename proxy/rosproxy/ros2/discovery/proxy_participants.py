@@ -123,7 +123,9 @@ class ProxyParticipants:
         participants = self.former_ports.keepers(self.inside.by_prefix.values())
         return [sent for p in participants for sent in self.former_ports.reminders(p, now)]
 
-    def told_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
+    def handle_from_inside(
+        self, message: DiscoveryMessage, source: str, now: float
+    ) -> list[Outgoing]:
         """Handle a message from a participant inside to the proxy's participants.
 
         Return the answers. Raises RtpsError.
@@ -144,7 +146,9 @@ class ProxyParticipants:
         questions = self._ask(self.settings.unicast_port, message, for_proxy.rewritten)
         return sent_to(insider.metatraffic, questions)
 
-    def told_outside(self, message: DiscoveryMessage, source: str, received: int) -> list[Outgoing]:
+    def handle_from_outside(
+        self, message: DiscoveryMessage, source: str, received: int
+    ) -> list[Outgoing]:
         """Handle a message from a participant outside to the discovery participant.
 
         Return the answers. ``received`` is the number of bytes that came from the participant.

@@ -40,11 +40,11 @@ from rosproxy.ros2.rewriting.discovery import read_discovery, rewritten
 
 SEPARATION_S = 0.4
 """Seconds in which a dispose message arrives and takes effect on both sides."""
-VERDICTS_AT_ONCE = 32
+MOST_VERDICTS_PER_PART = 32
 """Verdicts that the policy judges again at a time. With 1,000 rules a verdict takes 0.7 ms."""
-PAIRS_AT_ONCE = 32
+MOST_PAIRS_PER_PART = 32
 """Pairs of a participant inside and one outside that are handled at a time. A pair takes 0.1 ms."""
-LAN_RELAY_TIME = 30.0
+LAN_RELAY_TIMEOUT_S = 30.0
 """Seconds for which a separation waits for the LAN relay. If no participant is on its LAN, the
 relay sends nothing."""
 
@@ -87,10 +87,10 @@ class Rediscovery:
     def next_datagrams(self, now: float) -> list[Outgoing]:
         """The datagrams of the next part of the work."""
         self._now = now
-        verdicts = list(islice(self._review, VERDICTS_AT_ONCE))
-        self._has_verdicts = len(verdicts) == VERDICTS_AT_ONCE
+        verdicts = list(islice(self._review, MOST_VERDICTS_PER_PART))
+        self._has_verdicts = len(verdicts) == MOST_VERDICTS_PER_PART
         sent = [out for insider in filter(None, verdicts) for out in self._separate_known(insider)]
-        for _ in range(PAIRS_AT_ONCE):
+        for _ in range(MOST_PAIRS_PER_PART):
             if not self._waiting:
                 break
             sent += self._next_pair()
@@ -177,4 +177,4 @@ class Rediscovery:
 
     def _may_separate(self, waits_from: float, now: float) -> bool:
         no_lan_relay = self.settings.relay is None
-        return no_lan_relay or self.lan_relay_heard or now - waits_from >= LAN_RELAY_TIME
+        return no_lan_relay or self.lan_relay_heard or now - waits_from >= LAN_RELAY_TIMEOUT_S

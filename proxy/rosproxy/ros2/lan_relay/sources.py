@@ -9,7 +9,7 @@ other sources share one allowance, as at the proxy.
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from rosproxy.ros2.discovery.discovery_participant import ANNOUNCE_INTERVAL
+from rosproxy.ros2.discovery.discovery_participant import ANNOUNCE_INTERVAL_S
 from rosproxy.ros2.sources.address_proofs import MOST_ADDRESSES
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing
 
@@ -23,7 +23,7 @@ UNPROVEN_PER_SECOND = 2500.0
 forged datagrams a second, the relay then takes a fifth of a processor."""
 UNPROVEN_BURST = 10_000.0
 """The charge of all unproven sources together at once."""
-REMEMBERED_S = 10 * ANNOUNCE_INTERVAL
+REMEMBERED_S = 10 * ANNOUNCE_INTERVAL_S
 """Seconds for which an address counts as proven after the proxy has listed the address. A proxy
 that has just started knows no proven addresses."""
 

@@ -1,9 +1,10 @@
 """Restores ports after a start: participants get their former ports again.
 
-In the first `REMEMBERED` seconds, the first announcement of a participant inside waits. The proxy
+In the first `EVIDENCE_PERIOD_S`, the first announcement of a participant inside waits. The proxy
 asks the participant for its former ports (`rosproxy.ros2.ports.store` explains how the participant
-remembers these). The wait ends with the answer, or after `ANSWER_TIME` without an answer. The wait
-lasts at least until outside has had `SETTLING` seconds to send to former ports (`LocatorPorts`).
+remembers these). The wait ends with the answer, or after `ANSWER_TIMEOUT_S` without an answer. The
+wait lasts at least until outside has had `SETTLING_PERIOD_S` to send to former ports
+(`LocatorPorts`).
 Later, reminders make participants remember their present ports.
 """
 
@@ -26,7 +27,7 @@ from rosproxy.ros2.rewriting.announced_participant import first_metatraffic
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
-ANSWER_TIME = 5.0
+ANSWER_TIMEOUT_S = 5.0
 """Seconds that a participant has to name its former ports."""
 
 
@@ -241,7 +242,7 @@ class FormerPorts:
         return (
             self.must_be_rediscovered(prefix)
             or self.port_store.has_answered(prefix)
-            or now - since >= ANSWER_TIME
+            or now - since >= ANSWER_TIMEOUT_S
         )
 
     def _questions(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:

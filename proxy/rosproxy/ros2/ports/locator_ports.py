@@ -33,9 +33,9 @@ from rosproxy.ros2.registry.participants import TrafficKind
 MOST_NAMED = 8
 """Participants that may be named at one port. If more are named, the names count for nothing. A
 participant that is named for metatraffic and for user data counts twice."""
-SETTLING = 1.0
+SETTLING_PERIOD_S = 1.0
 """Seconds from the start in which the proxy gives no port, and waits for datagrams from outside."""
-REMEMBERED = 30.0
+EVIDENCE_PERIOD_S = 30.0
 """Seconds from the start in which the proxy considers evidence from before the start."""
 
 
@@ -140,12 +140,12 @@ class LocatorPorts:
         """Ports that several participants claim, and the evidence of these claims."""
 
     def may_give_ports(self, now: float) -> bool:
-        """Whether the proxy may give ports: `SETTLING` seconds are over."""
-        return now - self._started >= SETTLING
+        """Whether the proxy may give ports: `SETTLING_PERIOD_S` is over."""
+        return now - self._started >= SETTLING_PERIOD_S
 
     def is_restoring(self, now: float) -> bool:
-        """Whether `REMEMBERED` seconds are not over, so that former evidence counts."""
-        return now - self._started < REMEMBERED
+        """Whether `EVIDENCE_PERIOD_S` is not over, so that former evidence counts."""
+        return now - self._started < EVIDENCE_PERIOD_S
 
     def note_use(self, port: int, datagram: bytes, by: NamedBy, now: float) -> None:
         """Note the destination of a datagram from outside at a port without a mapping.
@@ -246,7 +246,7 @@ class LocatorPorts:
         return port
 
     def _forget_former(self) -> None:
-        """Forget the evidence from before the start, because `REMEMBERED` seconds are over."""
+        """Forget the evidence from before the start, because `EVIDENCE_PERIOD_S` is over."""
         self._former_users.clear()
         self._forwarded.clear()
         self._claims.clear()

@@ -19,7 +19,7 @@ from rosproxy.ros2.sources.claimed_addresses import is_proxy_port
 
 STAND_INS = PortRange(20_000, 32_767)
 """The range of stand-ins. It ends below the ephemeral ports of Linux."""
-TRIES = 32
+MOST_PORTS_TRIED = 32
 """Ports that are tried for a locator outside."""
 MOST_SHARING = 3
 """Locators outside that a stand-in may serve. For a known participant, the locators of unknown
@@ -117,4 +117,6 @@ def stand_in_port(key: str, users: Callable[[int], int], busy: Callable[[int], b
     count as tries, because there may be many.
     """
     order = (port for port in order_for(key, STAND_INS) if not busy(port))
-    return next((port for port in islice(order, TRIES) if users(port) < MOST_SHARING), None)
+    return next(
+        (port for port in islice(order, MOST_PORTS_TRIED) if users(port) < MOST_SHARING), None
+    )

@@ -176,11 +176,11 @@ def carries_samples(datagram: bytes) -> bool:
     subscriber sends such messages to each publisher.
     """
     size = len(datagram)
-    if not HEADER < size <= LONGEST_WITHOUT_SAMPLES:
+    if not HEADER_BYTES < size <= LONGEST_WITHOUT_SAMPLES:
         return True
     # The proxy does this for each small datagram. `walk_submessages` takes three times as long.
     kinds = _WITHOUT_SAMPLES_OF.get(datagram[6:8], _WITHOUT_SAMPLES)
-    offset = HEADER
+    offset = HEADER_BYTES
     while offset < size:
         if datagram[offset] not in kinds or offset + 4 > size:
             return True

@@ -9,16 +9,16 @@ import asyncio
 from collections.abc import Callable, Hashable, Sequence
 
 from rosproxy.ros2.domain_settings import Outgoing
-from rosproxy.ros2.sources.fair_queue import OVERHEAD, DiscoveryQueue
+from rosproxy.ros2.sources.fair_queue import OVERHEAD_BYTES, DiscoveryQueue
 from rosproxy.ros2.sources.rates import Standing
 
-ROUND = 8 * 1024
+ROUND_BYTES = 8 * 1024
 """Bytes that a round reads and sends. A datagram of the greatest length takes a round of 5 ms."""
 
-LONGEST_ROUND = 64 * 1024
+LONGEST_ROUND_BYTES = 64 * 1024
 """Bytes of the longest round."""
-PER_RECEIVED = 512
-"""Bytes of a round for each datagram that has come since the last round, up to `LONGEST_ROUND`.
+BYTES_PER_RECEIVED = 512
+"""Bytes of a round for each datagram since the last round, up to `LONGEST_ROUND_BYTES`.
 Reading these bytes takes about as long as receiving a datagram. With rounds of constant length,
 many sockets would leave no time to read what they receive (receive livelock; Mogul, Ramakrishnan:
 TOCS 1997)."""
@@ -42,7 +42,7 @@ class DiscoveryScheduler:
     @property
     def is_behind(self) -> bool:
         """Whether a new datagram has to wait."""
-        return bool(self._queue) or self._spent >= ROUND
+        return bool(self._queue) or self._spent >= ROUND_BYTES
 
     def read(
         self, source: str, standing: Standing, size: int, read: Read, key: Hashable = None
@@ -55,7 +55,7 @@ class DiscoveryScheduler:
         if self.is_behind:
             return self.put(source, standing, size, read, key)
         self._schedule()
-        self._spent += size + OVERHEAD + _size_of(read())
+        self._spent += size + OVERHEAD_BYTES + _size_of(read())
         return True
 
     def put(
@@ -86,7 +86,7 @@ class DiscoveryScheduler:
     def _begin_round(self) -> None:
         self._round = None
         self._spent = 0
-        budget = max(ROUND, min(self._received * PER_RECEIVED, LONGEST_ROUND))
+        budget = max(ROUND_BYTES, min(self._received * BYTES_PER_RECEIVED, LONGEST_ROUND_BYTES))
         self._received = 0
         try:
             while self._spent < budget and (waiting := self._queue.pop()):
@@ -100,4 +100,4 @@ class DiscoveryScheduler:
 
 def _size_of(sent: Sequence[Outgoing]) -> int:
     """The bytes that datagrams count for."""
-    return sum(len(out.datagram) + OVERHEAD for out in sent)
+    return sum(len(out.datagram) + OVERHEAD_BYTES for out in sent)

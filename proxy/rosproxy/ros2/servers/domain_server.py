@@ -53,11 +53,11 @@ from rosproxy.ros2.sources.selected import SelectedAddresses
 
 log = logging.getLogger(__name__)
 
-EXPIRY_INTERVAL = 0.5
+EXPIRY_INTERVAL_S = 0.5
 """Seconds between calls of `DomainServer.expire`."""
-ADMISSION_TIMEOUT = 5.0
+ADMISSION_TIMEOUT_S = 5.0
 """Seconds after which a waiting participant is queued again, unless already served."""
-PER_TURN = 16
+DATAGRAMS_PER_TURN = 16
 """Datagrams that a socket passes on before other sockets follow."""
 QUEUED_FOR_PASSED = 8
 """Datagrams that a socket may queue in place of a datagram that passes. Queueing is that much
@@ -271,7 +271,7 @@ class DomainServer:
         """Queue the participants that may get ports now. After a start there are many at once."""
         now = self._now()
         # The longest queue loses the last items without notice (`FairQueue`).
-        admitting = {p: t for p, t in self._admitting.items() if now - t < ADMISSION_TIMEOUT}
+        admitting = {p: t for p, t in self._admitting.items() if now - t < ADMISSION_TIMEOUT_S}
         self._admitting = admitting
         former_ports = self.domain.former_ports
         for prefix in former_ports.ready(now):
@@ -389,12 +389,12 @@ class DomainServer:
     def _take_in(self, sock: socket.socket, take: Take, must_queue: MustQueue) -> None:
         """Receive the datagrams at a socket: queue discovery, and pass all others at once.
 
-        A turn ends after `PER_TURN` datagrams, or after half the bytes of the longest datagram.
+        A turn ends after `DATAGRAMS_PER_TURN`, or after half the bytes of the longest datagram.
         Then other sockets follow. A queued datagram counts less (`QUEUED_FOR_PASSED`).
         """
         spent_bytes = spent = 0.0
         with contextlib.suppress(BlockingIOError):
-            while spent < PER_TURN and spent_bytes < LARGEST_DATAGRAM // 2:
+            while spent < DATAGRAMS_PER_TURN and spent_bytes < LARGEST_DATAGRAM // 2:
                 try:
                     datagram, sender = sock.recvfrom(LARGEST_DATAGRAM)
                 except ConnectionRefusedError:
@@ -521,5 +521,5 @@ def _sending_socket(family: socket.AddressFamily) -> socket.socket:
     sock = socket.socket(family, socket.SOCK_DGRAM)
     sock.setblocking(False)
     with contextlib.suppress(OSError):
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, datagrams.RECEIVE_BUFFER)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, datagrams.RECEIVE_BUFFER_BYTES)
     return sock

@@ -36,16 +36,16 @@ from rosproxy.ros2.rewriting.discovery import BuiltinWriter, DiscoveryMessage
 LEASE_DURATION_S = 12.0
 """Seconds for which a participant remembers the participant in a question. Cyclone DDS announces
 itself each 8 s, and gets another question then if it has not answered."""
-KEPT = 60.0
+PROOF_KEPT_S = 60.0
 """Seconds for which an address stays proven after its last participant has gone."""
 MOST_ADDRESSES = 4096
 """Proven addresses. Beyond this number, the address that has had no participant for longest
 goes."""
-ANSWER_KEPT = 30.0
+ANSWER_KEPT_S = 30.0
 """Seconds for which the answer of a participant counts after the participant has gone."""
 MOST_ANSWERED = 128
 """Participants at an address whose answers count. Beyond this number, the first one goes."""
-LONGEST_ANSWER = 256
+LONGEST_ANSWER_BYTES = 256
 """Bytes of a first answer, which is read without an allowance. An answer of Fast DDS has 72."""
 _INFO_DST = bytes([SubmessageId.INFO_DST])
 _NOT_IN_ANSWERS = (SubmessageId.INFO_SRC, SubmessageId.DATA, SubmessageId.DATA_FRAG)
@@ -101,7 +101,7 @@ class AddressProofs:
         return (
             len(answered) < MOST_ANSWERED
             and datagram[HEADER_BYTES - PREFIX_BYTES : HEADER_BYTES] not in answered
-            and len(datagram) <= LONGEST_ANSWER
+            and len(datagram) <= LONGEST_ANSWER_BYTES
             and datagram[HEADER_BYTES : HEADER_BYTES + 1] == _INFO_DST
             and datagram[HEADER_BYTES + 4 : HEADER_BYTES + 4 + PREFIX_BYTES]
             == self._prefix(address)
@@ -118,7 +118,7 @@ class AddressProofs:
             del self._until[first]
             self._answered.pop(first, None)
         answered = self._answered.setdefault(address, {})
-        answered[source_prefix(datagram)] = now + ANSWER_KEPT
+        answered[source_prefix(datagram)] = now + ANSWER_KEPT_S
         if len(answered) > MOST_ANSWERED:
             del answered[next(iter(answered))]
         return True
@@ -143,16 +143,16 @@ class AddressProofs:
         for address, answered in list(self._answered.items()):
             for prefix, until in list(answered.items()):
                 if any(table.find(prefix, address) for table in present):
-                    answered[prefix] = now + ANSWER_KEPT
+                    answered[prefix] = now + ANSWER_KEPT_S
                 elif until < now:
                     del answered[prefix]
             if not answered:
                 del self._answered[address]
 
     def _renew(self, address: str, now: float) -> None:
-        """Let an address count as proven for `KEPT` seconds from now."""
+        """Let an address count as proven for `PROOF_KEPT_S` from now."""
         self._until.pop(address, None)
-        self._until[address] = now + KEPT
+        self._until[address] = now + PROOF_KEPT_S
 
     def _prefix(self, address: str) -> bytes:
         size = PREFIX_BYTES - len(NO_VENDOR)

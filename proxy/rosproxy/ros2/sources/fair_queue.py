@@ -29,7 +29,7 @@ a
 second."""
 MOST_UNKNOWN = 256
 """Sources with the same other standing that may wait."""
-OVERHEAD = 256
+OVERHEAD_BYTES = 256
 """Bytes that are added to the length of each datagram."""
 
 Item = TypeVar("Item")
@@ -77,7 +77,7 @@ class FairQueue(Generic[Item]):
 
         While an item with a ``key`` waits, `replace` may replace it.
         """
-        waiting = Waiting(source, item, size + OVERHEAD, key)
+        waiting = Waiting(source, item, size + OVERHEAD_BYTES, key)
         if not self._has_room(waiting):
             return False
         if key is not None:

@@ -21,7 +21,7 @@ PER_SECOND = 10_000.0
 BURST = 50_000.0
 """The charge that a source may cause at once. With two peers, fifty participants at an address that
 start together cause 10,000, and then some 1,200 a second."""
-STEP = 256
+BYTES_PER_UNIT = 256
 """Bytes of a datagram for each unit of the charge. An announcement costs two or three units."""
 MOST_SOURCES = 4096
 """Sources with an allowance. Beyond this number, the oldest allowance is forgotten."""
@@ -43,7 +43,7 @@ class Standing(IntEnum):
 
 def cost(size: int) -> int:
     """The charge for a datagram of ``size`` bytes."""
-    return 1 + size // STEP
+    return 1 + size // BYTES_PER_UNIT
 
 
 @dataclass(slots=True)

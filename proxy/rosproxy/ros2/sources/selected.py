@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 
 from rosproxy.ros2.protocol.rtps import source_prefix
 
-UPDATE_TIMEOUT = 3.0
+UPDATE_TIMEOUT_S = 3.0
 """Seconds from the start that the operator has for the first selection."""
 MOST_HELD = 256
 """Addresses whose announcements are held."""
 MOST_HELD_EACH = 8
 """Participants at an address whose announcements are held."""
-LONGEST_HELD = 8192
+LONGEST_HELD_BYTES = 8192
 """Bytes of an announcement that is held."""
 
 
@@ -46,7 +46,7 @@ class SelectedAddresses:
     def hold(self, address: str, datagram: bytes) -> None:
         """Hold an announcement from an address that is not served. Raises RtpsError."""
         prefix = source_prefix(datagram)
-        if len(datagram) > LONGEST_HELD:
+        if len(datagram) > LONGEST_HELD_BYTES:
             return
         if address not in self.held_announcements and len(self.held_announcements) >= MOST_HELD:
             del self.held_announcements[next(iter(self.held_announcements))]

@@ -9,7 +9,7 @@ from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import DomainSettings, Judge, LanRelayLink, Outgoing
-from rosproxy.ros2.ports.locator_ports import REMEMBERED
+from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S
 from rosproxy.ros2.ports.store import HALF_BITS, WRITERS, halves
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
@@ -34,7 +34,7 @@ SECRET = "a secret of both"
 UNIX_TIME = 1.7e9
 PROOF = RelayProof(SECRET, lambda: UNIX_TIME)
 RANGE = PortMap(PortRange(45000, 45015), PortRange(46000, 46015))
-NOW = REMEMBERED + 1
+NOW = EVIDENCE_PERIOD_S + 1
 SEDP_WRITERS = 0x000003C2
 CYCLONE_DDS = b"\x01\x10"
 

@@ -6,7 +6,11 @@ from itertools import chain
 from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.rediscovery import PAIRS_AT_ONCE, SEPARATION_S, VERDICTS_AT_ONCE
+from rosproxy.ros2.discovery.rediscovery import (
+    MOST_PAIRS_PER_PART,
+    MOST_VERDICTS_PER_PART,
+    SEPARATION_S,
+)
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
@@ -94,7 +98,7 @@ def test_a_change_of_the_policy_is_applied_in_parts() -> None:
     meeting = parts(domain, domain.continue_pending(later), later)
     assert told([*chain(*meeting)], ended=False) == every_pair
     assert not any(insider.is_separated for insider in domain.inside.by_prefix.values())
-    most = PAIRS_AT_ONCE + 3 * (INSIDE_COUNT + 1)  # three for outside, of each inside
+    most = MOST_PAIRS_PER_PART + 3 * (INSIDE_COUNT + 1)  # three for outside, of each inside
     assert max(map(len, parting + meeting)) <= most
 
 
@@ -130,7 +134,7 @@ def test_verdicts_are_judged_again_a_few_at_a_time() -> None:
         insider.verdicts = {(RuleKind.PUBLISH, f"/t{number}"): True for number in range(100)}
     policy.count = 0
     domain.apply_policy(NOW)
-    assert policy.count == VERDICTS_AT_ONCE
+    assert policy.count == MOST_VERDICTS_PER_PART
     assert finished(domain, []) == []
     assert policy.count == 100 * (INSIDE_COUNT + 1)
 

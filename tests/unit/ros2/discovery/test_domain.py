@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announcements import to_inside
-from rosproxy.ros2.discovery.announcements.to_outside import ANNOUNCED_AGAIN
+from rosproxy.ros2.discovery.announcements.to_outside import REPEAT_INTERVAL_S
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.domain_settings import MOST_MAPPINGS, MOST_PER_ADDRESS, Outgoing
-from rosproxy.ros2.ports.former_ports import ANSWER_TIME
-from rosproxy.ros2.ports.locator_ports import SETTLING
+from rosproxy.ros2.ports.former_ports import ANSWER_TIMEOUT_S
+from rosproxy.ros2.ports.locator_ports import SETTLING_PERIOD_S
 from rosproxy.ros2.protocol.addressing import destination, destinations
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
@@ -22,7 +22,7 @@ from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import source_prefix, source_vendor
 from rosproxy.ros2.registry.participants import ShortageKind, TrafficKind
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
-from rosproxy.ros2.sources.rates import BURST, STEP, cost
+from rosproxy.ros2.sources.rates import BURST, BYTES_PER_UNIT, cost
 from tests.unit.ros2.discovery.domains import (
     HOST,
     INSIDE,
@@ -90,9 +90,11 @@ def test_the_same_is_told_outside_once_in_a_while() -> None:
     domain = make_domain()
     assert to(meet(domain), ROBOT)
     again = spdp(A, INSIDE)
-    assert not to(domain.heard_inside(again, INSIDE, NOW + ANNOUNCED_AGAIN / 2), ROBOT)
+    assert not to(domain.heard_inside(again, INSIDE, NOW + REPEAT_INTERVAL_S / 2), ROBOT)
     assert to(domain.heard_inside(spdp(A, INSIDE, lease=30), INSIDE, NOW), ROBOT)  # something new
-    assert to(domain.heard_inside(spdp(A, INSIDE, lease=30), INSIDE, NOW + ANNOUNCED_AGAIN), ROBOT)
+    assert to(
+        domain.heard_inside(spdp(A, INSIDE, lease=30), INSIDE, NOW + REPEAT_INTERVAL_S), ROBOT
+    )
 
 
 @pytest.mark.parametrize("inside", ["fd30::11", "172.30.0.5"])
@@ -316,7 +318,7 @@ def test_ports_are_given_once_it_is_known_who_had_which() -> None:
     assert {told.target, *(out.target for out in asked)} == {HostPort(INSIDE, 7410)}
     assert len(to(settle(domain, 0.5), INSIDE)) == 2  # asked again
     assert not domain.mappings.by_port
-    assert to(settle(domain, 0.1 + ANSWER_TIME), ROBOT)
+    assert to(settle(domain, 0.1 + ANSWER_TIMEOUT_S), ROBOT)
     assert domain.mappings.by_port
 
 
@@ -329,7 +331,7 @@ def test_a_participant_says_which_ports_it_had() -> None:
         not domain.proxy_participants.port_store.prefixes
     )  # an answer from another address does not count
     domain.heard_inside(answer, INSIDE, 0.2)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     ports = {mapping.target.port: port for port, (_, mapping) in domain.mappings.by_port.items()}
     assert ports == {7410: 45009, 7411: 45004}
 
@@ -342,7 +344,7 @@ def test_what_a_peer_says_of_a_port_counts_more_than_what_others_do() -> None:
             domain.at_range_port(port, sedp(outsider, ROBOT, 7410, to=prefix), source, 0.1)
     domain.heard_inside(spdp(B, INSIDE), INSIDE, 0.2)
     domain.heard_inside(spdp(A, OTHER), OTHER, 0.3)
-    settle(domain, SETTLING + ANSWER_TIME)
+    settle(domain, SETTLING_PERIOD_S + ANSWER_TIMEOUT_S)
     ports = {
         participant.prefix: port
         for port, (participant, mapping) in domain.mappings.by_port.items()
@@ -463,7 +465,7 @@ def test_a_long_announcement_is_charged_for_each_copy() -> None:
     domain = make_domain(peers=[f"10.0.1.{number}" for number in range(32)])
     before = allowance_left(domain, INSIDE)
     domain.heard_inside(spdp(A, INSIDE, padding=7000), INSIDE, NOW)
-    assert before - allowance_left(domain, INSIDE) > 33 * 7000 / STEP
+    assert before - allowance_left(domain, INSIDE) > 33 * 7000 / BYTES_PER_UNIT
 
 
 def targets_of(domain: Domain, announcement: bytes, now: float) -> set[HostPort]:
@@ -652,7 +654,7 @@ def test_who_is_gone_gets_no_port_any_more() -> None:
     assert domain.former_ports.waiting
 
     domain.end_participants_at({INSIDE})
-    settle(domain, SETTLING + ANSWER_TIME + 1)
+    settle(domain, SETTLING_PERIOD_S + ANSWER_TIMEOUT_S + 1)
 
     assert not domain.inside.by_prefix
 
@@ -666,7 +668,7 @@ def test_a_participant_that_ends_while_waiting_is_not_announced() -> None:
     domain.heard_inside(dispose_message(B), INSIDE, 0.2)  # from another address: ignored
     domain.heard_inside(dispose_message(A), INSIDE, 0.2)
 
-    sent = settle(domain, SETTLING + ANSWER_TIME)
+    sent = settle(domain, SETTLING_PERIOD_S + ANSWER_TIMEOUT_S)
 
     assert {source_prefix(told) for told in to(sent, ROBOT)} == {B}
     assert domain.inside.by_prefix.keys() == {B}

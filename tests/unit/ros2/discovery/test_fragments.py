@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import fragments
-from rosproxy.ros2.discovery.fragments import OVERHEAD, FragmentStore, FragmentStores
+from rosproxy.ros2.discovery.fragments import OVERHEAD_BYTES, FragmentStore, FragmentStores
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
@@ -60,7 +60,7 @@ def through(
 
 @given(
     st.integers(0, 400),
-    st.integers(fragments.SHORTEST // 4, 175).map(lambda words: 4 * words),
+    st.integers(fragments.SHORTEST_FRAGMENT_BYTES // 4, 175).map(lambda words: 4 * words),
     st.randoms(use_true_random=False),
     st.booleans(),
 )
@@ -156,7 +156,7 @@ def test_so_much_is_remembered_of_a_participant_and_no_more(
     """Waiting datagrams and their parsed content once took 600 MB, and small samples cost
     nothing.
     """
-    monkeypatch.setattr(fragments, "MOST_BYTES", 4 * OVERHEAD)
+    monkeypatch.setattr(fragments, "MOST_BYTES", 4 * OVERHEAD_BYTES)
     stores = FragmentStores()
     for sequence in range(1, 30):
         through(stores, cut(described(100), 128, sequence)[0])
@@ -220,7 +220,7 @@ def test_a_datagram_waits_for_all_that_it_has_a_part_of() -> None:
 
 
 def test_nobody_pushes_out_what_others_have_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fragments, "MOST_OF_ALL", 100 * OVERHEAD)
+    monkeypatch.setattr(fragments, "MOST_OF_ALL", 100 * OVERHEAD_BYTES)
     stores = FragmentStores()
     sent = cut(described(100), 128)
     assert [through(stores, datagram) for datagram in sent[:-1]] == [[]] * (len(sent) - 1)
@@ -228,7 +228,7 @@ def test_nobody_pushes_out_what_others_have_sent(monkeypatch: pytest.MonkeyPatch
         prefix = bytes([9, 9, number % 2]) + bytes(9)
         other = cut(described(100), 128, number)[0]
         through(stores, other.replace(PREFIX, prefix, 1))
-        assert stores.size <= 100 * OVERHEAD
+        assert stores.size <= 100 * OVERHEAD_BYTES
     assert len(through(stores, sent[-1])) == len(sent)
 
 

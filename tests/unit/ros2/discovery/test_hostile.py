@@ -15,7 +15,7 @@ from rosproxy.ros2.discovery.domain import MOST_ENDED_PER_CALL
 from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS, MOST_PER_HOST, MOST_WAITING
 from rosproxy.ros2.ports import locator_ports
-from rosproxy.ros2.ports.former_ports import ANSWER_TIME
+from rosproxy.ros2.ports.former_ports import ANSWER_TIMEOUT_S
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import LAST_SEQUENCE_NUMBER, RtpsError
@@ -295,7 +295,7 @@ def test_one_address_does_not_keep_others_from_waiting_after_a_start() -> None:
     assert len(domain.former_ports.waiting) == MOST_PER_ADDRESS
     assert domain.heard_inside(spdp(A, OTHER), OTHER, 0.2)
     assert A in domain.former_ports.waiting
-    settle(domain, 0.2 + ANSWER_TIME)
+    settle(domain, 0.2 + ANSWER_TIMEOUT_S)
     assert not domain.former_ports.waiting
     assert domain.heard_inside(spdp(B, INSIDE), INSIDE, 6.0)
 
@@ -330,7 +330,7 @@ def test_who_waits_does_not_take_the_prefix_of_somebody_met_meanwhile() -> None:
     domain = make_domain()
     domain.heard_inside(spdp(B, INSIDE), INSIDE, 0.1)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, 0.2)
-    settle(domain, 0.1 + ANSWER_TIME)
+    settle(domain, 0.1 + ANSWER_TIMEOUT_S)
     assert B in domain.outside.by_prefix
     assert B not in domain.inside.by_prefix
 
@@ -453,7 +453,7 @@ def test_one_that_waits_and_is_malformed_keeps_no_others_waiting(
         return rewritten(for_outside, told)
 
     monkeypatch.setattr(ForOutside, "rewritten", refusing)
-    assert to(settle(domain, 0.1 + ANSWER_TIME), ROBOT)
+    assert to(settle(domain, 0.1 + ANSWER_TIMEOUT_S), ROBOT)
     assert domain.inside.by_prefix[A].mappings
 
 

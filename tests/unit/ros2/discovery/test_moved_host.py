@@ -1,6 +1,6 @@
 """The advertised host has another address: outside meets the participants inside anew."""
 
-from rosproxy.ros2.discovery.announcements.to_outside import ANNOUNCED_AGAIN
+from rosproxy.ros2.discovery.announcements.to_outside import REPEAT_INTERVAL_S
 from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.protocol.rtps import source_prefix
 from tests.unit.ros2.discovery.domains import (
@@ -36,7 +36,7 @@ def test_outside_forgets_and_meets_participants_where_the_host_is_now() -> None:
     assert {locator.host for locator in reached_at(again)} == {MOVED}
     ports = {RANGE.advertised(port) for port in domain.inside.by_prefix[A].ports}
     assert {locator.port for locator in reached_at(again)} == ports
-    later = NOW + SEPARATION_S + ANNOUNCED_AGAIN
+    later = NOW + SEPARATION_S + REPEAT_INTERVAL_S
     (repeated,) = to(domain.heard_inside(spdp(A, INSIDE), INSIDE, later), ROBOT)
     assert repeated == again
 

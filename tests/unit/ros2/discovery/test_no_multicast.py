@@ -5,9 +5,9 @@ import pytest
 from rosproxy.admin.requests import BodyError, ContainerUpdate, read_body
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.announcements.to_inside import DISPOSE_MESSAGE_INTERVAL
+from rosproxy.ros2.discovery.announcements.to_inside import DISPOSE_MESSAGE_INTERVAL_S
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.rediscovery import LAN_RELAY_TIME, SEPARATION_S
+from rosproxy.ros2.discovery.rediscovery import LAN_RELAY_TIMEOUT_S, SEPARATION_S
 from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
@@ -174,7 +174,7 @@ def test_they_meet_anew_once_the_lan_relay_is_heard() -> None:
 def test_they_meet_anew_though_nobody_is_on_the_lan_relays_lan() -> None:
     domain = moved(LAN_RELAY)
     meet(domain)
-    assert by(A, to(settle(domain, NOW + LAN_RELAY_TIME), ROBOT))
+    assert by(A, to(settle(domain, NOW + LAN_RELAY_TIMEOUT_S), ROBOT))
 
 
 def test_who_comes_later_is_forgotten_before_he_is_met() -> None:
@@ -199,11 +199,11 @@ def test_who_does_not_take_it_in_is_told_again() -> None:
         sent = domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW + later)
         return [is_dispose_message(datagram) for datagram in by(C, to(sent, INSIDE))]
 
-    assert told(DISPOSE_MESSAGE_INTERVAL - 0.1) == [False]
-    assert told(DISPOSE_MESSAGE_INTERVAL) == [True, False]
+    assert told(DISPOSE_MESSAGE_INTERVAL_S - 0.1) == [False]
+    assert told(DISPOSE_MESSAGE_INTERVAL_S) == [True, False]
     (stand_in,) = domain.stand_ins.by_port
-    domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW + DISPOSE_MESSAGE_INTERVAL)
-    assert told(3 * DISPOSE_MESSAGE_INTERVAL) == [False]
+    domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW + DISPOSE_MESSAGE_INTERVAL_S)
+    assert told(3 * DISPOSE_MESSAGE_INTERVAL_S) == [False]
 
 
 def test_ports_of_locators_that_are_told_later_are_those_before() -> None:

@@ -7,8 +7,8 @@ import pytest
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.domain_settings import Outgoing
-from rosproxy.ros2.ports.former_ports import ANSWER_TIME
-from rosproxy.ros2.ports.locator_ports import REMEMBERED, SETTLING
+from rosproxy.ros2.ports.former_ports import ANSWER_TIMEOUT_S
+from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S, SETTLING_PERIOD_S
 from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.rtps import source_prefix
@@ -120,7 +120,7 @@ def test_a_forged_proof_gets_no_port_of_another_participant(proof: str, is_first
     claims = [(B, OTHER, FORGED[proof]), (A, INSIDE, PROOF)]
     for prefix, address, claimed in claims if is_first else reversed(claims):
         come(domain, prefix, address, NUMBER, 0.1, claimed)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     assert ports_of(domain, A) == PORTS
     assert not {*ports_of(domain, B)} & {*PORTS}
 
@@ -129,7 +129,7 @@ def test_a_forged_proof_gets_no_port_of_another_participant(proof: str, is_first
 def test_a_participant_with_a_proof_takes_its_port_from_a_liar(proof: str) -> None:
     domain = restarted()
     come(domain, B, OTHER, NUMBER, 0.1, FORGED[proof])
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     assert ports_of(domain, B) == PORTS
     come(domain, A, INSIDE, NUMBER, 3.0, PROOF)
     sent = settle(domain, 3.1)
@@ -145,7 +145,7 @@ def test_a_proof_that_another_participant_has_as_well_gets_the_port_for_neither(
     domain = restarted()
     come(domain, B, OTHER, NUMBER, 0.1, proof_of(B, PORTS))
     come(domain, A, INSIDE, NUMBER, 0.1, PROOF)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     for prefix in (A, B):
         assert not {*ports_of(domain, prefix)} & {*PORTS}
         assert domain.inside.by_prefix[prefix].is_separated
@@ -155,7 +155,7 @@ def test_a_participant_that_has_lost_a_port_meets_outside_anew() -> None:
     domain = restarted()
     domain.heard_outside(spdp(C, ROBOT), ROBOT, 0.1)
     come(domain, B, OTHER, NUMBER, 0.1)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     come(domain, A, INSIDE, NUMBER, 3.0, PROOF)
     settle(domain, 3.1)
     domain.heard_inside(spdp(B, OTHER), OTHER, 4.0)
@@ -172,18 +172,18 @@ def test_two_that_claim_one_port_by_their_word_both_get_others(second: float) ->
     """Without a secret neither can prove anything; outside may send to neither at that port."""
     domain = restarted(key=b"")
     come(domain, B, OTHER, NUMBER, 0.1)
-    if second > SETTLING:
-        settle(domain, SETTLING)
+    if second > SETTLING_PERIOD_S:
+        settle(domain, SETTLING_PERIOD_S)
         assert ports_of(domain, B) == PORTS
     come(domain, A, INSIDE, NUMBER, second)
-    settle(domain, second + SETTLING)
+    settle(domain, second + SETTLING_PERIOD_S)
     come(domain, B, OTHER, NUMBER, second + 2)
     settle(domain, second + 2)
     for prefix in (A, B):
         assert not {*ports_of(domain, prefix)} & {*PORTS}
         assert domain.inside.by_prefix[prefix].is_separated
-    come(domain, C, THIRD, 1, REMEMBERED - 1)
-    settle(domain, REMEMBERED - 1)
+    come(domain, C, THIRD, 1, EVIDENCE_PERIOD_S - 1)
+    settle(domain, EVIDENCE_PERIOD_S - 1)
     assert not {*ports_of(domain, C)} & {*PORTS}
 
 
@@ -193,7 +193,7 @@ def test_a_peer_decides_between_two_words() -> None:
     come(domain, A, INSIDE, NUMBER, 0.1)
     for port in PORTS:
         domain.at_range_port(port, sedp(C, ROBOT, 7410, to=A), ROBOT, 0.5)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     assert ports_of(domain, A) == PORTS
     assert not {*ports_of(domain, B)} & {*PORTS}
 
@@ -207,7 +207,7 @@ def test_a_forged_name_at_a_port_decides_nothing(source: str) -> None:
     come(domain, A, INSIDE, NUMBER, 0.1)
     for port in PORTS:
         domain.at_range_port(port, sedp(C, source, 7410, to=B), source, 0.5)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     assert not {*ports_of(domain, B)} & {*PORTS}
 
 
@@ -219,14 +219,14 @@ def test_an_address_that_receives_decides_between_two_words() -> None:
     for port in PORTS:
         domain.at_range_port(port, sedp(C, LAPTOP, 7410, to=A), LAPTOP, 0.5)
         domain.at_range_port(port, sedp(C, "10.0.0.66", 7410, to=B), "10.0.0.66", 0.5)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     assert ports_of(domain, A) == PORTS
 
 
 def test_the_operators_record_counts_more_than_a_word() -> None:
     domain = restarted(key=b"")
     come(domain, B, OTHER, NUMBER, 0.1)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     domain.former_ports.note_recorded({A: PORTS}, domain.inside.by_prefix)
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 3.0)
     settle(domain, 3.1)
@@ -237,7 +237,7 @@ def test_the_operators_record_counts_more_than_a_word() -> None:
 def test_a_number_without_a_proof_gets_its_ports_where_no_other_claims_them() -> None:
     domain = restarted()
     come(domain, A, INSIDE, NUMBER, 0.1)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     assert ports_of(domain, A) == PORTS
     assert not domain.inside.by_prefix[A].is_separated
 
@@ -251,7 +251,7 @@ def test_wrong_proofs_from_many_addresses_take_nothing_from_a_proof() -> None:
         come(domain, prefix, f"172.31.{number // 250}.{number % 250}", NUMBER, 0.1, PROOF)
     come(domain, A, INSIDE, NUMBER, 0.2, PROOF)
     prove(domain, INSIDE)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     assert ports_of(domain, A) == PORTS
 
 
@@ -259,10 +259,10 @@ def test_ports_are_given_once_their_proof_is_known() -> None:
     domain = restarted()
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     domain.heard_inside(kept_answer(domain, A, NUMBER), INSIDE, 0.1)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     assert not domain.inside.by_prefix
-    domain.heard_inside(proof_answer(domain, A, PROOF), INSIDE, SETTLING)
-    settle(domain, SETTLING)
+    domain.heard_inside(proof_answer(domain, A, PROOF), INSIDE, SETTLING_PERIOD_S)
+    settle(domain, SETTLING_PERIOD_S)
     assert ports_of(domain, A) == PORTS
 
 
@@ -296,8 +296,8 @@ def test_an_unproven_address_keeps_no_participant_inside_from_being_served(start
     assert A in domain.outside.by_prefix
     come(domain, A, INSIDE, 1, start + 0.1)
     announce_from(domain, A, LAPTOP, start + 0.2)
-    settle(domain, start + ANSWER_TIME + 1)
-    announce_from(domain, A, LAPTOP, start + ANSWER_TIME + 2)
+    settle(domain, start + ANSWER_TIMEOUT_S + 1)
+    announce_from(domain, A, LAPTOP, start + ANSWER_TIMEOUT_S + 2)
     assert A in domain.inside.by_prefix
     assert A not in domain.outside.by_prefix
     assert reasons_of(domain)["prefix"]
@@ -316,7 +316,7 @@ def test_a_proof_of_before_the_start_beats_peers_and_proven_addresses(
     if not is_answered_first:
         assert A in domain.outside.by_prefix
         come(domain, A, INSIDE, NUMBER, 0.3, PROOF)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     announce_from(domain, A, source, 3.0)
     assert ports_of(domain, A) == PORTS
     assert A not in domain.outside.by_prefix
@@ -327,23 +327,23 @@ def test_what_a_peer_sends_to_a_participant_tells_that_it_was_inside() -> None:
     domain.at_range_port(PORTS[0], sedp(C, ROBOT, 7410, to=A), ROBOT, 0.1)
     announce_from(domain, A, ROBOT, 0.2)
     come(domain, A, INSIDE, 1, 0.3)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     announce_from(domain, A, ROBOT, 3.0)
     assert A in domain.inside.by_prefix
 
 
 @pytest.mark.parametrize("proof", FORGED.values())
-@pytest.mark.parametrize("second", [0.2, SETTLING + 1, REMEMBERED - 1])
+@pytest.mark.parametrize("second", [0.2, SETTLING_PERIOD_S + 1, EVIDENCE_PERIOD_S - 1])
 def test_no_address_inside_takes_the_prefix_of_a_peers_participant(
     proof: int, second: float
 ) -> None:
     """The container was first after the restart, and the robot was heard no more."""
     domain = restarted()
     come(domain, B, OTHER, NUMBER, 0.1, proof)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     sent = announce_from(domain, B, ROBOT, second)
     sent += domain.heard_inside(spdp(B, OTHER), OTHER, second + 0.1)
-    sent += settle(domain, REMEMBERED)
+    sent += settle(domain, EVIDENCE_PERIOD_S)
     sent += domain.heard_inside(spdp(B, OTHER), OTHER, NOW)
     assert B in domain.outside.by_prefix
     assert B not in domain.inside.by_prefix
@@ -354,7 +354,7 @@ def test_no_address_inside_takes_the_prefix_of_a_peers_participant(
 def test_an_address_that_proves_to_receive_takes_its_prefix_back() -> None:
     domain = restarted(peers=())
     come(domain, B, OTHER, 1, 0.1)
-    settle(domain, SETTLING)
+    settle(domain, SETTLING_PERIOD_S)
     assert B in domain.inside.by_prefix
     asked = to(announce_from(domain, B, LAPTOP, 2.0), LAPTOP)
     (question,) = [d for d in asked if destination(d) == B]
@@ -404,10 +404,10 @@ def test_nothing_is_kept_of_a_participant_inside_that_is_refused() -> None:
     prefix.
     """
     domain = restarted()
-    domain.heard_outside(carried(ROBOT, spdp(A, ROBOT)), LAN_RELAY.host, SETTLING)
-    come(domain, A, INSIDE, 1, SETTLING)
+    domain.heard_outside(carried(ROBOT, spdp(A, ROBOT)), LAN_RELAY.host, SETTLING_PERIOD_S)
+    come(domain, A, INSIDE, 1, SETTLING_PERIOD_S)
     assert A in domain.proxy_participants.port_store.prefixes
-    settle(domain, SETTLING + ANSWER_TIME)
+    settle(domain, SETTLING_PERIOD_S + ANSWER_TIMEOUT_S)
     assert A not in domain.inside.by_prefix
     assert reasons_of(domain)["prefix"]
     assert A not in domain.proxy_participants.port_store.prefixes

@@ -11,7 +11,7 @@ from rosproxy.ros2.protocol.addressing import MOST_OF_USERS, may_be_discovery
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import TrafficKind
-from rosproxy.ros2.sources.rates import BURST, STEP
+from rosproxy.ros2.sources.rates import BURST, BYTES_PER_UNIT
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NOW,
@@ -97,8 +97,8 @@ def test_discovery_behind_user_data_is_read_and_charged(in_front: bytes) -> None
         ):
             assert len(sent[-1].datagram) in (len(outwards), len(inwards))
             assert sent[-1].datagram not in (outwards, inwards)  # the locators are rewritten
-        assert allowance_left(domain, INSIDE) == before[0] - 1 - len(outwards) // STEP
-        assert allowance_left(domain, ROBOT) == before[1] - 1 - len(inwards) // STEP
+        assert allowance_left(domain, INSIDE) == before[0] - 1 - len(outwards) // BYTES_PER_UNIT
+        assert allowance_left(domain, ROBOT) == before[1] - 1 - len(inwards) // BYTES_PER_UNIT
 
 
 def test_what_users_send_passes_where_discovery_is_used_up() -> None:

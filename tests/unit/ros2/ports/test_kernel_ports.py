@@ -4,9 +4,9 @@ from rosproxy.forwarding.kernel.decisions import HostForwarding, destination
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.ports.former_ports import ANSWER_TIME
+from rosproxy.ros2.ports.former_ports import ANSWER_TIMEOUT_S
 from rosproxy.ros2.ports.kernel_ports import KernelPorts
-from rosproxy.ros2.ports.locator_ports import SETTLING
+from rosproxy.ros2.ports.locator_ports import SETTLING_PERIOD_S
 from rosproxy.ros2.registry.participants import TrafficKind
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
@@ -114,6 +114,6 @@ def test_what_an_older_process_forwarded_to_such_a_port_ends_with_the_participan
     domain.ports.note_forwarded({port: LOCATOR})
     assert led(kernel_ports) == {port: LOCATOR}
     domain.heard_inside(of_vendor(spdp(A, INSIDE)), INSIDE, 0.0)
-    settle(domain, SETTLING + ANSWER_TIME)
+    settle(domain, SETTLING_PERIOD_S + ANSWER_TIMEOUT_S)
     assert domain.mappings.by_port[port][1].target == LOCATOR
     assert led(kernel_ports) == {}

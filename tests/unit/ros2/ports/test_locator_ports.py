@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.ports.locator_ports import (
-    REMEMBERED,
-    SETTLING,
+    EVIDENCE_PERIOD_S,
+    SETTLING_PERIOD_S,
     LocatorPorts,
     NamedBy,
     order_for,
@@ -55,15 +55,15 @@ def test_who_is_meant_at_a_port_gets_it(prefix: bytes, other_prefix: bytes) -> N
     (first, *_) = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
     pool.note_former_user(first, other_prefix, DATA, PEER, 0.5)
     if prefix != other_prefix:
-        assert pool.take(prefix, locator(0), DATA, SETTLING) != first
-    assert pool.take(other_prefix, locator(3), DATA, SETTLING) == first
+        assert pool.take(prefix, locator(0), DATA, SETTLING_PERIOD_S) != first
+    assert pool.take(other_prefix, locator(3), DATA, SETTLING_PERIOD_S) == first
 
 
 @given(prefixes, st.integers(45000, 45019))
 def test_who_says_what_it_had_gets_it(prefix: bytes, had: int) -> None:
     pool = ports()
-    assert pool.take(prefix, locator(0), DATA, SETTLING, had) == had
-    assert pool.take(prefix, locator(1), DATA, SETTLING, had) != had
+    assert pool.take(prefix, locator(0), DATA, SETTLING_PERIOD_S, had) == had
+    assert pool.take(prefix, locator(1), DATA, SETTLING_PERIOD_S, had) != had
 
 
 def test_what_outside_says_counts_more_than_ones_own_word() -> None:
@@ -71,16 +71,16 @@ def test_what_outside_says_counts_more_than_ones_own_word() -> None:
     prefix = bytes(12)
     other_prefix = bytes(range(12))
     pool.note_former_user(45007, other_prefix, DATA, PEER, 0.5)
-    assert pool.take(prefix, locator(0), DATA, SETTLING, 45007) != 45007
-    assert pool.take(other_prefix, locator(0), DATA, SETTLING) == 45007
+    assert pool.take(prefix, locator(0), DATA, SETTLING_PERIOD_S, 45007) != 45007
+    assert pool.take(other_prefix, locator(0), DATA, SETTLING_PERIOD_S) == 45007
 
 
 def test_a_port_for_metatraffic_is_none_for_data() -> None:
     pool = ports()
     prefix = bytes(12)
     pool.note_former_user(45007, prefix, METATRAFFIC, PEER, 0.5)
-    assert pool.take(prefix, locator(1), DATA, SETTLING) != 45007
-    assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING) == 45007
+    assert pool.take(prefix, locator(1), DATA, SETTLING_PERIOD_S) != 45007
+    assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING_PERIOD_S) == 45007
 
 
 @given(st.permutations([(bytes(12), 45003), (bytes(range(12)), 45007)]))
@@ -92,7 +92,7 @@ def test_if_several_are_named_their_own_claims_decide(
     for port in (45003, 45007):
         for prefix, _ in had:
             pool.note_former_user(port, prefix, DATA, PEER, 0.5)
-    taken = [pool.take(prefix, locator(0), DATA, SETTLING, port) for prefix, port in had]
+    taken = [pool.take(prefix, locator(0), DATA, SETTLING_PERIOD_S, port) for prefix, port in had]
     assert taken == [port for _, port in had]
 
 
@@ -103,7 +103,9 @@ def test_each_locator_of_a_participant_gets_its_own_port() -> None:
     had = {0: 45003, 1: 45007}
     for port in had.values():
         pool.note_former_user(port, prefix, DATA, PEER, 0.5)
-    taken = {n: pool.take(prefix, locator(n), DATA, SETTLING, port) for n, port in had.items()}
+    taken = {
+        n: pool.take(prefix, locator(n), DATA, SETTLING_PERIOD_S, port) for n, port in had.items()
+    }
     assert taken == had
 
 
@@ -112,7 +114,9 @@ def test_each_locator_gets_its_own_port_though_outside_names_one_alone() -> None
     prefix = bytes(12)
     had = {0: 45003, 1: 45007}
     pool.note_former_user(45007, prefix, DATA, PEER, 0.5)
-    taken = {n: pool.take(prefix, locator(n), DATA, SETTLING, port) for n, port in had.items()}
+    taken = {
+        n: pool.take(prefix, locator(n), DATA, SETTLING_PERIOD_S, port) for n, port in had.items()
+    }
     assert taken == had
 
 
@@ -122,10 +126,10 @@ def test_each_locator_gets_its_former_port_without_a_claim(order: list[int]) -> 
     before = ports()
     after = ports()
     prefix = bytes(12)
-    had = {n: before.take(prefix, locator(n), DATA, SETTLING) for n in range(3)}
+    had = {n: before.take(prefix, locator(n), DATA, SETTLING_PERIOD_S) for n in range(3)}
     for port in had.values():
         after.note_former_user(port or 0, prefix, DATA, PEER, 0.5)
-    assert {n: after.take(prefix, locator(n), DATA, SETTLING) for n in order} == had
+    assert {n: after.take(prefix, locator(n), DATA, SETTLING_PERIOD_S) for n in order} == had
 
 
 def test_a_locator_for_both_kinds_keeps_its_port() -> None:
@@ -133,7 +137,7 @@ def test_a_locator_for_both_kinds_keeps_its_port() -> None:
     pool = ports()
     prefix = bytes(12)
     pool.note_former_user(45007, prefix, DATA, PEER, 0.5)
-    assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING, 45007) == 45007
+    assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING_PERIOD_S, 45007) == 45007
 
 
 def test_a_locator_for_both_kinds_keeps_its_port_without_a_word() -> None:
@@ -141,7 +145,7 @@ def test_a_locator_for_both_kinds_keeps_its_port_without_a_word() -> None:
     prefix = bytes(12)
     first, *_ = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
     pool.note_former_user(first, prefix, DATA, PEER, 0.5)
-    assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING) == first
+    assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING_PERIOD_S) == first
 
 
 def test_a_stranger_names_nobody_where_a_peer_has() -> None:
@@ -150,8 +154,8 @@ def test_a_stranger_names_nobody_where_a_peer_has() -> None:
     other_prefix = bytes(range(12))
     pool.note_former_user(45007, prefix, DATA, PEER, 0.5)
     pool.note_former_user(45007, other_prefix, DATA, OTHERS, 0.5)
-    assert pool.take(other_prefix, locator(0), DATA, SETTLING, 45007) != 45007
-    assert pool.take(prefix, locator(0), DATA, SETTLING) == 45007
+    assert pool.take(other_prefix, locator(0), DATA, SETTLING_PERIOD_S, 45007) != 45007
+    assert pool.take(prefix, locator(0), DATA, SETTLING_PERIOD_S) == 45007
 
 
 def test_too_many_names_at_a_port_count_for_nothing() -> None:
@@ -161,7 +165,7 @@ def test_too_many_names_at_a_port_count_for_nothing() -> None:
     for number in range(1, 100):
         pool.note_former_user(45007, number.to_bytes(12, "big"), DATA, PEER, 0.5)
     pool.note_former_user(45007, b"a stranger's", DATA, OTHERS, 0.5)
-    assert pool.take(prefix, locator(0), DATA, SETTLING, 45007) == 45007
+    assert pool.take(prefix, locator(0), DATA, SETTLING_PERIOD_S, 45007) == 45007
 
 
 def test_a_port_of_somebody_who_may_come_back_is_better_than_none() -> None:
@@ -171,7 +175,10 @@ def test_a_port_of_somebody_who_may_come_back_is_better_than_none() -> None:
     for port in RANGE.ports():
         pool.note_former_user(port, other_prefix, DATA, PEER, 0.5)
     first, second, *_ = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
-    assert [pool.take(prefix, locator(0), DATA, SETTLING) for _ in range(2)] == [first, second]
+    assert [pool.take(prefix, locator(0), DATA, SETTLING_PERIOD_S) for _ in range(2)] == [
+        first,
+        second,
+    ]
 
 
 def test_what_was_heard_is_forgotten_after_a_time() -> None:
@@ -180,8 +187,8 @@ def test_what_was_heard_is_forgotten_after_a_time() -> None:
     other_prefix = bytes(range(12))
     (first, *_) = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
     pool.note_former_user(first, other_prefix, DATA, PEER, 0.5)
-    pool.note_former_user(45000, other_prefix, DATA, PEER, REMEMBERED + 1)
-    assert pool.take(prefix, locator(0), DATA, REMEMBERED) == first
+    pool.note_former_user(45000, other_prefix, DATA, PEER, EVIDENCE_PERIOD_S + 1)
+    assert pool.take(prefix, locator(0), DATA, EVIDENCE_PERIOD_S) == first
 
 
 @given(prefixes, prefixes, st.integers(45000, 45019))
@@ -191,12 +198,12 @@ def test_what_the_kernel_forwarded_leads_there_again(
     pool = ports()
     pool.note_forwarded({port: locator(1), 9: locator(1)})
     pool.note_former_user(port, other_prefix, DATA, PEER, 0.5)
-    assert pool.take(other_prefix, locator(0), DATA, SETTLING, had=port) != port
-    assert pool.take(prefix, locator(1), METATRAFFIC, SETTLING, had=port) != port
-    assert pool.take(prefix, locator(1), DATA, SETTLING) == port
+    assert pool.take(other_prefix, locator(0), DATA, SETTLING_PERIOD_S, had=port) != port
+    assert pool.take(prefix, locator(1), METATRAFFIC, SETTLING_PERIOD_S, had=port) != port
+    assert pool.take(prefix, locator(1), DATA, SETTLING_PERIOD_S) == port
     pool.give_back(port)
     order = order_for(f"{other_prefix.hex()} {locator(2)}", RANGE)
-    taken = [pool.take(other_prefix, locator(2), DATA, SETTLING) for _ in range(18)]
+    taken = [pool.take(other_prefix, locator(2), DATA, SETTLING_PERIOD_S) for _ in range(18)]
     assert taken == [number for number in order if number in taken]
 
 
@@ -204,7 +211,7 @@ def test_what_the_kernel_forwarded_is_forgotten_in_time() -> None:
     pool = ports()
     first, *_ = order_for(f"{bytes(12).hex()} {locator(0)}", RANGE)
     pool.note_forwarded({first: locator(1)})
-    assert pool.take(bytes(12), locator(0), DATA, REMEMBERED) == first
+    assert pool.take(bytes(12), locator(0), DATA, EVIDENCE_PERIOD_S) == first
 
 
 @given(st.permutations([(b"a" * 12, True), (b"b" * 12, False)]), prefixes)
@@ -213,7 +220,9 @@ def test_a_proof_counts_more_than_a_word(order: list[tuple[bytes, bool]], strang
     pool.note_former_user(45007, stranger, DATA, PEER, 0.5)
     for prefix, is_proven in order:
         pool.note_claims(prefix, [45007], is_proven)
-    taken = {prefix: pool.take(prefix, locator(0), DATA, SETTLING, 45007) for prefix, _ in order}
+    taken = {
+        prefix: pool.take(prefix, locator(0), DATA, SETTLING_PERIOD_S, 45007) for prefix, _ in order
+    }
     assert taken[b"a" * 12] == 45007
     assert taken[b"b" * 12] != 45007
 
@@ -224,26 +233,26 @@ def test_equal_claims_give_the_port_to_neither(is_proven: bool, port: int) -> No
     one, other, third = (letter * 12 for letter in (b"a", b"b", b"c"))
     for prefix in (one, other):
         pool.note_claims(prefix, [port], is_proven)
-    assert pool.take(one, locator(0), DATA, SETTLING, port) != port
+    assert pool.take(one, locator(0), DATA, SETTLING_PERIOD_S, port) != port
     pool.forget_claims(one)
-    assert pool.take(other, locator(0), DATA, SETTLING, port) != port
-    assert pool.displaced_by(other, SETTLING) == set()
-    rest = [pool.take(third, locator(n), DATA, SETTLING) for n in range(18)]
+    assert pool.take(other, locator(0), DATA, SETTLING_PERIOD_S, port) != port
+    assert pool.displaced_by(other, SETTLING_PERIOD_S) == set()
+    rest = [pool.take(third, locator(n), DATA, SETTLING_PERIOD_S) for n in range(18)]
     assert rest[-1] == port  # the last that is left
-    assert pool.take(third, locator(18), DATA, SETTLING) is None
+    assert pool.take(third, locator(18), DATA, SETTLING_PERIOD_S) is None
 
 
 def test_a_proof_gets_a_port_back_from_a_participant_that_came_first() -> None:
     pool = ports()
     first = b"a" * 12
     later = b"b" * 12
-    had = pool.take(first, locator(0), DATA, SETTLING)
+    had = pool.take(first, locator(0), DATA, SETTLING_PERIOD_S)
     assert had is not None
     pool.note_claims(later, [had], 0)
     assert pool.displaced_by(later, 3.0) == set()
     pool.note_claims(later, [had], 1)
     assert pool.displaced_by(later, 3.0) == {first}
-    assert pool.displaced_by(later, REMEMBERED) == set()
+    assert pool.displaced_by(later, EVIDENCE_PERIOD_S) == set()
     pool.give_back(had)
     assert pool.displaced_by(later, 3.0) == set()
     assert pool.take(later, locator(0), DATA, 3.0, had) == had
@@ -252,7 +261,7 @@ def test_a_proof_gets_a_port_back_from_a_participant_that_came_first() -> None:
 def test_what_the_kernel_forwarded_stays_with_its_locator() -> None:
     pool = ports()
     pool.note_forwarded({45007: locator(1)})
-    assert pool.take(b"a" * 12, locator(1), DATA, SETTLING) == 45007
+    assert pool.take(b"a" * 12, locator(1), DATA, SETTLING_PERIOD_S) == 45007
     pool.note_claims(b"b" * 12, [45007], 1)
     assert pool.displaced_by(b"b" * 12, 3.0) == set()
 
@@ -263,9 +272,9 @@ def test_a_name_that_may_be_forged_makes_a_word_no_better_and_voids_one_without_
     pool = ports()
     pool.note_former_user(45007, liar, DATA, OTHERS, 0.5)
     pool.note_claims(owner, [45007], 0)
-    assert pool.take(liar, locator(0), DATA, SETTLING) != 45007
-    assert pool.take(owner, locator(0), DATA, SETTLING, 45007) != 45007
+    assert pool.take(liar, locator(0), DATA, SETTLING_PERIOD_S) != 45007
+    assert pool.take(owner, locator(0), DATA, SETTLING_PERIOD_S, 45007) != 45007
     pool.note_former_user(45008, liar, DATA, OTHERS, 0.5)
     pool.note_former_user(45008, owner, DATA, PROVEN, 0.5)
-    assert pool.take(liar, locator(1), DATA, SETTLING, 45008) != 45008
-    assert pool.take(owner, locator(1), DATA, SETTLING, 45008) == 45008
+    assert pool.take(liar, locator(1), DATA, SETTLING_PERIOD_S, 45008) != 45008
+    assert pool.take(owner, locator(1), DATA, SETTLING_PERIOD_S, 45008) == 45008

@@ -19,7 +19,7 @@ from rosproxy.ros2.domain_settings import (
     MOST_WAITING,
     Outgoing,
 )
-from rosproxy.ros2.ports.former_ports import ANSWER_TIME
+from rosproxy.ros2.ports.former_ports import ANSWER_TIMEOUT_S
 from rosproxy.ros2.ports.mappings import PART_FOR_PROVEN
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknowledged
@@ -27,11 +27,11 @@ from rosproxy.ros2.protocol.rtps import HEADER_BYTES, PREFIX_BYTES, source_prefi
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
 from rosproxy.ros2.sources.address_proofs import (
-    ANSWER_KEPT,
-    KEPT,
-    LONGEST_ANSWER,
+    ANSWER_KEPT_S,
+    LONGEST_ANSWER_BYTES,
     MOST_ADDRESSES,
     MOST_ANSWERED,
+    PROOF_KEPT_S,
     AddressProofs,
 )
 from rosproxy.ros2.sources.rates import BURST, Standing
@@ -332,7 +332,7 @@ def test_forged_sources_inside_keep_nobody_from_being_announced() -> None:
     asked = questions(domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW), INSIDE)
     for question in asked:
         domain.heard_inside(answer(question, A), INSIDE, NOW)
-    told = settle(domain, NOW + ANSWER_TIME)
+    told = settle(domain, NOW + ANSWER_TIMEOUT_S)
     assert A in {source_prefix(datagram) for datagram in to(told, ROBOT)}
     assert len(domain.inside.by_prefix[A].mappings) == 2
 
@@ -380,7 +380,7 @@ def test_a_source_is_known_once_it_has_proved_to_receive() -> None:
     domain.expire(NOW + 10)
     assert domain.standing(INSIDE) is Standing.PROVEN
     domain.expire(NOW + 21)
-    domain.expire(NOW + 22 + KEPT)
+    domain.expire(NOW + 22 + PROOF_KEPT_S)
     assert domain.standing(INSIDE) is Standing.INSIDE
     prove(domain, LAPTOP, ROBOT)
     assert domain.standing(LAPTOP) is Standing.PROVEN_OUTSIDE
@@ -453,7 +453,7 @@ def test_an_announcement_beside_an_answer_is_charged(speaks_another: bool) -> No
         info_src = submessage(0x0C, 0, bytes(4) + b"\2\3\1\x0f" + NEIGHBOUR)
         told = spdp(NEIGHBOUR if speaks_another else B, address)[HEADER_BYTES:]
         hidden = answer(asked, B) + (ends + info_src if speaks_another else b"") + told
-        assert len(hidden) <= LONGEST_ANSWER
+        assert len(hidden) <= LONGEST_ANSWER_BYTES
         assert must_queue(hidden, address)
         domain.rates.take(address, 0, NOW)
         domain.rates.charge(address, int(BURST))
@@ -530,7 +530,7 @@ def test_forged_participants_at_an_address_keep_none_from_waiting_after_a_start(
     assert A in domain.former_ports.waiting
     crowd_at(domain, INSIDE, 0.4)
     assert A in domain.former_ports.waiting
-    settle(domain, ANSWER_TIME + 0.5)
+    settle(domain, ANSWER_TIMEOUT_S + 0.5)
     assert A in domain.inside.by_prefix
 
 
@@ -542,7 +542,7 @@ def test_forged_participants_at_proven_addresses_take_three_quarters_of_the_rang
         crowd_at(domain, address, NOW)
     assert domain.ports.pool.free == len(RANGE.listen) // PART_FOR_PROVEN
     answers_what_it_is_asked(domain, NOW)
-    settle(domain, NOW + ANSWER_TIME)
+    settle(domain, NOW + ANSWER_TIMEOUT_S)
     assert len(domain.inside.by_prefix[A].mappings) == 2
 
 
@@ -576,6 +576,6 @@ def test_answers_in_the_name_of_many_are_forgotten() -> None:
     prove(domain, OTHER, prefixes=map(named, range(2 * MOST_ANSWERED)))
     assert not domain.proofs.has_answered(OTHER, named(0))
     assert domain.proofs.has_answered(OTHER, named(2 * MOST_ANSWERED - 1))
-    domain.expire(NOW + ANSWER_KEPT + 1)
+    domain.expire(NOW + ANSWER_KEPT_S + 1)
     assert not domain.proofs.has_answered(OTHER, named(2 * MOST_ANSWERED - 1))
     assert domain.proofs.has_answered(INSIDE, A)

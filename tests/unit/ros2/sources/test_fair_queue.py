@@ -5,7 +5,7 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.ros2.sources.fair_queue import MOST_KNOWN, OVERHEAD, DiscoveryQueue, FairQueue
+from rosproxy.ros2.sources.fair_queue import MOST_KNOWN, OVERHEAD_BYTES, DiscoveryQueue, FairQueue
 from rosproxy.ros2.sources.rates import Standing
 from tests.unit.ros2.discovery.domains import INSIDE, ROBOT, make_domain, prove
 
@@ -28,7 +28,7 @@ def test_a_source_with_one_datagram_does_not_wait_for_one_with_many() -> None:
 def test_long_datagrams_count_for_more() -> None:
     queue = FairQueue[int](most_sources=10)
     for number in range(50):
-        queue.put("long", number, 10 * OVERHEAD - OVERHEAD)
+        queue.put("long", number, 10 * OVERHEAD_BYTES - OVERHEAD_BYTES)
         queue.put("short", number, 0)
     assert Counter(taken(queue, 22)) == {"long": 2, "short": 20}
 
@@ -43,7 +43,7 @@ def test_a_source_pays_for_what_its_datagrams_lead_to() -> None:
         (source,) = taken(queue, 1)
         sources.append(source)
         if source == "announces":
-            queue.charge(source, 9 * OVERHEAD)
+            queue.charge(source, 9 * OVERHEAD_BYTES)
     assert Counter(sources) == {"announces": 2, "other": 20}
 
 
@@ -60,7 +60,7 @@ def test_a_datagram_may_take_the_place_of_the_one_that_waits_with_its_key() -> N
 
 
 def test_what_lost_its_place_to_another_source_is_not_replaced() -> None:
-    queue = FairQueue[int](most_sources=10, most_of_all=4 * OVERHEAD)
+    queue = FairQueue[int](most_sources=10, most_of_all=4 * OVERHEAD_BYTES)
     for number in range(4):
         queue.put("many", number, 0, number)
     assert queue.put("few", 9, 0)
@@ -92,14 +92,14 @@ def test_silence_saves_nothing() -> None:
 
 
 def test_a_source_has_so_much_room() -> None:
-    queue = FairQueue[int](most_sources=2, most_of_source=10 * OVERHEAD)
+    queue = FairQueue[int](most_sources=2, most_of_source=10 * OVERHEAD_BYTES)
     assert [queue.put("one", number, 0) for number in range(11)] == [True] * 10 + [False]
     assert queue.put("another", 0, 0)
     assert not queue.put("a third", 0, 0)
 
 
 def test_the_source_with_most_loses_what_does_not_fit() -> None:
-    queue = FairQueue[int](most_sources=10, most_of_all=10 * OVERHEAD)
+    queue = FairQueue[int](most_sources=10, most_of_all=10 * OVERHEAD_BYTES)
     for number in range(9):
         queue.put("many", number, 0)
     assert [queue.put("few", number, 0) for number in range(9)] == [True] * 5 + [False] * 4
@@ -170,5 +170,5 @@ def test_a_standing_pays_for_what_its_datagrams_lead_to() -> None:
         (source,) = taken(queue, 1)
         sources.append(source)
         if source == "announces":
-            queue.charge(source, 9 * OVERHEAD)
+            queue.charge(source, 9 * OVERHEAD_BYTES)
     assert Counter(sources) == {"announces": 2, "other": 20}

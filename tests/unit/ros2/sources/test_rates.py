@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from rosproxy.ros2.sources.rates import (
     BURST,
+    BYTES_PER_UNIT,
     MOST_SOURCES,
     PER_SECOND,
-    STEP,
     DiscoveryRates,
     Standing,
     cost,
@@ -50,13 +50,17 @@ def test_so_many_sources_are_remembered_and_no_more() -> None:
 
 @given(st.lists(st.integers(0, 65_536), min_size=1, max_size=50))
 def test_what_is_charged_follows_from_the_bytes(sizes: list[int]) -> None:
-    assert sum(sizes) / STEP <= sum(map(cost, sizes)) <= sum(sizes) / STEP + len(sizes)
+    assert (
+        sum(sizes) / BYTES_PER_UNIT
+        <= sum(map(cost, sizes))
+        <= sum(sizes) / BYTES_PER_UNIT + len(sizes)
+    )
 
 
 def test_a_long_datagram_is_charged_as_several() -> None:
     rates = DiscoveryRates()
     longest = sum(rates.take("a", 64_000, 0.0) for _ in range(1000))
-    assert longest == pytest.approx(BURST * STEP / 64_000, abs=1)
+    assert longest == pytest.approx(BURST * BYTES_PER_UNIT / 64_000, abs=1)
 
 
 def test_forged_sources_have_one_allowance_together() -> None:

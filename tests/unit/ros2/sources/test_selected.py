@@ -4,10 +4,10 @@ import pytest
 
 from rosproxy.ros2.protocol.rtps import RtpsError, message_header
 from rosproxy.ros2.sources.selected import (
-    LONGEST_HELD,
+    LONGEST_HELD_BYTES,
     MOST_HELD,
     MOST_HELD_EACH,
-    UPDATE_TIMEOUT,
+    UPDATE_TIMEOUT_S,
     SelectedAddresses,
 )
 
@@ -24,16 +24,16 @@ def test_without_an_operator_all_are_let_in() -> None:
 
 
 def test_an_operator_is_waited_for() -> None:
-    selected = SelectedAddresses(UPDATE_TIMEOUT)
+    selected = SelectedAddresses(UPDATE_TIMEOUT_S)
     selected.hold(ADDRESS, said(1))
     assert not selected.admits(ADDRESS, 1.0)
     assert selected.released(1.0) == []
-    assert selected.released(UPDATE_TIMEOUT) == [(ADDRESS, said(1))]
-    assert selected.released(UPDATE_TIMEOUT) == []
+    assert selected.released(UPDATE_TIMEOUT_S) == [(ADDRESS, said(1))]
+    assert selected.released(UPDATE_TIMEOUT_S) == []
 
 
 def test_who_is_selected_is_let_in_and_nobody_else() -> None:
-    selected = SelectedAddresses(UPDATE_TIMEOUT)
+    selected = SelectedAddresses(UPDATE_TIMEOUT_S)
     selected.hold(ADDRESS, said(1))
     selected.hold(OTHER_ADDRESS, said(2, b"at first"))
     selected.hold(OTHER_ADDRESS, said(2, b"at last"))
@@ -47,8 +47,8 @@ def test_who_is_selected_is_let_in_and_nobody_else() -> None:
 
 
 def test_what_is_held_is_bounded() -> None:
-    selected = SelectedAddresses(UPDATE_TIMEOUT)
-    selected.hold(ADDRESS, said(1, bytes(LONGEST_HELD)))
+    selected = SelectedAddresses(UPDATE_TIMEOUT_S)
+    selected.hold(ADDRESS, said(1, bytes(LONGEST_HELD_BYTES)))
     assert not selected.held_announcements
     for number in range(2 * MOST_HELD_EACH):
         selected.hold(ADDRESS, said(number))

@@ -12,11 +12,11 @@ from rosproxy.net.addresses import Network, is_address, is_inside, is_loopback
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.node_health import UNKNOWN_PID, ProbeResult
 
-DIRECT_INTERVAL = 2.0
+LONGEST_DIRECT_INTERVAL_S = 2.0
 """The longest time between probes, in seconds, of a node that registered directly."""
-FORGET_AFTER = 3600.0
+FORGET_AFTER_S = 3600.0
 """Seconds after which the proxy forgets a node that was unregistered while silent."""
-NO_PATIENCE = 0.001
+NO_PATIENCE_S = 0.001
 """Seconds, less than between any two probes. Zero would mean that no node is unregistered."""
 
 
@@ -74,7 +74,8 @@ def may_be_kept(endpoint: Endpoint) -> bool:
 def is_due(endpoint: Endpoint, now: float, interval: float) -> bool:
     """Whether to probe a node now; ``interval`` is that of idle nodes in seconds."""
     return endpoint.health.due(
-        now, min(interval, DIRECT_INTERVAL) if endpoint.has_registered_directly else interval
+        now,
+        min(interval, LONGEST_DIRECT_INTERVAL_S) if endpoint.has_registered_directly else interval,
     )
 
 
@@ -85,14 +86,14 @@ def is_to_be_unregistered(endpoint: Endpoint, now: float, after: float) -> bool:
     effect. So the proxy unregisters such a node as soon as the node has ended.
     """
     if endpoint.has_registered_directly and endpoint.health.refused:
-        after = min(after, NO_PATIENCE)
+        after = min(after, NO_PATIENCE_S)
     return endpoint.health.clean_up(now, after)
 
 
 def lease_lasts(endpoint: Endpoint, linger: float) -> float:
     """Seconds for which an unused lease lasts; an hour for a silent node, which may come back."""
     health = endpoint.health
-    return FORGET_AFTER if health.cleaned and not (health.refused or health.has_ended) else linger
+    return FORGET_AFTER_S if health.cleaned and not (health.refused or health.has_ended) else linger
 
 
 def dead_endpoints(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint]:

@@ -11,7 +11,7 @@ SIDES = {OUT: "published", IN: "received"}
 MOST_NAMES = 1000
 """The highest number of topics with separate sums. All further topics share a sum."""
 OTHERS = "other"
-WRAP = 2**32
+OVERFLOW_DIFFERENCE = 2**32
 """The difference after an overflow: roscpp's numbers are signed 32-bit integers."""
 
 
@@ -74,7 +74,7 @@ def _difference(former: int, newest: int) -> int:
     """The growth of a number. A smaller number started anew, or overflowed if negative."""
     if newest >= former:
         return newest - former
-    return newest - former + WRAP if newest < 0 <= former else max(newest, 0)
+    return newest - former + OVERFLOW_DIFFERENCE if newest < 0 <= former else max(newest, 0)
 
 
 def _sum_up(direction: str, counts: list[Count]) -> Count:

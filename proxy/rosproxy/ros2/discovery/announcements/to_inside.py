@@ -29,7 +29,7 @@ from rosproxy.ros2.rewriting.discovery import (
     rewritten,
 )
 
-DISPOSE_MESSAGE_INTERVAL = 2.0
+DISPOSE_MESSAGE_INTERVAL_S = 2.0
 """Seconds until a participant inside gets the next dispose message for the same participant
 outside. The proxy repeats the message until the two have rediscovered each other."""
 
@@ -143,12 +143,12 @@ class AnnouncementsToInside:
         """The dispose message for a participant outside, if a participant inside has to forget it.
 
         Empty outside of a rediscovery, and if the last such message is more recent than
-        `DISPOSE_MESSAGE_INTERVAL`.
+        `DISPOSE_MESSAGE_INTERVAL_S`.
         """
         if (
             insider.dispose_message_times is None
             or now - insider.dispose_message_times.get(outsider.prefix, -inf)
-            < DISPOSE_MESSAGE_INTERVAL
+            < DISPOSE_MESSAGE_INTERVAL_S
         ):
             return []
         insider.dispose_message_times[outsider.prefix] = now

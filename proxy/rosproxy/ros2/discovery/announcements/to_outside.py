@@ -16,7 +16,7 @@ from rosproxy.ros2.registry.participants import InsideParticipant, TrafficKind
 from rosproxy.ros2.rewriting.announced_participant import note_endpoints
 from rosproxy.ros2.rewriting.discovery import Announcement, DiscoveryMessage, rewritten
 
-ANNOUNCED_AGAIN = 0.5
+REPEAT_INTERVAL_S = 0.5
 """Seconds in which the proxy sends the same announcement outside only once."""
 
 
@@ -79,7 +79,7 @@ class AnnouncementsToOutside:
         many discover each other, and each goes to all ports of the peers. Empty during a
         separation, too.
         """
-        if announcement == insider.announcement and now - insider.announced_at < ANNOUNCED_AGAIN:
+        if announcement == insider.announcement and now - insider.announced_at < REPEAT_INTERVAL_S:
             return []
         is_first = not insider.announcement
         insider.announcement = announcement

@@ -10,7 +10,7 @@ preference is:
 4. the participant inside;
 5. the participant outside at any other address.
 
-A served participant inside keeps its place, except in the first `REMEMBERED` seconds after the
+A served participant inside keeps its place, except in the first `EVIDENCE_PERIOD_S` after the
 start. In these seconds, a copy of the prefix may have come before the participant outside.
 """
 
