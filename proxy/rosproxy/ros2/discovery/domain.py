@@ -138,29 +138,17 @@ class Domain:
         self.to_outside = AnnouncementsToOutside(settings, outside)
         former_ports = FormerPorts.starting(settings, self.ports, proofs, unix_s - monotonic_s)
         self.former_ports = former_ports
+        asking = DiscoveryParticipant(discovery_prefix)
         self.owners = PrefixOwners(settings, inside, outside, former_ports, proofs)
         self.rediscovery = Rediscovery(settings, inside, outside, self.to_inside)
         self.fragments = fragments = FragmentStores()
         self.proxy_participants = ProxyParticipants(
-            settings,
-            DiscoveryParticipant(discovery_prefix),
-            inside,
-            outside,
-            former_ports,
-            fragments,
-            proofs,
+            settings, asking, inside, outside, former_ports, fragments, proofs
         )
         self.disposal = Disposal(
-            settings,
-            inside,
-            outside,
-            self.proxy_participants,
-            former_ports,
-            self.rediscovery,
-            fragments,
-            proofs,
-            refused,
-        )
+            settings, inside, outside, self.proxy_participants, former_ports,
+            self.rediscovery, fragments, proofs, refused,
+        )  # fmt: skip
 
     @property
     def is_busy(self) -> bool:
