@@ -4,8 +4,7 @@ aiohttp's parser (llhttp) reads the responses. The client does not use aiohttp's
 call through ClientSession takes twice as long, because of cookies, redirects and proxies. A
 cancelled call of ClientSession closes the connection, and that ends roslisp nodes. This client
 leaves such a connection open until the answer has arrived (`rosproxy.net.late_answers`). The client
-also refuses compressed bodies: ROS does not compress, and a
-small body could become huge.
+also refuses compressed bodies: ROS does not compress, and a small body could become huge.
 
 Long bodies that the proxy need not read pass piece by piece, in requests and replies. The proxy
 reads a piece only after the receiver has taken the previous pieces. So a body needs about 100 KiB
