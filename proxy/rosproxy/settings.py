@@ -453,15 +453,6 @@ class Settings:
         if len(self.zenoh_peer) > MOST_ZENOH_PEERS:
             text = f"{len(self.zenoh_peer)} routers; give at most {MOST_ZENOH_PEERS}"
             raise SettingError("--zenoh-peer", text)
-        rules = {
-            "--policy": self.policy_rules,
-            "--policy-file": self.policy_file,
-            "--policy-layers": self.policy_layers,
-        }
-        for option, given in rules.items():
-            if given:  # rules that only seem to hold would be worse than none
-                text = "has no effect on rmw_zenoh. Remove this option, or --ros zenoh"
-                raise SettingError(option, text)
 
     @property
     def ports(self) -> PortMap:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -62,12 +63,12 @@ class Lab:
         self.proxy = self.start("px", argv, {"PYTHONPATH": os.pathsep.join(paths)})
         self.proxy.wait_for("listening: ")
 
-    def restart_proxy(self) -> None:
+    def restart_proxy(self, *options: str) -> None:
         """Kill the process of the proxy, and start another."""
         assert self.proxy is not None
         os.kill(self.proxy.pid, 9)
         self.proxy.wait()
-        self.start_proxy()
+        self.start_proxy(*options)
 
     def start_router(self, version: str) -> Process:
         """Start the router of the robot."""
@@ -121,6 +122,17 @@ class Lab:
             with closing(asking):
                 asking.request("GET", "/status")
                 return parse_status(asking.getresponse().read())
+
+    def post_policy(self, *layers: Mapping[str, object]) -> None:
+        """Give the proxy layers of rules, as an operator does."""
+        body = json.dumps({"layers": layers})
+        with self.topology.places["px"].entered():
+            asking = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
+            with closing(asking):
+                asking.request("POST", "/policy", body, {"Content-Type": "application/json"})
+                answer = asking.getresponse()
+                told = answer.read()
+                assert answer.status == 200, told
 
     def zenoh(self) -> ZenohStatus:
         """The status of the proxy's routers."""

@@ -7,7 +7,7 @@ metrics and the status report each denial, and what a layer in audit mode would 
 
 import asyncio
 import contextlib
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from rosproxy.access.layers import (
     ALLOWED,
@@ -33,7 +33,9 @@ PARAMETERS = frozenset({RuleKind.GET_PARAM, RuleKind.SET_PARAM})
 class AccessPolicy:
     """The layers in force: of the options, of the policy file and of an operator.
 
-    ``version`` grows by 1 with each change of the layers. ``empty``: there is no rule.
+    ``version`` grows by 1 with each change of the layers. ``empty``: there is no rule. ``checks``
+    are called with all layers before new layers are put in force, and raise ValueError for a rule
+    that cannot be enforced.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class AccessPolicy:
         self._operator_layers = tuple(operator_layers)
         self._file_layers = tuple[PolicyLayer, ...]()
         self._operator_told = asyncio.Event()
+        self.checks: list[Callable[[Sequence[PolicyLayer]], None]] = []
         self._by_kind: dict[RuleKind, tuple[PolicyLayer, ...]] = {}
         self.version = 0
         self.empty = False
@@ -60,14 +63,14 @@ class AccessPolicy:
         return (*self._option_layers, *self._file_layers, *self._operator_layers)
 
     def use_file(self, layer: PolicyLayer) -> None:
-        """Put the layer of the policy file in force. Raises ValueError as `check_bounds` does."""
-        check_bounds((*self._option_layers, layer, *self._operator_layers))
+        """Put the layer of the policy file in force. Raises ValueError if a check fails."""
+        self._check((*self._option_layers, layer, *self._operator_layers))
         self._file_layers = (layer,)
         self._note_change()
 
     def use_operator_layers(self, layers: Sequence[PolicyLayer]) -> None:
-        """Put the layers of an operator in force. Raises ValueError as `check_bounds` does."""
-        check_bounds((*self._option_layers, *self._file_layers, *layers))
+        """Put the layers of an operator in force. Raises ValueError if a check fails."""
+        self._check((*self._option_layers, *self._file_layers, *layers))
         self._operator_layers = tuple(layers)
         self._note_change()
         self._operator_told.set()
@@ -134,6 +137,11 @@ class AccessPolicy:
         if self.empty:
             return False
         return any(may_deny(self._layers_for(kind), (kind,), callers, address) for kind in kinds)
+
+    def _check(self, layers: Sequence[PolicyLayer]) -> None:
+        check_bounds(layers)
+        for check in self.checks:
+            check(layers)
 
     def _note_change(self) -> None:
         self._by_kind.clear()

@@ -7,7 +7,7 @@ the layer would deny.
 
 from collections.abc import Collection, Iterable, Sequence
 from enum import Enum
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
@@ -20,6 +20,9 @@ LONGEST_LAYER_NAME = 200
 """Characters of a layer's name."""
 
 
+_Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
+
+
 class PolicyMode(Enum):
     """Whether the proxy enforces the rules of a layer, or only reports what they would deny."""
 
@@ -28,12 +31,17 @@ class PolicyMode(Enum):
 
 
 class PolicyLayer(msgspec.Struct, frozen=True):
-    """Rules of one author, for the nodes inside at ``addresses``; None: for all nodes inside."""
+    """Rules of one author, for the nodes inside at ``addresses``; None: for all nodes inside.
+
+    On rmw_zenoh, a layer with addresses holds at the ``ports`` of the proxy that its nodes use, and
+    None stands for all ports.
+    """
 
     name: str
     rules: tuple[Rule, ...]
     mode: PolicyMode = PolicyMode.ENFORCE
     addresses: frozenset[str] | None = None
+    ports: frozenset[int] | None = None
 
     def is_for(self, address: str) -> bool:
         """Whether the rules hold for the node inside at an address."""
@@ -47,6 +55,7 @@ class WrittenLayer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rules: tuple[str, ...]
     mode: PolicyMode = PolicyMode.ENFORCE
     addresses: tuple[str, ...] | None = None
+    ports: tuple[_Port, ...] | None = None
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -137,7 +146,8 @@ def read_layer(written: WrittenLayer) -> PolicyLayer:
         addresses = _addresses(written.addresses)
     except ValueError as error:
         raise ValueError(f"layer {shown!r}: {error}") from None
-    return PolicyLayer(written.name, rules, written.mode, addresses)
+    ports = None if written.ports is None else frozenset(written.ports)
+    return PolicyLayer(written.name, rules, written.mode, addresses, ports)
 
 
 def read_layers(value: object) -> tuple[PolicyLayer, ...]:
@@ -157,6 +167,7 @@ def layers_as_json(layers: Iterable[PolicyLayer]) -> list[dict[str, Any]]:
             "mode": layer.mode.value,
             "rules": [str(rule) for rule in layer.rules],
             "addresses": None if layer.addresses is None else sorted(layer.addresses),
+            **({} if layer.ports is None else {"ports": sorted(layer.ports)}),
         }
         for layer in layers
     ]

@@ -1,8 +1,8 @@
 """The sources of the policy in a running proxy: options, policy file, operator.
 
 The rules of the options stay. The rules of the file and of the operator may change at any time. The
-stacks of ROS 1 and ROS 2 look for changes of the file themselves. When an operator posts rules, the
-stacks apply the rules before the proxy answers.
+stacks look for changes of the file themselves. When an operator posts rules, the stacks apply the
+rules before the proxy answers.
 """
 
 import logging
@@ -23,6 +23,7 @@ from rosproxy.settings import Settings
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
+from rosproxy.zenoh.policy.name_sets import check_layers
 
 log = logging.getLogger(__name__)
 
@@ -72,8 +73,6 @@ class PolicySources:
     def _use_operator_layers(self, body: Any) -> None:
         """Put the layers of a body in force. Raises BodyError."""
         written = read_body(body, PolicyUpdate).layers
-        if written and self._runtime.settings.for_zenoh:
-            raise BodyError("layers: rules have no effect on rmw_zenoh. Send no layers")
         try:
             self._runtime.policy.use_operator_layers([read_layer(layer) for layer in written])
         except ValueError as error:
@@ -90,6 +89,8 @@ def read_policy_file(settings: Settings) -> None:
         problems = Problems()
         refusals = Refusals(metrics, problems, time.monotonic)
         policy = AccessPolicy(settings.policy, settings.policy_layers, metrics, refusals)
+        if settings.for_zenoh:
+            policy.checks.append(check_layers)
         _read(PolicyFile(settings.policy_file, PolicyMode(settings.policy_mode), policy, problems))
 
 

@@ -4,18 +4,21 @@ A router never passes data between two peers of this router: zenoh expects such 
 other directly. rmw_zenoh makes each node a peer that listens on loopback. So nodes of the same
 container reach each other, and nodes of two containers do not. With a router for each container,
 two containers are peers of two routers, and routers pass data on to each other. The hub is linked
-to all these routers, and to routers outside.
+to all these routers, and to routers outside. The hub dials the routers of containers by sockets in
+a directory. So the access control of such a router distinguishes the hub from nodes.
 
 The values come from rmw_zenohd (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_ROUTER_CONFIG.json5).
 Exceptions are the addresses, the bound of sessions, and the delay for scouting, which is off.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.zenoh.policy.access_control import HUB_PROTOCOL, NODE_PROTOCOL
 from rosproxy.zenoh.protocol.report import MOST_SESSIONS
 
 RouterConfig = Mapping[str, str]
@@ -44,24 +47,52 @@ _COMMON: dict[str, Any] = {
 }
 
 
-def router_configs(
-    bind: str, ports: PortRange, listen: int | None, peers: Sequence[HostPort]
-) -> list[RouterConfig]:
-    """A router for each port, in order, and the hub as the last.
+@dataclass(frozen=True, slots=True)
+class RouterPlan:
+    """Where the routers listen, and what they dial.
 
     ``listen`` is the port of the hub for outside, ``peers`` are routers that the hub dials.
+    ``directory`` has the sockets by which the hub dials the routers of containers. If empty, the
+    hub dials by TCP, and the routers can have no access control.
     """
-    containers = [HostPort(bind, port) for port in ports.ports()]
-    # The hub dials the other routers, so without ``listen`` the hub has no port.
-    dialed = [HostPort(_LOOPBACK.get(bind, bind), port) for port in ports.ports()]
-    hub_ports = [] if listen is None else [HostPort(bind, listen)]
-    routers = [_config([container], []) for container in containers]
-    return [*routers, _config(hub_ports, [*dialed, *peers])]
+
+    bind: str
+    ports: PortRange
+    listen: int | None
+    peers: Sequence[HostPort]
+    directory: str = ""
+
+    def configs(self, access: Mapping[int, object]) -> list[RouterConfig]:
+        """A router for each port, in order, and the hub as the last.
+
+        ``access`` has the access control of routers by port. Raises ValueError for access control
+        without a directory.
+        """
+        if access and not self.directory:
+            raise ValueError("access control needs a directory for sockets")
+        routers = [
+            _config([_tcp(HostPort(self.bind, port)), *self._socket(port)], [], access.get(port))
+            for port in self.ports.ports()
+        ]
+        # The hub dials the other routers. So without ``listen``, others reach no port of the hub.
+        hub_ports = [] if self.listen is None else [HostPort(self.bind, self.listen)]
+        host = _LOOPBACK.get(self.bind, self.bind)
+        dialed = [
+            endpoint
+            for port in self.ports.ports()
+            for endpoint in self._socket(port) or [_tcp(HostPort(host, port))]
+        ]
+        return [*routers, _config(map(_tcp, hub_ports), [*dialed, *map(_tcp, self.peers)], None)]
+
+    def _socket(self, port: int) -> list[str]:
+        return [f"{HUB_PROTOCOL}/{self.directory}/{port}"] if self.directory else []
 
 
-def _config(listen: Sequence[HostPort], connect: Sequence[HostPort]) -> RouterConfig:
-    endpoints = {
-        "listen/endpoints": [f"tcp/{address}" for address in listen],
-        "connect/endpoints": [f"tcp/{address}" for address in connect],
-    }
-    return {key: json.dumps(value) for key, value in (_COMMON | endpoints).items()}
+def _tcp(address: HostPort) -> str:
+    return f"{NODE_PROTOCOL}/{address}"
+
+
+def _config(listen: Iterable[str], connect: Iterable[str], access: object) -> RouterConfig:
+    own: dict[str, object] = {"listen/endpoints": [*listen], "connect/endpoints": [*connect]}
+    own |= {"access_control": access} if access else {}
+    return {key: json.dumps(value) for key, value in (_COMMON | own).items()}

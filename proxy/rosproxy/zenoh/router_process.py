@@ -3,9 +3,10 @@
 The routers are a library in Rust. A crash or a hang of the library ends this process, and leaves
 the proxy alone. The proxy then starts the process again (`rosproxy.zenoh.router_supervisor`).
 
-Standard input has a line of JSON, a list of `RouterConfig`. Standard output gets a `Report` each
-second. The process ends with an error in the last report if a router cannot be opened, or does not
-answer.
+Each line of standard input is JSON: a revision, and a list of `RouterConfig`. With each further
+line, the process restarts the routers with changed configurations, and leaves the other routers
+alone. Standard output gets a `Report` each second, and at once after a line. The process ends with
+an error in the last report if a router cannot be opened, or does not answer.
 
 Nodes wait for the process, so the process loads little: msgspec would take as long as all the rest.
 """
@@ -13,9 +14,10 @@ Nodes wait for the process, so the process loads little: msgspec would take as l
 import ctypes
 import json
 import os
+import queue
 import signal
 import sys
-import time
+import threading
 from collections.abc import Mapping, Sequence
 from typing import Any, TextIO
 
@@ -27,10 +29,11 @@ REPORT_INTERVAL_S = 1.0
 ANSWER_TIMEOUT_S = 5.0
 """Time in which a router has to describe itself. A router takes less than a millisecond."""
 _PR_SET_PDEATHSIG = 1
+_NO_LINE = "\n"
 
 
 class Tokens:
-    """The liveliness tokens of the graph."""
+    """The liveliness tokens of the graph, as a router sees them."""
 
     def __init__(self) -> None:
         self._keys: set[str] = set()
@@ -50,12 +53,68 @@ class Tokens:
             self.left_out += not is_kept
         self._changed = True
 
-    def changed(self) -> list[str] | None:
-        """All tokens; None if none has changed since the last call."""
-        if not self._changed:
-            return None
+    def look(self) -> bool:
+        """Whether a token has changed since the last call."""
+        changed = self._changed
         self._changed = False
-        return list(self._keys.copy())
+        return changed
+
+    def keys(self) -> set[str]:
+        """All tokens."""
+        return self._keys.copy()
+
+
+class Router:
+    """An open router, with the tokens of the graph if it is the hub or has access control.
+
+    Behind access control are tokens that do not reach the hub. Raises zenoh.ZError.
+    """
+
+    def __init__(self, config: Mapping[str, str], *, is_hub: bool) -> None:
+        self.config = config
+        self.session = open_router(config)
+        self.tokens = Tokens()
+        if is_hub or "access_control" in config:
+            # The subscriber ends with its object, which has to have a name.
+            self._subscriber = self.session.liveliness().declare_subscriber(
+                ALL_TOKENS, self.tokens.take, history=True
+            )
+
+
+class Routers:
+    """The routers of the latest configurations; the last is the hub."""
+
+    def __init__(self) -> None:
+        self._routers: list[Router] = []
+        self._left_out = 0
+
+    def use(self, configs: Sequence[Mapping[str, str]]) -> None:
+        """Open the routers with new or changed configurations. Raises zenoh.ZError."""
+        changed = [
+            index
+            for index, config in enumerate(configs)
+            if index >= len(self._routers) or self._routers[index].config != config
+        ]
+        for index in changed:
+            if index < len(self._routers):
+                self._routers[index].session.close()
+        last = len(configs) - 1
+        opened = {index: Router(configs[index], is_hub=index == last) for index in changed}
+        kept = dict(enumerate(self._routers))
+        self._routers = [(kept | opened)[index] for index in range(len(configs))]
+
+    def report(self) -> dict[str, Any]:
+        """The fields of a report. Raises ValueError if a router does not answer."""
+        described = [describe(router.session) for router in self._routers]
+        tokens = [router.tokens for router in self._routers]
+        keys = None
+        looks = [told.look() for told in tokens]  # `look` of every router, so a list
+        if any(looks):
+            union = sorted(set[str]().union(*(told.keys() for told in tokens)))
+            keys = union[:MOST_TOKENS]
+            self._left_out = len(union) - len(keys)
+        left_out = max(told.left_out for told in tokens) + self._left_out
+        return {"routers": described, "tokens": keys, "tokens_left_out": left_out}
 
 
 def open_router(config: Mapping[str, str]) -> Any:
@@ -80,17 +139,28 @@ def report(output: TextIO, **fields: Any) -> None:
     print(json.dumps(fields), file=output, flush=True)
 
 
-def run(configs: Sequence[Mapping[str, str]], output: TextIO) -> None:
+def read_lines(lines: "queue.SimpleQueue[str]") -> None:
+    """Put each line of standard input into a queue; an empty text at the end."""
+    while line := sys.stdin.readline():
+        lines.put(line)
+    lines.put("")
+
+
+def run(lines: "queue.SimpleQueue[str]", output: TextIO) -> None:
     """Run routers and report, without end. Raises zenoh.ZError, ValueError, BrokenPipeError."""
-    routers = [open_router(config) for config in configs]
-    tokens = Tokens()
-    # The subscriber ends with its object, which has to have a name.
-    _subscriber = routers[-1].liveliness().declare_subscriber(ALL_TOKENS, tokens.take, history=True)
+    routers = Routers()
+    revision = 0
+    line = lines.get()
     while True:
-        described = [describe(router) for router in routers]
-        changed = tokens.changed()
-        report(output, routers=described, tokens=changed, tokens_left_out=tokens.left_out)
-        time.sleep(REPORT_INTERVAL_S)
+        if line != _NO_LINE:
+            told = json.loads(line)  # not valid at the end of the input, which ends the process
+            routers.use(told["routers"])
+            revision = told["revision"]
+        report(output, revision=revision, **routers.report())
+        try:
+            line = lines.get(timeout=REPORT_INTERVAL_S)
+        except queue.Empty:
+            line = _NO_LINE
 
 
 def main() -> int:
@@ -103,8 +173,10 @@ def main() -> int:
     output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     zenoh.init_log_from_env_or("error")
+    lines = queue.SimpleQueue[str]()
+    threading.Thread(target=read_lines, args=[lines], daemon=True).start()
     try:
-        run(json.loads(sys.stdin.readline()), output)
+        run(lines, output)
     except (zenoh.ZError, ValueError) as error:
         report(output, error=str(error))
     except BrokenPipeError:

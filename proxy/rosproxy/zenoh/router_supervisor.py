@@ -2,7 +2,8 @@
 
 Nodes of rmw_zenoh dial a router again 1, 3, 7 and 11 seconds after the connection has ended. So if
 the routers are back within a second, the first of these tries succeeds. The proxy kills a process
-without reports, which counts as hung.
+without reports, which counts as hung. The proxy also kills a process that does not confirm changed
+configurations by a report, so that no router keeps former rules.
 """
 
 import asyncio
@@ -25,7 +26,9 @@ log = logging.getLogger(__name__)
 REPORT_TIMEOUT_S = 10.0
 """Time without a report after which the process counts as hung."""
 START_TIMEOUT_S = 30.0
-"""The same for the first report of a process."""
+"""Time without a first report after which a new process counts as hung."""
+CHANGE_TIMEOUT_S = 5.0
+"""Time in which a process has to open routers with other configurations."""
 LEAST_START_INTERVAL_S = 1.0
 """A process that has lived longer starts again at once."""
 MOST_LOG_LINES = 20
@@ -52,23 +55,51 @@ class RouterSupervisor:
     def __init__(
         self,
         tasks: Tasks,
-        configs: Sequence[RouterConfig],
         take_report: Callable[[Report], None],
     ) -> None:
         self._tasks = tasks
-        self._configs = json.dumps(configs).encode() + b"\n"
+        self._revision = 1
+        self._line = b""
+        self._confirmed = 0
+        self._process: Process | None = None
         self._take_report = take_report
         self._changed = asyncio.Event()
+        self._reported = asyncio.Event()
         self.program: Sequence[str] = PROGRAM
         self.failure = "the routers have not started yet"
         self.restarts = 0
 
-    async def start(self) -> None:
+    async def start(self, configs: Sequence[RouterConfig]) -> None:
         """Start the process, and wait until the routers run. Raises RoutersFailed."""
+        self._line = _line(self._revision, configs)
         self._tasks.spawn(self._keep_running(), "running the zenoh routers")
         await self._changed.wait()
         if self.failure:
             raise RoutersFailed(self.failure)
+
+    async def use(self, configs: Sequence[RouterConfig]) -> None:
+        """Put other configurations in force: the process restarts the routers with changes.
+
+        Returns when no router runs with a former configuration.
+        """
+        self._revision += 1
+        revision = self._revision
+        self._line = _line(revision, configs)
+        process = self._process
+        if process is None:  # the next process gets the line
+            return
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            _piped(process.stdin).write(self._line)
+        try:
+            async with asyncio.timeout(CHANGE_TIMEOUT_S):
+                while self._confirmed < revision and process is self._process:
+                    self._reported.clear()
+                    await self._reported.wait()
+        except TimeoutError:
+            log.error("zenoh routers do not confirm a change within %g s", CHANGE_TIMEOUT_S)
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
 
     async def _keep_running(self) -> None:
         loop = asyncio.get_running_loop()
@@ -91,14 +122,17 @@ class RouterSupervisor:
         logging_task = self._tasks.spawn(
             _log_lines(_piped(process.stderr)), "reading the log of routers"
         )
+        self._process = process
         try:
-            _piped(process.stdin).write(self._configs)
+            _piped(process.stdin).write(self._line)
             return await self._read_reports(process)
         finally:
             # Zenoh's own end of a session may hang. Nodes see the end of the connections alike.
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             await process.wait()
+            self._process = None
+            self._reported.set()
             # The last lines may name the cause of the end.
             await asyncio.wait({logging_task}, timeout=LAST_LINES_TIMEOUT_S)
             logging_task.cancel()
@@ -123,7 +157,14 @@ class RouterSupervisor:
             patience = REPORT_TIMEOUT_S
             self._take_report(report)
             self.failure = ""
+            self._confirmed = max(self._confirmed, report.revision)
             self._changed.set()
+            self._reported.set()
+
+
+def _line(revision: int, configs: Sequence[RouterConfig]) -> bytes:
+    """The line of standard input for the router process."""
+    return json.dumps({"revision": revision, "routers": configs}).encode() + b"\n"
 
 
 def _piped(stream: _Stream | None) -> _Stream:

@@ -1,13 +1,17 @@
 """rmw_zenoh in a running proxy: the routers, the links, and the faults of both."""
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace as replace_plan
 from importlib import metadata
 
 from msgspec.structs import replace
 
+from rosproxy.access.layers import PolicyLayer
 from rosproxy.admin.admin_server import Action
+from rosproxy.admin.common_status import with_hidden
 from rosproxy.admin.doctor_finding import DoctorFinding
 from rosproxy.admin.requests import EnforcementCounts, PortProbe
 from rosproxy.admin.status_document import ProxyStatus
@@ -21,9 +25,17 @@ from rosproxy.telemetry.text import listed
 from rosproxy.zenoh import findings
 from rosproxy.zenoh.link_probe import try_link
 from rosproxy.zenoh.links import Link
+from rosproxy.zenoh.policy.access_control import access_control
+from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy.zenoh.protocol.report import Report
-from rosproxy.zenoh.router_configs import router_configs
+from rosproxy.zenoh.router_configs import RouterPlan
+from rosproxy.zenoh.router_policy import RouterPolicy
 from rosproxy.zenoh.router_supervisor import RoutersFailed, RouterSupervisor
+from rosproxy.zenoh.socket_directory import (
+    NO_DIRECTORY,
+    make_socket_directory,
+    remove_socket_directory,
+)
 from rosproxy.zenoh.status import ZenohState
 
 log = logging.getLogger(__name__)
@@ -32,6 +44,8 @@ LINK_INTERVAL_S = 5.0
 """Seconds between look-ups of the peers' addresses, and between tries of links that are down."""
 FAULT_INTERVAL_S = 1.0
 """Seconds between two searches for faults."""
+POLICY_INTERVAL_S = 0.5
+"""Seconds between checks of the policy, and of the sessions at the ports for containers."""
 _ROS_OPTION = "--ros zenoh"
 
 
@@ -42,29 +56,53 @@ class Zenoh:
         self._runtime = runtime
         self._settings = runtime.settings
         self._faults: dict[str, DoctorFinding] = {}
+        self._applying = asyncio.Lock()
         settings = runtime.settings
-        configs = router_configs(
+        self._plan = RouterPlan(
             settings.bind, settings.zenoh_ports, settings.zenoh_listen, settings.zenoh_peer
         )
-        self.supervisor = RouterSupervisor(runtime.tasks, configs, self._take_report)
+        runtime.policy.checks.append(self._check_layers)
+        self._policy = RouterPolicy(runtime.policy, settings.zenoh_ports)
+        self._access: dict[int, object] = {}
+        self._awaiting = bool(settings.await_policy)
+        self.supervisor = RouterSupervisor(runtime.tasks, self._take_report)
         self.state = ZenohState(settings, self.supervisor, runtime.now)
 
     async def start(self) -> None:
         """Start the routers and the periodic checks. Raises SettingError."""
         _check_package()
         _check_ports(self._settings)
-        try:
-            await self.supervisor.start()
-        except RoutersFailed as error:
-            raise SettingError(_ROS_OPTION, f"the routers do not run: {error}") from None
-        self._runtime.metrics.registry.register(self.state)
+        self._plan = replace_plan(self._plan, directory=make_socket_directory())
+        self._check_policy()
         tasks = self._runtime.tasks
+        if self._awaiting:
+            tasks.spawn(self._start_with_policy(), "waiting for an operator's policy")
+        else:
+            try:
+                await self._start_routers()
+            except RoutersFailed as error:
+                raise SettingError(_ROS_OPTION, f"the routers do not run: {error}") from None
+        self._runtime.metrics.registry.register(self.state)
         tasks.repeat(self._look_at_links, LINK_INTERVAL_S, "looking at zenoh links")
         tasks.repeat(self._look_for_faults, FAULT_INTERVAL_S, "looking for faults of zenoh")
+        tasks.repeat(self._look_at_policy, POLICY_INTERVAL_S, "applying the policy to zenoh")
+
+    async def _start_with_policy(self) -> None:
+        """Start the routers when the operator has sent the policy, or when the time is up."""
+        await self._runtime.policy.wait_for_operator(self._settings.await_policy)
+        with contextlib.suppress(RoutersFailed):  # the supervisor logs this, and retries
+            await self._start_routers()
+
+    async def _start_routers(self) -> None:
+        """Start the routers with the present policy. Raises RoutersFailed."""
+        self._access = self._policy.access()
+        self._awaiting = False
+        await self.supervisor.start(self._plan.configs(self._access))
 
     async def stop(self) -> None:
         """Cancel all tasks. This also stops the routers."""
         await self._runtime.tasks.cancel()
+        remove_socket_directory(self._plan.directory)
 
     @property
     def greeting(self) -> str:
@@ -92,10 +130,24 @@ class Zenoh:
         """Bind the ports and close them again, without a start. Raises SettingError."""
         _check_package()
         _check_ports(self._settings)
+        self._check_policy()
         return ()
 
     async def apply_policy(self) -> EnforcementCounts:
-        """Zero counts: rmw_zenoh has no policy, and `Settings` refuses rules."""
+        """Restart the routers with changed access control, and wait until these routers run.
+
+        Returns no counts: the routers have no registrations.
+        """
+        if self._awaiting:  # the routers start with the policy
+            return EnforcementCounts()
+        async with self._applying:
+            access = self._policy.access()
+            if access is not self._access and access != self._access:
+                await self.supervisor.use(self._plan.configs(access))
+                ports = access.keys() | self._access.keys()
+                changed = sorted(p for p in ports if access.get(p) != self._access.get(p))
+                log.info("zenoh policy changed: ports %s", listed(map(str, changed)))
+            self._access = access  # after the change, so that a failure is repeated
         return EnforcementCounts()
 
     def unready(self) -> str | None:
@@ -105,13 +157,33 @@ class Zenoh:
 
     def extended_status(self, status: ProxyStatus) -> ProxyStatus:
         """The status of the proxy, with the routers."""
-        return replace(status, zenoh=self.state.status())
+        policy = with_hidden(status.policy, *self._policy.hidden())
+        return replace(status, zenoh=self.state.status(), policy=policy)
 
     def _take_report(self, report: Report) -> None:
         self.state.take(report)
         for link in self.state.links:
             if self.state.is_up(link) and link.note(None, self._runtime.now()):
                 log.info("zenoh link up: %s", link.peer)
+
+    async def _look_at_policy(self) -> None:
+        """Apply changes of the policy and of the containers at ports. Report denied names."""
+        self._policy.note(self.state.places)
+        await self.apply_policy()
+        self._policy.look(self.state.inside_names())
+
+    def _check_policy(self) -> None:
+        """Raise SettingError for rules that the routers cannot enforce."""
+        try:
+            self._check_layers(self._runtime.policy.layers)
+        except ValueError as error:
+            raise SettingError("--policy", str(error)) from None
+
+    def _check_layers(self, layers: Sequence[PolicyLayer]) -> None:
+        """Raise ValueError for rules that the routers cannot enforce."""
+        check_layers(layers)
+        if not self._plan.directory and access_control(layers):
+            raise ValueError(NO_DIRECTORY)
 
     async def _look_at_links(self) -> None:
         await asyncio.gather(*(self._look_at(link) for link in self.state.links))
@@ -133,6 +205,8 @@ class Zenoh:
 
     async def _look_for_faults(self) -> None:
         """Log each fault once, and report the fault as a problem while the fault lasts."""
+        if self._awaiting:
+            return
         current = {fault.subject: fault for fault in findings.faults(self.state.status())}
         if self.supervisor.failure:  # other faults are unknown meanwhile, and stay
             current = self._faults | current

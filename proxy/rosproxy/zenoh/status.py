@@ -7,6 +7,7 @@ from typing import Protocol
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from rosproxy.access.rules import RuleKind
 from rosproxy.admin.status_document import (
     ZenohLinkStatus,
     ZenohNodeStatus,
@@ -17,6 +18,7 @@ from rosproxy.settings import Settings
 from rosproxy.zenoh.links import Link, is_linked
 from rosproxy.zenoh.protocol.liveliness import ZenohNode, nodes_of, parse_token
 from rosproxy.zenoh.protocol.report import Ends, Report, RouterReport, RouterSession, ends_of
+from rosproxy.zenoh.router_policy import InsideName
 
 MODES = ("client", "peer", "router")
 _PlacedSession = tuple[int | None, RouterSession, Ends]
@@ -64,6 +66,28 @@ class ZenohState(Collector):
         return not self._process.failure and is_linked(
             link.peer, link.addresses, self._hub_routers, self._settings.zenoh_listen
         )
+
+    @property
+    def places(self) -> list[tuple[int, str]]:
+        """The port and the address of each session with a container."""
+        return [(port, ends.remote.host) for port, _, ends in self._sessions if port is not None]
+
+    def inside_names(self) -> list[InsideName]:
+        """The topics and services of the nodes inside."""
+        place_by_zid = {s.peer: (port, ends.remote.host) for port, s, ends in self._sessions}
+        names: list[InsideName] = []
+        for node in self._nodes:
+            port, address = place_by_zid.get(node.session, (None, ""))
+            if port is None:
+                continue
+            for kind, of_kind in (
+                (RuleKind.PUBLISH, node.publishes),
+                (RuleKind.SUBSCRIBE, node.subscribes),
+                (RuleKind.SERVE, node.services),
+                (RuleKind.CALL, node.calls),
+            ):
+                names += [InsideName(port, address, node.name, kind, name) for name in of_kind]
+        return names
 
     def status(self) -> ZenohStatus:
         """The part of the status."""

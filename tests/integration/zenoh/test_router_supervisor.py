@@ -28,9 +28,18 @@ while True:
 FAILS = """
 print('{"error": "Can not create a new TCP listener: Address already in use"}', flush=True)
 """
+CONFIRMS = """
+import json, sys
+for line in sys.stdin:
+    told = json.loads(line)
+    report = {"revision": told["revision"], "tokens": [json.dumps(told["routers"])]}
+    print(json.dumps(report), flush=True)
+"""
 HANGS = "import time; time.sleep(60)"
 TALKS = 'print("no report", flush=True)'
 ENDS = "import sys; sys.stderr.write('thread panicked\\n'); sys.exit(3)"
+
+CONFIGS = [{"mode": '"router"'}]
 
 
 class Kept:
@@ -38,7 +47,7 @@ class Kept:
 
     def __init__(self, tasks: Tasks, program: str) -> None:
         self.reports: list[Report] = []
-        self.supervisor = RouterSupervisor(tasks, [{"mode": '"router"'}], self.reports.append)
+        self.supervisor = RouterSupervisor(tasks, self.reports.append)
         self.supervisor.program = (sys.executable, "-c", program)
 
     @property
@@ -57,7 +66,7 @@ async def tasks() -> AsyncIterator[Tasks]:
 
 async def test_reports_are_taken_and_the_process_ends_with_the_tasks(tasks: Tasks) -> None:
     kept = Kept(tasks, REPORTS)
-    await kept.supervisor.start()
+    await kept.supervisor.start(CONFIGS)
     assert (kept.supervisor.failure, kept.supervisor.restarts) == ("", 0)
     pid = kept.pid
     await tasks.cancel()
@@ -68,7 +77,7 @@ async def test_a_process_that_is_killed_starts_again(
     tasks: Tasks, caplog: pytest.LogCaptureFixture
 ) -> None:
     kept = Kept(tasks, REPORTS)
-    await kept.supervisor.start()
+    await kept.supervisor.start(CONFIGS)
     first = kept.pid
     os.kill(first, signal.SIGKILL)
     await until(lambda: kept.pid != first, "another process reports")
@@ -96,7 +105,7 @@ async def test_the_reason_of_a_failed_start_is_told(
     if program is HANGS:
         monkeypatch.setattr(router_supervisor, "START_TIMEOUT_S", 0.2)
     with pytest.raises(RoutersFailed, match=reason):
-        await Kept(tasks, program).supervisor.start()
+        await Kept(tasks, program).supervisor.start(CONFIGS)
     if program is ENDS:
         assert "zenoh: thread panicked" in caplog.text
 
@@ -106,7 +115,7 @@ async def test_a_process_that_falls_silent_is_killed(
 ) -> None:
     monkeypatch.setattr(router_supervisor, "REPORT_TIMEOUT_S", 0.5)
     kept = Kept(tasks, REPORTS)
-    await kept.supervisor.start()
+    await kept.supervisor.start(CONFIGS)
     first = kept.pid
     os.kill(first, signal.SIGSTOP)
     await until(lambda: kept.pid != first, "another process reports")
@@ -118,7 +127,7 @@ async def test_a_process_that_can_not_start_is_told(tasks: Tasks) -> None:
     kept = Kept(tasks, REPORTS)
     kept.supervisor.program = ("/nothing/here",)
     with pytest.raises(RoutersFailed, match="can't be started: No such file or directory"):
-        await kept.supervisor.start()
+        await kept.supervisor.start(CONFIGS)
     kept.supervisor.program = (sys.executable, "-c", REPORTS)
     await until(lambda: kept.reports, "the next start succeeds")
 
@@ -127,8 +136,33 @@ async def test_what_the_library_prints_is_logged_up_to_a_bound(
     tasks: Tasks, caplog: pytest.LogCaptureFixture
 ) -> None:
     program = "import sys\nfor _ in range(99): print('panic\\x1b', file=sys.stderr)\n" + REPORTS
-    await Kept(tasks, program).supervisor.start()
+    await Kept(tasks, program).supervisor.start(CONFIGS)
     await until(lambda: "zenoh: panic" in caplog.text, "a line is logged")
     await asyncio.sleep(0.1)
     assert caplog.text.count("zenoh: panic") == router_supervisor.MOST_LOG_LINES
     assert "\x1b" not in caplog.text
+
+
+async def test_other_configurations_are_in_force_when_use_returns(tasks: Tasks) -> None:
+    kept = Kept(tasks, CONFIRMS)
+    await kept.supervisor.start(CONFIGS)
+    for mode in ("a", "b"):
+        await kept.supervisor.use([{"mode": mode}])
+        assert kept.reports[-1].tokens == (f'[{{"mode": "{mode}"}}]',)
+    assert kept.supervisor.restarts == 0
+
+
+async def test_a_process_that_does_not_confirm_is_replaced(
+    tasks: Tasks, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its routers would go on with former rules."""
+    monkeypatch.setattr(router_supervisor, "CHANGE_TIMEOUT_S", 0.2)
+    kept = Kept(tasks, REPORTS)
+    await kept.supervisor.start(CONFIGS)
+    first = kept.pid
+    await kept.supervisor.use([{"mode": "b"}])
+    assert not Path(f"/proc/{first}").exists()
+    assert "do not confirm a change" in caplog.text
+    kept.supervisor.program = (sys.executable, "-c", CONFIRMS)
+    await until(lambda: kept.reports[-1].revision == 2, "the next process has the change")
+    assert kept.reports[-1].tokens == ('[{"mode": "b"}]',)

@@ -3,13 +3,17 @@
 A small program stands in for the process of the routers, which needs the zenoh library.
 """
 
+import json
 import sys
 from collections.abc import AsyncIterator, Callable
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from rosproxy.access.layers import PolicyLayer
+from rosproxy.access.rules import parse_rules
 from rosproxy.admin.requests import BodyError
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.app.policy_sources import PolicySources
@@ -34,6 +38,13 @@ while True:
     time.sleep(0.05)
 """.replace("PEER", PEER)
 """Two routers. The hub has a session with the peer while a file exists."""
+CONFIRMS = """
+import json, sys
+for line in sys.stdin:
+    with open(sys.argv[1], "a") as told:
+        told.write(line)
+    print(json.dumps({"revision": json.loads(line)["revision"]}), flush=True)
+"""
 Make = Callable[..., Zenoh]
 
 
@@ -106,15 +117,114 @@ async def test_a_fault_is_told_until_it_is_over(
     assert caplog.text.count("zenoh opens no session") == 1
 
 
-async def test_posted_rules_are_refused(caplog: pytest.LogCaptureFixture) -> None:
-    runtime = Runtime(parse_settings({"ros": ("zenoh",)}))
-    sources = PolicySources(runtime, ())
-    layer = {"name": "operator", "rules": ["deny publish /camera"]}
-    with pytest.raises(BodyError, match="rules have no effect on rmw_zenoh"):
-        await sources.post({"layers": [layer]})
-    assert not runtime.policy.layers
-    assert "rules have no effect" in runtime.problems.all()[0].text
-    assert "rules have no effect" in caplog.text
+@pytest.fixture
+def lines(tmp_path: Path) -> Callable[[], list[dict[str, Any]]]:
+    """The configurations that the process of the routers has got, of all its lines."""
 
-    assert await sources.post({"layers": []}) == {}
-    assert not runtime.problems.all()
+    def read() -> list[dict[str, Any]]:
+        told = tmp_path / "told"
+        texts = told.read_text().splitlines() if told.exists() else []
+        return [json.loads(text) for text in texts]
+
+    return read
+
+
+Lines = Callable[[], list[dict[str, Any]]]
+
+
+def with_confirming_process(zenoh: Zenoh, tmp_path: Path) -> Zenoh:
+    """The stack, with a process that notes and confirms each line."""
+    zenoh.supervisor.program = (sys.executable, "-c", CONFIRMS, str(tmp_path / "told"))
+    return zenoh
+
+
+def layer(*rules: str) -> dict[str, object]:
+    return {"layers": [{"name": "operator", "rules": rules}]}
+
+
+async def test_posted_rules_are_in_force_when_the_proxy_answers(
+    make: Make, tmp_path: Path, lines: Lines
+) -> None:
+    zenoh = with_confirming_process(make(), tmp_path)
+    await zenoh.start()
+    sources = PolicySources(zenoh._runtime, (zenoh,))
+    await sources.post(layer("deny publish /camera"))
+    await sources.post(layer("deny publish /camera"))  # changes nothing
+    await sources.post({"layers": []})
+    routers = [line["routers"] for line in lines()]
+    assert ["access_control" in router for router, _ in routers] == [False, True, False]
+    assert not any("access_control" in hub for _, hub in routers)
+    assert "*/camera/*/*" in routers[1][0]["access_control"]
+
+
+async def test_rules_of_a_changed_file_come_into_force(
+    make: Make, tmp_path: Path, lines: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stack, "POLICY_INTERVAL_S", 0.05)
+    zenoh = with_confirming_process(make(), tmp_path)
+    await zenoh.start()
+    rules = parse_rules("deny serve /arm")
+    zenoh._runtime.policy.use_file(PolicyLayer("file", rules))
+    await until(lambda: len(lines()) == 2, "the routers have the rules")
+    assert "*/arm/*/*" in lines()[1]["routers"][0]["access_control"]
+
+
+async def test_posted_rules_that_routers_can_not_have_are_refused(
+    make: Make, tmp_path: Path, lines: Lines, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The former rules stay in force."""
+    zenoh = with_confirming_process(make(), tmp_path)
+    await zenoh.start()
+    runtime = zenoh._runtime
+    sources = PolicySources(runtime, (zenoh,))
+    await sources.post(layer("deny publish /camera"))
+    with pytest.raises(BodyError, match=r"rmw_zenoh has no [?]"):
+        await sources.post(layer("deny publish /c?"))
+    assert runtime.policy.layers[0].rules == parse_rules("deny publish /camera")
+    assert "rmw_zenoh has no ?" in runtime.problems.all()[0].text
+    assert "rmw_zenoh has no ?" in caplog.text
+    assert len(lines()) == 2
+
+
+async def test_options_that_routers_can_not_have_are_refused(make: Make) -> None:
+    zenoh = make(policy="allow publish /a/b; deny publish /a/*")
+    for start in (zenoh.start, zenoh.try_ports):
+        with pytest.raises(SettingError, match=r"--policy: layer '--policy': .*except /a/b"):
+            await start()
+
+
+async def test_rules_need_a_directory_for_sockets(
+    make: Make, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, lines: Lines
+) -> None:
+    """Without a directory the hub dials by TCP, and a router cannot tell the hub from nodes."""
+    monkeypatch.setattr(stack, "make_socket_directory", lambda: "")
+    with pytest.raises(SettingError, match="Mount a tmpfs at /dev/shm"):
+        await make(policy="deny publish *").start()
+    zenoh = with_confirming_process(make(), tmp_path)
+    await zenoh.start()
+    with pytest.raises(BodyError, match="Mount a tmpfs at /dev/shm"):
+        await PolicySources(zenoh._runtime, (zenoh,)).post(layer("deny publish *"))
+    assert "unixsock" not in json.dumps(lines())
+
+
+async def test_no_router_runs_before_the_policy_of_an_operator(
+    make: Make, tmp_path: Path, lines: Lines
+) -> None:
+    zenoh = with_confirming_process(make(await_policy=3600.0), tmp_path)
+    await zenoh.start()
+    assert "have not started yet" in (zenoh.unready() or "")
+    assert not lines()
+    await PolicySources(zenoh._runtime, (zenoh,)).post(layer("deny publish /camera"))
+    await until(lambda: zenoh.unready() is None, "the routers run")
+    assert ["access_control" in line["routers"][0] for line in lines()] == [True]
+
+
+async def test_the_directory_goes_with_the_proxy(make: Make, tmp_path: Path, lines: Lines) -> None:
+    zenoh = with_confirming_process(make(), tmp_path)
+    await zenoh.start()
+    endpoint = json.loads(lines()[0]["routers"][0]["listen/endpoints"])[1]
+    directory = Path(endpoint.removeprefix("unixsock-stream/")).parent
+    assert directory.is_dir()
+    assert directory.stat().st_mode & 0o077 == 0
+    await zenoh.stop()
+    assert not directory.exists()

@@ -6,7 +6,7 @@ import pytest
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.zenoh.router_configs import RouterConfig, router_configs
+from rosproxy.zenoh.router_configs import RouterConfig, RouterPlan
 
 PORTS = PortRange(7448, 7449)
 
@@ -19,7 +19,7 @@ def endpoints(config: RouterConfig, key: str) -> list[str]:
 
 def test_a_router_for_each_port_and_a_hub_that_dials_all() -> None:
     peers = (HostPort("robot", 7447), HostPort("fd00::7", 7448))
-    *routers, hub = router_configs("0.0.0.0", PORTS, None, peers)
+    *routers, hub = RouterPlan("0.0.0.0", PORTS, None, peers).configs({})
     assert [endpoints(router, "listen") for router in routers] == [
         ["tcp/0.0.0.0:7448"],
         ["tcp/0.0.0.0:7449"],
@@ -38,12 +38,37 @@ def test_a_router_for_each_port_and_a_hub_that_dials_all() -> None:
     ],
 )
 def test_the_hub_reaches_routers_at_the_bound_address(bind: str, listens: str, dialed: str) -> None:
-    hub = router_configs(bind, PORTS, 7447, ())[-1]
+    hub = RouterPlan(bind, PORTS, 7447, ()).configs({})[-1]
     assert endpoints(hub, "listen") == [listens]
     assert endpoints(hub, "connect")[0] == dialed
 
 
 def test_every_value_is_json() -> None:
-    for config in router_configs("0.0.0.0", PORTS, 7447, ()):
+    for config in RouterPlan("0.0.0.0", PORTS, 7447, ()).configs({}):
         assert config["mode"] == '"router"'
         assert {key: json.loads(value) for key, value in config.items()}
+
+
+def test_the_hub_dials_by_sockets_of_a_directory() -> None:
+    peers = (HostPort("robot", 7447),)
+    access = {7449: {"enabled": True}}
+    plan = RouterPlan("0.0.0.0", PORTS, None, peers, "/dev/shm/sockets")
+    first, second, hub = plan.configs(access)
+    assert endpoints(first, "listen") == [
+        "tcp/0.0.0.0:7448",
+        "unixsock-stream//dev/shm/sockets/7448",
+    ]
+    assert endpoints(hub, "connect") == [
+        "unixsock-stream//dev/shm/sockets/7448",
+        "unixsock-stream//dev/shm/sockets/7449",
+        "tcp/robot:7447",
+    ]
+    assert "access_control" not in first
+    assert json.loads(second["access_control"]) == access[7449]
+    assert "access_control" not in hub
+
+
+def test_without_a_directory_there_is_no_access_control() -> None:
+    """The routers could not tell the hub from nodes."""
+    with pytest.raises(ValueError, match="needs a directory"):
+        RouterPlan("0.0.0.0", PORTS, None, ()).configs({7448: {"enabled": True}})

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry, generate_latest
 
+from rosproxy.access.rules import RuleKind
 from rosproxy.admin.status_document import ZenohSessionStatus
 from rosproxy.zenoh.protocol.report import Link, Report, RouterReport, RouterSession
+from rosproxy.zenoh.router_policy import InsideName
 from rosproxy.zenoh.status import ZenohState
 from tests.run_options import parse_settings
 
@@ -83,6 +85,14 @@ def test_nodes_here_have_an_address() -> None:
         ("/chatter",),
     )
     assert (robot.name, robot.address) == ("/robot", "")
+
+
+def test_names_of_nodes_inside_have_port_and_address() -> None:
+    state = make_state(FakeProcess())
+    assert state.places == [(7448, "172.18.0.3")]
+    assert state.inside_names() == [
+        InsideName(7448, "172.18.0.3", "/talker", RuleKind.PUBLISH, "/chatter")
+    ]
 
 
 def test_tokens_stay_until_a_report_has_others() -> None:

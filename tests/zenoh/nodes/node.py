@@ -1,7 +1,7 @@
 """A replacement for a node of rmw_zenoh: session, keys and liveliness tokens.
 
-`python node.py KIND NAME TOPIC`, where KIND is pub, sub, serve, call or graph. Prints a line for
-each event, and runs until killed.
+`python node.py KIND NAME TOPIC`, where KIND is pub, shout, sub, latch, late, serve, call, probe
+or graph. Prints a line for each event, and runs until killed.
 """
 
 import sys
@@ -11,6 +11,7 @@ from typing import Any
 
 import zenoh
 from sessions import NODE, open_session
+from zenoh import ext
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 TYPE = "std_msgs::msg::dds_::String_"
@@ -22,8 +23,11 @@ def say(*words: object) -> None:
 
 
 def graph_change(sample: Any) -> None:
-    name = str(sample.key_expr).split("/")[8]
-    say("gone" if sample.kind == zenoh.SampleKind.DELETE else "seen", name)
+    parts = str(sample.key_expr).split("/")
+    is_end = sample.kind == zenoh.SampleKind.DELETE
+    say("gone" if is_end else "seen", parts[8])
+    if len(parts) > 9:
+        say("unlisted" if is_end else "listed", parts[8], parts[5], parts[9])
 
 
 def call(session: Any, key: str) -> None:
@@ -31,6 +35,7 @@ def call(session: Any, key: str) -> None:
         for reply in session.get(key, timeout=1.0):
             if reply.ok is not None:
                 say(reply.ok.payload.to_string())
+        say("asked")
         time.sleep(PERIOD_S)
 
 
@@ -39,8 +44,40 @@ def publish(session: Any, key: str) -> None:
     number = 0
     while True:
         publisher.put(f"hello {number}")
+        if number == 2:
+            say("said")
         number += 1
         time.sleep(PERIOD_S)
+
+
+def subscribe(session: Any, key: str, _: str) -> Any:
+    return session.declare_subscriber(key, lambda s: say("got", s.payload.to_string()))
+
+
+def serve(session: Any, key: str, name: str) -> Any:
+    return session.declare_queryable(key, lambda query: query.reply(key, f"answer of {name}"))
+
+
+def watch_graph(session: Any, _: str, __: str) -> Any:
+    return session.liveliness().declare_subscriber("@ros2_lv/0/**", graph_change, history=True)
+
+
+def latch(session: Any, key: str, _: str) -> Any:
+    """Publish as rmw_zenoh does with the durability transient_local."""
+    latched = ext.declare_advanced_publisher(
+        session, key, cache=ext.CacheConfig(1), publisher_detection=True
+    )
+    latched.put("latched")
+    say("latched")
+    return latched
+
+
+def subscribe_late(session: Any, key: str, _: str) -> Any:
+    """Subscribe as rmw_zenoh does with the durability transient_local."""
+    history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+    return ext.declare_advanced_subscriber(
+        session, key, lambda s: say("got", s.payload.to_string()), history=history
+    )
 
 
 def main(kind: str, name: str, topic: str) -> None:
@@ -50,29 +87,29 @@ def main(kind: str, name: str, topic: str) -> None:
     node = session.liveliness().declare_token(f"@ros2_lv/0/{zid}/0/0/NN/%/%/{name}")
     held = [node]
     if kind in ENTITIES:
+        mangled = f"/{topic}".replace("/", "%")
         token = (
-            f"@ros2_lv/0/{zid}/0/1/{ENTITIES[kind]}/%/%/{name}/%{topic}/{TYPE}/{HASH}/::,10:,:,:,,"
+            f"@ros2_lv/0/{zid}/0/1/{ENTITIES[kind]}/%/%/{name}/{mangled}/{TYPE}/{HASH}/::,10:,:,:,,"
         )
         held.append(session.liveliness().declare_token(token))
     say("ready")
-    if kind == "pub":
-        publish(session, key)
-    if kind == "call":
-        call(session, key)
-    if kind == "sub":
-        held.append(session.declare_subscriber(key, lambda s: say("got", s.payload.to_string())))
-    if kind == "serve":
-        held.append(
-            session.declare_queryable(key, lambda query: query.reply(key, f"answer of {name}"))
-        )
-    if kind == "graph":
-        held.append(
-            session.liveliness().declare_subscriber("@ros2_lv/0/**", graph_change, history=True)
-        )
+    if kind in RUNS:
+        RUNS[kind](session, key)
+    if kind in DECLARES:
+        held.append(DECLARES[kind](session, key, name))
     threading.Event().wait()
 
 
-ENTITIES = {"pub": "MP", "sub": "MS", "serve": "SS", "call": "SC"}
+ENTITIES = {"pub": "MP", "latch": "MP", "sub": "MS", "late": "MS", "serve": "SS", "call": "SC"}
+RUNS = {"pub": publish, "shout": publish, "call": call, "probe": call}
+"""`shout` and `probe` have no token, so their topic may have wildcards."""
+DECLARES = {
+    "sub": subscribe,
+    "serve": serve,
+    "graph": watch_graph,
+    "latch": latch,
+    "late": subscribe_late,
+}
 
 if __name__ == "__main__":
     main(*sys.argv[1:])

@@ -38,6 +38,12 @@ class EntityKind(Enum):
 
 
 _KINDS = {kind.value: kind for kind in EntityKind}
+_KINDS_OF_NAMES = (
+    EntityKind.PUBLISHER,
+    EntityKind.SUBSCRIPTION,
+    EntityKind.SERVICE,
+    EntityKind.SERVICE_CLIENT,
+)
 
 
 class Entity(NamedTuple):
@@ -56,7 +62,7 @@ class Entity(NamedTuple):
 
 
 class ZenohNode(NamedTuple):
-    """A ROS node with its publishers, subscriptions and services, but without service clients.
+    """A ROS node with its publishers, subscriptions, services and service clients.
 
     The full names of topics and services are sorted.
     """
@@ -67,6 +73,7 @@ class ZenohNode(NamedTuple):
     publishes: tuple[str, ...]
     subscribes: tuple[str, ...]
     services: tuple[str, ...]
+    calls: tuple[str, ...] = ()
 
 
 def parse_token(key: str) -> Entity | None:
@@ -100,10 +107,7 @@ def nodes_of(entities: Iterable[Entity]) -> tuple[ZenohNode, ...]:
             domain,
             session,
             node,
-            *(
-                tuple(sorted(names[kind]))
-                for kind in (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION, EntityKind.SERVICE)
-            ),
+            *(tuple(sorted(names[kind])) for kind in _KINDS_OF_NAMES),
         )
         for (domain, node, session, _), names in sorted(by_node.items(), key=lambda item: item[0])
     )

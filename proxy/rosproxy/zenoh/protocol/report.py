@@ -43,12 +43,14 @@ class Report(msgspec.Struct, frozen=True):
 
     ``tokens`` is None if nothing has changed since the last report. ``tokens_left_out`` counts
     tokens above the bound. ``error``: why the routers do not run; empty if the routers run.
+    ``revision``: the revision of the configurations with which the routers run.
     """
 
     routers: tuple[RouterReport, ...] = ()
     tokens: tuple[str, ...] | None = None
     tokens_left_out: int = 0
     error: str = ""
+    revision: int = 0
 
 
 class Ends(NamedTuple):

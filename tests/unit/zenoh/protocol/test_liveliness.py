@@ -82,6 +82,6 @@ def test_entities_become_nodes() -> None:
     keys.append(NODE.replace("/0/", "/5/", 1))
     entities = [entity for key in keys if (entity := parse_token(key))]
     assert nodes_of(reversed(entities)) == (
-        ZenohNode(0, ZID, "/talker", ("/chatter",), ("/chatter",), ()),
+        ZenohNode(0, ZID, "/talker", ("/chatter",), ("/chatter",), (), ("/chatter",)),
         ZenohNode(5, ZID, "/talker", (), (), ()),
     )

@@ -1,0 +1,175 @@
+"""The access control of a container's router, for zenoh's configuration.
+
+The access control filters what passes between the router and the hub, so that other containers and
+outside get and see nothing that the policy denies. The nodes of the container reach each other.
+Nodes connect by TCP, and the hub by a socket of the file system. The router distinguishes both by
+the protocol of the link.
+
+As in DDS, a denied topic or service is hidden from both sides: the subscription of a node outside
+is hidden from a publisher inside that may not publish to outside.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from rosproxy.access.layers import PolicyLayer
+from rosproxy.access.rules import RuleKind
+from rosproxy.zenoh.policy.key_expressions import data_keys, in_cache, token_key
+from rosproxy.zenoh.policy.name_sets import ALL_NAMES, KINDS, NameSet, allowed_names
+from rosproxy.zenoh.protocol.liveliness import EntityKind
+
+HUB_PROTOCOL = "unixsock-stream"
+"""The protocol of the links between the hub and the routers of containers."""
+NODE_PROTOCOL = "tcp"
+_ALL_KEYS = ("**", "**/@adv/**", "@ros2_lv/**")
+_INTERESTS = ("declare_liveliness_subscriber", "liveliness_query")
+"""Questions for tokens. The router checks the tokens in the answers."""
+_EVERY_MESSAGE = (
+    *("put", "delete", "query", "reply", "declare_subscriber", "declare_queryable"),
+    *("liveliness_token", *_INTERESTS),
+)
+_IN = "ingress"
+_OUT = "egress"
+
+
+class _Check(NamedTuple):
+    """Messages of a direction, seen from the router, whose names are checked."""
+
+    messages: tuple[str, ...]
+    flow: str
+
+
+class _Kind(NamedTuple):
+    """What a kind of rules is about: data, latched topics, and tokens of both sides.
+
+    ``of_cache`` has the checks for latched topics by the owner of the key: ``pub`` or ``sub``.
+    Readers ask for the keys of both, so a question has ``**`` in this place (zenoh-ext,
+    advanced_subscriber.rs).
+    ``inside`` is the kind of the tokens of nodes inside. ``outside`` is the kind of the tokens of
+    the nodes outside that the nodes inside would find.
+    """
+
+    of_data: tuple[_Check, ...]
+    of_cache: Mapping[str, _Check]
+    inside: EntityKind
+    outside: EntityKind
+
+
+_PUTS = ("put", "delete")
+_READS = ("query", "declare_subscriber")
+_CACHE = ("put", "delete", "declare_queryable", "liveliness_token")
+_MESSAGES = {
+    RuleKind.PUBLISH: _Kind(
+        (_Check(_PUTS, _OUT), _Check(("declare_subscriber",), _IN)),
+        {
+            "pub": _Check(_CACHE, _OUT),
+            "sub": _Check(_CACHE, _IN),
+            "**": _Check(_READS, _IN),
+        },
+        EntityKind.PUBLISHER,
+        EntityKind.SUBSCRIPTION,
+    ),
+    RuleKind.SUBSCRIBE: _Kind(
+        (_Check(_PUTS, _IN), _Check(("declare_subscriber",), _OUT)),
+        {
+            "pub": _Check(_CACHE, _IN),
+            "sub": _Check(_CACHE, _OUT),
+            "**": _Check(_READS, _OUT),
+        },
+        EntityKind.SUBSCRIPTION,
+        EntityKind.PUBLISHER,
+    ),
+    RuleKind.SERVE: _Kind(
+        (_Check(("query",), _IN), _Check(("declare_queryable",), _OUT)),
+        {},
+        EntityKind.SERVICE,
+        EntityKind.SERVICE_CLIENT,
+    ),
+    RuleKind.CALL: _Kind(
+        (_Check(("query",), _OUT), _Check(("declare_queryable",), _IN)),
+        {},
+        EntityKind.SERVICE_CLIENT,
+        EntityKind.SERVICE,
+    ),
+}
+
+
+def access_control(layers: Sequence[PolicyLayer]) -> dict[str, Any] | None:
+    """The value ``access_control`` for a router; None if the layers deny nothing.
+
+    Raises ValueError as `check_layers` does.
+    """
+    names = {kind: allowed_names(layers, kind) for kind in KINDS}
+    if all(allowed == ALL_NAMES for allowed in names.values()):
+        return None
+    rules = [
+        _rule("nodes", _EVERY_MESSAGE, (_IN, _OUT), _ALL_KEYS),
+        _rule("interests", _INTERESTS, (_IN, _OUT), _ALL_KEYS),
+        # A reply passes only to a query that has passed.
+        _rule("replies", ("reply",), (_IN, _OUT), _ALL_KEYS),
+        _rule("node names", ("liveliness_token",), (_IN, _OUT), ["@ros2_lv/*/*/*/*/NN/*/*/*"]),
+    ]
+    for kind, allowed in names.items():
+        rules += _rules(kind, allowed)
+    of_hub = [rule["id"] for rule in rules[1:]]
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [
+            {"id": "nodes", "link_protocols": [NODE_PROTOCOL]},
+            {"id": "hub", "link_protocols": [HUB_PROTOCOL]},
+        ],
+        "policies": [
+            {"rules": ["nodes"], "subjects": ["nodes"]},
+            {"rules": of_hub, "subjects": ["hub"]},
+        ],
+    }
+
+
+def _rules(kind: RuleKind, names: NameSet) -> list[dict[str, Any]]:
+    """The rules for the hub about one kind."""
+    rules = _rules_about(kind, names.allowed, "allow")
+    return rules + _rules_about(kind, names.denied, "deny") if names.denied else rules
+
+
+def _rules_about(
+    kind: RuleKind, globs: Sequence[str] | None, permission: str
+) -> list[dict[str, Any]]:
+    """Rules that allow or deny the names of globs; None: all names, and keys of no name."""
+    if globs is not None and not globs:
+        return []
+    about = _MESSAGES[kind]
+    data = ["**"] if globs is None else [key for glob in globs for key in data_keys(glob)]
+    keyed = [(data, check) for check in about.of_data]
+    for owner, check in about.of_cache.items():
+        keyed.append((_cache_keys(globs, owner), check))
+    for entity, flow in ((about.inside, _OUT), (about.outside, _IN)):
+        tokens = [token_key(glob, entity.value) for glob in globs or ("*",)]
+        keyed.append((tokens, _Check(("liveliness_token",), flow)))
+    return [
+        _rule(f"{permission} {kind.value} {number}", c.messages, [c.flow], keys, permission)
+        for number, (keys, c) in enumerate(keyed)
+    ]
+
+
+def _cache_keys(globs: Sequence[str] | None, owner: str) -> list[str]:
+    if globs is None:
+        return [in_cache("**", owner)]
+    return [in_cache(key, owner) for glob in globs for key in data_keys(glob)]
+
+
+def _rule(
+    title: str,
+    messages: Iterable[str],
+    flows: Iterable[str],
+    keys: Iterable[str],
+    permission: str = "allow",
+) -> dict[str, Any]:
+    return {
+        "id": title,
+        "messages": [*messages],
+        "flows": [*flows],
+        "permission": permission,
+        "key_exprs": [*dict.fromkeys(keys)],
+    }

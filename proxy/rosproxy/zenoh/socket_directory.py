@@ -1,0 +1,28 @@
+"""A directory for the sockets by which the hub reaches the routers of containers."""
+
+import contextlib
+import shutil
+import tempfile
+from pathlib import Path
+
+PARENTS = ("/dev/shm", "/run", "/tmp")  # noqa: S108 - mkdtemp makes a private directory
+"""The first that is writable. With a read-only file system, containers can write to /dev/shm."""
+
+NO_DIRECTORY = (
+    "rules on rmw_zenoh need a directory for sockets, and none of "
+    f"{', '.join(PARENTS)} is writable. Mount a tmpfs at /dev/shm"
+)
+
+
+def make_socket_directory() -> str:
+    """Make a directory that only this user can enter; empty if no parent is writable."""
+    for parent in PARENTS:
+        with contextlib.suppress(OSError):
+            return tempfile.mkdtemp(prefix="rosproxy-zenoh-", dir=parent)
+    return ""
+
+
+def remove_socket_directory(path: str) -> None:
+    """Remove a directory, with the sockets in it."""
+    if path and Path(path).name.startswith("rosproxy-zenoh-"):
+        shutil.rmtree(path, ignore_errors=True)
