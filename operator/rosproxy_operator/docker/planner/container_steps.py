@@ -48,7 +48,6 @@ from rosproxy_operator.docker.planner.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.network_owner import by_reference
 from rosproxy_operator.docker.planner.specs import (
     proxy_fingerprint,
     proxy_name,
@@ -88,8 +87,8 @@ class PlanContext:
     @property
     def label_policy(self) -> tuple[PolicyLayer, ...]:
         """The layers from the labels of the proxy's containers."""
-        containers = by_reference(self.observed.containers)
-        return label_layers(self.desired.members, containers, self.desired.networks)
+        routers = self.ports if self.desired.key == ZENOH else None
+        return label_layers(self.desired.members, self.observed, self.desired.networks, routers)
 
     @property
     def lan_relay(self) -> HostPort | None:

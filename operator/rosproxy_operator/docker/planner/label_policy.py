@@ -12,10 +12,11 @@ from msgspec import structs
 
 from rosproxy.access.layers import LONGEST_LAYER_NAME, MOST_LAYERS, PolicyLayer
 from rosproxy.access.rules import MOST_RULES, format_rules
+from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.docker.planner.labels.readers import POLICY
-from rosproxy_operator.docker.planner.model import Key, Member
-from rosproxy_operator.docker.planner.network_owner import ByReference, network_owner
+from rosproxy_operator.docker.planner.model import ZENOH, Container, HostState, Key, Member
+from rosproxy_operator.docker.planner.network_owner import by_reference, network_owner
 from rosproxy_operator.docker.settings import PlanSettings
 
 LAYERS_KEPT_S = 10.0
@@ -55,9 +56,16 @@ def with_bounded_rules(
 
 
 def label_layers(
-    members: Iterable[Member], containers: ByReference, networks: Collection[str]
+    members: Iterable[Member],
+    observed: HostState,
+    networks: Collection[str],
+    routers: PortRange | None = None,
 ) -> tuple[PolicyLayer, ...]:
-    """Return the layers of living members, each for the container's addresses on ``networks``."""
+    """Return the layers of living members, each for the container's addresses on ``networks``.
+
+    ``routers``: the ports for containers of a proxy for rmw_zenoh, whose layers need ports.
+    """
+    containers = by_reference(observed.containers)
     layers: list[PolicyLayer] = []
     for member in members:
         owner = network_owner(member.container, containers)
@@ -65,8 +73,24 @@ def label_layers(
         addresses = frozenset(a.address for a in attachments if a.address)
         if member.policy and member.container.alive and addresses:
             name = bounded(f"label of container {member.container.name}", LONGEST_LAYER_NAME)
-            layers.append(PolicyLayer(name, member.policy, addresses=addresses))
+            ports = _ports_at(owner, routers, observed) if routers else None
+            layers.append(PolicyLayer(name, member.policy, addresses=addresses, ports=ports))
     return tuple(layers)
+
+
+def _ports_at(owner: Container, routers: PortRange, observed: HostState) -> frozenset[int]:
+    """The ports of the proxy for rmw_zenoh at which the rules of a container apply.
+
+    These are the port of the container's redirect, and all ports that no container has: a container
+    gets its port before the proxy learns of that.
+    """
+    alive = {container.id for container in observed.containers if container.alive}
+    owner_by_port: dict[int, set[str]] = {}
+    for record in observed.redirects:
+        target = record.container.network_container
+        if record.key == ZENOH and target in alive:
+            owner_by_port.setdefault(record.range.first, set()).add(target)
+    return frozenset(p for p in routers.ports() if owner.id in owner_by_port.get(p, {owner.id}))
 
 
 class RecentLayers:

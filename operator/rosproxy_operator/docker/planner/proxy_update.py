@@ -17,6 +17,7 @@ from rosproxy.net.addresses import is_address, is_inside, is_loopback
 from rosproxy_operator.docker.planner.label_policy import RecentLayers, label_layers
 from rosproxy_operator.docker.planner.model import (
     STARTED,
+    ZENOH,
     Attachment,
     Container,
     HostState,
@@ -237,6 +238,7 @@ def network_facts(
     joined = {a.network for a in sandbox.container.attachments if a.address} if sandbox else set()
     containers = by_reference(observed.containers)
     running = [container for container in observed.containers if container.state in STARTED]
+    routers = proxy.range if proxy.key == ZENOH else None
     own_members = [member for member in members if member.key == proxy.key]
     return NetworkFacts(
         master_address="" if not host or is_address(host) else observed.masters.get(host, ""),
@@ -265,7 +267,7 @@ def network_facts(
             if member.container.alive
             for a in _attachments(network_owner(member.container, containers), joined)
         ),
-        policy=(*policy, *label_layers(own_members, containers, joined)),
+        policy=(*policy, *label_layers(own_members, observed, joined, routers)),
     )
 
 

@@ -413,6 +413,8 @@ def _settings_fields(
             "ros": (key.ros,),
             "zenoh_ports": action.range,
             "zenoh_peer": action.peers,
+            "await_policy": AWAITED,
+            "policy_layers": as_variable((*settings.policy, *action.policy)),
         }
     return {
         "master_uri": key.master_uri,

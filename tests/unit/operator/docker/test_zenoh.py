@@ -36,6 +36,7 @@ from rosproxy_operator.docker.planner.model import (
 )
 from rosproxy_operator.docker.planner.own_containers import forgery_reason
 from rosproxy_operator.docker.planner.plan import DockerPlan
+from rosproxy_operator.docker.planner.proxy_update import network_facts
 from rosproxy_operator.docker.planner.redirect import redirect_config
 from rosproxy_operator.docker.planner.specs import (
     container_config,
@@ -49,6 +50,7 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import (
     IMAGE,
     SECRET,
@@ -178,7 +180,16 @@ def test_domains_and_hosts_share_one_proxy() -> None:
     ("labels", "text"),
     [
         ({RMW: "dds"}, "label rosproxy.rmw='dds' is not zenoh. Write rosproxy.rmw=zenoh"),
-        ({"rosproxy.policy": "deny publish /x"}, "label rosproxy.policy has no effect on rmw_zeno"),
+        ({"rosproxy.policy": "deny publish /x"}, ""),
+        ({"rosproxy.policy": "deny x /x"}, "label rosproxy.policy: rule 'deny x /x'"),
+        (
+            {"rosproxy.policy": "allow publish /a/b; deny publish /a/*"},
+            "label rosproxy.policy: layer 'rosproxy.policy': rmw_zenoh can't except /a/b",
+        ),
+        (
+            {"rosproxy.policy": "deny publish /x", "rosproxy.redirect": "false"},
+            "label rosproxy.policy has no effect without the redirect",
+        ),
         ({"rosproxy.peers": "a b"}, ""),
         ({"rosproxy.peers": "a:b:c"}, "label rosproxy.peers: 'a:b:c' is not of the form HOST or"),
         ({"rosproxy.peers": ",".join(f"h{n}" for n in range(33))}, "more than 32 hosts"),
@@ -214,11 +225,98 @@ def test_a_container_of_ros_1_and_rmw_zenoh_has_no_domain() -> None:
     ]
 
 
-def test_rules_of_the_administrator_keep_it_out() -> None:
-    layer = PolicyLayer("administrator", parse_rules("deny publish /x"))
+# rules
+
+RULES = "deny publish /x"
+ADMINISTRATOR = (PolicyLayer("administrator", parse_rules(RULES)),)
+
+
+def test_rules_of_the_administrator_hold() -> None:
+    settings = replace(SETTINGS, policy=ADMINISTRATOR)
+    (member,), told = read(node(), settings=settings)
+    assert (member.policy, told) == ((), [])
+    (made,) = [a for a in look(observed(node()), settings).actions if isinstance(a, Create)]
+    body = container_config(made, settings, SECRET, "")
+    variables = dict(variable.split("=", 1) for variable in body["Env"])
+    told_settings = settings_of(variables)
+    assert told_settings.policy_layers == ADMINISTRATOR
+    assert told_settings.await_policy > 0
+
+
+def test_rules_of_the_administrator_that_a_router_can_not_have_keep_it_out() -> None:
+    layer = PolicyLayer("administrator", parse_rules("deny publish /x?"))
     members, (text,) = read(node(), settings=replace(SETTINGS, policy=(layer,)))
     assert not members
-    assert "the operator's --policy has no effect" in text
+    assert text.startswith("the operator's --policy: layer 'administrator': ")
+
+
+@pytest.mark.parametrize(
+    ("override", "of_label", "of_administrator"),
+    [
+        ("", True, True),
+        ('connect/endpoints=["tcp/localhost:7447"]', True, True),
+        ('connect/endpoints=["tcp/rosproxy:7448"]', False, True),
+        (ROBOT, False, False),
+        ('connect/endpoints=["tls/robot:7447"]', False, False),
+        ('connect/endpoints=["tcp/other:7447"]', False, False),
+    ],
+)
+def test_with_rules_no_node_connects_past_them(
+    override: str, of_label: bool, of_administrator: bool
+) -> None:
+    labelled = node(labels={"rosproxy.policy": RULES}, override=override)
+    settings = replace(SETTINGS, policy=ADMINISTRATOR)
+    for made, used, is_served in (
+        (labelled, SETTINGS, of_label),
+        (node(override=override), settings, of_administrator),
+    ):
+        members, told = read(made, settings=used)
+        assert bool(members) == is_served
+        assert is_served or "connects the nodes to" in told[0]
+
+
+def test_with_rules_no_router_runs_in_the_container() -> None:
+    members, (text,) = read(node(labels={"rosproxy.policy": RULES}, router=True))
+    assert not members
+    assert "a router runs in the container" in text
+
+
+@pytest.mark.parametrize(
+    "ruled",
+    [
+        [node("a", {"rosproxy.policy": RULES})],
+        [
+            node("a"),
+            node("shares", mode="container:id-a"),
+            node("z", {"rosproxy.policy": RULES}, mode="container:shares"),
+        ],
+    ],
+    ids=["own network", "network of another container"],
+)
+def test_a_layer_holds_at_the_port_of_its_container_and_at_free_ports(
+    ruled: list[Container],
+) -> None:
+    """Until the operator has told the proxy of a redirect, the port counts as free."""
+    plain = node("b", address="172.18.0.4")
+    gone = replace(node("c", address="172.18.0.5"), state="exited")
+    before = observed(*ruled, plain, **the_proxy())
+
+    def ports_of(state: HostState) -> set[int]:
+        members, _ = read_members(state, SETTINGS)
+        facts = network_facts(state, state.proxies[0], members)
+        (layer,) = facts.policy
+        assert layer.addresses == frozenset({"172.18.0.3"})
+        return set(layer.ports or ())
+
+    assert ports_of(before) == set(PORTS.ports())
+    records = [record(made) for made in made_for(before).values()]
+    port_by_target = {r.container.network_container: r.range.first for r in records}
+    after = observed(*ruled, plain, **the_proxy(), redirects=records)
+    assert ports_of(after) == set(PORTS.ports()) - {port_by_target["id-b"]}
+    ended = replace(plain, state="exited")
+    assert ports_of(observed(*ruled, ended, gone, **the_proxy(), redirects=records)) == set(
+        PORTS.ports()
+    )
 
 
 # routers outside
@@ -354,6 +452,7 @@ def test_the_proxy_publishes_nothing_and_is_told_its_routers() -> None:
         "ROSPROXY_ROS": "zenoh",
         "ROSPROXY_ZENOH_PORTS": "7448-7479",
         "ROSPROXY_ZENOH_PEERS": " ".join(peers),
+        "ROSPROXY_AWAIT_POLICY": "3",
     }
     assert "CapAdd" not in config["HostConfig"]
     assert str(made) == "create container n: proxy of the zenoh network, ports 7448-7479 of box"

@@ -8,9 +8,12 @@ serving the containers around it, and the proxy connects to the router, too.
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
+from rosproxy.access.layers import PolicyLayer
+from rosproxy.access.rules import Rule
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.setting_kinds import read_zenoh_peer
 from rosproxy.settings import MOST_ZENOH_PORTS
+from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, router_port
 from rosproxy_operator.docker.planner.labels import readers
@@ -29,6 +32,13 @@ from rosproxy_operator.docker.planner.network_owner import by_reference, network
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.zenoh_redirect import LOCAL_ROUTER, as_client
 from rosproxy_operator.docker.settings import PlanSettings
+
+_PROXIES = (ALIAS, proxy_name(ZENOH))
+"""The names of the proxy on the networks of containers."""
+_NEEDS_REDIRECT = (
+    "has no effect without the redirect, since the container then has no port of its own. Remove "
+    "--no-redirect of the operator and the label rosproxy.redirect, or remove the rules"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,18 +69,21 @@ def zenoh_member(
 ) -> tuple[Member, list[str]]:
     """Return what a container with rmw_zenoh asks for, and warnings. Raises UnusableLabel."""
     labels = container.labels
-    _refuse_rules(labels, settings)
+    rules = _rules(labels, settings)
     member = Member(
         container,
         ZENOH,
+        policy=rules,
         networks=readers.networks(container, observed, settings.uplink),
         redirect=readers.redirect(labels),
     )
+    owner = readers.network_owner(container, observed)
+    if rules or settings.policy:
+        _refuse_detours(container, bool(rules), _has_router(owner, observed))
     own = [*_connected(member, observed)]
     dialed = [r for r in (*_labelled(labels), *own) if _may_be_dialed(r, settings)]
     refused = [r for r in (*_labelled(labels), *own) if r not in dialed]
     peers = {router.peer for router in dialed}
-    owner = readers.network_owner(container, observed)
     if container.is_zenoh_router:
         port = router_port(container.variables.get(OVERRIDE, ""))
         peers.add(str(HostPort(owner.name, port)))
@@ -82,6 +95,8 @@ def zenoh_member(
     redirected = [router for router in outside if _is_redirectable(router, owner, observed)]
     warnings += _past_the_proxy(router for router in outside if router not in redirected)
     if not settings.redirect or member.redirect is False:
+        if rules:
+            raise UnusableLabel(f"label {POLICY} {_NEEDS_REDIRECT}")
         return member, [*warnings, _not_redirected()]
     addresses = (LOCAL_ROUTER, *(router.address for router in redirected))
     return replace(member, redirected=tuple(dict.fromkeys(addresses))), warnings
@@ -108,16 +123,40 @@ def with_bounded_containers(
     return tuple(member for member in every if member not in excess), tuple(problems)
 
 
-def _refuse_rules(labels: Labels, settings: PlanSettings) -> None:
-    """Raise UnusableLabel if a policy applies: on rmw_zenoh, the proxy could hide no name."""
-    if labels.get(POLICY, "").strip():
-        text = "has no effect on rmw_zenoh, so outside would see denied names. Remove the label"
-        raise UnusableLabel(f"label {POLICY} {text}")
-    if settings.policy:
+def _rules(labels: Labels, settings: PlanSettings) -> tuple[Rule, ...]:
+    """The rules of the label. Raises UnusableLabel for rules that a router cannot enforce."""
+    rules = readers.policy(labels)
+    for source, layers in (
+        (f"label {POLICY}", (PolicyLayer(POLICY, rules),)),
+        ("the operator's --policy", settings.policy),
+    ):
+        try:
+            check_layers(layers)
+        except ValueError as error:
+            raise UnusableLabel(f"{source}: {error}") from None
+    return rules
+
+
+def _refuse_detours(container: Container, has_own_rules: bool, has_router: bool) -> None:
+    """Raise UnusableLabel if nodes of a container with rules can get past the proxy's router.
+
+    Before the redirect is in place, a node reaches an address outside directly. If the variable
+    names a port of the proxy, the administrator's rules apply there, and the label's rules do not.
+    """
+    if has_router:
         raise UnusableLabel(
-            "uses rmw_zenoh, on which the operator's --policy has no effect. Use DDS in this "
-            "container, or start the operator without --policy"
+            "has a policy, and a router runs in the container or in its network. Nodes at that "
+            "router bypass the policy. Remove the router, or the rules"
         )
+    proxies = () if has_own_rules else _PROXIES
+    for protocol, address in connect_endpoints(container.variables.get(OVERRIDE, "")):
+        is_of_proxy = protocol == "tcp" and address.host in proxies
+        if not is_loopback(address.host) and not is_of_proxy:
+            raise UnusableLabel(
+                f"has a policy, and variable {OVERRIDE} connects the nodes to "
+                f"{quoted(str(address))}, past the policy. Remove connect/endpoints from the "
+                f"variable, and name routers outside in the label {PEERS}"
+            )
 
 
 def _labelled(labels: Labels) -> Iterator[_Router]:
@@ -136,7 +175,7 @@ def _connected(member: Member, observed: HostState) -> Iterator[_Router]:
         return
     for protocol, address in connect_endpoints(container.variables.get(OVERRIDE, "")):
         host = address.host
-        if protocol == "tcp" and not is_loopback(host) and host not in (ALIAS, proxy_name(ZENOH)):
+        if protocol == "tcp" and not is_loopback(host) and host not in _PROXIES:
             yield _Router(address, f"variable {OVERRIDE}", _neighbour(host, member, observed))
 
 
