@@ -13,8 +13,8 @@ User data to inside goes through the range. User data to outside goes directly o
 some implementations act on discovery that arrives at a port for user data. So the proxy also reads
 discovery at such a port (`Participant.reads_discovery_at`).
 
-This module does no I/O: each method takes a datagram, the source and the time, and returns the
-datagrams to send. After each call, `stand_ins` has the ports that have to be open.
+This module does no I/O: methods that handle a datagram or the passing of time return the datagrams
+to send. After each call, `stand_ins` has the ports of stand-ins that have to be open.
 
 Each datagram may be forged. So these rules hold:
 
@@ -29,12 +29,15 @@ Each datagram may be forged. So these rules hold:
 - A proof with a shared secret identifies the LAN relay. The address that the relay states for a
   participant must neither be inside nor belong to the proxy.
 - Until the address of a participant outside is proven, the proxy sends the participant no more
-  bytes than came from it, or ANSWERED_FACTOR times as many after an answer (`OutsideParticipant`).
-  A *question* of the proxy has a secret GUID prefix, and an answer with this prefix proves the
-  address (`AddressProofs`). So no sender can make the proxy flood another machine.
+  bytes than came from it. After the participant has named the discovery participant or one inside
+  as the destination of a message, the proxy may send ANSWERED_FACTOR times as many
+  (`OutsideParticipant`). Only an answer to a *question* of the proxy proves the address: the
+  question has a secret GUID prefix, and the answer names this prefix (`AddressProofs`). So no
+  sender can make the proxy flood another machine.
 - Each source has an allowance for discovery. At the discovery port and inside, the charge includes
   the datagrams that the proxy sends in consequence. At range ports and stand-ins, the proxy charges
-  only the received datagram. An answer that proves an address is free.
+  only the received datagram. The first answer of a participant to a question takes no allowance:
+  the proxy charges only the datagrams that it sends in consequence.
 """
 
 from collections import Counter
@@ -138,12 +141,12 @@ class Domain:
         self.to_outside = AnnouncementsToOutside(settings, outside)
         former_ports = FormerPorts.starting(settings, self.ports, proofs, unix_s - monotonic_s)
         self.former_ports = former_ports
-        asking = DiscoveryParticipant(discovery_prefix)
+        discovery_participant = DiscoveryParticipant(discovery_prefix)
         self.owners = PrefixOwners(settings, inside, outside, former_ports, proofs)
         self.rediscovery = Rediscovery(settings, inside, outside, self.to_inside)
         self.fragments = fragments = FragmentStores()
         self.proxy_participants = ProxyParticipants(
-            settings, asking, inside, outside, former_ports, fragments, proofs
+            settings, discovery_participant, inside, outside, former_ports, fragments, proofs
         )
         self.disposal = Disposal(
             settings, inside, outside, self.proxy_participants, former_ports,
@@ -154,7 +157,8 @@ class Domain:
     def is_busy(self) -> bool:
         """Whether a rediscovery has further parts for `go_on`.
 
-        Hundreds of participants may have to rediscover hundreds, so the work has parts.
+        Hundreds of participants may have to rediscover hundreds of others. So the proxy does the
+        work in parts.
         """
         return self.rediscovery.is_busy
 
@@ -183,8 +187,8 @@ class Domain:
         # the relay's address.
         if relay and source == relay.address.host and not datagram.startswith(MAGIC):
             return self._heard_by_relay(relay, datagram, now)
-        # A flood may have taken the participant's place in the table. The proxy accepts the answer
-        # of this participant nevertheless.
+        # Forged participants may fill the table, so that no participant is known at this address.
+        # So the proxy accepts the first answer to a question from any source.
         if not self.proofs.is_answer(source, datagram) and self.outside.is_strange(source):
             return []
         return self._heard_at_discovery(datagram, source, False, now)
@@ -238,7 +242,9 @@ class Domain:
     def must_queue_discovery(self, datagram: bytes, source: str) -> bool:
         """Whether a datagram at the discovery port must wait in the queue of discovery.
 
-        A datagram waits if parsing takes time. Answers that prove an address do not wait.
+        A datagram waits if the proxy is going to read it: a participant is known at its source, the
+        source is a peer, or the LAN relay has passed the datagram on. The first answer of a
+        participant to a question does not wait.
         """
         if self.proofs.is_answer(source, datagram):
             return False
@@ -247,7 +253,7 @@ class Domain:
     def must_queue_inside(self, datagram: bytes, source: str) -> bool:
         """Whether a datagram for `heard_inside` must wait in the queue of discovery.
 
-        Answers that prove an address do not wait.
+        The first answer of a participant to a question does not wait.
         """
         return not self.proofs.is_answer(source, datagram)
 
@@ -281,8 +287,9 @@ class Domain:
                 return []
             passed = [datagram]
             back = list[Outgoing]()
+            # A port for metatraffic may get user data: Cyclone DDS has one locator for both kinds.
             is_read = is_for_data or may_be_discovery(datagram)
-            if is_read:  # Cyclone DDS has one locator for both
+            if is_read:
                 if not self._take_allowance(datagram, source, now):
                     return []
                 passed, back = self._read_at_range_port(port, source, insider, datagram, now)
@@ -341,7 +348,7 @@ class Domain:
         return self.rediscovery.next_datagrams(now)
 
     def move_to(self, hosts: tuple[str, ...], now: float) -> list[Outgoing]:
-        """Announce the participants inside with other addresses of the advertised host.
+        """Announce the participants inside with the new addresses of the advertised host.
 
         Fast DDS accepts no new locators of a known participant (PDPListener.cpp). So all
         participants outside rediscover the participants inside and the discovery participant.
@@ -358,10 +365,10 @@ class Domain:
         return sent + self.rediscovery.next_datagrams(now)
 
     def retire(self, now: float) -> list[Outgoing]:
-        """Let the participants of both sides forget each other, because no proxy takes over.
+        """Let the participants of both sides forget each other, because no proxy takes over now.
 
-        A proxy that is started later may serve the participants that live on. For a rediscovery
-        then, both sides have to forget now (`Rediscovery`).
+        A proxy may start later and serve the participants that still live. Both sides discover
+        each other then only if they have forgotten each other (`Rediscovery`).
         """
         sent = list[Outgoing]()
         self.former_ports.forget({insider.address for insider in self.inside.by_prefix.values()})
@@ -404,7 +411,7 @@ class Domain:
         return sent
 
     def end_participants_at(self, addresses: Collection[str]) -> list[Outgoing]:
-        """End the participants at inside addresses that are gone. Return the datagrams for outside.
+        """End the participants whose inside address is gone. Return the datagrams for outside.
 
         Without this, outside would keep these participants until the end of their lease durations.
         """
@@ -443,7 +450,7 @@ class Domain:
             text = f"GUID prefix {outsider.guid_prefix} belongs to a participant outside, at "
             return self._drop("prefix", source, text + outsider.address)
         sent = self.disposal.give_prefix_to_inside(message.prefix, source)
-        return sent + self._announced_inside(message, source, now)
+        return sent + self._handle_inside_announcement(message, source, now)
 
     def _wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Let a participant inside wait until it has answered the proxy."""
@@ -479,7 +486,7 @@ class Domain:
             return []
         if self.owners.is_inside(message.prefix):
             return self._claimed_by_outside(message, source, received, now)
-        return self._announced_outside(message, source, received, now)
+        return self._handle_outside_announcement(message, source, received, now)
 
     def _claimed_by_outside(
         self, message: DiscoveryMessage, source: str, received: int, now: float
@@ -487,10 +494,12 @@ class Domain:
         """Handle an announcement from outside with a prefix of inside. Raises RtpsError."""
         claimant = self.outside.claimant(message, source, received, now)
         if claimant is None:
-            return []  # the relay has heard an announcement of the proxy, or the message is an end
+            # The message announces an end, or no metatraffic locator at the source. Or the LAN
+            # relay has heard the proxy's own announcement.
+            return []
         if self.owners.yields_to_outside(message.prefix, source, now):
             self.disposal.give_prefix_to_outside(message.prefix, source)
-            return self._announced_outside(message, source, received, now)
+            return self._handle_outside_announcement(message, source, received, now)
         text = f"GUID prefix {claimant.guid_prefix} belongs to a participant inside"
         self.refused("prefix", source, text)
         return self.proxy_participants.question_to_outside(claimant)
@@ -510,7 +519,7 @@ class Domain:
             sent += self.to_inside.of_outside(told, inside, now)
         return sent + self.proxy_participants.handle_from_outside(message, source, received)
 
-    def _announced_outside(
+    def _handle_outside_announcement(
         self, message: DiscoveryMessage, source: str, received: int, now: float
     ) -> list[Outgoing]:
         """Handle the announcement of a participant outside, and announce it inside.
@@ -534,8 +543,8 @@ class Domain:
 
         The other participant ends to make room.
         """
-        made_room = self._end_one_for_place(message, source)
-        return self.outside.meet(message, source, now), made_room
+        end_datagrams = self._end_one_for_place(message, source)
+        return self.outside.meet(message, source, now), end_datagrams
 
     def _end_one_for_place(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
         """End a participant outside in favour of a new one, if necessary."""
@@ -547,7 +556,7 @@ class Domain:
             self.disposal.end_outside(outsider, self.inside.by_prefix.values()) if outsider else []
         )
 
-    def _announced_inside(
+    def _handle_inside_announcement(
         self, message: DiscoveryMessage, source: str, now: float
     ) -> list[Outgoing]:
         """Handle the announcement of a participant inside, and announce the participant outside."""
@@ -572,9 +581,9 @@ class Domain:
         for_outside = ForOutside(self.inside, insider, now, self.former_ports.of(prefix))
         exported = for_outside.rewritten(message)
         sent += self.to_inside.of_neighbour(insider, message)
-        # Outside knows former ports of the participant, so all participants outside have to
-        # rediscover it. The participant may know the port store at a former address of the proxy,
-        # so the port store also ends for this participant.
+        # If outside knows former ports of the participant, all participants outside have to
+        # rediscover it. The participant may know the port store at a former address of the proxy.
+        # So the proxy also sends it dispose messages of the port store.
         if is_new and self.former_ports.must_be_rediscovered(prefix):
             sent += self.proxy_participants.port_store_dispose_message(insider)
             insider.separation_due_from = now
@@ -582,8 +591,8 @@ class Domain:
             sent += self._port_reminders(insider, mapping_count, now)
         if not is_new and len(insider.mappings) > mapping_count:
             insider.separation_due_from = now  # Fast DDS outside accepts no new locators
-        # An answer names the discovery participant as its destination. `for_all` makes it a message
-        # for all participants outside.
+        # An announcement may name the discovery participant as its destination. `for_all` makes the
+        # announcement a message for all participants outside.
         sent += self.to_outside.of_inside(insider, for_all(exported), now)
         if is_new:
             sent += self.to_inside.of_outside(self.outside.by_prefix.values(), [insider], now)
@@ -595,11 +604,13 @@ class Domain:
     def _end_former_users_of_ports(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
         """End the former users of the ports of a new participant inside.
 
-        These are participants of crashed processes that had the same socket, and participants that
-        hold its ports of the range. Return the datagrams for outside.
+        These are participants of crashed processes that had the same socket. They are also
+        participants that hold ports of the range to which the new participant has a better or equal
+        claim. Return the datagrams for outside.
         """
         prefix = insider.prefix
-        # The participant may have answered while it waited.
+        # An answer shows that a former process at this socket is gone. The answer may have come
+        # while the participant waited, when the proxy did not yet know its socket.
         sent = self.disposal.end_former_processes(prefix, insider.address)
         insider.was_inside = self.former_ports.was_inside(prefix)
         for holder in self.ports.displaced_by(prefix, now):
@@ -627,7 +638,8 @@ class Domain:
     ) -> list[Outgoing]:
         """Rewrite discovery from inside for outside.
 
-        Return the rewritten datagrams, and the questions to inside. Raises RtpsError.
+        Return the questions and port reminders for inside, and the rewritten datagrams. Raises
+        RtpsError.
         """
         insider = self.inside.find(message.prefix, source)
         if insider is None:
