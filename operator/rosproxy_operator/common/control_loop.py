@@ -1,8 +1,8 @@
 """The loop of an operator, for any engine: look, act, and wait for a reason to look again.
 
-A reason is an event (`wake`), a time (`wake_in`, or the result of the look), or the resync. A look
-is level-triggered: each look reads the whole state. So an event needs no content, and a burst of
-events costs a single look.
+A reason is an event (`wake`), a time (`wake_in`, or the result of the look), or the end of the
+resync interval (`Pace`). A look is level-triggered: each look reads the whole state. So an event
+needs no content, and a burst of events costs a single look.
 
 After a failed look, the loop pauses (`RETRY_PAUSES_S`). Events do not shorten the pause, because
 more requests do not help an engine that does not answer. `retry` ends the pause: the engine is
@@ -39,7 +39,7 @@ Raises LookFailed."""
 
 
 class LookFailed(Exception):
-    """A look failed; the message is a line. ``is_engine_away``: the engine does not answer."""
+    """A look failed; the message has one line. ``is_engine_away``: the engine does not answer."""
 
     def __init__(self, message: str, away: bool = False) -> None:
         super().__init__(message)
@@ -55,7 +55,8 @@ class Pace:
     """The times of a loop, in seconds.
 
     ``resync`` is the longest and ``debounce`` the shortest time from the end of a look to the next
-    look. The loop cancels a look that takes more than ``longest``. Messages name the ``engine``.
+    look. ``longest`` is the time-out of a look: the loop cancels the look then. Messages name the
+    ``engine``.
     """
 
     engine: str
@@ -125,7 +126,7 @@ class ControlLoop:
                 self._loop.call_soon_threadsafe(self._woken.set)
 
     def wake_in(self, seconds: float) -> None:
-        """Look again in so many seconds, instead of the time of the previous call."""
+        """Look again in ``seconds``. A further call replaces the time of the previous call."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = asyncio.get_running_loop().call_later(seconds, self._woken.set)

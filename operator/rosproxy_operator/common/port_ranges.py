@@ -39,9 +39,9 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class FormerRange:
-    """A range that a proxy had.
+    """A range that a proxy had, or that the operator has planned for the proxy.
 
-    The proxy gets the range again if the range has no port of ``blocked`` and of ``ranges``.
+    The proxy gets the range if the range has no port of ``blocked``, and none of ``ranges``.
     """
 
     ports: PortRange
@@ -61,8 +61,8 @@ class RangeRequest:
     - ``growing``: ranges of other proxies, which may get longer.
 
     A new range has no port of ``avoided``, and leaves room to grow: the new range and the
-    ``growing`` ranges can all have ``room`` times their length. If there is no such range, both
-    conditions are dropped.
+    ``growing`` ranges can each become ``room`` times as long without overlapping the others. If
+    there is no such range, both conditions are dropped.
     """
 
     count: int
@@ -215,9 +215,10 @@ def local_ports(
 ) -> PortRange:
     """Return the ports for outgoing connections of a proxy that listens on the ``listening`` ports.
 
-    Otherwise a connection might take a port of the range before a node needs the port. The result
-    is the first range of `LOCAL_PORTS` that fits. If none fits, the result is the longest range
-    without ports of ``listening`` and of ``stand_ins``.
+    These ports are apart from ``listening``. Else a connection might take a port of the proxy's
+    range before a node needs the port. The result is the first range of `LOCAL_PORTS` without ports
+    of ``listening``; this range may have ports of ``stand_ins``. If there is none, the result is
+    the longest range without ports of ``listening`` and of ``stand_ins``.
     """
     free = gaps(_UNPRIVILEGED_PORTS, (), [*listening, *stand_ins])
     longest = max(free, key=len, default=LOCAL_PORTS[0])

@@ -47,8 +47,9 @@ class ProxyError(Exception):
     ``is_unreachable``: no answer in time, or an error of the operating system, such as no route. A
     refused connection does not count. ``status`` is the HTTP status; 0 without an HTTP answer.
     ``lacks_master``: HTTP 503. The proxy answers, but its master does not, or all places for
-    callers are taken. ``is_unreadable``: the answer has more bytes than the operator reads. Such an
-    answer does not show a restart of the proxy, so the operator does not send everything again.
+    callers are taken. ``is_unreadable``: the answer has more bytes than the operator reads. After
+    other errors the proxy may have restarted, so the operator for Kubernetes sends everything
+    again. An answer with too many bytes is no sign of a restart.
     """
 
     def __init__(
@@ -70,7 +71,7 @@ class PolicyRefused(ProxyError):
 
 
 class ProxyClient:
-    """Calls the admin endpoints of proxies. All calls raise ProxyError."""
+    """Calls the admin endpoints of proxies. All calls except `documents` raise ProxyError."""
 
     def __init__(self) -> None:
         self._session: aiohttp.ClientSession | None = None
