@@ -267,7 +267,10 @@ class Domain:
         return may_be_read and may_be_discovery(datagram)
 
     def must_queue_at_stand_in(self, port: int, datagram: bytes, _: str) -> bool:
-        """Whether a datagram for `at_stand_in` must wait in the queue of discovery."""
+        """Whether a datagram for `at_stand_in` must wait in the queue of discovery.
+
+        The proxy reads these datagrams, and no others.
+        """
         users = self.stand_ins.by_port.get(port, ())
         may_be_read = any(outsider.reads_discovery_at(mapping) for outsider, mapping in users)
         return may_be_read and may_be_discovery(datagram)
@@ -314,7 +317,10 @@ class Domain:
         return sent
 
     def continue_pending(self, now: float) -> list[Outgoing]:
-        """Repeat questions about former ports, and continue rediscoveries."""
+        """Repeat questions about former ports, and begin or continue rediscoveries that are due.
+
+        Calls come twice a second. Between these calls, `go_on` does the parts of the work.
+        """
         sent = self.former_ports.repeated_questions(now)
         for insider in list(self.inside.by_prefix.values()):
             try:
@@ -337,7 +343,7 @@ class Domain:
             return []  # the participant has ended meanwhile
         source, message = waited
         try:
-            return self._admitted_inside(message, source, now)
+            return self._serve_inside(message, source, now)
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
 
@@ -438,11 +444,9 @@ class Domain:
         is_new = prefix not in self.inside.by_prefix
         if is_new and (self.ports.is_restoring(now) or self.mappings.lacks_proof(prefix, source)):
             return self._wait(message, source, now)
-        return self._admitted_inside(message, source, now)
+        return self._serve_inside(message, source, now)
 
-    def _admitted_inside(
-        self, message: DiscoveryMessage, source: str, now: float
-    ) -> list[Outgoing]:
+    def _serve_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Serve a participant inside, unless its prefix belongs to a participant outside."""
         if not self.owners.yields_to_inside(message.prefix):
             outsider = self.outside.by_prefix[message.prefix]
