@@ -32,8 +32,8 @@ splice moves less, so large pipes bring nothing."""
 FURTHER_PIPE_BYTES = 256 * 1024
 """Bytes of each further pipe: an unprivileged user has 64 MiB for all pipes together."""
 MOST_UNBOUNDED_DIRECTIONS = 128
-"""The highest number of directions with large transfers at the same time. With more, the proxy
-bounds the socket buffers of all these directions."""
+"""Up to this number of directions with large transfers at the same time, the kernel chooses the
+sizes of the socket buffers. With more directions, the proxy bounds the buffers of all of these."""
 RECEIVE_BUFFER_BYTES = 128 * 1024
 """The bound of a receive buffer; Linux doubles the value (socket(7)).
 
@@ -47,8 +47,8 @@ wmem_max."""
 LEAST_PIPE_BYTES = 64 * 1024
 """Bytes of the smallest pipe that a direction uses for splice."""
 BLOCK_BYTES = 128 * 1024
-"""Bytes of a read without a pipe. ``recv`` makes a new buffer for each read. A reused bytearray
-costs more, because Python fills it with zeros."""
+"""Bytes of a read without a pipe. ``recv`` makes a new buffer for each read. A bytearray for each
+read costs more, because Python fills a new bytearray with zeros."""
 RESET_GRACE_S = 0.1
 """Seconds in which the other direction may end after SHUT_RD, before SHUT_WR follows."""
 
@@ -106,7 +106,8 @@ class Relay:
     def start(self, finished: Finished, when_readable: WhenReadable) -> None:
         """Relay both directions in threads; one of these threads calls ``finished``.
 
-        If ``client_is_silent``, the direction from the client gets a thread once the client sends.
+        If a thread can't be started, the thread that tried to start it may call ``finished``. If
+        ``client_is_silent``, the direction from the client gets a thread once the client sends.
         """
         for sock in (self.outside, self.inside):
             _prepare(sock)
@@ -163,8 +164,8 @@ class Relay:
             pump = _Pump(self.outside, self.inside, self._count_received, self.splice)
         try:
             pump.run()
-            # SHUT_RD in `_pass_reset_on` also ends the last read. Then the sockets are about to be
-            # reset, so send no FIN.
+            # The read may have ended because the other direction called `_pass_reset_on`, which
+            # calls SHUT_RD. Then a reset follows, so send no FIN.
             if not self.failed:
                 pump.target.shutdown(socket.SHUT_WR)
         except OSError as error:
@@ -311,7 +312,7 @@ def _pipe(size: int) -> Iterator[tuple[int, int] | None]:
     """A pipe of ``size`` bytes if possible; None if the pipe is too small for splice.
 
     An unprivileged user has a limited number of pages for pipes (pipe-user-pages-soft, pipe(7)).
-    Further pipes get two pages each, and then copying is faster.
+    Beyond this limit a new pipe gets two pages, and then copying is faster.
     """
     try:
         ends = os.pipe()

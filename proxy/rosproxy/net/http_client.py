@@ -42,8 +42,8 @@ LONG_BODY_TIMEOUT_S = 600.0
 CONNECT_TIMEOUT_S = 2.0
 """Seconds for the attempt to connect to one address of a peer.
 
-This time is short, because rosmaster calls all subscribers from three threads (master_api.py,
-NUM_WORKERS). Each subscriber that does not answer blocks a thread.
+rosmaster calls all subscribers from three threads (master_api.py, NUM_WORKERS). While the proxy
+tries to reach a node for such a call, a thread of rosmaster waits. So this time is short.
 """
 
 _NO_CONTROL_OR_SPACE = re.compile(r"[^\x00-\x20\x7f]+")
@@ -113,7 +113,7 @@ class ClientConnection(HttpProtocol):
         return self._is_persistent and is_read and is_open and not self._messages
 
     def data_received(self, data: bytes) -> None:
-        """Parse received bytes. aiohttp passes no bytes when the parser may go on."""
+        """Parse received bytes. aiohttp passes b"" to let a paused parser go on."""
         if self._failure is not None:
             return
         try:
@@ -129,7 +129,7 @@ class ClientConnection(HttpProtocol):
             wake(self._arrival)
 
     def eof_received(self) -> None:
-        """Have asyncio close the connection, because the peer has closed the other side."""
+        """Return None, so that asyncio closes the connection: the peer sends nothing more."""
 
     def connection_lost(self, exc: BaseException | None) -> None:
         """End the call under way with an error."""
@@ -164,12 +164,12 @@ class ClientConnection(HttpProtocol):
 
 
 class HttpClient:
-    """Sends XML-RPC calls to peers, either to the master or to nodes.
+    """Sends XML-RPC calls to peers. One client calls the master, another calls nodes.
 
     ``headers``: sent with each call. ``keepalive``: seconds until an idle connection is closed; the
-    check may come half that time later. ``most``: connections in use at once, without long bodies
-    and without the connections in ``late``, whose callers have given up. ``longest``: bound of a
-    reply body in bytes. ``source``: the source of the peers' names (see `resolver`).
+    check may come half that time later. ``most``: the highest number of connections in use at once.
+    Connections with a long body, and connections in ``late``, do not count. ``longest``: bound of a
+    reply body in bytes. ``source`` says where the peers' names come from (see `resolver.resolve`).
     ``last_address``: the address of the latest new connection.
     """
 
@@ -222,11 +222,11 @@ class HttpClient:
     ) -> bytes | LongReply:
         """Send a request; return the body of the reply.
 
-        A body of more than LONG_BODY_BYTES is a LongReply, except a body without
+        A reply body of more than LONG_BODY_BYTES is a LongReply, except a reply without
         ``Content-Length``. ``within``: seconds until a long reply begins, or a short reply ends.
-        For a LongBody the time counts from the end of the body, and connecting has the same time. A
-        LongBody uses a new connection, because the client can't send the pieces twice. Raises the
-        errors of `post` and of ``body.pieces``.
+        For a LongBody, connecting may take ``within`` seconds. After the end of the body, the reply
+        has ``within`` seconds again. A LongBody uses a new connection, because the client can't
+        send the pieces twice. Raises the errors of `post` and of ``body.pieces``.
         """
         if isinstance(body, bytes):
             head = self._head(path, host, len(body))
@@ -249,7 +249,7 @@ class HttpClient:
             return await self._pass_reply(peer, connection, *answer)
 
     def encoded_request(self, path: str, host: str, body: bytes) -> bytes:
-        """The bytes of a call, for a connection that the caller has made. Raises ValueError."""
+        """The bytes of a request, for a connection outside this client. Raises ValueError."""
         return self._head(path, host, len(body)) + body
 
     async def close(self) -> None:
@@ -264,9 +264,9 @@ class HttpClient:
         await asyncio.sleep(0)  # asyncio closes a transport's socket in the loop's next turn
 
     def close_after_answer(self, sock: socket.socket, received: bytes = b"") -> None:
-        """Close a connection that the caller has made, once the answer on it is complete.
+        """Close a connection that this client did not make, once the answer on it is complete.
 
-        ``received``: the part of the answer that the caller has read. Without an answer, the
+        ``received``: the part of the answer that was already read. Without an answer, the
         connection is closed after LATE_TIMEOUT_S.
         """
         self.late.wait(partial(_drain_socket, sock, received), sock.close)

@@ -127,7 +127,7 @@ class RouterSupervisor:
             _piped(process.stdin).write(self._line)
             return await self._read_reports(process)
         finally:
-            # Zenoh's own end of a session may hang. Nodes see the end of the connections alike.
+            # Zenoh's own end of a session may hang. Nodes see their connections end in both cases.
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             await process.wait()
@@ -138,7 +138,7 @@ class RouterSupervisor:
             logging_task.cancel()
 
     async def _read_reports(self, process: Process) -> str:
-        """Take reports until there are no more; returns the reason."""
+        """Take reports until the process ends, fails or hangs; return the reason."""
         reports = _piped(process.stdout)
         patience = START_TIMEOUT_S
         while True:

@@ -90,7 +90,8 @@ class SlaveApi:
                 raise Unreachable("the caller has closed the connection")
             results.append(await self._multicall_result(endpoint, inner, call))
             call.charge(len(results[-1]))
-            # A call that the proxy refuses or keeps back waits for no node.
+            # If the proxy refuses a call or keeps it from the node, the proxy waits for no node. So
+            # let other tasks run here.
             await asyncio.sleep(0)
         return multicall.results_reply(results)
 
@@ -126,10 +127,11 @@ class SlaveApi:
         return endpoint
 
     def _matches_path(self, endpoint: Endpoint, path: str) -> bool:
-        """Whether the path of a request names this endpoint, or no node, as roscpp's paths do.
+        """Whether the path of a request names this endpoint.
 
-        The port may serve another node by now. A ``shutdown`` of the master for the former node
-        must not end the present node.
+        Also true if the path names no node: roscpp drops the path of a URI (subscription.cpp,
+        negotiateConnection). The port may serve another node by now. A ``shutdown`` that the master
+        sends to the former node must not end the present node.
         """
         inside_path = parse_inside_path(path)
         return inside_path is None or inside_path.slave == endpoint.slave
@@ -204,7 +206,7 @@ class SlaveApi:
             await self._stand_ins.listen_for_announced(topic, announced, node)
             if len(announced) > MANY_VALUES:
                 await self._context.yield_to_others()
-            body, parsed = self._with_allowed_publishers(endpoint, parsed, body)
+            body, parsed = self._with_publishers_for_node(endpoint, parsed, body)
         self._context.refresh_networks()
         addressing = self._context.addressing
         is_local = call.reached_locally
@@ -228,12 +230,14 @@ class SlaveApi:
         reached = HostPort(call.local.host, port) if is_local else addressing.outside(port)
         return slave_api.rewrite_reply(parsed, reply, reached, view)
 
-    def _with_allowed_publishers(
+    def _with_publishers_for_node(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes
     ) -> tuple[bytes, xmlrpc.Call]:
-        """The body and the parsed call of a publisherUpdate with all publishers for the node.
+        """The body and the parsed call of a publisherUpdate with the publishers for the node.
 
-        `publishers_for` chooses the publishers. Unchanged if the publishers are the same.
+        `publishers_for` adds the publishers that the master does not have. If the subscriber itself
+        is hidden from the master, only publishers inside remain. Unchanged if the publishers are
+        the same.
         """
         topic = parsed.string(1) or ""
         announced = slave_api.announced_publishers(parsed)
@@ -280,7 +284,8 @@ class SlaveApi:
             if error.probe is ProbeResult.ANSWERED:  # by an HTTP error status
                 health.note(error.probe, self._context.now())
             if error.refused and health.note(error.probe, self._context.now()):
-                # With this refusal the node counts as ended, so the port refuses at once, too.
+                # With this refusal the node counts as ended. So the proxy closes the node's port
+                # now, and the port refuses the next caller.
                 log.info("%s has ended: %s", endpoint.label, error)
                 self._leases.close(endpoint)
             raise
@@ -300,8 +305,9 @@ class SlaveApi:
         """The reason to refuse a ``paramUpdate``; None if the node may have subscribed.
 
         rosmaster keeps parameter subscriptions of nodes that have ended. Some libraries do not
-        unsubscribe (rosrust subscribes to every parameter). So rosmaster calls the present node at
-        the port. rosnodejs never answers such a call, and meanwhile rosmaster sends this node no
+        unsubscribe (rosrust subscribes to every parameter). The port may now belong to another
+        node, which gets the updates for the former node. A node of rosnodejs never answers a
+        ``paramUpdate``. While rosmaster waits for the answer, rosmaster sends this node no
         ``publisherUpdate``.
         """
         await self._context.wait_for_registration(endpoint)
