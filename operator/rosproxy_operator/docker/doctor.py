@@ -1,8 +1,9 @@
-"""``rosproxy-operator docker doctor``: the faults of a host, the first cause first.
+"""``rosproxy-operator docker doctor``: the faults of a host.
 
 First come the findings of the operator: images, networks, masters, labels, and remaining steps.
-Then the doctor runs in the container of each proxy (``docker exec``), and checks from the proxy's
-network.
+Fatal problems come before warnings, and causes before consequences. Then come the findings of the
+doctors, which check from the proxies' networks. A doctor runs in the container of each running
+proxy (``docker exec``), unless the proxy has just been started.
 """
 
 import asyncio
@@ -56,7 +57,11 @@ async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding
     served = served_participants(status)
     return [
         *host_findings(status),
-        *(f for f in without_names_of_others(findings_by_proxy, names) if not _is_about(f, served)),
+        *(
+            finding
+            for finding in without_names_of_others(findings_by_proxy, names)
+            if not _is_of_another_proxy(finding, served)
+        ),
     ]
 
 
@@ -66,14 +71,21 @@ def served_participants(status: Json) -> frozenset[str]:
     return frozenset(p["guid_prefix"] for p in participants)
 
 
-def _is_about(finding: DoctorFinding, served: frozenset[str]) -> bool:
-    """Whether a proxy misses a participant that another proxy of this host serves."""
-    is_of_another = finding.check in (OTHER_DOMAIN, OWN_MACHINE)
-    return is_of_another and finding.subject.rpartition(" ")[2] in served
+def _is_of_another_proxy(finding: DoctorFinding, served: frozenset[str]) -> bool:
+    """Whether a finding is about a participant that another proxy of this host serves.
+
+    The doctor of a proxy knows no other proxy. So the doctor warns that such a participant is in
+    another domain, or announces itself on its own machine only.
+    """
+    is_about_participant = finding.check in (OTHER_DOMAIN, OWN_MACHINE)
+    return is_about_participant and finding.subject.rpartition(" ")[2] in served
 
 
 def host_findings(status: Json) -> Iterator[DoctorFinding]:
-    """Yield the findings in the status of a host, the first cause first."""
+    """Yield the findings in the status of a host.
+
+    Fatal problems come first. Among these, and among the warnings, causes come before consequences.
+    """
     problems = sorted(status["problems"], key=_order)
     for problem in problems:
         report = error if problem["fatal"] else warning

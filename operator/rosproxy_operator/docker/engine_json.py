@@ -1,7 +1,7 @@
 """Converts the engine's JSON to the planner's data. These functions do not call the engine.
 
-The engine's list of containers has states, labels, addresses and networks. Only an inspection of a
-container has the rest. Any empty field may be missing or null.
+The engine's list of containers has states, labels, addresses, networks, network modes and published
+ports. Only an inspection of a container has the rest. Any empty field may be missing or null.
 """
 
 from collections.abc import Iterable
@@ -129,7 +129,7 @@ def container_of(event: Json) -> str:
 
 
 def environment(inspected: Json | None) -> dict[str, str]:
-    """Return the environment variables of a container."""
+    """Return the environment variables of a container that `check_inspection` keeps."""
     return dict(text.partition("=")[::2] for text in dig(inspected, "Config", "Env") or ())
 
 

@@ -193,7 +193,7 @@ class Executor:
     async def _run(
         self, job: Job, groups: list[Group], actions: list[Action], carry_out: CarryOut
     ) -> None:
-        """Wait for the uplink's job, carry out all groups, and record the first group's problem."""
+        """Wait for the uplink's job, carry out all groups, and record the first problem."""
         problem: Problem | None = None
         try:
             if job != UPLINK and UPLINK in self._busy:

@@ -72,8 +72,8 @@ class Create(_CreateContainer, frozen=True):
     """Create the container of a proxy, in the network namespace of the container ``sandbox``.
 
     ``replaces`` is the name of the former container, or empty. ``policy`` has the layers from
-    labels. ``peers`` and ``lan_relay``, the endpoint of the LAN relay, are for ROS 2. For rmw_zenoh
-    ``peers`` are routers outside.
+    labels. ``peers`` are hosts for ROS 2, and routers for rmw_zenoh (`Member.peers`). ``lan_relay``
+    is the address and port of the LAN relay, for ROS 2.
     """
 
     sandbox: str

@@ -62,11 +62,11 @@ class Group:
 class DockerPlan:
     """The groups of actions that the operator carries out, and the memory for the next look.
 
-    ``deferred`` are groups that wait for an address. A proxy for ROS 1 waits for the address of
-    the master. The proxy can't resolve the master's host name: on the proxy's networks this name is
-    an alias of the proxy itself. All other proxies wait for the uplink network: LAN relays and
-    zenoh routers of this host listen at the address of its gateway, which the proxy gets as an
-    option.
+    ``deferred`` are groups that create a proxy and wait for an address. A proxy for ROS 1 waits
+    only while the address of the master is unknown. The proxy can't resolve the master's host name:
+    on the proxy's networks this name is an alias of the proxy itself. Other proxies wait until the
+    uplink network exists. These proxies get the address of the uplink's gateway as an option: at
+    that address, LAN relays and zenoh routers of this host listen.
 
     ``again_in`` are the seconds until the next look if no event comes; None if nothing is pending.
     """
@@ -94,9 +94,10 @@ def plan(
 ) -> DockerPlan:
     """Return the plan for a host. The plan has no actions if nothing is left to do.
 
-    If a container of a proxy is busy (`HostState.busy`), the plan has no actions for this proxy.
-    ``labels`` are the labels in ``observed``. ``memory`` is the memory of the previous plan, empty
-    for the first plan. ``now`` is in seconds of a monotonic clock, the same for all plans.
+    If a container of a proxy is busy (`HostState.busy`), the plan has no actions for the containers
+    and networks of this proxy. The plan may still set or remove redirects to the proxy. ``labels``
+    are the labels in ``observed``. ``memory`` is the memory of the previous plan, empty for the
+    first plan. ``now`` is in seconds of a monotonic clock, the same for all plans.
     """
     members, member_problems = find_members(labels, observed, settings)
     members, bound_problems = _within_bounds(members, settings)
@@ -140,7 +141,11 @@ def plan(
 def _within_bounds(
     members: Collection[Member], settings: PlanSettings
 ) -> tuple[tuple[Member, ...], list[Problem]]:
-    """Return the members within the limits of their proxies, and a problem for each other one."""
+    """Return the members that the proxies can serve, and the problems of the limits.
+
+    A member with too many peers stays, without peers. A living member that loses its peers or its
+    proxy gets a problem.
+    """
     members, rule_problems = with_bounded_rules(members, settings)
     members, peer_problems = with_bounded_peers(members, settings)
     members, zenoh_problems = with_bounded_containers(members)

@@ -305,10 +305,11 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
 
 
 def _advertised(request: Member, observed: HostState) -> str:
-    """Return this host's address towards a master, else the advertised host of an existing proxy.
+    """Return this host's address towards outside, else the advertised host of an existing proxy.
 
-    So a proxy stays if the name of the master does not resolve for a moment. A proxy on a network
-    of the container comes first. Empty without address and proxy.
+    Outside is the master for ROS 1, and far hosts for ROS 2. A proxy on a network of the container
+    comes first. So a proxy stays if the name of the master does not resolve for a moment. Return an
+    empty text if there is neither an address nor a proxy.
     """
     key = request.key
     networks = request.container.networks

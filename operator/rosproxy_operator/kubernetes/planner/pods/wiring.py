@@ -139,8 +139,9 @@ def wiring_finding(
 def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
     """Whether a pod does not use its proxy, and the webhook would wire a recreated pod.
 
-    False for a pod that the webhook would not wire: without the label, or with these variables in
-    the template: ROS_STATIC_PEERS, or a ROS_MASTER_URI that does not name the RosProxy's master.
+    True if ROS_MASTER_URI or ROS_STATIC_PEERS is missing or outdated, or if the pod was wired for a
+    former RosProxy. A variable that the template sets does not count, except a ROS_MASTER_URI that
+    names the real master of the RosProxy. False for a pod without the label.
     """
     masters = _masters_of(rosproxy)
     lacks_master = (
@@ -185,8 +186,8 @@ def edit_fix(change: str, pod: Pod) -> str:
 def _is_of_former(pod: Pod, rosproxy: RosProxy) -> bool:
     """Whether a pod was wired for a deleted RosProxy of the same name.
 
-    The proxy unregistered the ROS nodes of the pod when that RosProxy was deleted. ROS 1 nodes
-    don't register again by themselves.
+    The proxy may have unregistered the ROS nodes of the pod when that RosProxy was deleted. ROS 1
+    nodes don't register again by themselves.
     """
     return bool(pod.wired_master_uri) and _is_older(pod, rosproxy)
 

@@ -90,7 +90,7 @@ def reconcile_proxies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
     A change of the image or of the settings is a rollout. A rollout stops a working proxy, or
     checks its next image, only while fewer than ``spec.maxUnavailable`` proxies are down or have
     such a check. The other proxies wait. A proxy that moves to other ports or to another master
-    does not wait.
+    does not wait, except for the check of a new image.
     """
     places = context.view.places.get(rosproxy.id, ())
     wanted = [place for place in places if _is_creatable(context, place)]
@@ -213,7 +213,7 @@ def _replace_or_set_image(
 ) -> Iterator[Action]:
     """Yield the deletion of a proxy that has to be recreated, or the change of the image.
 
-    A proxy that moves to other ports or to another master does not wait for its turn.
+    Here, a proxy that moves to other ports or to another master does not wait for its turn.
     """
     image = manifests.image_of(site.rosproxy, context.settings)
     fingerprint = manifests.proxy_fingerprint(site, context.settings)
