@@ -2,8 +2,8 @@
 
 The event loop makes all calls: reflectors write (`changed`, `listed`, `failed`), the controller
 reads (`snapshot`, `take_changes`). The state may lag behind the API server, or lack an event that a
-watch has lost. A later look corrects the consequences. Before the operator deletes an object, it
-reads the facts from the API server again (`confirm_deletion`).
+watch has lost. The next list corrects the state, and a later look corrects the consequences. Before
+the operator deletes an object, it reads the facts from the API server again (`confirm_deletion`).
 """
 
 import asyncio
@@ -47,8 +47,8 @@ from rosproxy_operator.kubernetes.resources.records import POLICIES, Change, Rec
 log = logging.getLogger(__name__)
 
 R = TypeVar("R", bound=Record)
-Collection = tuple[str, str]
-"""A kind, and a namespace, empty for all."""
+WatchKey = tuple[str, str]
+"""A kind, and a namespace. An empty namespace stands for all."""
 MOST_VANISHED = 4096
 """Places of vanished proxy pods at most; for a further place the store forgets the oldest."""
 
@@ -62,7 +62,7 @@ class StoreChanges:
 
 
 class ClusterStore:
-    """The records of the watched ``kinds``. The operator manages the namespaces in ``places``.
+    """The records of all ``watches``. The operator manages ``namespaces``; all if ("",).
 
     The store calls ``wake`` when a look is due, and ``back`` when a failed watch works again.
     ``corrected`` gets the number of objects in which a new list differs from the store. ``now``
@@ -71,8 +71,8 @@ class ClusterStore:
 
     def __init__(
         self,
-        kinds: Iterable[Collection],
-        places: tuple[str, ...],
+        watches: Iterable[WatchKey],
+        namespaces: tuple[str, ...],
         wake: Callable[[], None],
         back: Callable[[], None],
         corrected: Callable[[int], None] = lambda _: None,
@@ -82,10 +82,10 @@ class ClusterStore:
         self._back = back
         self._corrected = corrected
         self._now = now
-        self._places = places
-        self._tables: dict[Collection, dict[str, Record]] = {collection: {} for collection in kinds}
-        self._errors: dict[Collection, ApiError] = {}
-        self._listed: set[Collection] = set()
+        self._namespaces = namespaces
+        self._tables: dict[WatchKey, dict[str, Record]] = {watch: {} for watch in watches}
+        self._errors: dict[WatchKey, ApiError] = {}
+        self._listed: set[WatchKey] = set()
         self._pending = set(self._tables)
         self._all_heard = asyncio.Event()
         self._pods: dict[str, dict[str, Pod]] = defaultdict(dict)
@@ -100,31 +100,37 @@ class ClusterStore:
     # For reflectors:
 
     def changed(self, kind: str, place: str, changes: Sequence[Change]) -> None:
-        """Apply changes in this order; None means that the object is gone. The watch works."""
-        collection = kind, place
-        self._note_heard(collection)
-        if self._errors.pop(collection, None):
+        """Apply changes in this order; None means that the object is gone.
+
+        Each call shows that the watch works, also a call without changes.
+        """
+        watch = kind, place
+        self._note_heard(watch)
+        if self._errors.pop(watch, None):
             self._back()
         for key, record in changes:
-            self._put(collection, key, record)
+            self._put(watch, key, record)
 
     def listed(self, kind: str, place: str, records: Mapping[str, Record]) -> None:
-        """Replace all records of a kind in a namespace. The watch starts later."""
-        collection = (kind, place)
+        """Replace all records of a kind in a namespace.
+
+        This call does not show that the watch works: the watch starts after the list.
+        """
+        watch = (kind, place)
         former = dict(self._tables[kind, place])
         gone = dict.fromkeys(former.keys() - records.keys())
-        kept = {key: self._as_foreign(record) for key, record in records.items()}
+        kept = {key: self._without_foreign_ownership(record) for key, record in records.items()}
         differ = [key for key, record in kept.items() if former.get(key) != record]
         for key, record in {**gone, **kept}.items():
-            self._put(collection, key, record)
-        if collection in self._listed and (gone or differ):
+            self._put(watch, key, record)
+        if watch in self._listed and (gone or differ):
             log.info(
                 "watch corrected: %s, a new list differs from the watched state in %d objects",
                 kind,
                 len(gone) + len(differ),
             )
             self._corrected(len(gone) + len(differ))
-        self._listed.add(collection)
+        self._listed.add(watch)
 
     def failed(self, kind: str, place: str, error: ApiError) -> None:
         """Note an error of a list or watch; `check` raises the error while the watch fails."""
@@ -136,8 +142,8 @@ class ClusterStore:
         if fresh:
             self._wake()
 
-    def _note_heard(self, collection: Collection) -> None:
-        self._pending.discard(collection)
+    def _note_heard(self, watch: WatchKey) -> None:
+        self._pending.discard(watch)
         if not self._pending:
             self._all_heard.set()
 
@@ -239,15 +245,15 @@ class ClusterStore:
         return {id: (services.get(id), numbers) for id, numbers in ports.items()}
 
     def _errors_of(self, kind: str) -> list[ApiError]:
-        return [error for collection, error in self._errors.items() if collection[0] == kind]
+        return [error for watch, error in self._errors.items() if watch[0] == kind]
 
     def _records_of(self, kind: str, record_type: type[R]) -> Iterator[R]:
-        for collection, table in self._tables.items():
-            if collection[0] == kind:
+        for watch, table in self._tables.items():
+            if watch[0] == kind:
                 yield from (record for record in table.values() if isinstance(record, record_type))
 
     def _is_looked_after(self, namespace: str) -> bool:
-        return self._places == ("",) or namespace in self._places
+        return self._namespaces == ("",) or namespace in self._namespaces
 
     def _is_selected(self, pod: Pod) -> bool:
         rosproxies = self._rosproxies.get(pod.id.namespace)
@@ -255,10 +261,10 @@ class ClusterStore:
 
     # Changes:
 
-    def _put(self, collection: Collection, key: str, record: Record | None) -> None:
-        table = self._tables[collection]
+    def _put(self, watch: WatchKey, key: str, record: Record | None) -> None:
+        table = self._tables[watch]
         former = table.get(key)
-        record = self._as_foreign(record)
+        record = self._without_foreign_ownership(record)
         if former == record:
             return
         if record is None:
@@ -266,13 +272,14 @@ class ClusterStore:
         else:
             table[key] = record
         # Touch the former record, then the new record: a pod with a changed label may leave one
-        # RosProxy for another. An update of a proxy's pod must end with add=True (`_note_place`).
+        # RosProxy for another. An update of a proxy's pod must end with add=True: see
+        # `_note_vanished`.
         self._index(former, key, add=False)
         self._touch(former, record)
         self._index(record, key, add=True)
         self._touch(record, former)
 
-    def _as_foreign(self, record: Record | None) -> Record | None:
+    def _without_foreign_ownership(self, record: Record | None) -> Record | None:
         """Treat a pod of another operator, which manages other namespaces, as an ordinary pod."""
         if isinstance(record, OwnPod) and not self._is_looked_after(record.of.namespace):
             return record.pod
@@ -284,11 +291,11 @@ class ClusterStore:
         elif isinstance(record, OwnPod):
             _set(self._own_pods, record.of.namespace, key, record if add else None)
             if isinstance(record, ProxyPod):
-                self._note_place(record, add)
+                self._note_vanished(record, add)
         elif isinstance(record, Pod):
             self._index_pod(record, key, record if add else None)
 
-    def _note_place(self, proxy: ProxyPod, is_there: bool) -> None:
+    def _note_vanished(self, proxy: ProxyPod, is_there: bool) -> None:
         """Note the time when a proxy's pod vanishes and the store has not seen the container end.
 
         Such a container may still run and hold ports. A new pod at the place clears the note.
@@ -356,7 +363,7 @@ class ClusterStore:
 
 
 def _requested(record: Record | None) -> object:
-    """The part of a RosProxy that users write, without the status; None for other records."""
+    """The parts of a RosProxy without those that come from the status; None for other records."""
     if isinstance(record, RosProxy):
         asked = record.uid, record.generation, record.deleting, record.spec, record.remakes
         return *asked, record.misspelt
@@ -375,9 +382,10 @@ def _set(index: dict[str, dict[str, R]], name: str, key: str, record: R | None) 
 
 
 def read_master(service: MasterService | None, id: Name, ports: Iterable[int]) -> tuple[str, str]:
-    """Return the address of a master's Service, and the problem of the Service; either is empty.
+    """Return the address of a master's Service, and the problem of the Service.
 
-    ``ports`` are the ports that RosProxies name. The Service needs at least one of these ports.
+    Exactly one of the two is empty. ``ports`` are the ports that RosProxies name. The Service needs
+    at least one of these ports.
     """
     if service is None:
         return "", "does not exist. Create the Service, or correct spec.master.service"

@@ -41,7 +41,10 @@ from rosproxy_operator.kubernetes.status.findings import pod_finding
 MIRROR = "kubernetes.io/config.mirror"
 """Annotation of the mirror pod of a static pod. A change of a mirror pod changes no container."""
 WEBHOOK_READY_AFTER = timedelta(minutes=1)
-"""Time after which a new RosProxy, or the webhook of a new operator, is sure to wire pods."""
+"""Time after which the webhook is sure to wire the pods of a new RosProxy.
+
+The time starts when the RosProxy exists and the webhook is ready.
+"""
 UNKNOWN_WEBHOOK = WebhookState()
 _KINDS = ("initContainers", "containers")
 
@@ -87,9 +90,9 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
     - ROS 2: ROS_STATIC_PEERS, and ROS_DOMAIN_ID if the RosProxy names a domain.
 
     New variables come first, because Kubernetes expands ``$(ROS_MASTER_URI)`` only in the variables
-    after it. The webhook replaces a ROS_MASTER_URI that names the RosProxy's own master, and keeps
-    the first such value in an annotation. A copy of a wired pod may have a former address of the
-    proxy. The webhook knows this address from another annotation, and replaces the address. A
+    after it. The webhook replaces a ROS_MASTER_URI that names the real master of the RosProxy, and
+    keeps the first such value in an annotation. A copy of a wired pod may have a former address of
+    the proxy. The webhook knows this address from another annotation, and replaces the address. A
     second wiring of the same pod changes nothing.
 
     The caller must not pass a pod in the host's network: see `selection.select_rosproxy`.
@@ -132,7 +135,7 @@ def wiring_finding(
     Also if the pod has to be recreated so that the nodes use the proxy. ``cluster_ip`` is the
     address of the RosProxy's Service.
     """
-    text = _master_fault(pod, rosproxy, cluster_ip, webhook)
+    text = _why_not_wired(pod, rosproxy, cluster_ip, webhook)
     return pod_finding(pod, rosproxy, "NotWired", text, fatal=False) if text else None
 
 
@@ -210,7 +213,7 @@ def should_be_wired(pod: Pod, rosproxy: RosProxy, ready_since: str) -> bool:
     return datetime.fromisoformat(pod.created) - latest >= WEBHOOK_READY_AFTER
 
 
-def _master_fault(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState) -> str:
+def _why_not_wired(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState) -> str:
     """Return why the ROS 1 nodes of a pod do not use the proxy, and the fix; empty if they do."""
     masters = _masters_of(rosproxy)
     bypassing = [

@@ -4,7 +4,7 @@ Each ``reconcile_…`` function compares the wanted objects with the existing ob
 next actions. Later looks yield the actions after these. Of the settings of an object, the
 comparison reads only the fingerprint annotation and the image. A pod with another fingerprint is
 deleted, and a later look creates the pod again under the same name. If only the image differs, the
-operator sets the image of the pod. `Retries` delays the repetition of an action without an effect.
+operator sets the image of the pod. `Retries` delays the next try of an action that had no effect.
 """
 
 from collections import Counter
@@ -118,7 +118,10 @@ def _image_check_is_open(context: ClusterContext, place: ProxyPlace) -> bool:
 
 
 def _lacks_ports(context: ClusterContext, place: ProxyPlace) -> bool:
-    """Whether a proxy waits for its ports. So a rollout does not count this proxy as down."""
+    """Whether a proxy waits for its ports.
+
+    A rollout does not count such a proxy as down: no rollout has caused the lack of ports.
+    """
     current = context.view.current.get(place)
     return current is not None and current.stuck is PodFailure.PORTS
 
@@ -171,9 +174,9 @@ def _reconcile_wanted(
     """Yield the next action for a wanted proxy without an obstacle."""
     name = proxy_id(place.of, place.node)
     current = context.view.current.get(place)
-    misplaced = [p for p in context.view.proxies.get(place, ()) if p.pod.id != name]
-    if misplaced:
-        for proxy in misplaced:
+    misnamed = [p for p in context.view.proxies.get(place, ()) if p.pod.id != name]
+    if misnamed:
+        for proxy in misnamed:
             yield from _delete_pod(context, proxy, "the pod has a former name")
     elif name in context.view.names:
         _keep_creation_count(context, place)
@@ -221,14 +224,14 @@ def _replace_or_set_image(
     # (`retire`). A range with the same first port has only grown or shrunk at the end, so the
     # nodes keep their ports.
     moved = proxy.range.first != site.ports.first
-    lost = moved or not manifests.keeps_registrations(proxy.fingerprint, fingerprint)
-    if not may_stop and not lost:
+    unregisters = moved or not manifests.keeps_registrations(proxy.fingerprint, fingerprint)
+    if not may_stop and not unregisters:
         context.retries.look_again_in(ROLLOUT_RECHECK_S)
     elif proxy.fingerprint != fingerprint:
         why = "replaced, since the RosProxy, the node or the operator's options have changed"
         if proxy.range != site.ports:
             why = f"replaced, since the ports change from {proxy.range} to {site.ports}"
-        yield from _delete_pod(context, proxy, why, retire=serves(proxy) and lost)
+        yield from _delete_pod(context, proxy, why, retire=serves(proxy) and unregisters)
     elif context.retries.is_due(_setting_image(proxy, image)):
         yield SetImage(proxy.of, proxy.pod.id, proxy.pod.uid, image)
 
@@ -246,9 +249,9 @@ def _delete_pod(
 ) -> Iterator[Action]:
     """Yield the deletion of a proxy's pod, unless the pod is being deleted already.
 
-    With ``retire`` the proxy first unregisters its nodes. Then the deletion is also for a pod that
-    is being deleted already and still runs: the garbage collector is often faster than the
-    operator.
+    With ``retire`` the proxy first unregisters its nodes. The garbage collector often deletes the
+    pod before the operator does. So with ``retire``, also yield the deletion of a pod that is being
+    deleted already but still runs.
     """
     node = context.observed.nodes.get(proxy.node)
     runs = serves(proxy) and node is not None and node.ready
@@ -260,7 +263,8 @@ def _delete_pod(
 def _keep_creation_count(context: ClusterContext, place: ProxyPlace) -> None:
     """Keep the retry record of the creation of a proxy while the proxy does not serve.
 
-    So the operator creates a pod that never runs again ever more slowly (`PROMPT_RECREATIONS`).
+    If no pod of the proxy ever runs, the operator waits longer before each further creation
+    (`PROMPT_RECREATIONS`).
     """
     current = context.view.current.get(place)
     if current is None or not serves(current):
@@ -281,7 +285,7 @@ def reconcile_orphans(context: ClusterContext) -> Iterator[Action]:
         # not unregister the nodes.
         takes_over = proxy.of in context.view.rosproxies
         yield from _delete_pod(context, proxy, "its RosProxy is gone", retire=not takes_over)
-    # An unusable RosProxy exists. Its Service stays, so that its pods keep the address.
+    # An unusable RosProxy is not gone. So its Service stays, and its pods keep the address.
     unusable = {r.uid for r in context.observed.unusable.values()}
     for service in context.observed.services.values():
         if service.of not in context.view.rosproxies and service.owner not in unusable:
