@@ -5,7 +5,8 @@ A job may take a minute (the engine publishes a thousand ports) or fail at every
 operator looks again, and other jobs run.
 
 If an action is already done, or its container or network has gone since the look, nothing is left
-to do: no error. A creation is the exception: the action fails without its image or network.
+to do: no error. An exception is the creation of a container, which fails without its image or
+network.
 """
 
 import asyncio
@@ -61,12 +62,13 @@ from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 log = logging.getLogger(__name__)
 
 RETRY_PAUSES_S = (1.0, 2.0, 5.0, 15.0, 60.0)
-"""Pauses in seconds after the first, second, … failure of a job in a row. The last one repeats."""
+"""Pauses in seconds after one, two, … failures of a job in succession. The last pause repeats."""
 FAILURE_REMEMBERED_S = 120.0
 """Seconds after which a failure of an action is forgotten, if the action has not failed again.
 
-A failure that comes again before is not logged as a warning again. Retries come at least every 60
-s, so a failure that goes on is logged as a warning once. The status reports the problem meanwhile.
+If the same failure comes again within this time, the operator does not log another warning. Retries
+come at least every 60 s, so a lasting failure is logged as a warning once. Meanwhile the status
+reports the problem.
 """
 STOP_TIMEOUT_S = 2
 """Seconds that a container has to end before the engine kills it."""
@@ -84,7 +86,7 @@ HARMLESS_ERRORS: dict[type, tuple[str, ...]] = {
     Remove: ("is already in progress",),
     RemoveNetwork: (),
 }
-"""Parts of the engine's errors after which this action has nothing left to do, by type of action.
+"""For each type of action: texts in the engine's errors that mean that nothing is left to do.
 
 For these types, the error NoSuchObject also means that nothing is left to do. For all other types
 every error is a failure.
@@ -107,9 +109,9 @@ UPLINK: Job = (None, "")
 
 @dataclass(slots=True)
 class _Failure:
-    """All actions of a job that has failed, its failures in a row, and the problem to report.
+    """All actions of a job that has failed, and the problem to report.
 
-    ``retry_at`` is in monotonic seconds.
+    ``count`` is the number of failures in succession. ``retry_at`` is in monotonic seconds.
     """
 
     actions: list[Action]
@@ -271,7 +273,7 @@ def _subject(job: Job) -> str:
 
 
 class DockerActions:
-    """Makes the engine's calls for single actions, each action in a thread."""
+    """Calls the engine to carry out single actions, each action in a thread."""
 
     def __init__(self, engine: DockerClient, settings: PlanSettings, proxies: ProxyClient) -> None:
         self._engine = engine
@@ -383,7 +385,7 @@ class DockerActions:
                 log.debug("container not stopped, so it is killed: %s: %s", name, error)
         # When a sandbox ends, the engine publishes the ports anew over each network that the
         # sandbox still has, which takes 2 s per network. So disconnect the networks while the
-        # sandbox runs. A proxy's container, which gets ``stop``, has no network of its own.
+        # sandbox runs. The code above stops only proxies' containers, which use the sandbox's.
         networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
         for network in networks:
             # The engine disconnects no container from the network host.

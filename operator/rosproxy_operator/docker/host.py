@@ -63,8 +63,8 @@ def own_address_towards(master: str, gateways: Collection[str]) -> str:
     """Return the address at which a master reaches this host; empty without a route.
 
     ``master`` is an address. If the route starts at loopback or at one of the engine's
-    ``gateways``, no other host can use that source. Then the result is `default_route_address`, or
-    the gateway without a default route.
+    ``gateways``, no other host can reach that address. Then the result is `default_route_address`.
+    If there is no default route either, the result is the gateway, and empty for loopback.
     """
     own = address_towards(master)
     if own in gateways or is_loopback(own):

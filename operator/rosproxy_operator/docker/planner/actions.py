@@ -1,7 +1,7 @@
 """The actions of the operator on a Docker host, as data. `docker.executor` carries actions out.
 
-Actions name containers instead of ids: a plan may start a container that the same plan creates. The
-text of an action is one line without control characters.
+Actions have the names of containers, not the ids: a plan may start a container that the same plan
+creates. The text of an action is one line without control characters.
 """
 
 from typing import ClassVar
@@ -114,10 +114,11 @@ class CreateLanRelay(_CreateContainer, frozen=True):
 
 
 class CreateRedirect(_CreateContainer, frozen=True):
-    """Create a helper container that sets the rules of a redirect in a container's network.
+    """Create a helper container that sets the rules of a redirect for a container.
 
-    ``target`` is the id of that container, ``started`` the time of its start. The rules lead
-    ``addresses`` to ``proxy``. Without ``proxy``, the helper removes the rules.
+    The rules are in the container's network namespace, and lead ``addresses`` to ``proxy``.
+    ``target`` is the id of that container, ``started`` the time of its start. Without ``proxy``,
+    the helper removes the rules.
     """
 
     target: str

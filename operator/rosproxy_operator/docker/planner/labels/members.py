@@ -33,7 +33,7 @@ _PREFIX = "rosproxy"
 # An exited container may start again: the proxy stays on its networks for the grace (`desire`).
 _COUNTED = ALIVE | {"exited"}
 MOST_LABELS = 256
-"""Labels of a container that are checked for their spelling. A check takes some 30 microseconds."""
+"""Labels of a container that are checked for their spelling. A check takes about 30 µs."""
 MOST_UNKNOWN_LABELS = 8
 """Unknown labels of a container with a warning each. Further unknown labels are only counted."""
 MOST_NAME_CHARACTERS = 80
@@ -154,8 +154,8 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
 def _why_no_host(key: Key, observed: HostState) -> str:
     """Return why the advertised host is unknown, and the fix.
 
-    This host's address depends on the route to the master. So an unknown address of the master is
-    the first cause.
+    The address of the Docker host depends on the route to the master. So an unknown address of the
+    master is the first cause.
     """
     if not key.is_ros2 and observed.masters.get(master(key).host.lower()) == "":
         return f"no address of the master: {unresolved_master(master(key).host)}"
@@ -175,8 +175,10 @@ def _requests(
     """
     readers.refuse_long_values(container.labels)
     served = ros_versions.versions(container)
-    of_range = sorted(served - {"zenoh"})
-    requests = [_request(r, container, observed, settings, proxies) for r in of_range]
+    versions_with_range = sorted(served - {"zenoh"})
+    requests = [
+        _request(version, container, observed, settings, proxies) for version in versions_with_range
+    ]
     granted = [bounds.narrowed(r, settings) for r in requests]
     warnings = [*ros_versions.warnings(container, served)]
     for request in requests:
@@ -240,7 +242,7 @@ def _problem(container: Container, text: str, fatal: bool) -> Problem:
 
 def _unusable(container: Container, text: str) -> Problem:
     """Return a problem, fatal only if a label asks for a proxy: a variable alone is no request."""
-    return _problem(container, text, fatal=bool(_own(container)))
+    return _problem(container, text, fatal=bool(_labels_for_operator(container)))
 
 
 def _is_enabled(container: Container, settings: PlanSettings) -> bool:
@@ -258,14 +260,15 @@ def _exposed(container: Container, settings: PlanSettings) -> bool:
     if not settings.expose_by_default:
         return False
     is_ros2 = not ros_versions.versions(container) <= {"1"}
-    return bool(_own(container) or container.master_uri or is_ros2)
+    return bool(_labels_for_operator(container) or container.master_uri or is_ros2)
 
 
-def _own(container: Container) -> list[str]:
+def _labels_for_operator(container: Container) -> list[str]:
     """Return the labels that are meant for this operator, also misspelt labels."""
     prefixed = [name for name in container.labels if name.lower().startswith(f"{_PREFIX}.")]
     # A label without the prefix may belong to another program, so only very similar names count.
-    # Labels io.rosproxy.… are the operator's: io.rosproxy.domain is 0.91 near to rosproxy.domain.
+    # Labels io.rosproxy.… are the operator's own: io.rosproxy.domain has a similarity of 0.91 to
+    # rosproxy.domain, and would count as misspelt.
     others = (name for name in container.labels if not name.startswith(f"io.{_PREFIX}."))
     checked = islice(others, MOST_LABELS)
     near = [name for name in checked if nearest(name, LABELS, LEAST_SIMILARITY)]
@@ -285,7 +288,7 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
             "so the operator ignores this label. Remove the container (docker rm -f "
             f"{container.name}) or the label"
         )
-    own = _own(container)
+    own = _labels_for_operator(container)
     if container.labels.get(ENABLE, "").strip().lower() == "false":
         return
     unknown = [name for name in own if name not in LABELS]
@@ -307,9 +310,9 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
 def _advertised(request: Member, observed: HostState) -> str:
     """Return this host's address towards outside, else the advertised host of an existing proxy.
 
-    Outside is the master for ROS 1, and far hosts for ROS 2. A proxy on a network of the container
-    comes first. So a proxy stays if the name of the master does not resolve for a moment. Return an
-    empty text if there is neither an address nor a proxy.
+    Outside is the master for ROS 1, and far hosts for ROS 2. The name of the master may not resolve
+    for a moment: then the proxy stays. Of several proxies, a proxy on a network of the container
+    comes first. Return an empty text if there is neither an address nor a proxy.
     """
     key = request.key
     networks = request.container.networks

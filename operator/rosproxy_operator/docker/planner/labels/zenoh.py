@@ -45,12 +45,12 @@ _NEEDS_REDIRECT = (
 class _Router:
     """A router that a container names.
 
-    ``source`` is the label or variable with the name, for messages. ``neighbour`` is the container
-    in which the router runs; None for a router outside.
+    ``named_by`` is the label or variable with the name, for messages. ``neighbour`` is the
+    container in which the router runs; None for a router outside.
     """
 
     address: HostPort
-    source: str
+    named_by: str
     neighbour: Container | None = None
 
     @property
@@ -109,9 +109,10 @@ def _may_be_dialed(router: _Router, settings: PlanSettings) -> bool:
 def with_bounded_containers(
     members: Iterable[Member],
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
-    """Return the members for which the proxy has a router, and problems of all other members.
+    """Return the members, without excess members of the proxy for rmw_zenoh, and the problems.
 
-    Only members of the proxy for rmw_zenoh count; all members of other proxies stay.
+    This proxy has a router for each of its first `MOST_ZENOH_PORTS` members. Each living member
+    beyond that limit gets a problem. All members of other proxies stay.
     """
     every = tuple(members)
     excess = [member for member in every if member.key == ZENOH][MOST_ZENOH_PORTS:]
@@ -212,7 +213,7 @@ def _is_redirectable(router: _Router, owner: Container, observed: HostState) -> 
 def _refusals(refused: Iterable[_Router]) -> Iterator[str]:
     for router in refused:
         yield (
-            f"{router.source} names {quoted(router.peer)}, which the operator does not allow in "
+            f"{router.named_by} names {quoted(router.peer)}, which the operator does not allow in "
             "labels. The proxy does not connect there. To allow this router, start the operator "
             f"with --allow-peer {router.peer}"
         )
@@ -222,7 +223,7 @@ def _past_the_proxy(routers: Iterable[_Router]) -> Iterator[str]:
     """Warnings for routers to which the nodes connect directly, not through the proxy."""
     for router in routers:
         yield (
-            f"{router.source} connects the nodes to {quoted(router.peer)}, and the operator can "
+            f"{router.named_by} connects the nodes to {quoted(router.peer)}, and the operator can "
             "redirect only an IPv4 address with a route. So the nodes bypass the proxy. Remove "
             f"connect/endpoints from the variable, and add the label {PEERS}={router.peer}"
         )
