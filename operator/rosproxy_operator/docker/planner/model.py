@@ -308,7 +308,8 @@ class Member:
             routers to which the proxy connects.
         redirect: The value of the label ``rosproxy.redirect``; None without the label.
         redirected: The addresses and ports that the operator redirects to the proxy, in the
-            container's network: of the master, or of the routers that nodes of rmw_zenoh look for.
+            container's network namespace: of the master, or of the routers that nodes of rmw_zenoh
+            look for.
     """
 
     container: Container
