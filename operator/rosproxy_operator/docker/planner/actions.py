@@ -128,7 +128,7 @@ class CreateRedirect(_CreateContainer, frozen=True):
     fingerprint: str = ""
 
     def _details(self) -> str:
-        location = f"in the network of container {self.target[:12]}"
+        location = f"in the network namespace of container {self.target[:12]}"
         if self.proxy is None:
             return f": removes the redirect of the {self.key.graph} {location}"
         addresses = listed(map(str, self.addresses))

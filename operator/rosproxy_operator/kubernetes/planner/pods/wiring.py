@@ -234,7 +234,7 @@ def _why_not_wired(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: Webho
     if _is_of_former(pod, rosproxy):
         return (
             f"is older than RosProxy {rosproxy.id.name}: the former RosProxy of that name was "
-            "deleted, and the ROS nodes of the pod were unregistered at the master. Run "
+            "deleted, and the ROS nodes of the pod may have been unregistered at the master. Run "
             f"{recreate_command(pod)}"
         )
     if not bypassing and (pod.wired_master_uri or pod.own_masters):
