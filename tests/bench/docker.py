@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -37,7 +37,8 @@ QUICK_SECONDS = 5.0
 AT_ONCE = 8
 FIRST_MASTER = 21400
 PATIENCE = 600.0
-_LOOK = re.compile(r"looked in ([\d.]+) s: (\d+) actions")
+LOOK_LINE = re.compile(r"look ended in ([\d.]+) s: (\d+) actions")
+"""A line of the operator's log: the duration of a look, and the number of actions."""
 
 
 class Look(NamedTuple):
@@ -93,16 +94,23 @@ def _measure_size(book: Book, size: int, seconds: float, folder: Path) -> None:
         add("half start: looks", len(looks))
         add("half start: one look, median, s", median(looks))
         add("half start: one look, longest, s", max(looks))
+        _measure_rest(add, operator, pid, seconds)
 
-        seen = len(_looks(operator))
-        cpu = cpu_seconds(pid)
-        since = time.monotonic()
-        time.sleep(seconds)
-        looks = [look.seconds for look in _looks(operator)[seen:]]
-        took = time.monotonic() - since
-        add("nothing happens: operator, % of a core", (cpu_seconds(pid) - cpu) / took * 100)
-        add("nothing happens: operator, MiB", resident(pid) / 1024)
-        add("nothing happens: one look, longest, s", max(looks))
+
+def _measure_rest(
+    add: Callable[[str, float], None], operator: Process, pid: int, seconds: float
+) -> None:
+    """Measure the operator while nothing happens. There may be no look in this time."""
+    seen = len(_looks(operator))
+    cpu = cpu_seconds(pid)
+    since = time.monotonic()
+    time.sleep(seconds)
+    looks = [look.seconds for look in _looks(operator)[seen:]]
+    took = time.monotonic() - since
+    add("nothing happens: operator, % of a core", (cpu_seconds(pid) - cpu) / took * 100)
+    add("nothing happens: operator, MiB", resident(pid) / 1024)
+    add("nothing happens: looks", len(looks))
+    add("nothing happens: one look, longest, s", max(looks, default=0.0))
 
 
 def _serving() -> int:
@@ -110,7 +118,7 @@ def _serving() -> int:
 
 
 def _looks(operator: Process) -> list[Look]:
-    return [Look(float(match[1]), int(match[2])) for match in _LOOK.finditer(operator.logs())]
+    return [Look(float(match[1]), int(match[2])) for match in LOOK_LINE.finditer(operator.logs())]
 
 
 def _rest(operator: Process, quiet: float = 6.0) -> None:

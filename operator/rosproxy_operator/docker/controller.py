@@ -59,6 +59,8 @@ LOOK_TIMEOUT_S = 60.0
 """Seconds after which the loop cancels a look."""
 COMMAND_TIMEOUT_S = 60.0
 """Seconds in which ``--once`` and ``uninstall`` must finish."""
+LOOK_MESSAGE = "look ended in %.3f s: %d actions, next look in %s s"
+"""The log line of a look, with its duration, its actions, and the seconds to the next look."""
 
 Decide = Callable[[HostState, LabelReading, PlanSettings, DockerMemory, float], DockerPlan]
 """Returns the plan from the state, the labels, the settings, the memory, and the monotonic time."""
@@ -220,12 +222,7 @@ class DockerController:
             snapshot.state, snapshot.labels, self._settings, self._memory, time.monotonic()
         )
         took = time.monotonic() - started
-        log.debug(
-            "look ended in %.3f s: %d actions, next look in %s s",
-            took,
-            len(planned.actions),
-            planned.again_in,
-        )
+        log.debug(LOOK_MESSAGE, took, len(planned.actions), planned.again_in)
         self._memory = planned.memory
         self._last = (snapshot, planned)
         if snapshot.state.busy and not self._observer.waiting:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.bench import report
+from rosproxy_operator.docker.controller import LOOK_MESSAGE
+from tests.bench import docker, report
 from tests.bench.book import DIRECT, Book, in_turn, loss, percentile, ratio, smallest_share
 from tests.bench.streams import Spent, per_second
 from tests.bench.world import processors
@@ -155,3 +156,9 @@ def test_a_page_without_marks_is_left_alone(tmp_path: Path) -> None:
 def test_each_way_begins_a_round_once() -> None:
     orders = [in_turn("abc", number) for number in range(4)]
     assert orders == [["a", "b", "c"], ["b", "c", "a"], ["c", "a", "b"], ["a", "b", "c"]]
+
+
+def test_the_section_docker_finds_the_looks_in_the_operators_log() -> None:
+    line = docker.LOOK_LINE.search(LOOK_MESSAGE % (0.25, 3, None))
+    assert line is not None
+    assert line.groups() == ("0.250", "3")
