@@ -210,6 +210,33 @@ def test_a_router_in_a_container_is_dialed(sides: Sides, controller: Controller)
     assert row["links"] == {f"{router.name}:7447": True, f"{sides.robot.address}:7447": True}
 
 
+def test_a_label_hides_a_topic_from_outside(sides: Sides, controller: Controller) -> None:
+    """The rule holds when the proxy is lost, and other topics of the container flow on."""
+    topic = unique("hidden").replace("-", "_")
+    rule = f"rosproxy.policy=deny publish /{topic}"
+    hider = sides.inside("pub", topic, labels=(*sides.peers, rule))
+    assert hider.container is not None
+    hider.container.start(*NODE, "pub", "shown", "shown")
+    denied = [sides.outside("sub", topic), sides.inside("sub", topic)]
+    allowed = [sides.outside("sub", "shown"), sides.inside("sub", "shown")]
+    for node in allowed:
+        node.wait_for("got hello ")
+    wait_until(
+        lambda: f"publish /{topic} of /{hider.name}" in proxy_status(),
+        30, lambda: proxy_status(),
+    )  # fmt: skip
+
+    docker("kill", the_proxy().name)
+    for node in allowed:
+        node.wait_for("got hello ")
+    assert [node.count("got ") for node in denied] == [0, 0]
+
+
+def proxy_status() -> str:
+    """What `rosproxy status` says in the proxy's container."""
+    return docker("exec", the_proxy().name, "rosproxy", "status", check=False)
+
+
 def test_the_last_container_goes_and_nothing_is_left(sides: Sides, controller: Controller) -> None:
     talker = sides.inside("pub")
     robot_listener = sides.outside("sub")
