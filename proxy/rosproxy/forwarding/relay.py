@@ -33,7 +33,7 @@ FURTHER_PIPE_BYTES = 256 * 1024
 """Bytes of each further pipe: an unprivileged user has 64 MiB for all pipes together."""
 MOST_UNBOUNDED_DIRECTIONS = 128
 """Up to this number of directions with large transfers at the same time, the kernel chooses the
-sizes of the socket buffers. With more directions, the proxy bounds the buffers of all of these."""
+sizes of the socket buffers. With more, the proxy bounds the buffers of each such direction."""
 RECEIVE_BUFFER_BYTES = 128 * 1024
 """The bound of a receive buffer; Linux doubles the value (socket(7)).
 
@@ -75,8 +75,9 @@ class Relay:
     """A relayed connection.
 
     ``kind`` (topic or service) and ``name`` say what the connection carries. ``caller_id`` and
-    ``peer`` are name and address of the client that has connected to ``port``: outside, or inside
-    if ``inside_asks``. ``client_is_silent``: the client probably sends nothing more.
+    ``peer`` are name and address of the client that has connected to ``port``. The client is
+    outside, or inside if ``inside_asks``. ``client_is_silent``: the client probably sends nothing
+    more. ``failed``: a direction has ended with an error, so the proxy resets both connections.
     ``sent`` are bytes towards outside, ``received`` bytes towards inside. ``sent_rate`` and
     ``received_rate`` are in bytes per second, as of the last `sample`. Without ``splice`` all bytes
     are copied.
@@ -106,8 +107,9 @@ class Relay:
     def start(self, finished: Finished, when_readable: WhenReadable) -> None:
         """Relay both directions in threads; one of these threads calls ``finished``.
 
-        If a thread can't be started, the thread that tried to start it may call ``finished``. If
-        ``client_is_silent``, the direction from the client gets a thread once the client sends.
+        If ``client_is_silent``, the direction from the client gets a thread once the client sends.
+        If a direction can't get a thread, the calling thread or the event loop's thread may call
+        ``finished``.
         """
         for sock in (self.outside, self.inside):
             _prepare(sock)

@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 STOP_TIMEOUT_S = 1.0
 """Seconds in which the relays may end when the server stops."""
 STARTS_PER_TURN = 64
-"""Threads that start in a round of the event loop, if many subscribers leave at once."""
+"""Most threads that start in a round of the event loop, if many subscribers leave at once."""
 
 
 class OpenRelays:
@@ -35,7 +35,7 @@ class OpenRelays:
         return len(self._open)
 
     def start(self, relay: Relay, ended: Callable[[Relay], None]) -> None:
-        """Start a relay; ``ended`` is called in the event loop when it has ended."""
+        """Start a relay. After its end, ``ended`` is called in the event loop."""
         loop = asyncio.get_running_loop()
         if self._quiet_sockets is None:
             self._quiet_sockets = _QuietSockets(loop)
@@ -69,7 +69,7 @@ class OpenRelays:
 
 
 class _QuietSockets:
-    """Sockets of clients that have sent nothing yet, and a function for each.
+    """Sockets of silent clients, and the function to call when a client sends or leaves.
 
     The event loop watches a single epoll descriptor for all sockets. libuv makes watched sockets
     non-blocking, but relays need blocking sockets.

@@ -17,16 +17,17 @@ class LeaseHolder(Protocol):
     """The holder of a port that the kernel may forward, as the kernel plane sees the holder.
 
     An endpoint or stand-in of ROS 1 (`rosproxy.ros1.registry`), or a port of ROS 2
-    (`rosproxy.ros2.ports.kernel_ports`). The only port of the latter is lease and fast port.
+    (`rosproxy.ros2.ports.kernel_ports`). For ROS 2, ``port`` and ``fast_port`` are the same port.
 
-    ``inside``: the node is inside, and its peers connect from outside. Otherwise the reverse.
+    ``inside``: True if the node is inside, and its peers connect from outside. False if the node is
+    outside, and its peers connect from inside.
     """
 
     inside: bool
 
     fast_port: int | None
     fast_peers: Mapping[str, int]
-    """How many connections the kernel forwards now, by the address of the peer."""
+    """The number of connections that the kernel forwards now, by the address of the peer."""
 
     @property
     def port(self) -> int:
@@ -107,10 +108,11 @@ class BothSides:
 
 
 def partner(ports: PortRange, port: int) -> int | None:
-    """The partner of a port; None for the last port of an odd number of ports.
+    """The partner of a port: the fast port for a lease at the port.
 
-    Of n ports, each of the first n // 2 has a partner in the next n // 2. The proxy gives leases
-    from the first port on, so leases need the ports of partners as late as possible.
+    Of n ports, each of the first n // 2 has a partner in the next n // 2, and the reverse. None for
+    the last port of an odd number of ports, and for a port outside the range. The proxy gives
+    leases from the first port on, so leases need the ports of partners as late as possible.
     """
     half = len(ports) // 2
     index = port - ports.first
@@ -120,7 +122,10 @@ def partner(ports: PortRange, port: int) -> int | None:
 
 
 def claim(pool: PortPool, endpoint: LeaseHolder) -> bool:
-    """Give an endpoint the fast port of its lease, unless it has the port; False if not free."""
+    """Give an endpoint the fast port of its lease; return whether the endpoint has a fast port.
+
+    False if the lease has no partner, or if the partner is not free.
+    """
     if endpoint.fast_port is not None:
         return True
     port = partner(pool.range, endpoint.port)
@@ -143,7 +148,8 @@ def give_back(pool: PortPool, endpoint: LeaseHolder, blocked: bool = False) -> N
 def least_used_holder(holders: Iterable[_H]) -> _H | None:
     """The holder with the fewest connections, which loses its fast port first in a full range.
 
-    The connections of that holder stay: the kernel continues to forward open connections.
+    None if no holder has a fast port. The connections of the holder stay: the kernel continues to
+    forward open connections.
     """
     candidates = [endpoint for endpoint in holders if endpoint.fast_port is not None]
     return min(candidates, key=lambda e: e.fast_connections, default=None)

@@ -85,11 +85,11 @@ class PortPool:
             self._free[port] = None
 
     def unblock(self, port: int) -> None:
-        """Make a port free that another program has released."""
+        """Make a blocked port free, because another program has released the port."""
         self.blocked.discard(port)
         self._free[port] = None
 
     def block(self, port: int) -> None:
-        """Never hand out this port."""
+        """Take a port out of the free ports, until `unblock`."""
         self.blocked.add(port)
         self._free.pop(port, None)

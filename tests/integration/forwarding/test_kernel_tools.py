@@ -24,8 +24,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / "net" / interface).mkdir(parents=True)
         (tmp_path / "net" / interface / "mtu").write_text(f"{mtu}\n")
     for attribute, name in (
-        ("_IPV4", "ipv4"),
-        ("_IPV6", "ipv6"),
+        ("_IPV4_FORWARDING", "ipv4"),
+        ("_IPV6_FORWARDING", "ipv6"),
         ("_LEGACY_TABLES", "tables"),
         ("_INTERFACES", "net"),
     ):

@@ -11,19 +11,21 @@ from rosproxy.setting_kinds import DataPlane
 
 _INTERFACES = Path("/sys/class/net")
 _LEGACY_TABLES = Path("/proc/net/ip_tables_names")
-_IPV4 = Path("/proc/sys/net/ipv4/ip_forward")
-_IPV6 = Path("/proc/sys/net/ipv6/conf/all/forwarding")
+_IPV4_FORWARDING = Path("/proc/sys/net/ipv4/ip_forward")
+_IPV6_FORWARDING = Path("/proc/sys/net/ipv6/conf/all/forwarding")
 
 
 def read_forwarding() -> HostForwarding:
-    """Read which IP versions this network namespace forwards, and the largest MTU."""
+    """Read which IP versions this network namespace forwards, and the largest MTU in bytes."""
     return HostForwarding(
-        ipv4=_read(_IPV4) == "1", ipv6=_read(_IPV6) == "1", longest_packet=_longest_packet()
+        ipv4=_read(_IPV4_FORWARDING) == "1",
+        ipv6=_read(_IPV6_FORWARDING) == "1",
+        longest_packet=_longest_packet(),
     )
 
 
 async def find_obstacle(mode: DataPlane, tools: Tools) -> str | None:
-    """The reason against the kernel plane, with advice; None without a reason.
+    """The reason against the kernel plane, with advice; None if the proxy may use the plane.
 
     ``auto`` does not use the kernel plane in the network of a host: there the table of the proxy
     would see the connections of all programs.
@@ -46,7 +48,7 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
     if sys.platform != "linux":
         yield "forwarding in the kernel needs Linux"
         return
-    if mode == "auto" and (hardware := _hardware()):
+    if mode == "auto" and (hardware := _hardware_interface()):
         yield (
             f"the proxy seems to run in the host's network (interface {hardware}), where "
             "--data-plane auto does not use the kernel: set --data-plane kernel, or run the proxy "
@@ -67,8 +69,8 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
         )
 
 
-def _hardware() -> str | None:
-    """The name of a hardware network interface; containers have only virtual interfaces."""
+def _hardware_interface() -> str | None:
+    """The name of the first hardware network interface; None with only virtual interfaces."""
     return next((path.name for path in _interfaces() if (path / "device").exists()), None)
 
 

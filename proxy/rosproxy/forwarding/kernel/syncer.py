@@ -40,7 +40,7 @@ LOST_TABLE_RETRY_S = 30.0
 """Seconds between attempts to make a lost table again."""
 
 FORWARD_TIMEOUT_S = 1.0
-"""Seconds for which the requestTopic of a subscriber waits for the forward at most."""
+"""Most seconds for which the requestTopic of a subscriber waits for the forward."""
 ROUTE_AGE_S = 60.0
 """Seconds after which the routes to nodes are read again."""
 
@@ -50,8 +50,8 @@ class ForwardSyncer:
 
     ``why_not``: the reason against all forwards; None if the kernel may forward. ``recovered`` is
     False until the registry is rebuilt: until then the forwards of an earlier process stay.
-    ``near`` returns the networks that may use the forwards to outside. ``traffic`` names what the
-    table forwards, for messages. ``subject`` is the subject of problems.
+    ``near`` returns the networks that may use the forwards to outside. ``traffic``: what the table
+    forwards (topics or datagrams), for messages. ``subject`` is the subject of problems.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class ForwardSyncer:
                 self.why_not = None
 
     async def regain(self) -> bool:
-        """Make a lost table again, if LOST_TABLE_RETRY_S is over; return whether that succeeded."""
+        """Make a lost table again, once LOST_TABLE_RETRY_S have passed; return True on success."""
         if self._clock() < self._retry_at:
             return False
         await self.begin()
@@ -119,7 +119,7 @@ class ForwardSyncer:
             self._routes_until = self._clock() + ROUTE_AGE_S
 
     def note_change(self, endpoint: LeaseHolder | None = None) -> None:
-        """Note that an endpoint may have changed; None: any endpoint."""
+        """Note that an endpoint may have changed; None: any number of endpoints."""
         if endpoint is None or not self.usable:
             self._all_changed = True
         elif endpoint.fast_port is None and not self._accounts.owns(endpoint):
@@ -148,7 +148,10 @@ class ForwardSyncer:
         return "" if is_forwarded else "the kernel's table is being updated"
 
     def log_reason(self, endpoint: LeaseHolder) -> None:
-        """Log why the kernel does not forward for an endpoint, unless the reason is the same."""
+        """Log why the kernel does not forward for an endpoint; a reason is logged once in a row.
+
+        Log nothing if the kernel forwards, or if ``why_not`` is against all forwards.
+        """
         why = self.reason(endpoint)
         if why and self.usable and self._logged.get(endpoint) != why:
             self._logged[endpoint] = why
@@ -175,7 +178,10 @@ class ForwardSyncer:
         await self._wait_until(lambda: not self.usable or port not in self._table.forwards)
 
     async def read_kernel(self) -> tuple[Counters, Survey | None] | None:
-        """Read the kernel's counters and connections; None if the table had to be made again."""
+        """Read the kernel's counters and connections; None if the table had to be made again.
+
+        Without connection tracking, the survey of the connections is None.
+        """
         async with self._lock:
             self._accounts.note_owners(self._endpoints)
             ipv6 = any(":" in endpoint.address for endpoint in self._accounts.owners.values())

@@ -17,12 +17,16 @@ log = logging.getLogger(__name__)
 
 
 class KernelTable:
-    """The table as of the last change or reading: ``forwards``, and the ``counted`` ports."""
+    """A table of the proxy in the kernel; this class itself has no connection tracking.
+
+    ``forwards``: the table's forwards, as of the last change or read. ``counted``: ports whose
+    traffic the table counts, also after the end of a forward.
+    """
 
     has_connections = False
     """Whether the kernel tracks connections: knows whether a node has answered, and resets."""
     weakness = ""
-    """A fault of a table that forwards nonetheless, with advice; usually empty."""
+    """A fault of a table that still forwards, with advice; usually empty."""
 
     def __init__(self, table: Table, tools: Tools) -> None:
         self.table = table

@@ -15,11 +15,11 @@ from typing import cast
 IMAGE_FOLDER = Path("/usr/libexec/rosproxy")
 """The folder of the programs in the image; searched before the PATH."""
 SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
-"""Folders of the programs that are not in the PATH of an unprivileged user."""
+"""Folders to search after the PATH, which lacks these folders for an unprivileged user."""
 RUN_TIMEOUT_S = 5.0
 """Seconds that a run of a program may take."""
 LONGEST_LIST_BYTES = 16 * 1024 * 1024
-"""Bytes of a list of connections that the proxy reads: some 95,000 lines."""
+"""Most bytes of a list of connections that the proxy reads: some 95,000 lines."""
 PIECE_BYTES = 16 * 1024
 """Bytes of a list that the proxy reads at once: some hundred lines."""
 ENVIRONMENT = {"LC_ALL": "C"}
@@ -53,8 +53,9 @@ class Tools:
     async def list_flows(self, take: Callable[[str], None], ipv6: bool, *options: str) -> None:
         """Pass the tracked TCP connections that options select to ``take``. Raises ToolError.
 
-        ``take`` gets whole lines in pieces of some PIECE_BYTES, so that other tasks run in between,
-        and at most LONGEST_LIST_BYTES in all. The program ends with the calling task.
+        ``take`` gets whole lines in pieces of some PIECE_BYTES, so that other tasks run in between.
+        After LONGEST_LIST_BYTES, the rest of the list is dropped without an error. If the calling
+        task is cancelled, conntrack is killed.
         """
         command = [_find("conntrack"), "-L", *_selection(ipv6), *options]
         try:
