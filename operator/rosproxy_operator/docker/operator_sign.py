@@ -19,7 +19,7 @@ def publish_sign(admin: HostPort, engine: str) -> socket.socket | None:
 
     ``engine`` is the URL of the operator's engine. None if the kernel refuses the socket.
     """
-    return signs.put_up(f"{_begin(engine)}/{admin}")
+    return signs.publish(f"{_begin(engine)}/{admin}")
 
 
 def operators(first: HostPort, engine: str) -> list[HostPort]:

@@ -14,8 +14,8 @@ from urllib.parse import urlsplit
 
 Network = IPv4Network | IPv6Network
 
-_MOST_CACHED = 4096
-_LONGEST_CACHED = 200
+_MOST_CACHED_RESULTS = 4096
+_LONGEST_CACHED_CHARACTERS = 200
 _T = TypeVar("_T")
 _HOST = re.compile(r"[\w.-]+|[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%[\w.-]+)?")
 
@@ -23,14 +23,14 @@ _HOST = re.compile(r"[\w.-]+|[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%[\w.-]+)?")
 def cached(read: Callable[[str], _T]) -> Callable[[str], _T]:
     """Cache the results of a function of a short text.
 
-    Every call of the master's graph brings the same texts. Strangers may send long texts, so the
+    Each reading of the master's graph brings the same texts. Any client may send long texts, so the
     cache is only for texts of up to 200 characters.
     """
-    remembered = lru_cache(_MOST_CACHED)(read)
+    remembered = lru_cache(_MOST_CACHED_RESULTS)(read)
 
     @wraps(read)
     def cached_read(text: str) -> _T:
-        return remembered(text) if len(text) <= _LONGEST_CACHED else read(text)
+        return remembered(text) if len(text) <= _LONGEST_CACHED_CHARACTERS else read(text)
 
     return cached_read
 
@@ -48,7 +48,7 @@ class HostPort:
 
 
 class Route(NamedTuple):
-    """The route to an address: ``source`` is the own address, ``mtu`` the bytes of a packet."""
+    """A route: ``source`` is the own address, ``mtu`` the most bytes of a packet."""
 
     source: str
     mtu: int
@@ -84,7 +84,7 @@ def is_loopback(host: str) -> bool:
     return f".{host}".lower().endswith(".localhost")
 
 
-def is_of_link(host: str) -> bool:
+def is_ipv6_link_local(host: str) -> bool:
     """Whether a host is a link-local IPv6 address, which other links can't reach."""
     parsed = as_ip(host)
     return parsed is not None and parsed.version == 6 and parsed.is_link_local
@@ -104,7 +104,10 @@ def subnet(address: str) -> str:
 
 @cached
 def plain_address(address: str) -> str:
-    """An IP address without an IPv4-in-IPv6 prefix (``::ffff:``) and without a zone."""
+    """An IP address without an IPv4-in-IPv6 prefix (``::ffff:``) and without a zone.
+
+    A host name stays unchanged.
+    """
     bare = address.partition("%")[0]
     parsed = as_ip(bare)
     if parsed is None:

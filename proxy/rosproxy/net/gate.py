@@ -15,7 +15,7 @@ from itertools import count
 from rosproxy.fixes import how_to_in_a_sentence
 
 MOST_WAITING = 512
-"""Waiting connections of a source at most. In ROS 1 the client sends first, at once."""
+"""Most waiting connections of a source. In ROS 1 the client sends first, at once."""
 LEAST_PER_SOURCE = 64
 """Connections that each source may have, even if there are few file descriptors."""
 FILES_PER_CONNECTION = 4
@@ -34,7 +34,7 @@ class Gate:
 
     def __init__(self, per_source: int, per_port: int, note_refusal: NoteRefusal) -> None:
         self.per_source = per_source
-        self._few_files = 0
+        self._file_limit = 0
         self._per_port = per_port
         self._note_refusal = note_refusal
         self._by_source: Counter[str] = Counter()
@@ -43,16 +43,17 @@ class Gate:
         self._numbers = count()
 
     def bound(self, files: int) -> None:
-        """Lower the bound of a source if the process may open only so many ``files``."""
+        """Lower the bound of a source if the process may open only this number of ``files``."""
         most = max(files // FILES_PER_CONNECTION, LEAST_PER_SOURCE)
         if most < self.per_source:
             self.per_source = most
-            self._few_files = files
+            self._file_limit = files
 
     def admits(self, source: str, port: int) -> bool:
         """Whether the acceptor may accept a connection from a source at a port.
 
-        If the source has too many, the gate ends its oldest waiting connection to make room.
+        If the source has too many connections, the gate reports that, and ends the source's oldest
+        waiting connection to make room. False if there is none to end.
         """
         if self._by_port[port] >= self._per_port:
             text = f"port {port} already has {self._per_port} connections. "
@@ -62,8 +63,8 @@ class Gate:
         if self._by_source[source] < self.per_source:
             return True
         text = f"the source already has {self.per_source} connections"
-        if self._few_files:
-            text += f", as many as the {self._few_files} open files of the proxy allow. "
+        if self._file_limit:
+            text += f", as many as the {self._file_limit} open files of the proxy allow. "
             text += how_to_in_a_sentence("open files")
         else:
             text += f". {how_to_in_a_sentence('connections of a source')}"
@@ -84,7 +85,7 @@ class Gate:
         if not self._by_port[port]:
             del self._by_port[port]
 
-    def wait(self, source: str, end: Callable[[], None]) -> Callable[[], None]:
+    def note_waiting(self, source: str, end: Callable[[], None]) -> Callable[[], None]:
         """Note a waiting connection; ``end`` ends the connection.
 
         Return the function to call when the client has sent bytes, or the connection is gone.
@@ -108,7 +109,7 @@ class Gate:
     @contextmanager
     def waiting(self, source: str, end: Callable[[], None]) -> Iterator[None]:
         """Note a waiting connection until the context ends; ``end`` ends the connection."""
-        spoke = self.wait(source, end)
+        spoke = self.note_waiting(source, end)
         try:
             yield
         finally:

@@ -9,7 +9,7 @@ import asyncio
 from aiohttp.base_protocol import BaseProtocol
 
 READ_AHEAD_BYTES = 64 * 1024
-"""Bytes of a body that wait to be read, before the peer has to wait."""
+"""Bytes of a body that may wait to be read, before the peer has to wait."""
 SEPARATE_BODY_BYTES = 64 * 1024
 """A body of at least this size is not copied to stand behind its header."""
 
@@ -23,7 +23,7 @@ class HttpProtocol(BaseProtocol):
         return self.transport is None
 
     def resume_reading(self, resume_parser: bool = True) -> None:
-        """Read on after a pause. aiohttp's streams ask for it at the end of each body."""
+        """Read on after a pause. aiohttp's streams call this after each body, paused or not."""
         if self._reading_paused:
             super().resume_reading(resume_parser)
 
@@ -33,7 +33,7 @@ class HttpProtocol(BaseProtocol):
             self.transport.write(data)
 
     def write_message(self, head: bytes, body: bytes) -> None:
-        """Send a header and the body, at once unless that would copy a long body."""
+        """Send a header and the body, in a single write unless that would copy a long body."""
         if len(body) < SEPARATE_BODY_BYTES:
             self.write(head + body)
         else:
@@ -47,6 +47,6 @@ class HttpProtocol(BaseProtocol):
 
 
 def wake(waiter: asyncio.Future[None] | None) -> None:
-    """Let go on what waits for this future, if anything does."""
+    """Let the task that waits for a future go on. Do nothing for None or a future that is done."""
     if waiter is not None and not waiter.done():
         waiter.set_result(None)

@@ -101,7 +101,7 @@ class HttpRequest:
         length = self.headers.get("Content-Length")
         return None if length is None else int(length)
 
-    def invite(self) -> None:
+    def send_continue(self) -> None:
         """Send ``100 Continue`` if the client waits for that before sending the body."""
         waits = self.headers.get("Expect", "").lower() == "100-continue"
         if waits and self._message.version >= HttpVersion11:
@@ -123,7 +123,7 @@ class HttpRequest:
         await self.connection.drain()
 
     def reset(self) -> None:
-        """Reset the connection, as if the peer had gone. ROS clients then try again."""
+        """Reset the connection, as if the server had gone. ROS clients then try again."""
         self.connection.reset()
 
     def _head(self, reply: HttpReply, size: int) -> bytes:
@@ -202,7 +202,7 @@ class HttpConnection(HttpProtocol):
             self._pause_reading_for_buffer()
 
     def eof_received(self) -> None:
-        """Have asyncio close the connection, because the client has closed the other side."""
+        """Return None, so that asyncio closes the connection: the client sends nothing more."""
 
     def connection_lost(self, exc: BaseException | None) -> None:
         """Forget the connection. A call under way runs to the end."""

@@ -61,7 +61,7 @@ def is_own(address: str) -> bool:
 
 
 def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
-    """The networks of the interfaces of this machine, without loopback.
+    """The networks of the interfaces of this machine, without loopback and IPv6 link-local.
 
     ``without_uplink``: also without the interface of the default route, unless there is no other.
     """

@@ -9,7 +9,7 @@ import contextlib
 import socket
 
 LOOK_INTERVAL_S = 5.0
-"""Seconds after which the networks count as changed if the kernel does not report changes."""
+"""Seconds after which the networks count as changed if there is no netlink socket."""
 _ROUTE_FAMILY = 0  # NETLINK_ROUTE (linux/netlink.h), which Python's module lacks
 _GROUPS = 0x1 | 0x10 | 0x40 | 0x100 | 0x400
 """RTMGRP_LINK, RTMGRP_IPV4_IFADDR, RTMGRP_IPV4_ROUTE, RTMGRP_IPV6_IFADDR and RTMGRP_IPV6_ROUTE
@@ -24,15 +24,18 @@ class NetworkChanges:
     def __init__(self) -> None:
         self._socket: socket.socket | None = None
         self._last: float | None = None
-        self._has_told = False
+        self._is_reported = False
 
     def noticed(self, now: float) -> bool:
-        """Whether the networks may have changed since the last time; True the first time."""
+        """Whether the networks may have changed since the last call that returned True.
+
+        The first call returns True, and opens the netlink socket.
+        """
         if self._last is None:
             self._subscribe()
-        elif not self._has_told and (self._socket or now - self._last < LOOK_INTERVAL_S):
+        elif not self._is_reported and (self._socket or now - self._last < LOOK_INTERVAL_S):
             return False
-        self._has_told = False
+        self._is_reported = False
         self._last = now
         return True
 
@@ -49,7 +52,7 @@ class NetworkChanges:
             asyncio.get_running_loop().add_reader(sock, self._note, sock)
 
     def _note(self, sock: socket.socket) -> None:
-        self._has_told = True
+        self._is_reported = True
         with contextlib.suppress(OSError):  # more has changed than the socket could hold (ENOBUFS)
             sock.recv(_READ_BYTES)
 

@@ -14,7 +14,7 @@ from rosproxy.net import signs
 from rosproxy.net.addresses import HostPort, is_address, parse_host_port
 
 MOST_SIGNS = 8
-"""Proxies that a message names at most."""
+"""Most proxies that a message names."""
 _SIGN = r"rosproxy/([12]{1,2})/(\d{1,5})-(\d{1,5})/([0-9A-Fa-z.:\[\]-]{1,60})"
 
 
@@ -42,17 +42,17 @@ def publish_sign(
 
     None if that fails: the proxy works without a sign.
     """
-    return signs.put_up(f"rosproxy/{''.join(sorted(ros))}/{first}-{last}/{admin}")
+    return signs.publish(f"rosproxy/{''.join(sorted(ros))}/{first}-{last}/{admin}")
 
 
 def overlapping_proxies(
     ros: str, first: int, last: int, admin: HostPort | None = None
 ) -> list[Sign]:
-    """The other proxies of a version of ROS on this machine whose range has some of these ports.
+    """The signs of other proxies for a ROS version on this machine, if the ranges overlap.
 
-    ``admin``: the own admin endpoint, to leave the own sign out; None before the own sign exists.
-    Before that, a sign with the same admin endpoint is of the same proxy, started twice. At most
-    MOST_SIGNS signs, and only signs with an IP address, where users can ask.
+    ``admin``: the own admin endpoint, to leave the own sign out. None before the own sign exists: a
+    sign with that endpoint then belongs to an earlier start of the same proxy, and counts.
+    At most MOST_SIGNS signs, and only signs with an IP address, where users can ask.
     """
     proxies = (Sign(m[1], int(m[2]), int(m[3]), m[4]) for m in signs.read_all(_SIGN))
     overlapping = (

@@ -25,7 +25,7 @@ MOST_LOOKUPS = 64
 """Look-ups that may be under way at once; above the bound a name counts as unresolvable."""
 MOST_FOR_OTHERS = 56
 """Look-ups at once for all sources except the proxy itself."""
-MOST_FOR_ONE = 8
+MOST_PER_SOURCE = 8
 """Look-ups at once for one source. Nodes usually give the name of their machine."""
 NODES = "nodes"
 """The source of the names of nodes in the master's graph, which does not say who gave a name."""
@@ -75,7 +75,7 @@ def _may_start(source: str) -> bool:
     sources = [source for source, _ in list(_running.values())]  # threads end at any time
     if not source:
         return len(sources) < MOST_LOOKUPS
-    limit = MOST_FOR_NODES if source == NODES else MOST_FOR_ONE
+    limit = MOST_FOR_NODES if source == NODES else MOST_PER_SOURCE
     return sum(map(bool, sources)) < MOST_FOR_OTHERS and sources.count(source) < limit
 
 

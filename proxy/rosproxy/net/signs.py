@@ -3,7 +3,8 @@
 A sign is a Unix socket with an abstract name (unix(7)). Like a port, a sign belongs to a network
 namespace, and the kernel removes the sign with the process. ``/proc/net/unix`` lists all signs.
 
-Any process can publish any sign, so signs prove nothing. Use signs in messages, or check the text.
+Any process can publish any sign, so signs prove nothing. Use signs only in messages, or verify by
+other means what the text says.
 """
 
 import contextlib
@@ -12,10 +13,10 @@ import secrets
 import socket
 from pathlib import Path
 
-_LISTED = Path("/proc/net/unix")
+_SOCKET_LIST = Path("/proc/net/unix")
 
 
-def put_up(text: str) -> socket.socket | None:
+def publish(text: str) -> socket.socket | None:
     """Publish a sign, a text without blanks, until the returned socket is closed.
 
     Several processes may publish the same text. None if the kernel refuses the socket.
@@ -31,11 +32,14 @@ def put_up(text: str) -> socket.socket | None:
     return None
 
 
-def read_all(text: str) -> list[re.Match[str]]:
-    """The matches of a regular expression with all signs in this network namespace."""
+def read_all(sign_pattern: str) -> list[re.Match[str]]:
+    """The matches of a regular expression with the signs in this network namespace.
+
+    ``sign_pattern`` describes the whole text of a sign. Other signs are left out.
+    """
     try:
-        lines = _LISTED.read_text("utf-8", "replace").splitlines()
+        lines = _SOCKET_LIST.read_text("utf-8", "replace").splitlines()
     except OSError:
         return []
-    pattern = re.compile(rf" @{text}/\w{{8}}$")
+    pattern = re.compile(rf" @{sign_pattern}/\w{{8}}$")
     return [match for line in lines if (match := pattern.search(line))]

@@ -21,14 +21,15 @@ from rosproxy.net.tasks import Tasks
 log = logging.getLogger(__name__)
 
 MOST_BACKLOG = 1024
-"""Connections that wait to be accepted at most. The next client tries again after a second."""
+"""Most connections that wait to be accepted. The next client tries again after a second."""
 ACCEPTS_PER_TURN = 64
+"""Most connections that a socket accepts in a round of the event loop."""
 CONNECT_TIMEOUT_S = 5.0
 """Seconds in which a peer must accept a connection."""
 WRITE_TIMEOUT_S = 30.0
 """Seconds in which a reader must take some of the bytes that wait for the reader."""
 SILENCE_TIMEOUT_S = 30.0
-"""Seconds in which a client must send the expected bytes; then the proxy closes the connection."""
+"""Seconds in which a client must send the expected bytes. Otherwise the connection ends."""
 
 Handler = Callable[[socket.socket, str], Awaitable[None]]
 """Takes over an accepted socket. The second argument is the address of the peer."""
@@ -188,7 +189,7 @@ def begin_to_dial(target: HostPort) -> socket.socket:
 
 
 async def dial(target: HostPort, within: float = CONNECT_TIMEOUT_S) -> socket.socket:
-    """Connect to an IP address and port, non-blocking. Raises OSError, TimeoutError."""
+    """Connect to an IP address and port in ``within`` seconds. Raises OSError, TimeoutError."""
     sock = socket.socket(_family(target.host), socket.SOCK_STREAM)
     sock.setblocking(False)
     try:

@@ -16,7 +16,7 @@ class TimeLimits:
         self._timer: asyncio.TimerHandle | None = None
 
     def look_at(self, when: float, loop: asyncio.AbstractEventLoop) -> None:
-        """Set the timer to look at ``when`` whether a limit has run out, instead of later."""
+        """Look at ``when`` (the loop's time in seconds), not later, whether a limit has run out."""
         if self._timer is not None:
             self._timer.cancel()
         self.next_look = when

@@ -39,9 +39,9 @@ def test_a_port_has_its_own_bound() -> None:
 def test_a_full_source_loses_the_one_that_has_said_nothing_for_longest() -> None:
     connection_gate, _ = make_gate()
     ended: list[str] = []
-    spoke = connection_gate.wait("a", lambda: ended.append("first"))
-    connection_gate.wait("a", lambda: ended.append("second"))
-    connection_gate.wait("a", lambda: ended.append("third"))
+    spoke = connection_gate.note_waiting("a", lambda: ended.append("first"))
+    connection_gate.note_waiting("a", lambda: ended.append("second"))
+    connection_gate.note_waiting("a", lambda: ended.append("third"))
     enter(connection_gate, "a", 1, 3)
     spoke()
     assert connection_gate.admits("a", 1)
@@ -54,8 +54,8 @@ def test_silent_connections_are_bounded_by_source() -> None:
     connection_gate, told = make_gate(10_000, 10_000)
     ended: list[int] = []
     for number in range(gate.MOST_WAITING + 2):
-        connection_gate.wait("a", lambda number=number: ended.append(number))  # type: ignore[misc]
-    connection_gate.wait("b", lambda: ended.append(-1))
+        connection_gate.note_waiting("a", lambda number=number: ended.append(number))  # type: ignore[misc]
+    connection_gate.note_waiting("b", lambda: ended.append(-1))
     assert ended == [0, 1]
     assert told == [("silent_connections", "a")] * 2
 

@@ -11,9 +11,9 @@ import pytest
 from rosproxy.net import resolver
 from rosproxy.net.resolver import (
     MOST_FOR_NODES,
-    MOST_FOR_ONE,
     MOST_FOR_OTHERS,
     MOST_LOOKUPS,
+    MOST_PER_SOURCE,
     NODES,
     resolve,
 )
@@ -97,7 +97,7 @@ async def test_an_entry_ends_with_its_look_up_however_that_ends(
 
 async def test_hanging_names_of_one_caller_hold_up_nobody_else(server: NameServer) -> None:
     await hang("10.0.0.5", 100)
-    assert len(server.asked) == MOST_FOR_ONE
+    assert len(server.asked) == MOST_PER_SOURCE
     assert await resolve("good", "10.0.0.5") == []
     assert await find("good", "10.0.0.6") == ["192.0.2.7"]
     assert await find("good-node", NODES) == ["192.0.2.7"]

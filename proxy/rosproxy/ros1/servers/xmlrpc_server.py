@@ -199,7 +199,7 @@ class XmlRpcServer(HttpServer):
         source = connection.source.host
         self._by_port[port].add(connection)
         self._context.gate.enter(source, port)  # the acceptor counts until `dispatch` has ended
-        self._mute[connection] = self._context.gate.wait(source, connection.force_close)
+        self._mute[connection] = self._context.gate.note_waiting(source, connection.force_close)
         asyncio.get_running_loop().call_later(HEADER_TIMEOUT, self._close_mute, connection)
 
     def connection_lost(self, connection: HttpConnection) -> None:
@@ -294,7 +294,7 @@ class XmlRpcServer(HttpServer):
                 await self._take_in(call, request.content.read_nowait())
                 return self._pass_unread(request, call)
             with TimeLimit(self._time_limits, BODY_TIMEOUT):
-                request.invite()
+                request.send_continue()
                 if size > passing.SHORT and self._long_calls is not None:
                     long_call = await self._read_head(request, call, size, self._long_calls)
                     if long_call is not None:

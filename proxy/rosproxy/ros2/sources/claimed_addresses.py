@@ -7,7 +7,7 @@ inside, to the machine of the proxy, or to the proxy's own ports.
 
 from collections.abc import Container
 
-from rosproxy.net.addresses import HostPort, as_ip, is_loopback, is_of_link
+from rosproxy.net.addresses import HostPort, as_ip, is_ipv6_link_local, is_loopback
 from rosproxy.ros2.domain_settings import DomainSettings
 
 _BROADCAST = "255.255.255.255"
@@ -22,7 +22,7 @@ def claim_fault(address: str, settings: DomainSettings) -> str | None:
     parsed = as_ip(address)
     if parsed is None or is_loopback(address) or address == _BROADCAST or parsed.is_multicast:
         return f"{address} is not an address of a machine on a LAN"
-    if is_of_link(address):
+    if is_ipv6_link_local(address):
         return f"{address} is a link-local address; use a global address on that machine"
     if settings.is_inside(address):
         return f"{address} is in an inside network"

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from math import inf
 
-from rosproxy.net.addresses import HostPort, is_loopback, is_of_link
+from rosproxy.net.addresses import HostPort, is_ipv6_link_local, is_loopback
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
 from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings, Outgoing, sent_to
@@ -94,7 +94,7 @@ class ForInside:
             return True
         # These addresses lead to the machine or the link of the receiver.
         is_same_host = is_loopback(self.near) and is_loopback(source)
-        return not is_same_host and (is_loopback(host) or is_of_link(host))
+        return not is_same_host and (is_loopback(host) or is_ipv6_link_local(host))
 
     def _is_hidden(self, announcement: Announcement, datagram: bytes) -> bool:
         if self.insider is None:
