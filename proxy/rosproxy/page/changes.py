@@ -27,8 +27,8 @@ def changes(before: Json, after: Json) -> Json:
     return update
 
 
-def changed(before: Json, update: Json) -> Json:
-    """The document ``before`` with the changes of ``update``."""
+def apply_update(before: Json, update: Json) -> Json:
+    """The document that ``update`` makes of ``before``; `changes` has made the update."""
     after = {**before, **update}
     for table in _TABLES:
         rows = {**before[table], **update.get(table, {})}

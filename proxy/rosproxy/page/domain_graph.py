@@ -1,7 +1,7 @@
 """ROS 2 in the document of a proxy: participants, topics and services of both sides.
 
-The proxy does not read user data, so a topic has no messages and no rate of messages. The measures
-are those of the ports of a participant: all links to this participant share the measures.
+The proxy does not read user data, so the document has no count and no rate of messages. The proxy
+measures the ports of a participant instead: all links to the participant share these measures.
 """
 
 from collections import Counter
@@ -19,7 +19,7 @@ from rosproxy.admin.status_document import (
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.doctor.rules.participant import check
 from rosproxy.net.addresses import is_loopback
-from rosproxy.page.measures import FLOWS, Measures
+from rosproxy.page.measures import FLOW_PERIOD_S, Measures
 from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
@@ -43,7 +43,7 @@ _QUIET_ENDINGS = (
     *("/describe_parameters", "/get_parameters", "/get_parameter_types", "/list_parameters"),
     *("/set_parameters", "/set_parameters_atomically", "/get_type_description"),
 )
-"""Services that every node of ROS 2 has."""
+"""Endings of the services that every node of ROS 2 has."""
 _QUIET_TOPICS = QUIET | {"ros_discovery_info"}
 """On ros_discovery_info, participants announce the ROS 2 nodes that each participant has."""
 KERNEL = "kernel"
@@ -80,7 +80,7 @@ def received(status: ProxyStatus) -> dict[str, int]:
     """
     return {
         _key(domain, participant.guid_prefix): sum(
-            lease.user_datagrams for lease in _user_data_ports(participant)
+            locator.user_datagrams for locator in _user_data_ports(participant)
         )
         for domain in status.domains
         for participant in (
@@ -114,7 +114,9 @@ def _user_data_ports(participant: ParticipantStatus) -> list[LocatorStatus]:
 
     Cyclone DDS has the same port for discovery and user data. Then this port counts.
     """
-    data = [lease for lease in participant.leases if lease.kind == TrafficKind.USER_DATA.value]
+    data = [
+        locator for locator in participant.leases if locator.kind == TrafficKind.USER_DATA.value
+    ]
     return data or [*participant.leases]
 
 
@@ -123,7 +125,7 @@ def _measured(
 ) -> Iterator[PageLink]:
     """The links, with the measures of the participants to which they lead.
 
-    Quiet and broken links get no measures, and carry little or nothing.
+    No measures for services, for quiet and broken links, and for links that do not pass the proxy.
     """
     groups: dict[str, list[PageLink]] = {}
     published: Counter[str] = Counter()
@@ -156,23 +158,24 @@ def _measures_of(
 
     ``published`` is the number of topics that the participant publishes to the other side. If the
     kernel forwards, the measures also have the acknowledgements for these topics. ``others`` is the
-    number of participants on the other side. Data came ``since`` seconds ago, None: not known.
+    number of participants on the other side. The last data came ``since`` seconds ago; None: not
+    known.
 
     A datagram may belong to any link or service of the participant. So ``flows`` is set only if all
     data comes from one participant.
     """
     ports = _user_data_ports(participant)
     services = sum(not _is_quiet_service(name) for name in participant.services)
-    acknowledged = published if any(lease.plane == KERNEL for lease in ports) else 0
+    acknowledged = published if any(locator.plane == KERNEL for locator in ports) else 0
     shared = len(group) + services + acknowledged
-    datagrams = sum(lease.user_datagram_rate for lease in ports)
-    is_active = datagrams > 0 or (since is not None and since < FLOWS)
+    datagrams = sum(locator.user_datagram_rate for locator in ports)
+    is_active = datagrams > 0 or (since is not None and since < FLOW_PERIOD_S)
     sources = others if services else len({link.source for link in group})
-    # Otherwise data has come since the rates were sampled, or comes more seldom.
+    # False: data has come after the latest sample of the rates, or comes less often than a sample.
     is_sampled = datagrams > 0 or not is_active
     return {
         "is_active": is_active,
-        "rate": rounded(sum(lease.user_rate for lease in ports)) if is_sampled else None,
+        "rate": rounded(sum(locator.user_rate for locator in ports)) if is_sampled else None,
         "datagrams": rounded(datagrams) if is_sampled else None,
         "flows": is_active and not acknowledged and sources == 1,
         "shared": shared if shared > 1 else 0,
@@ -201,8 +204,8 @@ def _node(
         text=shown_text(problem.text) if problem else "",
         fix=shown_text(problem.fix) if problem else "",
         address=shown_name(f"{participant.address}, {participant.vendor}"),
-        ports=", ".join(str(lease.port) for lease in participant.leases),
-        rate=rounded(sum(lease.rate for lease in data)) if data else None,
+        ports=", ".join(str(locator.port) for locator in participant.leases),
+        rate=rounded(sum(locator.rate for locator in data)) if data else None,
     )
 
 
@@ -230,7 +233,7 @@ def _node_label(nodes: Sequence[str]) -> str:
 
 
 def _detail(participant: ParticipantStatus) -> str:
-    """The text of a chosen participant: its nodes if there are several, and the GUID prefix."""
+    """The text of a selected participant: its nodes if there are several, and the GUID prefix."""
     nodes = f"nodes {', '.join(participant.nodes)}; " if len(participant.nodes) > 1 else ""
     return shown_text(f"{nodes}participant {participant.guid_prefix}")
 
@@ -244,17 +247,17 @@ def _state(problem: DomainProblem | None) -> str:
 def _mismatches(domain: DomainStatus) -> dict[Key, DomainProblem]:
     """The mismatches of QoS or type, by the link that shows the mismatch."""
     participants = {p.guid_prefix: p for p in (*domain.inside, *domain.outside)}
-    nobody = ParticipantStatus()
+    unknown = ParticipantStatus()
     mismatches: dict[Key, DomainProblem] = {}
     for pair, problem in mismatch_problems(domain):
-        writer = participants.get(pair.writer, nobody)
-        reader = participants.get(pair.reader, nobody)
+        writer = participants.get(pair.writer, unknown)
+        reader = participants.get(pair.reader, unknown)
         if pair.kind == "topic":
             ends = (writer, reader)
             has_link = pair.name in {*writer.publishes} & {*reader.subscribes}
         else:  # both ends of a service write and read
             ends = (reader, writer) if pair.name in reader.services else (writer, reader)
-            has_link = pair.name in ends[0].services and ends[1] is not nobody
+            has_link = pair.name in ends[0].services and ends[1] is not unknown
         if has_link:
             mismatches[pair.kind, pair.name, ends[0].guid_prefix, ends[1].guid_prefix] = problem
     return mismatches

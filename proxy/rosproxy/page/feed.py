@@ -1,10 +1,11 @@
 """Makes the documents of the live page while a watcher waits for documents.
 
 A watcher is an open page, or a program that polls. With a watcher, two loops run. The first loop
-reads the status and makes a document each `TICK` seconds. If a document takes long, the pause
-grows, so that documents take at most `SHARE` of the time. The second loop asks the master and the
-nodes in rounds (`rosproxy.doctor.collect.collect_running`), with at most `PER_SECOND` questions a
-second. Without a watcher, both loops end and all counts are dropped.
+reads the status and makes a document each `DOCUMENT_INTERVAL_S`. If a document takes long, the
+pause grows, so that documents take at most `LARGEST_TIME_SHARE` of the time. The second loop
+asks the master and the nodes in rounds (`rosproxy.doctor.collect.collect_running`), with at most
+`QUESTIONS_PER_SECOND` questions a second. `LINGER_S` after the last watcher, both loops end and all
+counts are dropped.
 
 Each watcher waits for a newer document than the previous document. So a slow watcher skips
 documents, and no documents queue up.
@@ -30,16 +31,16 @@ from rosproxy.page.page_document import Json
 
 log = logging.getLogger(__name__)
 
-TICK = 1.0
-"""Least seconds between two documents."""
-SHARE = 0.1
+DOCUMENT_INTERVAL_S = 1.0
+"""Seconds from one document to the next, at least."""
+LARGEST_TIME_SHARE = 0.1
 """Largest share of the time for making documents."""
-LOOK_AGAIN = 2.0
-"""Least seconds between two rounds of questions."""
-PER_SECOND = 100.0
+ROUND_INTERVAL_S = 2.0
+"""Seconds from the end of a round of questions to the next round, at least."""
+QUESTIONS_PER_SECOND = 100.0
 """Most questions a second, over a round and the following pause."""
-PER_NODE = 6
-"""Most questions to a node in a round."""
+QUESTIONS_PER_NODE = 6
+"""Most questions to a node in a round, to compute the pause after the round."""
 MOST_WATCHERS = 16
 """Watchers at the same time."""
 MOST_WATCHERS_EACH = 6
@@ -47,7 +48,7 @@ MOST_WATCHERS_EACH = 6
 
 Chromium and Firefox open at most six connections to a server, so a browser needs no more.
 """
-LINGER = 10.0
+LINGER_S = 10.0
 """Seconds until the loops end after the last watcher. Users reload pages, and operators poll."""
 
 
@@ -58,7 +59,7 @@ class Ended(Exception):
 class Feed:
     """Holds the newest document that ``make`` has yielded.
 
-    The feed starts ``make`` for the first watcher, and cancels ``make`` LINGER seconds after the
+    The feed starts ``make`` for the first watcher, and cancels ``make`` LINGER_S after the
     last watcher.
     """
 
@@ -121,7 +122,7 @@ class Feed:
 
     def _end_later(self) -> None:
         if not self.watchers.taken and not self._closed:
-            self._ending = asyncio.get_running_loop().call_later(LINGER, self._end)
+            self._ending = asyncio.get_running_loop().call_later(LINGER_S, self._end)
 
     def _end(self) -> None:
         if self._making:
@@ -138,7 +139,7 @@ class Feed:
                         await self._publish(document)
             except Exception:
                 log.exception("the live page failed; trying again")
-            await asyncio.sleep(TICK)
+            await asyncio.sleep(DOCUMENT_INTERVAL_S)
 
     async def _publish(self, document: Json) -> None:
         if document != self._newest:
@@ -167,14 +168,16 @@ class PageWatch:
         self._counting = asyncio.Lock()
 
     async def documents(self) -> AsyncGenerator[Json]:
-        """Yield a document each TICK, without an end."""
-        asking = asyncio.create_task(_again_and_again(self._ask))
+        """Yield a document each DOCUMENT_INTERVAL_S or later, without an end."""
+        asking = asyncio.create_task(_ask_repeatedly(self._ask))
         try:
             while True:
                 began = time.monotonic()
                 yield await self._document(began)
                 took = time.monotonic() - began
-                await asyncio.sleep(max(TICK - took, took * (1 / SHARE - 1)))
+                await asyncio.sleep(
+                    max(DOCUMENT_INTERVAL_S - took, took * (1 / LARGEST_TIME_SHARE - 1))
+                )
         finally:
             asking.cancel()
 
@@ -201,13 +204,13 @@ class PageWatch:
             relayed_links = relayed(status, facts.system)
             self._measures.read_nodes(facts, judged.pairs.keys() | relayed_links.keys())
             self._judged = judged
-        questions = PER_NODE * len(facts.nodes)
-        return max(LOOK_AGAIN, questions / PER_SECOND - (time.monotonic() - began))
+        questions = QUESTIONS_PER_NODE * len(facts.nodes)
+        return max(ROUND_INTERVAL_S, questions / QUESTIONS_PER_SECOND - (time.monotonic() - began))
 
 
-async def _again_and_again(ask: Callable[[], Awaitable[float]]) -> None:
+async def _ask_repeatedly(ask: Callable[[], Awaitable[float]]) -> None:
     """Repeat ``ask`` without an end, also after an error. ``ask`` returns the pause in seconds."""
-    pause = LOOK_AGAIN
+    pause = ROUND_INTERVAL_S
     while True:
         try:
             pause = await ask()

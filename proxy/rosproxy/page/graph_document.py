@@ -212,8 +212,8 @@ class _Ros1Links:
     def _pairs(self) -> set[Key]:
         """The links (topic, publisher, subscriber) with an inside node, and all relayed links.
 
-        Topics with more such links than the bound allows are only counted, in ``left_out``: /tf
-        may have very many.
+        The bound is 2 * MOST_LINKS. A topic whose links exceed the rest of the bound is left out:
+        /tf may have very many links. ``left_out`` counts these links.
         """
         pairs = {*self._relayed}
         for topic in sorted(self._graph.topics, key=lambda topic: (topic in QUIET, topic)):
@@ -296,7 +296,7 @@ class _Ros1Links:
         return error("pair", f"{topic} from {publisher} to {subscriber}", text, fix)
 
     def _way(self, key: Key) -> tuple[str, int | None]:
-        """How a link is carried (empty if unknown), and the port of the proxy, if any."""
+        """How a link is carried (`PageLink.carried`), and the port of the proxy, if any."""
         topic, publisher, subscriber = key
         if (topic, subscriber) in self._udpros:
             return "UDPROS", self._udpros[topic, subscriber]

@@ -36,8 +36,8 @@ class JudgedFacts(msgspec.Struct, frozen=True):
 def topics_to_ask_about(status: ProxyStatus, graph: SystemState) -> tuple[str, ...]:
     """The topics about which to ask nodes: topics of nodes inside, up to MOST_LINKS links.
 
-    Without the topics that nearly every node has (QUIET). A topic with more links than remain is
-    left out, and the next topics are not.
+    Without the topics that nearly every node has (QUIET). A topic whose links exceed the rest of
+    MOST_LINKS is left out; later topics with fewer links are not.
     """
     inside = inside_nodes(status)
     topics = []
@@ -58,8 +58,8 @@ def judge(
 ) -> JudgedFacts:
     """Have the doctor judge ``facts``. ``previous``: the judgement of the round before.
 
-    ``later``: the status of the proxy after the round. A pair counts as unconnected only after two
-    rounds in a row: nodes that start need a moment to connect.
+    ``later``: the status of the proxy after the round; None: judge only by ``facts``. A pair counts
+    as unconnected only after two rounds in a row: nodes that start need a moment to connect.
     """
     nodes: dict[str, DoctorFinding] = {}
     rest = []
@@ -74,10 +74,10 @@ def judge(
         for pair in facts.scope.pairs
         if inside.keys() & {pair[1], pair[2]}
     }
-    apart = frozenset(key for key, f in pairs.items() if f.severity is Severity.ERROR)
-    for key in apart - (previous.unconnected_pairs if previous else frozenset()):
+    unconnected = frozenset(key for key, f in pairs.items() if f.severity is Severity.ERROR)
+    for key in unconnected - (previous.unconnected_pairs if previous else frozenset()):
         del pairs[key]
-    return JudgedFacts(facts, nodes, pairs, tuple(rest), apart)
+    return JudgedFacts(facts, nodes, pairs, tuple(rest), unconnected)
 
 
 def _lasting(facts: DoctorFacts, later: ProxyStatus | None) -> list[DoctorFinding]:
@@ -85,14 +85,14 @@ def _lasting(facts: DoctorFacts, later: ProxyStatus | None) -> list[DoctorFindin
 
     A node that registers or ends during the round is in only one status, and has no finding.
     """
-    before = _wrong(facts)
+    before = _warnings_and_errors(facts)
     if later is None:
         return before
-    after = {(f.check, f.subject) for f in _wrong(replace(facts, status=later))}
+    after = {(f.check, f.subject) for f in _warnings_and_errors(replace(facts, status=later))}
     return [f for f in before if (f.check, f.subject) in after]
 
 
-def _wrong(facts: DoctorFacts) -> list[DoctorFinding]:
+def _warnings_and_errors(facts: DoctorFacts) -> list[DoctorFinding]:
     findings = diagnose_running(replace(facts, names=()))
     return [finding for finding in findings if finding.severity >= Severity.WARNING]
 

@@ -4,8 +4,8 @@ A link has up to three counters:
 
 - The subscriber counts messages and bytes that have arrived (``getBusStats``).
 - The publisher counts messages and bytes to send (``getBusStats``).
-- The proxy counts bytes that a relay has passed on. If nothing arrives, this counter goes on until
-  the buffers are full.
+- The proxy counts bytes that a relay has passed on. If nothing arrives at the subscriber, this
+  counter still grows until the buffers are full.
 
 The proxy reads the relays each second. A round of questions to a thousand nodes takes a minute. So
 the relay decides whether messages flow, unless the counts of the nodes show a stall.
@@ -18,14 +18,14 @@ from rosproxy.doctor.facts import DoctorFacts, SlaveReport
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 
-STALLED = 5.0
+STALLED_AFTER_S = 5.0
 """Seconds without a message at the subscriber after which a link counts as stalled."""
-MISSED = 2
-"""Messages that the publisher must have sent meanwhile. A single message may be under way."""
+MISSED_MESSAGES = 2
+"""Messages of the publisher that must be missing in a stalled link. One may be under way."""
 LATE_ROUNDS = 2
 """Rounds of questions without a new count after which a link no longer flows."""
-FLOWS = 3.0
-"""Seconds after a message in which a link flows."""
+FLOW_PERIOD_S = 3.0
+"""Seconds after a message for which a link flows."""
 Key = tuple[str, str, str]
 """Topic, publisher, subscriber."""
 
@@ -34,16 +34,16 @@ Key = tuple[str, str, str]
 class Counter:
     """A counter of messages or bytes, at the latest two reads.
 
-    ``value``: the count at the latest read. ``at``: the time of this read. ``grew``: the latest
-    read with a larger count than before. ``every``: seconds between the latest two reads. ``rate``:
-    growth a second between these reads. Times are monotonic seconds.
+    ``value``: the count at the latest read. ``at``: the time of this read. ``grew_at``: the time of
+    the latest read with a larger count than before. ``interval_s``: seconds between the latest two
+    reads. ``rate``: growth a second between these reads. Times are monotonic seconds.
     """
 
     value: int
     at: float
     rate: float | None = None
-    grew: float | None = None
-    every: float = 0.0
+    grew_at: float | None = None
+    interval_s: float = 0.0
 
     def read(self, value: int, at: float) -> None:
         """Record a later value. A smaller value belongs to a new connection and has no rate."""
@@ -51,14 +51,14 @@ class Counter:
             return
         self.rate = (value - self.value) / (at - self.at) if value >= self.value else None
         if value > self.value:
-            self.grew = at
-        self.every = at - self.at
+            self.grew_at = at
+        self.interval_s = at - self.at
         self.value = value
         self.at = at
 
     def is_outdated(self, now: float) -> bool:
         """Whether the next reads are overdue: the node no longer answers."""
-        return now - self.at > LATE_ROUNDS * self.every + FLOWS
+        return now - self.at > LATE_ROUNDS * self.interval_s + FLOW_PERIOD_S
 
 
 @dataclass(slots=True)
@@ -84,14 +84,14 @@ class Link:
     def message_rate(self, now: float) -> float | None:
         """Messages a second by the subscriber's count, else by the publisher's count.
 
-        Counts of a node that no longer answers do not count.
+        Leaves out the counts of a node that no longer answers. None if unknown.
         """
         return self._rate(now, "taken", "given")
 
     def byte_rate(self, now: float) -> float | None:
         """Bytes a second by the relay, else by the subscriber, else by the publisher.
 
-        Counts of a node that no longer answers do not count.
+        Leaves out the counts of a node that no longer answers. None if unknown.
         """
         return self._rate(now, "relayed", "taken bytes", "given bytes")
 
@@ -101,23 +101,24 @@ class Link:
         counters = [self.counters[name] for name in names if name in self.counters]
         if not counters:
             given = self.counters.get("given")
-            return given.grew if given else None
-        return max((c.grew for c in counters if c.grew is not None), default=None)
+            return given.grew_at if given else None
+        return max((c.grew_at for c in counters if c.grew_at is not None), default=None)
 
     def flows(self, now: float) -> bool:
-        """Whether messages flow at ``now``.
+        """Whether messages flow at ``now``: the last message is less than FLOW_PERIOD_S old.
 
-        If only nodes count, messages flow if the last read showed at least one message per FLOWS.
+        No messages flow over a stalled link. Without a relay, messages also flow if the latest
+        count of a node has grown by at least one message per FLOW_PERIOD_S.
         """
         last = self.last(now)
         if last is None or self.is_stalled(now):
             return False
         counter = self.counters.get("taken") or self.counters.get("given")
-        if now - last < FLOWS or counter is None or "relayed" in self.counters:
-            return now - last < FLOWS
+        if now - last < FLOW_PERIOD_S or counter is None or "relayed" in self.counters:
+            return now - last < FLOW_PERIOD_S
         if counter.is_outdated(now):
             return False
-        return counter.grew == counter.at and (counter.rate or 0.0) * FLOWS >= 1.0
+        return counter.grew_at == counter.at and (counter.rate or 0.0) * FLOW_PERIOD_S >= 1.0
 
     def note_progress(self) -> None:
         """Set ``mark`` if the subscriber's count has grown, for `is_stalled`."""
@@ -126,17 +127,21 @@ class Link:
         if sent is None or arrived is None:
             self.mark = None
         # A smaller count of the publisher belongs to a new connection, and needs a new mark.
-        elif self.mark is None or (arrived.grew or 0.0) > self.mark[1] or sent.value < self.mark[0]:
+        elif (
+            self.mark is None
+            or (arrived.grew_at or 0.0) > self.mark[1]
+            or sent.value < self.mark[0]
+        ):
             # The nodes answer at different times. The time of a stall starts at the later answer.
             self.mark = sent.value, max(sent.at, arrived.at)
 
     def is_stalled(self, now: float) -> bool:
-        """Whether no message arrived for STALLED seconds, although the publisher sent MISSED."""
+        """Whether no message arrived for STALLED_AFTER_S, although MISSED_MESSAGES were sent."""
         if self.mark is None:
             return False
         sent, since = self.mark
         missed = self.counters["given"].value - sent
-        return missed >= MISSED and now - since >= STALLED
+        return missed >= MISSED_MESSAGES and now - since >= STALLED_AFTER_S
 
     def _rate(self, now: float, *names: str) -> float | None:
         counters = (self.counters[name] for name in names if name in self.counters)
@@ -155,12 +160,12 @@ class Measures:
         return self._links.get(key, _EMPTY_LINK)
 
     def participant_last(self, key: str) -> float | None:
-        """When user data last passed to a participant of ROS 2; None: that is not known."""
+        """The time when user data last passed to a participant, in monotonic seconds, or None."""
         counter = self._participants.get(key)
-        return counter.grew if counter else None
+        return counter.grew_at if counter else None
 
     def read_participants(self, datagrams: Mapping[str, int], now: float) -> None:
-        """Take in the datagrams of user data that passed to each participant, by its key."""
+        """Record the number of user data datagrams that passed to each participant, by its key."""
         former = self._participants
         self._participants = {}
         for key, count in datagrams.items():

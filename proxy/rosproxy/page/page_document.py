@@ -33,7 +33,7 @@ MOST_NODE_BYTES = 1024 * 1024
 MOST_LINK_BYTES = 4 * MOST_NODE_BYTES
 """Bounds of all nodes and of all links in bytes, as JSON in ASCII. A document is made each second.
 With names of 50 characters and no faults, MOST_NODES and MOST_LINKS have 2 MB."""
-LONGEST = 300
+LONGEST_NAME = 300
 """Most characters of a name."""
 LONGEST_TEXT = 1000
 """Most characters of a problem or a fix."""
@@ -74,11 +74,13 @@ class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
     ``target``: empty if only one end is known. ``carried``: kernel, splice, copy or UDPROS; direct
     if the link does not pass the proxy; empty if unknown. ``port``: the port of the proxy.
     ``rate``: bytes a second. ``hz``: messages a second. ``since``: the Unix time in seconds of the
-    last message, if nothing flows. None means unknown. ``proxy``: the key of the proxy with the
-    ``port``, on an operator's page.
+    last message, if nothing flows. None means unknown. ``flows``: messages pass now. ``quiet``: the
+    page hides the link by default. ``proxy``: the key of the proxy with the ``port``, on an
+    operator's page.
 
     ``datagrams``: user data of ROS 2 in datagrams per second. If ``shared`` is 2 or more, the
-    measures are the sum of so many links, which lead to the same participant.
+    measures are the sum of this number of links, services and acknowledged topics of the same
+    participant.
     """
 
     kind: str
@@ -158,7 +160,7 @@ def within_bounds(
 
 
 def _fitting(rows: Iterable[tuple[str, Row]], room: int) -> Iterator[tuple[str, Row]]:
-    """The first rows and keys that need at most ``room`` bytes together."""
+    """The first rows, with their keys, that together need at most ``room`` bytes as JSON."""
     for keyed in rows:
         room -= len(encode(keyed))
         if room < 0:
@@ -203,13 +205,13 @@ def is_quiet_service(name: str) -> bool:
 
 
 def rounded(value: float) -> float:
-    """A value with two significant digits. Smaller changes would send the row again."""
+    """A value with two significant digits. Otherwise each small change would send the row again."""
     return float(f"{value:.2g}")
 
 
 def shown_name(name: str) -> str:
     """A name for the document: shortened, with control characters escaped."""
-    return brief(name, LONGEST)
+    return brief(name, LONGEST_NAME)
 
 
 def shown_text(text: str) -> str:

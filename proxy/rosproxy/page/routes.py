@@ -26,19 +26,19 @@ from rosproxy.net.http_client import TooLong, read_bounded
 from rosproxy.page.changes import changes
 from rosproxy.page.feed import Ended, Feed
 from rosproxy.page.page_document import Json
-from rosproxy.page.visitors import SESSION, Visitors, cookie_name
+from rosproxy.page.visitors import SESSION_S, Visitors, cookie_name
 
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
-HEARTBEAT = 15.0
+HEARTBEAT_S = 15.0
 """Seconds without a change after which the proxy sends the time.
 
 If sending fails, the browser has gone. If no event arrives, the page opens a new connection.
 """
-FIRST = 10.0
+FIRST_DOCUMENT_TIMEOUT_S = 10.0
 """Seconds within which the first document must be ready."""
-MOST_OF_FORM = 4096
+MOST_FORM_BYTES = 4096
 """Most bytes of the login form."""
-FORM_TIMEOUT = 10.0
+FORM_TIMEOUT_S = 10.0
 """Seconds within which the login form must arrive."""
 _HEADERS = {
     "Content-Security-Policy": (
@@ -59,7 +59,7 @@ _FILES = {
     "/findings.js": ("findings.js", "text/javascript"),
     "/page.css": ("page.css", "text/css"),
 }
-_WRONG = '<p role="alert">Wrong token. Enter the token of --admin-token.</p>'
+_WRONG_TOKEN = '<p role="alert">Wrong token. Enter the token of --admin-token.</p>'
 
 
 class Page:
@@ -88,7 +88,7 @@ class Page:
 
     async def _show(self, request: web.BaseRequest) -> web.StreamResponse:
         key = request.query.get("key", "")
-        if key and self.visitors.uses_key(key):
+        if key and self.visitors.use_key(key):
             return self._let_in(request)
         if self.visitors.may_look(request):
             return _html("index.html")
@@ -101,8 +101,8 @@ class Page:
 
     async def _log_in(self, request: web.BaseRequest) -> web.StreamResponse:
         try:
-            async with asyncio.timeout(FORM_TIMEOUT):
-                body = await read_bounded(request.content, MOST_OF_FORM)
+            async with asyncio.timeout(FORM_TIMEOUT_S):
+                body = await read_bounded(request.content, MOST_FORM_BYTES)
             fields = parse_qs(body.decode("utf-8", "surrogateescape"), max_num_fields=4)
         except (TimeoutError, TooLong, ValueError):
             return web.Response(
@@ -110,15 +110,15 @@ class Page:
             )
         if self.visitors.knows_token(fields.get("token", [""])[0]):
             return self._let_in(request)
-        return self._turn_away(_WRONG)
+        return self._turn_away(_WRONG_TOKEN)
 
     def _let_in(self, request: web.BaseRequest) -> web.Response:
         response = web.Response(status=303, headers={**_HEADERS, "Location": "./"})
-        # Not Secure, since all of this is HTTP without TLS (docs/guide/live-page.md).
+        # Without the attribute Secure, because the endpoint has no TLS (docs/guide/live-page.md).
         response.set_cookie(
             cookie_name(request),
             self.visitors.new_session(),
-            max_age=int(SESSION),
+            max_age=int(SESSION_S),
             httponly=True,
             samesite="Strict",
         )
@@ -130,7 +130,7 @@ class Page:
             return _refusal()
         try:
             with self.feed.watching(_source(request)):
-                document = await self.feed.after(None, FIRST)
+                document = await self.feed.after(None, FIRST_DOCUMENT_TIMEOUT_S)
                 if document is None:
                     return _not_now()
                 return await send_shared(request, [self._encode(document)], _JSON_HEADERS)
@@ -159,11 +159,11 @@ class Page:
         return response
 
     async def _send(self, response: web.StreamResponse) -> None:
-        """Send events without an end. Raises Ended, and ConnectionError if the browser closes."""
+        """Send events without an end. Raises Ended; ConnectionError if the browser has gone."""
         await response.write(_clock_event())
         former: Json | None = None
         while True:
-            newest = await self.feed.after(former, HEARTBEAT)
+            newest = await self.feed.after(former, HEARTBEAT_S)
             # Not a comment, which would be shorter: browsers do not pass comments to the page.
             event = _clock_event() if newest is None else self._event(former, newest)
             await write_pieces(response, event)

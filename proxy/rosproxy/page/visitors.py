@@ -1,7 +1,7 @@
 """Decides which requests may see the live page.
 
 Without a token, every caller may see the page, as ``/status``. With a token, callers on loopback
-and callers with the token may. A web page of a stranger may not (`rosproxy.admin.host_rule`).
+and callers with the token may. A web page of another site may not (`rosproxy.admin.host_rule`).
 
 A browser can't send the token with each request. A cookie with the token would be a risk, because
 browsers send a cookie to all ports of the host. So the user enters the token once, in a form, and
@@ -24,11 +24,11 @@ from rosproxy.admin.host_rule import is_own_host
 from rosproxy.admin.requests import EmptyBody, read_body
 from rosproxy.net.addresses import is_loopback
 
-SESSION = 12 * 3600.0
+SESSION_S = 12 * 3600.0
 """Seconds until a cookie expires."""
-KEY = 60.0
+KEY_LIFETIME_S = 60.0
 """Seconds until a key expires."""
-MOST = 64
+MOST_TOKENS = 64
 """Most valid cookies, and most valid keys. A further cookie or key replaces the oldest."""
 
 
@@ -41,15 +41,15 @@ class ExpiringTokens:
         self._until: dict[str, float] = {}
 
     def issue(self) -> str:
-        """Issue a text; the oldest text expires if there are MOST."""
+        """Issue a text. If there are MOST_TOKENS valid texts, the oldest expires."""
         self._forget()
-        while len(self._until) >= MOST:
+        while len(self._until) >= MOST_TOKENS:
             del self._until[next(iter(self._until))]
         text = secrets.token_urlsafe(32)
         self._until[_hash(text)] = self._now() + self._seconds
         return text
 
-    def is_good(self, text: str) -> bool:
+    def is_valid(self, text: str) -> bool:
         """Whether a text was issued here and has not expired.
 
         The comparison uses hashes, so the time of the comparison reveals nothing about a text.
@@ -58,7 +58,7 @@ class ExpiringTokens:
         return _hash(text) in self._until
 
     def use_up(self, text: str) -> bool:
-        """The same as `is_good`; the text then expires."""
+        """Return the same as `is_valid`. The text then expires."""
         self._forget()
         return self._until.pop(_hash(text), None) is not None
 
@@ -85,12 +85,12 @@ class Visitors:
         self._token_hash = token_hash
         self._local = local
         self._own_names = own_names
-        self._sessions = ExpiringTokens(SESSION, now)
-        self._keys = ExpiringTokens(KEY, now)
+        self._sessions = ExpiringTokens(SESSION_S, now)
+        self._keys = ExpiringTokens(KEY_LIFETIME_S, now)
 
     def may_look(self, request: web.BaseRequest) -> bool:
         """Whether a request may see the page."""
-        if self._sessions.is_good(request.cookies.get(cookie_name(request), "")):
+        if self._sessions.is_valid(request.cookies.get(cookie_name(request), "")):
             return True
         scheme, _, token = request.headers.get("Authorization", "").partition(" ")
         if scheme == "Bearer" and self.knows_token(token):
@@ -126,8 +126,8 @@ class Visitors:
         """The value of a new session cookie."""
         return self._sessions.issue()
 
-    def uses_key(self, key: str) -> bool:
-        """Whether a text is a valid key. The key then expires."""
+    def use_key(self, key: str) -> bool:
+        """Return whether a text is a valid key. The key then expires."""
         return self._keys.use_up(key)
 
     async def issue_key(self, body: Any) -> dict[str, Any]:

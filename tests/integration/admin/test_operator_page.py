@@ -98,7 +98,7 @@ async def test_a_proxy_of_a_former_release_says_so(client: ProxyClient) -> None:
 async def test_nobody_is_asked_while_nobody_looks(
     make_proxy: MakeProxy, client: ProxyClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy.page.feed.LINGER", 0.05)
+    monkeypatch.setattr("rosproxy.page.feed.LINGER_S", 0.05)
     proxy = await make_proxy()
     server = await opened({"one": (proxy.settings.admin, "")}, client)
     address = HostPort("127.0.0.1", free_ports(1))

@@ -44,9 +44,9 @@ def from_afar(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten all intervals of the feed."""
-    for name in ("TICK", "LOOK_AGAIN", "LINGER"):
+    for name in ("DOCUMENT_INTERVAL_S", "ROUND_INTERVAL_S", "LINGER_S"):
         monkeypatch.setattr(f"rosproxy.page.feed.{name}", 0.05)
-    monkeypatch.setattr("rosproxy.page.feed.PER_SECOND", 10_000.0)
+    monkeypatch.setattr("rosproxy.page.feed.QUESTIONS_PER_SECOND", 10_000.0)
 
 
 async def get(proxy: Proxy, path: str, *headers: str, host: str = "localhost") -> Reply:
@@ -77,14 +77,14 @@ class Stream:
 
     async def follow(self) -> None:
         """Process the next event."""
-        from rosproxy.page.changes import changed
+        from rosproxy.page.changes import apply_update
 
         kind, update = await self.event()
         self.kinds.append(kind)
         if kind == "all":
             self.document = update
         elif kind == "change":
-            self.document = changed(self.document, update)
+            self.document = apply_update(self.document, update)
 
     async def link(self, key: str, **wanted: Any) -> dict[str, Any]:
         """Wait until a link has these values."""
@@ -155,7 +155,7 @@ async def test_a_link_comes_flows_and_goes(proxy: Proxy, node: FakeNode) -> None
 async def test_where_nothing_changes_the_page_hears_that_it_is_connected(
     proxy: Proxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy.page.routes.HEARTBEAT", 0.1)
+    monkeypatch.setattr("rosproxy.page.routes.HEARTBEAT_S", 0.1)
     async with opened(proxy) as page:
         while page.kinds.count("clock") < 3:
             await page.follow()

@@ -20,7 +20,7 @@ from rosproxy.page.graph_document import graph_document, relayed
 from rosproxy.page.judgement import JudgedFacts, judge, topics_to_ask_about
 from rosproxy.page.measures import Measures
 from rosproxy.page.page_document import (
-    LONGEST,
+    LONGEST_NAME,
     LONGEST_TEXT,
     MOST_LINK_BYTES,
     MOST_LINKS,
@@ -304,7 +304,7 @@ def test_names_are_short_and_harmless(hostile: str) -> None:
         for candidate in made(None, status)["links"].values()
         if candidate["kind"] == "topic"
     ]
-    assert len(link["name"]) <= LONGEST
+    assert len(link["name"]) <= LONGEST_NAME
     assert link["name"].isprintable()
 
 
@@ -358,14 +358,14 @@ def test_a_document_has_few_bytes_whatever_nodes_call_themselves() -> None:
     graph = SystemState({"/chatter": ["/talker"]}, {"/chatter": names})
     nodes = {name: NodeFacts(name) for name in names}
     shown = made(JudgedFacts(replace(facts, graph=graph, nodes=nodes)))
-    assert len(json.dumps(shown)) < 50 * 6 * 5 * LONGEST
+    assert len(json.dumps(shown)) < 50 * 6 * 5 * LONGEST_NAME
     assert len(shown["links"]) == 50
     assert all(link["target"] in shown["nodes"] for link in shown["links"].values())
 
 
 def test_of_long_rows_what_is_broken_stays() -> None:
     text = "é" * LONGEST_TEXT
-    nodes = {f"/{n}{'é' * LONGEST}": PageNode("robot", text=text) for n in range(MOST_NODES)}
+    nodes = {f"/{n}{'é' * LONGEST_NAME}": PageNode("robot", text=text) for n in range(MOST_NODES)}
     nodes["/last"] = PageNode("robot", state="broken")
     links = [PageLink("topic", f"/{n}", "/last", text=text, fix=text) for n in range(MOST_LINKS)]
     links.append(PageLink("topic", "/x", "/last", state="broken"))

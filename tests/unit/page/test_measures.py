@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, SlaveReport, slave_report
 from rosproxy.net.addresses import HostPort
 from rosproxy.page import measures as module
-from rosproxy.page.measures import FLOWS, STALLED, Measures
+from rosproxy.page.measures import FLOW_PERIOD_S, STALLED_AFTER_S, Measures
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 
 KEY = ("/chatter", "/talker", "/listener")
@@ -68,9 +68,9 @@ def test_a_connection_that_carries_nothing_is_told_after_a_while() -> None:
     rounds = [(1.0, 10, 10), (3.0, 20, 20)]
     rounds += [(3.0 + 2 * step, 20 + 20 * step, 20) for step in (1, 2, 3)]
     link = read(*rounds).get(KEY)
-    assert not link.is_stalled(3.0 + STALLED - 0.1)
-    assert link.is_stalled(3.0 + STALLED)
-    assert not read(*rounds, (11.0, 90, 25)).get(KEY).is_stalled(11.0 + STALLED)
+    assert not link.is_stalled(3.0 + STALLED_AFTER_S - 0.1)
+    assert link.is_stalled(3.0 + STALLED_AFTER_S)
+    assert not read(*rounds, (11.0, 90, 25)).get(KEY).is_stalled(11.0 + STALLED_AFTER_S)
 
 
 def test_a_topic_on_which_nothing_is_sent_is_well() -> None:
@@ -84,7 +84,7 @@ def test_one_message_under_way_is_none_that_is_lost() -> None:
 def test_a_new_connection_begins_anew() -> None:
     link = read((1.0, 900, 900), (3.0, 2, 2), (5.0, 6, 6)).get(KEY)
     assert link.message_rate(5.0) == 2.0
-    assert not link.is_stalled(5.0 + STALLED)
+    assert not link.is_stalled(5.0 + STALLED_AFTER_S)
 
 
 def test_what_the_proxy_relays_counts_while_it_does() -> None:
@@ -103,8 +103,8 @@ def test_what_the_proxy_relays_is_newer_than_what_nodes_are_asked_for() -> None:
         measures.read_relays({KEY: 1000 * second}, float(second))
     link = measures.get(KEY)
     assert (link.last(61.0), link.flows(61.0)) == (61.0, True)
-    assert not link.flows(61.0 + FLOWS)
-    assert link.last(61.0 + FLOWS) == 61.0
+    assert not link.flows(61.0 + FLOW_PERIOD_S)
+    assert link.last(61.0 + FLOW_PERIOD_S) == 61.0
 
 
 def test_relayed_bytes_hide_no_connection_without_traffic() -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 from aiohttp.test_utils import make_mocked_request
 
-from rosproxy.page.visitors import KEY, MOST, SESSION, ExpiringTokens, Visitors
+from rosproxy.page.visitors import KEY_LIFETIME_S, MOST_TOKENS, SESSION_S, ExpiringTokens, Visitors
 from rosproxy.setting_kinds import hash_token
 
 TOKEN = "a token of a test"
@@ -66,7 +66,7 @@ def test_a_cookie_lets_look_for_a_time_and_at_one_port() -> None:
     assert guarded.may_look(request(Cookie=f"rosproxy-11312={cookie}"))
     assert not guarded.may_look(request(Cookie=f"rosproxy-11313={cookie}"))
     assert not guarded.may_look(request(Cookie=f"rosproxy-11312={TOKEN}"))
-    clock.now += SESSION + 1
+    clock.now += SESSION_S + 1
     assert not guarded.may_look(request(Cookie=f"rosproxy-11312={cookie}"))
 
 
@@ -74,15 +74,15 @@ async def test_a_key_is_good_once_and_not_for_long() -> None:
     clock = Clock()
     guarded = Visitors(hash_token(TOKEN), clock)
     key = (await guarded.issue_key({}))["key"]
-    assert guarded.uses_key(key)
-    assert not guarded.uses_key(key)
+    assert guarded.use_key(key)
+    assert not guarded.use_key(key)
     late = (await guarded.issue_key({}))["key"]
-    clock.now += KEY + 1
-    assert not guarded.uses_key(late)
-    assert not guarded.uses_key("")
+    clock.now += KEY_LIFETIME_S + 1
+    assert not guarded.use_key(late)
+    assert not guarded.use_key("")
 
 
 def test_so_many_are_good_at_a_time_and_the_oldest_goes() -> None:
     passes = ExpiringTokens(10.0, Clock())
-    issued = [passes.issue() for _ in range(MOST + 1)]
-    assert [passes.is_good(token) for token in issued] == [False] + [True] * MOST
+    issued = [passes.issue() for _ in range(MOST_TOKENS + 1)]
+    assert [passes.is_valid(token) for token in issued] == [False] + [True] * MOST_TOKENS
