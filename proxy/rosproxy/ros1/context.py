@@ -25,7 +25,7 @@ from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.runtime import Runtime
 from rosproxy.settings import MEBIBYTE
 
-REGISTRATION_GRACE = 0.5
+REGISTRATION_GRACE_S = 0.5
 """The longest time in seconds that a publisherUpdate waits for a registration of the node."""
 MANY_VALUES = 100
 """A document with more values is large. Registrations have six."""
@@ -33,7 +33,7 @@ MOST_PASSING = 256
 """Most calls and replies that pass unread at once. Each call takes a thread of the master."""
 MOST_CLIENTS = 4096
 """The highest number of addresses whose `ClientKind` is remembered."""
-PASSING_SHARE = 64
+PASSING_PER_SOURCE = 64
 """Most calls and replies of a single source among `MOST_PASSING`."""
 
 
@@ -68,7 +68,7 @@ class Context:
         capacity = settings.max_buffered * MEBIBYTE
         self.buffered = Budget(capacity, capacity // 2, "bytes of requests and replies")
         self._turn = asyncio.Lock()
-        self.unread_calls = Budget(MOST_PASSING, PASSING_SHARE, "long requests and replies")
+        self.unread_calls = Budget(MOST_PASSING, PASSING_PER_SOURCE, "long requests and replies")
         self.registry = Registry(settings.ports.listen)
         self.stand_ins = StandIns(settings)
         self.addressing = Addressing(
@@ -151,12 +151,13 @@ class Context:
         return self._client_networks
 
     async def wait_for_registration(self, endpoint: Endpoint) -> None:
-        """Let the reply to a pending registration reach a node before an update.
+        """Wait until no registration of a node is pending, for REGISTRATION_GRACE_S at most.
 
-        A node that applies an older list of publishers after a newer list loses a publisher. The
-        way through the proxy must not make this race of ROS more likely.
+        So the reply to the registration reaches the node before a later update. A node that applies
+        an older list of publishers after a newer list loses a publisher. The way through the proxy
+        must not make this race of ROS more likely.
         """
-        deadline = self.now() + REGISTRATION_GRACE
+        deadline = self.now() + REGISTRATION_GRACE_S
         while endpoint.pending and self.now() < deadline:  # noqa: ASYNC110 - rare, short
             await asyncio.sleep(0.002)
 

@@ -79,7 +79,11 @@ class Leases:
         return endpoint.port in self._acceptors
 
     def open(self, endpoint: Endpoint) -> OSError | None:
-        """Make the ports of an endpoint listen, if it holds the lease; the error if that fails."""
+        """Make the ports of an endpoint listen, if it holds the lease.
+
+        Return the error if the lease can't listen. If only the fast port can't, the endpoint loses
+        the fast port, and the result is None.
+        """
         if self._closed or self._registry.by_port.get(endpoint.port) is not endpoint:
             return None
         self._kernel.note_change(endpoint)
@@ -121,7 +125,7 @@ class Leases:
         self._reserved.clear()
 
     def give_up_spare(self) -> bool:
-        """Take back a port that no node needs (lent or fast); whether there was one."""
+        """Take back a port that no node needs (lent or fast); return whether there was one."""
         if self._lent:
             self._take_back(next(iter(self._lent)))
             return True
@@ -136,20 +140,24 @@ class Leases:
         self.watch([endpoint])
 
     def end_idle(self) -> bool:
-        """End the lease that has been unused for longest; whether there was one."""
+        """End the lease that has been unused for longest; return whether there was one."""
         oldest = self._registry.longest_idle()
         if oldest is not None:
             self.end(oldest)
         return oldest is not None
 
     async def cleared(self, endpoint: Endpoint) -> None:
-        """Wait a moment until the kernel no longer forwards a new lease that was a fast port."""
+        """Wait until the kernel no longer forwards a new lease that was a fast port.
+
+        Waits for FORWARD_TIMEOUT_S at most (`ForwardSyncer.cleared`).
+        """
         await self._kernel.cleared(endpoint.port)
 
     async def fast_port(self, endpoint: Endpoint, node_port: int) -> int | None:
         """The port that the kernel forwards to a TCPROS port of the endpoint's node; None if none.
 
-        The endpoint gets the fast port when a subscriber first asks for a topic, if a port is left.
+        The endpoint gets the fast port when a subscriber first asks for a topic, if that port is
+        free.
         """
         if self._kernel.may_forward(endpoint):
             if endpoint.fast_port is None and fast_ports.claim(self._pool, endpoint):
@@ -197,7 +205,7 @@ class Leases:
             self._pool.give_back(port)
 
     def _reserve(self, port: int) -> bool:
-        """Bind a port, which then refuses; False if another program holds it, or after the end."""
+        """Bind a port, which then refuses; False if that fails, or after `close_all`."""
         if self._closed:
             return False
         try:

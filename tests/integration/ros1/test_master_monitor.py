@@ -35,7 +35,7 @@ async def test_odd_answers_of_the_master_to_the_proxys_own_calls_are_survived(
 
 
 async def test_calls_that_wait_for_recovery_fail_together(master, make_proxy, node, monkeypatch):
-    monkeypatch.setattr("rosproxy.ros1.clients.master_client.MASTER_TIMEOUT", 2.0)
+    monkeypatch.setattr("rosproxy.ros1.clients.master_client.MASTER_TIMEOUT_S", 2.0)
     master.answers["getSystemState"] = End.HANG
     proxy = await make_proxy()
     started = asyncio.get_running_loop().time()

@@ -211,7 +211,7 @@ async def test_a_master_that_gives_no_answer_is_a_reset(proxy, master, node, ans
 
 
 async def test_the_proxy_itself_never_waits_for_a_hanging_master(proxy, master, node, monkeypatch):
-    monkeypatch.setattr("rosproxy.ros1.clients.master_client.MASTER_TIMEOUT", 0.3)
+    monkeypatch.setattr("rosproxy.ros1.clients.master_client.MASTER_TIMEOUT_S", 0.3)
     master.answers["registerPublisher"] = End.HANG
     async with connect(proxy.master, NODE) as wire, connect(proxy.master, NODE) as other:
         await wire.send(post(xml("registerPublisher", "/talker", "/chatter", "*", node.uri)))

@@ -90,8 +90,7 @@ class SlaveApi:
                 raise Unreachable("the caller has closed the connection")
             results.append(await self._multicall_result(endpoint, inner, call))
             call.charge(len(results[-1]))
-            # If the proxy refuses a call or keeps it from the node, the proxy waits for no node. So
-            # let other tasks run here.
+            # A refused or absorbed call waits for no node. So let other tasks run here.
             await asyncio.sleep(0)
         return multicall.results_reply(results)
 
@@ -104,11 +103,11 @@ class SlaveApi:
         endpoint = self._endpoint(call)
         method = long_call.method
         caller_id, parameter = passing.first_strings(call.body, 2)
-        reason = await self._why_not(endpoint, method, caller_id or "", call.source)
+        reason = await self._reason_against_call(endpoint, method, caller_id or "", call.source)
         if reason is None and caller_id is None and not self._policy.idle:
             reason = NO_CALLER_ID
         if reason is None and method == "paramUpdate":
-            reason = await self._not_subscribed(endpoint, parameter)
+            reason = await self._reason_against_update(endpoint, parameter)
         if reason is not None:
             return self._refuse(method, reason)
         reply = self._forward_unchanged(endpoint, long_call)
@@ -165,9 +164,9 @@ class SlaveApi:
         single call, or a multicall around the single call.
         """
         caller_id = parsed.string(0) or ""
-        reason = await self._why_not(endpoint, parsed.method, caller_id, call.source)
+        reason = await self._reason_against_call(endpoint, parsed.method, caller_id, call.source)
         if reason is None and parsed.method == "paramUpdate":
-            reason = await self._not_subscribed(endpoint, parsed.string(1))
+            reason = await self._reason_against_update(endpoint, parsed.string(1))
         if reason is not None:
             return self._refuse(parsed.method, reason)
         if too_long := too_long_to_ask(parsed):
@@ -189,7 +188,7 @@ class SlaveApi:
     async def _forward_allowed(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
     ) -> bytes | LongReply:
-        """The node's reply to an allowed call.
+        """The node's reply to an allowed call, or the proxy's reply to a call that `_absorb` takes.
 
         Imports the addresses in the call, and exports the addresses in the reply. Before a
         ``publisherUpdate``, opens stand-ins for the publishers and adds hidden publishers.
@@ -250,7 +249,7 @@ class SlaveApi:
     async def _absorb(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
         """Keep a needless ``shutdown`` or an outdated ``publisherUpdate`` from the node.
 
-        Return whether the call is kept from the node. `Adopter.absorb_shutdown` may also register
+        Return True if the call is kept from the node. `Adopter.absorb_shutdown` may also register
         the node again.
         """
         if parsed.method == "shutdown":
@@ -281,7 +280,7 @@ class SlaveApi:
         try:
             reply = await answer
         except Unreachable as error:
-            if error.probe is ProbeResult.ANSWERED:  # by an HTTP error status
+            if error.probe is ProbeResult.ANSWERED:  # with an HTTP answer that is no reply
                 health.note(error.probe, self._context.now())
             if error.refused and health.note(error.probe, self._context.now()):
                 # With this refusal the node counts as ended. So the proxy closes the node's port
@@ -292,7 +291,7 @@ class SlaveApi:
         health.note(ProbeResult.ANSWERED, self._context.now())
         return reply
 
-    async def _why_not(
+    async def _reason_against_call(
         self, endpoint: Endpoint, method: str, caller_id: str, source: str
     ) -> str | None:
         """The reason why a caller may not call a method of a node; None if allowed."""
@@ -301,7 +300,7 @@ class SlaveApi:
         denial = await self._policy.check_slave_call(method, endpoint, source, caller_id)
         return denial.reason if denial else None
 
-    async def _not_subscribed(self, endpoint: Endpoint, parameter: str | None) -> str | None:
+    async def _reason_against_update(self, endpoint: Endpoint, parameter: str | None) -> str | None:
         """The reason to refuse a ``paramUpdate``; None if the node may have subscribed.
 
         rosmaster keeps parameter subscriptions of nodes that have ended. Some libraries do not

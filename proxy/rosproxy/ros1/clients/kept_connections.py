@@ -7,7 +7,7 @@ answers (`KeptConnections.collect`). An answer with the same body as the last an
 pid, and the proxy does not parse it.
 
 The kernel tells which connections the nodes have ended (EPOLLRDHUP), also after a crash of the
-process. So the next look knows the end of a node.
+process. So the next look notices the end of a node.
 
 Kept connections are for healthy nodes. After any unexpected answer the proxy closes the connection,
 and `NodeClient.probe` finds out how the node is.
@@ -27,7 +27,7 @@ from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.registry.node_health import ProbeResult
 
 LONGEST_ANSWER_BYTES = 4096
-"""Most bytes of an answer with header. Answers of rospy have 400 bytes."""
+"""Most bytes of the header, and of the body, of an answer. An answer of rospy has 400 bytes."""
 
 _OK = b"HTTP/1.1 200 "
 _LENGTH = re.compile(rb"\r\nContent-Length:\s*(\d{1,4})\s*(?:\r\n|\Z)", re.IGNORECASE)
@@ -101,8 +101,8 @@ class KeptConnections(Generic[_K]):
     def collect(self, now: float) -> dict[_K, ProbeResult | None]:
         """The results since the last call, by key.
 
-        ANSWERED; SILENT after ``within`` seconds; None if the node has refused or ended the
-        connection, or has sent anything else.
+        ANSWERED: the node has answered with the expected pid. SILENT: no answer in ``within``
+        seconds. None: the node has refused or ended the connection, or has sent anything else.
         """
         results = dict(self._answers(now))
         # In this order: an end counts even if the node has answered before the end.
@@ -130,7 +130,7 @@ class KeptConnections(Generic[_K]):
             conn.sock.close()
 
     def _leave(self, key: _K) -> None:
-        """Give up a connection with an answer still due."""
+        """Leave a connection with an answer still due to `NodeClient.close_after_answer`."""
         conn = self._connections.pop(key)
         del self._waiting[key], self._key_by_fd[conn.sock.fileno()]
         # The socket stays open until the answer arrives. Closed sockets leave epoll by themselves
@@ -195,6 +195,6 @@ class KeptConnections(Generic[_K]):
 
 
 def _length(head: bytes) -> int:
-    """The length of the body from the header; -1 if there is none or it is too long."""
+    """The length of the body by the header; -1 if the header has none, or the body is too long."""
     match = _LENGTH.search(head)
     return int(match[1]) if match and int(match[1]) <= LONGEST_ANSWER_BYTES else -1

@@ -44,23 +44,24 @@ CALLER_ID = "/rosproxy"
 """The node name of the proxy in its own calls."""
 LOOP_HEADER = "X-Rosproxy"
 """Has the id of the proxy, so that the proxy notices when its own call comes back."""
-MULTICALL_SIZE = 100
-MASTER_CONNECTIONS = 64
-NODE_CONNECTIONS = 10_000
-MASTER_TIMEOUT = 30.0
-MASTER_KEEPALIVE = 8.0
+MULTICALL_CALLS = 100
+"""Most calls in a ``system.multicall`` of the proxy."""
+MOST_MASTER_CONNECTIONS = 64
+MOST_NODE_CONNECTIONS = 10_000
+MASTER_TIMEOUT_S = 30.0
+MASTER_KEEPALIVE_S = 8.0
 """Seconds to keep an unused connection to the master; rosmaster spends a thread on each."""
-NODE_KEEPALIVE = 2.0
+NODE_KEEPALIVE_S = 2.0
 """Seconds to keep an unused connection to a node; rospy spends a thread on each."""
-NODE_TIMEOUT = 15.0
+NODE_TIMEOUT_S = 15.0
 
 
 class Unreachable(CallFailed):
     """A call without an XML-RPC reply.
 
-    ``probe`` is the meaning for the health of the called node: the connection was refused, no
-    answer came, or (ANSWERED) an HTTP answer came that is no reply. Libraries answer so to methods
-    that they do not implement.
+    ``probe`` says what the failure means for the health of the called node. REFUSED: the connection
+    was refused. ANSWERED: the HTTP answer is no XML-RPC reply; libraries answer so to methods that
+    they do not implement. SILENT: any other failure, such as no answer in time.
     """
 
     def __init__(self, message: str, probe: ProbeResult = ProbeResult.SILENT) -> None:
@@ -74,7 +75,7 @@ class Unreachable(CallFailed):
 
 
 class MasterError(CallFailed):
-    """The master or a node answered, but not with status 1."""
+    """The master or a node answered with a fault, without a ROS triple, or not with status 1."""
 
 
 class MasterClient:
@@ -86,7 +87,7 @@ class MasterClient:
     ``master_address`` is the IP address at which the proxy reaches the host of ``master_uri``; it
     may change at any time. None: the address follows from the host name. In a container network
     this name may lead to the proxy itself. The address also holds for nodes on the master's host.
-    ``longest`` is the highest number of bytes of a document that passes unread.
+    ``longest`` is the highest number of bytes of a reply that passes unread.
     """
 
     def __init__(
@@ -108,8 +109,12 @@ class MasterClient:
         # --master-uri, or the address of a node (`MasterApi`).
         master_headers = {LOOP_HEADER: instance}
         node_headers = {LOOP_HEADER: f"{instance} node"}
-        self._master = HttpClient(master_headers, MASTER_KEEPALIVE, MASTER_CONNECTIONS, longest)
-        self._nodes = HttpClient(node_headers, NODE_KEEPALIVE, NODE_CONNECTIONS, longest, NODES)
+        self._master = HttpClient(
+            master_headers, MASTER_KEEPALIVE_S, MOST_MASTER_CONNECTIONS, longest
+        )
+        self._nodes = HttpClient(
+            node_headers, NODE_KEEPALIVE_S, MOST_NODE_CONNECTIONS, longest, NODES
+        )
 
     async def close(self) -> None:
         """Close all connections."""
@@ -145,18 +150,18 @@ class MasterClient:
         path = self._master_path
         name = self._netloc
         with _FailuresOf(f"master {self.master_uri}"):
-            return await self._master.post(target, path, name, body, MASTER_TIMEOUT, limits.size)
+            return await self._master.post(target, path, name, body, MASTER_TIMEOUT_S, limits.size)
 
     async def pass_to_master(self, body: bytes | LongBody) -> bytes | LongReply:
         """The master's reply to a call; the proxy reads neither the call nor the reply.
 
-        Raises Unreachable. Raises XmlRpcError if a long body does.
+        Raises Unreachable, and XmlRpcError if a long body raises that.
         """
         target = self.reach(self._master_host_port)
         path = self._master_path
         name = self._netloc
         with _FailuresOf(f"master {self.master_uri}"):
-            return await self._master.pass_on(target, path, name, body, MASTER_TIMEOUT)
+            return await self._master.pass_on(target, path, name, body, MASTER_TIMEOUT_S)
 
     async def call_master(self, method: str, *params: Any) -> Any:
         """Call the master and return the value. Raises Unreachable, MasterError."""
@@ -172,8 +177,8 @@ class MasterClient:
         ``params`` include the caller_id. The value of a failed call is None. Raises Unreachable.
         """
         values: list[Any] = []
-        for start in range(0, len(calls), MULTICALL_SIZE):
-            batch = calls[start : start + MULTICALL_SIZE]
+        for start in range(0, len(calls), MULTICALL_CALLS):
+            batch = calls[start : start + MULTICALL_CALLS]
             body = [{"methodName": method, "params": params} for method, params in batch]
             call = xmlrpc.dump_call("system.multicall", body)
             results = parse_value(await self.post_to_master(call, OWN_REPLY))
@@ -183,11 +188,11 @@ class MasterClient:
         return values
 
     async def read_changes(self, last: bytes) -> tuple[bytes, dict[str, list[Registration]] | None]:
-        """The registrations of each node, without types, and the digest for ``last`` next time.
+        """A digest of the master's state, and the registrations of each node, without types.
 
-        The registrations are None if nothing has changed since ``last``. To parse the names of ten
-        thousand topics takes half a second, to compare the digest a hundredth. Raises Unreachable,
-        MasterError.
+        ``last``: the digest of the previous call. If the digest is the same, the registrations are
+        None. To parse the names of ten thousand topics takes half a second, to compare the digest a
+        hundredth. Raises Unreachable, MasterError.
         """
         reply = await self.post_to_master(xmlrpc.dump_call("getSystemState", CALLER_ID), OWN_REPLY)
         digest = blake2b(reply).digest()
@@ -221,7 +226,7 @@ class MasterClient:
         self,
         slave: HostPort,
         body: bytes,
-        within: float = NODE_TIMEOUT,
+        within: float = NODE_TIMEOUT_S,
         path: str = "/",
         name: str = "",
     ) -> bytes:
@@ -238,17 +243,17 @@ class MasterClient:
     async def pass_to_node(self, slave: HostPort, body: bytes | LongBody) -> bytes | LongReply:
         """A node's reply to a call; the proxy reads neither the call nor the reply.
 
-        Raises Unreachable. Raises XmlRpcError if a long body does.
+        Raises Unreachable, and XmlRpcError if a long body raises that.
         """
         with _FailuresOf(f"node at {slave}"):
             target = self.reach(slave)
             name = str(slave)
-            return await self._nodes.pass_on(target, "/", name, body, NODE_TIMEOUT)
+            return await self._nodes.pass_on(target, "/", name, body, NODE_TIMEOUT_S)
 
     async def call_node(
         self, slave: HostPort, within: float, method: str, *params: Any, limits: Limits = REPLY
     ) -> Any:
-        """Call a node and return the value. Raises Unreachable, MasterError."""
+        """Call a node in ``within`` seconds; return the value. Raises Unreachable, MasterError."""
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
         return read_value(method, await self.post_to_node(slave, body, within), limits)
 
@@ -270,7 +275,7 @@ _FAILURES = (aiohttp.ClientError, OSError, TimeoutError, ValueError)
 class _FailuresOf:
     """Raises failures as Unreachable, with the name of the peer.
 
-    A class, as a context manager made of a generator takes four times as long, on each call.
+    This is a class, because a context manager of a generator takes four times as long.
     """
 
     __slots__ = ("_peer",)
@@ -282,7 +287,7 @@ class _FailuresOf:
         """Begin to call the peer."""
 
     def __exit__(self, _: object, error: BaseException | None, trace: object) -> None:
-        """Raise Unreachable for a failure of the peer's: the error of a long body is none."""
+        """Raise Unreachable for a failure of the peer. An error of a long body passes unchanged."""
         if isinstance(error, _FAILURES) and not isinstance(error, xmlrpc.XmlRpcError):
             raise _unreachable(self._peer, error) from error
 

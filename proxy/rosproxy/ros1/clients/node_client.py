@@ -37,8 +37,8 @@ from rosproxy.ros1.registry.node_health import ProbeResult
 log = logging.getLogger(__name__)
 
 GET_PID = "getPid"
-TOPICS_ASKED = 3
-"""The highest number of topics for which the proxy asks a node, until it has enough ports."""
+MOST_TOPICS_ASKED = 3
+"""Most topics of a node for whose TCPROS port the proxy asks."""
 ENOUGH_PORTS = 2
 """TCPROS ports that are enough: a node has one port for all topics, or one for each topic."""
 
@@ -61,7 +61,10 @@ class NodeClient:
         self._within = within
 
     async def probe(self, slave: HostPort, within: float | None = None) -> ProbeAnswer:
-        """Call ``getPid``. Any HTTP answer shows that the node lives, even an unknown method."""
+        """Call ``getPid``, for ``within`` seconds or the usual time-out.
+
+        Any HTTP answer shows that the node lives, even an error because the method is unknown.
+        """
         try:
             body = await self._upstream.post_to_node(slave, _PID_CALL, within or self._within)
             return ProbeAnswer(ProbeResult.ANSWERED, self.read_pid(body))
@@ -113,8 +116,8 @@ class NodeClient:
         its name in the header with which it answers a TCPROS connection for a topic or a service
         (transport_subscriber_link.cpp and service_client_link.cpp, handleHeader). roscpp has a
         topic or a service when it registers for the first time, because it records a publisher or
-        service before it registers. /rosout is the first publisher of all. ``service`` is the
-        service of the registration, with its port.
+        service before it registers. /rosout is the first publisher of all. ``service``: the name
+        and TCPROS port of the service, if the registration is for a service.
 
         The proxy does not ask for subscriptions, because roscpp keeps them locked during a
         registration (topic_manager.cpp, subscribe).
@@ -143,7 +146,7 @@ class NodeClient:
 
     async def _name_by_tcpros(self, slave: HostPort, service: tuple[str, int] | None) -> str | None:
         published = await self._topics(slave, "getPublications") or {ROSOUT: ""}
-        topics = sorted(published, key=lambda topic: topic != ROSOUT)[:TOPICS_ASKED]
+        topics = sorted(published, key=lambda topic: topic != ROSOUT)[:MOST_TOPICS_ASKED]
         for topic in topics:
             port = await self._topic_port_or_none(slave, topic)
             name = await self.publisher(HostPort(slave.host, port), topic) if port else None
@@ -164,7 +167,7 @@ class NodeClient:
             return None
 
     async def take_leave(self, conn: socket.socket, topic: str) -> None:
-        """Close a connection to a publisher that has not had a header, after a header of the proxy.
+        """Send the first header on a connection to a publisher, then close the connection.
 
         rospy accepts connections in a single thread, which logs a warning for each connection that
         ends before its header. With its first warning, the thread asks the master for a parameter,
@@ -184,7 +187,10 @@ class NodeClient:
             return None
 
     async def topic_port(self, slave: HostPort, topic: str) -> int | None:
-        """The TCPROS port that a node names for a topic. Raises Unreachable, MasterError."""
+        """The TCPROS port that a node names for a topic; None if the node names no port.
+
+        Raises Unreachable, MasterError.
+        """
         answer = await self._upstream.call_node(
             slave, self._within, "requestTopic", topic, [["TCPROS"]]
         )
@@ -194,9 +200,9 @@ class NodeClient:
         return None
 
     async def _topic_ports(self, slave: HostPort, topics: list[str]) -> dict[str, int]:
-        """The TCPROS ports of two topics, which show whether all topics have the same port."""
+        """The TCPROS ports of up to two topics: they show whether all topics have the same port."""
         ports: dict[str, int] = {}
-        for topic in topics[:TOPICS_ASKED]:
+        for topic in topics[:MOST_TOPICS_ASKED]:
             port = await self._topic_port_or_none(slave, topic)
             if port is not None:
                 ports[topic] = port

@@ -1,8 +1,8 @@
-"""The checks of the policy: before a call of the master or a node, and of the reply.
+"""Checks calls by the policy before the master or a node gets them, and filters the replies.
 
-Each ``check_…`` returns a `Denial`, or None if allowed, and reports the denial. A source with the
-address of a node inside is not outside: nodes in several inside networks reach each other through
-the ports of the proxy.
+Each ``check_…`` returns a `Denial`, or None if allowed, and reports the denial. Only
+`check_request` returns answers. A source with the address of a node inside is not outside: nodes in
+several inside networks reach each other through the ports of the proxy.
 """
 
 import asyncio
@@ -127,7 +127,10 @@ class Ros1Policy:
     def check_registration(
         self, call: Call, admission: Endpoint | Passing, caller: Caller, now: float
     ) -> Denial | None:
-        """Check a call that registers, after admission. A denied registration becomes hidden."""
+        """Check a call that registers, after admission.
+
+        A denied registration becomes hidden. At the URI of another node, the registration fails.
+        """
         affected = None if self.idle else registration_of(call, now, caller.address)
         if affected is None or affected.kind is Kind.PARAM:  # already checked
             return None

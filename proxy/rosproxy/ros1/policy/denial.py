@@ -1,4 +1,4 @@
-"""Denials: what a rule refuses, and what the caller is answered instead.
+"""Denials: the reason of a refusal, and the answer to the caller.
 
 Texts and values of the answers: ros_comm/tools/rosmaster/src/rosmaster/master_api.py, and for a
 topic that a node does not publish clients/rospy/src/rospy/impl/masterslave.py (requestTopic).
@@ -10,7 +10,7 @@ from rosproxy.ros1.rewriting.master_calls import LocalAnswer, refusal
 
 
 class Denial(msgspec.Struct, frozen=True):
-    """What a rule refuses: ``reason`` names the rule, ``answer`` is for the caller."""
+    """The result when a rule refuses: ``reason`` names the rule, ``answer`` is for the caller."""
 
     reason: str
     answer: LocalAnswer
@@ -33,5 +33,5 @@ def no_publisher(topic: str, reason: str) -> Denial:
 
 
 def with_fix(reason: str) -> str:
-    """The reason, which names a rule, with what to do about the rule."""
+    """A reason that names a rule, followed by advice."""
     return f"{reason}. Change that rule if the node may have this"

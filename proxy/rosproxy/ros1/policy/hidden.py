@@ -69,7 +69,7 @@ class HiddenAnswers:
         return LocalAnswer(1, f"rosrpc URI: [{imported}]", imported)
 
     def find_node(self, call: Call, caller: Caller) -> LocalAnswer | None:
-        """The answer to lookupNode; None if the master may know the node."""
+        """The answer to lookupNode for a node without shown registrations; None for other nodes."""
         caller_id = second_parameter_name(call)
         endpoint = self._registry.by_caller.get(caller_id)
         if endpoint is None or endpoint.health.cleaned:
@@ -130,7 +130,7 @@ class HiddenAnswers:
         return [[name, nodes] for name, nodes in rows.items()]
 
     def _types(self, kinds: Sequence[Kind]) -> dict[str, str]:
-        """The types of hidden topics, as far as a node has given a type."""
+        """The types of hidden topics; ``*`` if no node has given a type."""
         types: dict[str, str] = {}
         for _, registration in self._registry.hidden_registrations():
             if registration.kind in kinds and types.get(registration.name, "*") == "*":
@@ -143,7 +143,7 @@ class HiddenAnswers:
 
 
 def _living(endpoints: Iterable[Endpoint]) -> list[Endpoint]:
-    """The endpoints that are not cleaned, without duplicates, in the order of ports."""
+    """The endpoints that are not `Health.cleaned`, without duplicates, in order of ports."""
     by_id = {id(endpoint): endpoint for endpoint in endpoints if not endpoint.health.cleaned}
     return sorted(by_id.values(), key=lambda endpoint: endpoint.port)
 
