@@ -156,8 +156,8 @@ def _measures_of(
 ) -> Json:
     """The measures that all links in ``group`` to a participant share; ``is_active``: data comes.
 
-    ``published`` is the number of topics that the participant publishes to the other side. If the
-    kernel forwards, the measures also have the acknowledgements for these topics. ``others`` is the
+    ``published`` is the number of links from the participant, one for each topic and reader. If the
+    kernel forwards, the measures also have the acknowledgements for these links. ``others`` is the
     number of participants on the other side. The last data came ``since`` seconds ago; None: not
     known.
 

@@ -46,7 +46,7 @@ _STATES = {Severity.ERROR: BROKEN, Severity.WARNING: WARNING}
 
 
 def relayed(status: ProxyStatus, graph: SystemState) -> dict[Key, int]:
-    """The bytes that the proxy has relayed for each link of a topic."""
+    """The bytes that the proxy has relayed from publishers inside, by the link of a topic."""
     sizes: dict[Key, int] = {}
     for endpoint in status.nodes:
         for connection in endpoint.connections:

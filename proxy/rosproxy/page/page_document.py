@@ -79,8 +79,8 @@ class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
     operator's page.
 
     ``datagrams``: user data of ROS 2 in datagrams per second. If ``shared`` is 2 or more, the
-    measures are the sum of this number of links, services and acknowledged topics of the same
-    participant.
+    measures are a sum over this number of links to the same participant, services of the
+    participant, and links whose acknowledgements come back to the participant.
     """
 
     kind: str

@@ -133,7 +133,7 @@ class MasterClient:
         return await resolve(self._master_host_port.host)
 
     def reach(self, host_port: HostPort) -> HostPort:
-        """The address to connect to for a host and port in a URI from outside.
+        """The address to connect to for the host and port of the master or a node.
 
         Only the host of the master has a different address, and only if ``master_address`` is set.
         """
