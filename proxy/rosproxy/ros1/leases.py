@@ -146,12 +146,12 @@ class Leases:
             self.end(oldest)
         return oldest is not None
 
-    async def cleared(self, endpoint: Endpoint) -> None:
+    async def wait_until_cleared(self, endpoint: Endpoint) -> None:
         """Wait until the kernel no longer forwards a new lease that was a fast port.
 
-        Waits for FORWARD_TIMEOUT_S at most (`ForwardSyncer.cleared`).
+        Waits for FORWARD_TIMEOUT_S at most (`ForwardSyncer.wait_until_cleared`).
         """
-        await self._kernel.cleared(endpoint.port)
+        await self._kernel.wait_until_cleared(endpoint.port)
 
     async def fast_port(self, endpoint: Endpoint, node_port: int) -> int | None:
         """The port that the kernel forwards to a TCPROS port of the endpoint's node; None if none.
@@ -168,7 +168,7 @@ class Leases:
         return None
 
     @asynccontextmanager
-    async def lent(
+    async def lend(
         self, order: Iterable[int], handler: Handler, or_fast: bool
     ) -> AsyncIterator[int | None]:
         """Lend a port that no node needs, and serve it by a handler; None if none is free.
@@ -187,7 +187,7 @@ class Leases:
             return
         self._lent.add(port)
         try:
-            await self._kernel.cleared(port)
+            await self._kernel.wait_until_cleared(port)
             if port in self._lent:  # otherwise a node has needed the port meanwhile
                 self._accept(port, handler)
             yield port

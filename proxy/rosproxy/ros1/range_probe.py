@@ -80,7 +80,7 @@ async def probe_range(
     probes: list[PortProbe] = []
     for order in (ports, reversed(ports)):
         trial = _PortTrial()
-        async with leases.lent(order, trial.greet, or_fast) as port:
+        async with leases.lend(order, trial.greet, or_fast) as port:
             if port is None:
                 break
             target = context.addressing.outside(port)

@@ -166,7 +166,7 @@ class NodeClient:
             log.debug("TCPROS server at %s does not answer a connection header: %s", server, error)
             return None
 
-    async def take_leave(self, conn: socket.socket, topic: str) -> None:
+    async def close_after_header(self, conn: socket.socket, topic: str) -> None:
         """Send the first header on a connection to a publisher, then close the connection.
 
         rospy accepts connections in a single thread, which logs a warning for each connection that

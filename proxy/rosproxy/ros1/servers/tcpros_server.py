@@ -153,7 +153,7 @@ class TcprosServer:
             self._fail(target, conn, name)
         elif kind == "topic" and sockets.has_ended(conn):
             conn.close()
-            await self._context.nodes.take_leave(node, name)
+            await self._context.nodes.close_after_header(node, name)
             return None
         return node
 

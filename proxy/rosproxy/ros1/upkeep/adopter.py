@@ -196,7 +196,7 @@ class Adopter:
         if not isinstance(endpoint, Endpoint):
             return None
         endpoint.pending += 1
-        await self._leases.cleared(endpoint)
+        await self._leases.wait_until_cleared(endpoint)
         now = self._context.now()
         known_pid = endpoint.health.pid
         endpoint.mark_alive(info.pid, info.topic_ports, now)
