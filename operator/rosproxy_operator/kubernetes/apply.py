@@ -45,7 +45,7 @@ from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
 from rosproxy_operator.kubernetes.resources.objects import name_of
 from rosproxy_operator.kubernetes.status.events import count_patch, event_body
-from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
+from rosproxy_operator.kubernetes.status.refusal_fixes import NOT_OURS
 
 log = logging.getLogger(__name__)
 
@@ -355,7 +355,7 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
         return
     owners = {text_at(owner, "kind") for owner in submaps(metadata, "ownerReferences")}
     if not is_own(texts_at(metadata, "labels")) or KIND not in owners:
-        raise ApiConflict(f"a {body.get('kind')} of this name exists already that {OF_ANOTHER}")
+        raise ApiConflict(f"a {body.get('kind')} of this name exists already that {NOT_OURS}")
 
 
 def _emit(api: Api, event: Emit) -> None:

@@ -23,9 +23,13 @@ from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_
 from rosproxy_operator.kubernetes.resources.model import Json, Name, Pod
 from rosproxy_operator.kubernetes.resources.names import INJECT
 from rosproxy_operator.kubernetes.status.condition_findings import is_unnoticed
-from rosproxy_operator.kubernetes.status.event_findings import MOST, RecentEvent, recent_events
+from rosproxy_operator.kubernetes.status.event_findings import (
+    MOST_EVENTS,
+    RecentEvent,
+    recent_events,
+)
 from rosproxy_operator.kubernetes.status.operator_findings import (
-    OPERATORS,
+    OPERATOR_SELECTOR,
     Operators,
     service_accounts,
 )
@@ -36,7 +40,7 @@ from rosproxy_operator.kubernetes.status.webhook_findings import (
 )
 
 T = TypeVar("T")
-MOST_LOOKED_FOR = 3 * MOST
+MOST_LOOKED_FOR = 3 * MOST_EVENTS
 """Most Events whose pod the doctor looks up: Events of deleted users' pods do not matter."""
 
 
@@ -53,7 +57,9 @@ class DoctorFacts:
 
         The doctor checks only namespaces with a RosProxy that no operator has looked at.
         """
-        pods = self._ask("operator", lambda: self._api.list_fresh("pods", "", labels=OPERATORS))
+        pods = self._ask(
+            "operator", lambda: self._api.list_fresh("pods", "", labels=OPERATOR_SELECTOR)
+        )
         found = Operators(None if pods is None else tuple(pods))
         unnoticed = (rosproxy for rosproxy in rosproxies if is_unnoticed(rosproxy))
         namespaces = {text_at(submap(r, "metadata"), "namespace") for r in unnoticed}

@@ -14,7 +14,7 @@ from rosproxy_operator.kubernetes.status.operator_findings import (
     unnoticed,
 )
 
-_WRONG = {
+_BAD_STATUS = {
     "MasterReachable": "False",
     "PortsReachable": "False",
     "PortsAllocated": "False",
@@ -63,7 +63,7 @@ def _findings_of(rosproxy: Json, operators: Operators) -> Iterator[DoctorFinding
     if is_unnoticed(rosproxy) and not operators.missing:
         yield unnoticed(id, operators)
     messages: set[str] = set()
-    for kind, bad in _WRONG.items():
+    for kind, bad in _BAD_STATUS.items():
         condition = conditions.get(kind, {})
         message = text_at(condition, "message")
         if text_at(condition, "status") == bad and message not in messages:

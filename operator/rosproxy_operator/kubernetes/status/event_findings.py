@@ -17,7 +17,7 @@ from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import KIND
 from rosproxy_operator.kubernetes.status.events import COMPONENT
 
-MOST = 10
+MOST_EVENTS = 10
 """Events that the doctor reports at most."""
 MOST_TEXT_CHARACTERS = 400
 """Characters of a reason or a message at most."""
@@ -55,13 +55,13 @@ def recent_events(
     uids = {text_at(submap(obj, "metadata"), "uid") for obj in rosproxies}
     namespaces = {text_at(submap(obj, "metadata"), "namespace") for obj in rosproxies}
     pod_uids = {text_at(submap(obj, "metadata"), "uid") for obj in pods}
-    told = [*_messages(rosproxies)]
+    messages = [*_messages(rosproxies)]
     newest: dict[tuple[str, str, str], RecentEvent] = {}
     for event in sorted((_read(e, now) for e in events), key=lambda e: e.age):
         ours = uids if event.kind == KIND else pod_uids
         is_users = event.kind == "Pod" and event.own and event.id.namespace in namespaces
         matters = event.uid in ours or is_users
-        if matters and not (event.own and _is_told(event, told)):
+        if matters and not (event.own and _is_in_condition(event, messages)):
             # The scheduler repeats a reason with other texts, such as other counts of nodes.
             message = event.message if event.own else ""
             newest.setdefault((event.uid, event.reason, message), event)
@@ -71,8 +71,8 @@ def recent_events(
 def event_findings(
     events: Iterable[RecentEvent], ready: Collection[str]
 ) -> Iterator[DoctorFinding]:
-    """Findings about the first `MOST` Events; ``ready`` are the uids of the pods that are ready."""
-    for event in [*events][:MOST]:
+    """Findings about the first `MOST_EVENTS` Events; ``ready`` are the uids of ready pods."""
+    for event in [*events][:MOST_EVENTS]:
         subject = f"{event.kind.lower()} {event.id}"
         often = f", {event.count} times" if event.count > 1 else ""
         message = brief(event.message, MOST_TEXT_CHARACTERS)
@@ -94,7 +94,7 @@ def _messages(rosproxies: Iterable[Json]) -> Iterator[str]:
             yield text_at(condition, "message")
 
 
-def _is_told(event: RecentEvent, messages: Iterable[str]) -> bool:
+def _is_in_condition(event: RecentEvent, messages: Iterable[str]) -> bool:
     text = event.message.removesuffix("…")
     return any(text in message for message in messages)
 
@@ -109,14 +109,14 @@ def _read(event: Json, now: float) -> RecentEvent:
         uid=text_at(about, "uid"),
         reason=brief(text_at(event, "reason"), MOST_TEXT_CHARACTERS),
         message=text_at(event, "message"),
-        age=max(now - _time(event, series), 0.0),
+        age=max(now - _last_time(event, series), 0.0),
         count=int_at(series, "count") or int_at(event, "count") or 1,
         own=COMPONENT in (source, text_at(event, "reportingComponent")),
     )
 
 
-def _time(event: Json, series: Json) -> float:
-    """The last time of an Event, in seconds of Unix time; 0 if no field is readable.
+def _last_time(event: Json, series: Json) -> float:
+    """When an Event last happened, in seconds of Unix time; 0 if no field is readable.
 
     Clients of core/v1 write lastTimestamp, clients of events.k8s.io/v1 write eventTime and series.
     """

@@ -1,4 +1,8 @@
-"""The Kubernetes Events (core/v1) of the operator: an Event for each problem, not for each plan."""
+"""The Kubernetes Events (core/v1) of the operator.
+
+Warning Events report problems, once for a problem and not in each plan. Normal Events report
+actions.
+"""
 
 import hashlib
 from collections import Counter
@@ -33,20 +37,23 @@ EVENT_REPEAT_QUIET_S = 60.0
 MOST_WARNINGS = 50
 """Warning Events of a plan at most; the next plan has the rest."""
 MOST_TEXTS = 10
-"""The most texts of a reason about an object that come and go in `EVENT_REPEAT_QUIET_S` seconds.
+"""Texts at most that come and go in `EVENT_REPEAT_QUIET_S` seconds, for a reason and an object.
 
 Further texts wait. A hostile proxy or master chooses the texts of its errors, and could cause any
 number of Events.
 """
 MOST_RESULTS = 20
-"""Normal Events of a reason in a plan for a RosProxy; one more Event counts the rest."""
+"""Normal Events of a reason at most, for the actions of a plan for a RosProxy.
+
+One more Event counts the rest.
+"""
 MOST_MESSAGE_BYTES = 1024
 """Bytes of the message of an Event at most."""
 COUNT_INTERVAL_S = 60.0
 """Least seconds between two counts of the same Event."""
 COMPONENT = "rosproxy-operator"
 """The source that the Events name."""
-_LONGEST_NAME = 200
+_MOST_NAME_CHARACTERS = 200
 _ENDED: Mapping[type, tuple[str, str]] = {
     DeleteProxy: ("ProxyDeleted", "deleted"),
     EvictPod: ("PodEvicted", "evicted"),
@@ -80,16 +87,16 @@ def warnings(
     """
     findings = dict.fromkeys(f for f in problems if f.about)
     recent = {f: then for f, then in reported.items() if now - then < EVENT_REPEAT_QUIET_S}
-    gone = Counter(_kind(f) for f in recent if f not in findings)
+    gone = Counter(_cause_key(f) for f in recent if f not in findings)
     new = [f for f in findings if f not in reported]
-    changing = {f for f in new if gone[_kind(f)] >= MOST_TEXTS}
-    told = [f for f in new if f not in changing][:MOST_WARNINGS]
-    late = {*new}.difference(told)
-    current = {f: now for f in findings if f not in late}
-    return NewEvents(tuple(map(_warning, told)), {**recent, **current})
+    changing = {f for f in new if gone[_cause_key(f)] >= MOST_TEXTS}
+    announced = [f for f in new if f not in changing][:MOST_WARNINGS]
+    deferred = {*new}.difference(announced)
+    current = {f: now for f in findings if f not in deferred}
+    return NewEvents(tuple(map(_warning, announced)), {**recent, **current})
 
 
-def _kind(finding: ClusterFinding) -> tuple[object, ...]:
+def _cause_key(finding: ClusterFinding) -> tuple[object, ...]:
     """The key that findings with the same cause and different texts share."""
     return finding.of, finding.about, finding.subject, finding.reason
 
@@ -140,7 +147,7 @@ def event_body(event: Emit, now: float) -> Json:
     identity = "\n".join([about.uid, event.type, event.reason, event.message])
     digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
     # The part before the dot must not end in a dot or a hyphen (RFC 1123 subdomain).
-    name = f"{about.id.name[:_LONGEST_NAME].rstrip('.-')}.{digest}"
+    name = f"{about.id.name[:_MOST_NAME_CHARACTERS].rstrip('.-')}.{digest}"
     return {
         "apiVersion": "v1",
         "kind": "Event",

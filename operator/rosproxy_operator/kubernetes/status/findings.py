@@ -31,6 +31,7 @@ from rosproxy_operator.kubernetes.status.refusal_fixes import (
     scheduling_fix,
 )
 
+# Reasons of findings, and of the conditions that repeat the findings.
 NOT_ADMITTED = "ProxyNotAdmitted"
 CONFLICT = "PortConflict"
 EXHAUSTED = "PortsExhausted"
@@ -40,7 +41,7 @@ NO_MASTER = "MasterUnreachable"
 NO_WAY_IN = "PortsUnreachable"
 WARNS = "ProxyWarns"
 REFUSES = "PolicyRefused"
-_LONGEST = 600
+_MOST_TEXT_CHARACTERS = 600
 _UNRESOLVED = "can't be resolved"
 """Part of the error of a proxy about a host name (rosproxy.net.http_client)."""
 
@@ -72,7 +73,7 @@ def _node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> Iterator[Cluste
         yield _finding(rosproxy, f"node {state.name}", state.obstacle.text, state.obstacle.reason)
     relay = state.lan_relay
     if relay is not None and relay.stuck is not None and not relay.pod.deleting:
-        yield _deaf(rosproxy, relay)
+        yield _lan_relay_stuck(rosproxy, relay)
     proxy = state.proxy
     if proxy is None or proxy.pod.deleting:
         return
@@ -105,7 +106,9 @@ def pod_finding(
 
 
 def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> ClusterFinding:
-    return finding(rosproxy, reason, bounded(text, _LONGEST), fatal=True, subject=subject)
+    return finding(
+        rosproxy, reason, bounded(text, _MOST_TEXT_CHARACTERS), fatal=True, subject=subject
+    )
 
 
 def proxy_subject(proxy: ProxyPod) -> str:
@@ -150,17 +153,17 @@ def _unusable(rosproxy: RosProxy, check: HelperPod, proxy: ProxyPod) -> ClusterF
         fix = f"Read kubectl -n {id.namespace} describe pod {id.name}"
     kept = f"{text}. So proxy {proxy.pod.id.name} keeps the image {proxy.image}. {fix}"
     subject = f"node {check.node}"
-    return finding(rosproxy, "ImageUnusable", bounded(kept, _LONGEST), subject=subject)
+    return finding(rosproxy, "ImageUnusable", bounded(kept, _MOST_TEXT_CHARACTERS), subject=subject)
 
 
-def _deaf(rosproxy: RosProxy, lan_relay: HelperPod) -> ClusterFinding:
+def _lan_relay_stuck(rosproxy: RosProxy, lan_relay: HelperPod) -> ClusterFinding:
     id = lan_relay.pod.id
     text = (
         f"the pod does not run ({lan_relay.message}), so no discovery passes between the LAN and "
         f"the proxy. Read kubectl -n {id.namespace} describe pod {id.name}"
     )
     subject = f"LAN relay {id.name} on node {lan_relay.node}"
-    return finding(rosproxy, "LanRelayStuck", bounded(text, _LONGEST), subject=subject)
+    return finding(rosproxy, "LanRelayStuck", bounded(text, _MOST_TEXT_CHARACTERS), subject=subject)
 
 
 def _answered(
@@ -198,9 +201,9 @@ def _own_problems(answer: ProxyReport) -> list[str]:
 
     The operator reports the master and the range in findings and conditions of its own.
     """
-    told = ["master: "] if not answer.master_up else []
-    told += [f"{RANGE}: "] if answer.range_probe else []
-    return [problem for problem in answer.problems if not problem.startswith(tuple(told))]
+    known = ["master: "] if not answer.master_up else []
+    known += [f"{RANGE}: "] if answer.range_probe else []
+    return [problem for problem in answer.problems if not problem.startswith(tuple(known))]
 
 
 def _master_remedy(rosproxy: RosProxy, error: str) -> str:
@@ -223,6 +226,6 @@ def _refused(rosproxy: RosProxy, id: Name, text: str) -> ClusterFinding:
     message = clean(" ".join(text.split()))
     remedy = admission_fix(message, rosproxy)
     problem = "the operator could not create, change or delete this object"
-    message = message[: _LONGEST - len(f"{problem} (). {remedy}")]
+    message = message[: _MOST_TEXT_CHARACTERS - len(f"{problem} (). {remedy}")]
     text = f"{problem} ({message}). {remedy}"
     return _finding(rosproxy, str(id), text, NOT_ADMITTED)

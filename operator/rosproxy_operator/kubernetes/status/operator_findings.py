@@ -12,7 +12,7 @@ from rosproxy.telemetry.text import listed
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 
-OPERATORS = "app.kubernetes.io/component=operator,app.kubernetes.io/part-of=rosproxy"
+OPERATOR_SELECTOR = "app.kubernetes.io/component=operator,app.kubernetes.io/part-of=rosproxy"
 """Label selector of the pods of operators."""
 _CHECK = "operator"
 _OPTION = "--namespace"
@@ -96,7 +96,7 @@ def unnoticed(rosproxy: Name, operators: Operators) -> DoctorFinding:
         )
         return error(_CHECK, subject, text, fix)
     text = "the operator has not looked at the last change of this RosProxy yet"
-    fix = f"check that the operator runs: kubectl get pods -A -l {OPERATORS}"
+    fix = f"check that the operator runs: kubectl get pods -A -l {OPERATOR_SELECTOR}"
     if managers := _managers(operators, namespace):
         fix = _log(_id(managers[0]).namespace)
     return error(_CHECK, subject, text, fix)

@@ -49,7 +49,10 @@ def no_way_in(state: RosProxyOnNode, probe: RangeProbeStatus) -> str:
 
 
 def not_proven(state: RosProxyOnNode, probe: RangeProbeStatus | None) -> str:
-    """Why the test says nothing about outside. The name of the proxy precedes this text."""
+    """Why it is unknown whether outside reaches the ports, with the next step.
+
+    The name of the proxy precedes this text.
+    """
     if probe is None:
         return (
             f"has not tested {_target(state)} yet. The test needs a master that answers and a free "

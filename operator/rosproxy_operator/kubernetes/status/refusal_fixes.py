@@ -7,10 +7,10 @@ import re
 
 from rosproxy_operator.kubernetes.resources.model import RosProxy
 
-OF_ANOTHER = "the operator did not create"
+NOT_OURS = "the operator did not create"
 """Part of the error about a foreign object that has the name already."""
-_ENFORCE = "pod-security.kubernetes.io/enforce"
-_LIMITS = "the LimitRange of the namespace"
+_ENFORCE_LABEL = "pod-security.kubernetes.io/enforce"
+_LIMIT_RANGE = "the LimitRange of the namespace"
 # k8s.io/apiserver, pkg/admission/plugin/resourcequota/controller.go; k8s.io/kubernetes,
 # pkg/quota/v1/evaluator/core/pods.go, plugin/pkg/admission/limitranger and priority/admission.go;
 # k8s.io/apiserver, pkg/admission/plugin/webhook/errors/statuserror.go.
@@ -18,13 +18,13 @@ _ADMISSION = (
     (r"exceeded quota.* requested: [^ ]*(cpu|memory|storage)",
      "Raise this ResourceQuota, or lower spec.resources"),
     (r"exceeded quota|insufficient quota", "Raise this ResourceQuota"),
-    (r"minimum \S+ usage per", f"Raise spec.resources, or lower the minimum in {_LIMITS}"),
+    (r"minimum \S+ usage per", f"Raise spec.resources, or lower the minimum in {_LIMIT_RANGE}"),
     (r"maximum \S+ usage per .* no (request|limit) is specified",
-     f"Set this resource in spec.resources, or a default in {_LIMITS}"),
-    (r"maximum \S+ usage per", f"Lower spec.resources, or raise the maximum in {_LIMITS}"),
+     f"Set this resource in spec.resources, or a default in {_LIMIT_RANGE}"),
+    (r"maximum \S+ usage per", f"Lower spec.resources, or raise the maximum in {_LIMIT_RANGE}"),
     (r"max limit to request ratio",
      "Set requests and limits in spec.resources that differ less, or raise the ratio in "
-     f"{_LIMITS}"),
+     f"{_LIMIT_RANGE}"),
     (r"no priorityclass with name",
      "Create this PriorityClass, or correct the webhook that names it in pods"),
     (r"admission webhook .* denied the request", "Allow this object in the policy of the webhook"),
@@ -32,7 +32,7 @@ _ADMISSION = (
     (r"is invalid", "Correct the named field in the RosProxy's spec"),
     (r"user .* cannot",
      "The operator lacks a right. Install the operator's chart or manifests again"),
-    (OF_ANOTHER, "Delete that object, or use another name for the RosProxy"),
+    (NOT_OURS, "Delete that object, or use another name for the RosProxy"),
 )  # fmt: skip
 # k8s.io/kubernetes, pkg/scheduler/framework/plugins (tainttoleration, noderesources), and
 # pkg/kubelet/lifecycle/predicate.go.
@@ -95,7 +95,7 @@ def _unset_fix(low: str) -> str:
     names = re.findall(r"(?:limits\.|requests\.)?(?:cpu|memory|ephemeral-storage)\b", wanted)
     fields = [name if "." in name else f"requests.{name}" for name in dict.fromkeys(names)]
     where = " and ".join(f"spec.resources.{field}" for field in fields) or "spec.resources"
-    return f"Set {where}, or a default in {_LIMITS}"
+    return f"Set {where}, or a default in {_LIMIT_RANGE}"
 
 
 def _security_fix(low: str, rosproxy: RosProxy) -> str:
@@ -107,5 +107,5 @@ def _security_fix(low: str, rosproxy: RosProxy) -> str:
         takes += ", and the LAN relay of a proxy needs hostNetwork"
     return (
         f"A proxy needs {takes}. This requires Pod Security privileged. Run kubectl label namespace"
-        f" {rosproxy.id.namespace} {_ENFORCE}=privileged --overwrite"
+        f" {rosproxy.id.namespace} {_ENFORCE_LABEL}=privileged --overwrite"
     )

@@ -47,10 +47,10 @@ The API server refuses an object of more than 1.5 MB (etcd, --max-request-bytes)
 MOST_NAMES = 50
 """Names of ROS nodes in a line of ``perNode`` at most."""
 MOST_NAMES_OF_ALL = 4000
-"""Names in all lines at most: 4,000 names of `_NAME` characters take 400 kB."""
-_NAME = 100
-_MESSAGE = 300
-_BY_NODE = 400
+"""Names in all lines at most: 4,000 names of `_MOST_NAME_CHARACTERS` characters take 400 kB."""
+_MOST_NAME_CHARACTERS = 100
+_MOST_LINE_MESSAGE_CHARACTERS = 300
+_MOST_BY_NODE_CHARACTERS = 400
 # As for the reason of a metav1.Condition in k8s.io/apimachinery, pkg/apis/meta/v1/types.go.
 _REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
 _NO_PODS = "NoPods"
@@ -88,15 +88,15 @@ def status_of(
     """
     former = rosproxy.status
     shown = _shown_nodes(states)
-    names = min(MOST_NAMES, MOST_NAMES_OF_ALL // max(len(shown), 1))
-    lines = [_line(rosproxy, state, names) for state in shown]
-    nodes = sum(int_at(line, "rosNodes") for line in lines)
+    most_names = min(MOST_NAMES, MOST_NAMES_OF_ALL // max(len(shown), 1))
+    lines = [_line(rosproxy, state, most_names) for state in shown]
+    ros_nodes = sum(int_at(line, "rosNodes") for line in lines)
     wanted = [state for state in states if state.pods]
     spec = rosproxy.spec
-    members = sum(int_at(line, "participants") for line in lines)
-    served = [plural(nodes, "ROS node")] if spec.ros1 else []
+    participant_count = sum(int_at(line, "participants") for line in lines)
+    served = [plural(ros_nodes, "ROS node")] if spec.ros1 else []
     if spec.ros2:
-        served.append(f"{plural(members, 'participant')} of domain {spec.ros2.number}")
+        served.append(f"{plural(participant_count, 'participant')} of domain {spec.ros2.number}")
     ready = _ready(rosproxy, wanted, problems, " and ".join(served))
     judged = (
         ready,
@@ -109,10 +109,10 @@ def status_of(
         "observedGeneration": rosproxy.generation,
         "message": _message(ready, problems),
         **_addressed(rosproxy, cluster_ip, master),
-        **({"domain": spec.ros2.number, "participants": members} if spec.ros2 else {}),
+        **({"domain": spec.ros2.number, "participants": participant_count} if spec.ros2 else {}),
         "nodes": len(wanted),
         "proxies": f"{sum(map(_serving, wanted))}/{len(wanted)}",
-        "rosNodes": nodes,
+        "rosNodes": ros_nodes,
         "topics": _topics(states, former),
         "addresses": _addresses(wanted),
         "ports": _ports(states),
@@ -149,7 +149,7 @@ def _addressed(rosproxy: RosProxy, cluster_ip: str, master: str) -> dict[str, ob
 
 
 def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
-    """The former status of a RosProxy that can't be used, with other conditions Ready and Degraded.
+    """The former status of a RosProxy that can't be used, with new conditions Ready and Degraded.
 
     All other conditions stay, because the operator leaves the existing proxies as they are.
     """
@@ -178,7 +178,8 @@ def _shown_nodes(states: Sequence[RosProxyOnNode]) -> list[RosProxyOnNode]:
     return sorted(ranked[:MOST_NODES], key=lambda state: state.name)
 
 
-def _line(rosproxy: RosProxy, state: RosProxyOnNode, names: int) -> dict[str, object]:
+def _line(rosproxy: RosProxy, state: RosProxyOnNode, most_names: int) -> dict[str, object]:
+    """The entry of ``perNode`` for a node, with ``most_names`` names of ROS nodes at most."""
     proxy = state.proxy
     problem = next(iter(node_findings(rosproxy, state)), None)
     line = {
@@ -188,8 +189,8 @@ def _line(rosproxy: RosProxy, state: RosProxyOnNode, names: int) -> dict[str, ob
         "proxy": proxy.pod.id.name if proxy else "",
         "ready": _serving(state),
         "pods": len(state.pods),
-        **_ros(state, names, rosproxy.status),
-        "message": bounded(_one_line(problem), _MESSAGE) if problem else "",
+        **_ros(state, most_names, rosproxy.status),
+        "message": bounded(_one_line(problem), _MOST_LINE_MESSAGE_CHARACTERS) if problem else "",
     }
     return {key: value for key, value in line.items() if value != ""}
 
@@ -198,11 +199,11 @@ def _ros(state: RosProxyOnNode, limit: int, former: Json) -> dict[str, object]:
     """The ROS nodes and topics behind a proxy, by the present answer or else the former status."""
     if _has_answered(state.answer):
         names = sorted({name for group in state.answer.nodes.values() for name in group})
-        shown = [shorten(clean(name), _NAME) for name in names[:limit]]
+        shown = [shorten(clean(name), _MOST_NAME_CHARACTERS) for name in names[:limit]]
         by_address = state.answer.participants
-        members = {"participants": sum(map(len, by_address.values()))} if by_address else {}
+        counted = {"participants": sum(map(len, by_address.values()))} if by_address else {}
         count = len(state.answer.topics)
-        return {"rosNodes": len(names), "names": shown, "topics": count, **members}
+        return {"rosNodes": len(names), "names": shown, "topics": count, **counted}
     lines = submaps(former, "perNode") if state.proxy is not None else ()
     last = next((line for line in lines if line.get("name") == state.name), {})
     return {
@@ -218,6 +219,7 @@ def _has_answered(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:
 
 
 def _topics(states: Sequence[RosProxyOnNode], former: Json) -> int:
+    """The number of topics; at least the former number while a proxy has not answered."""
     answers = [state.answer for state in states if state.proxy is not None]
     count = len({topic for answer in answers if _has_answered(answer) for topic in answer.topics})
     return count if all(map(_has_answered, answers)) else max(count, int_at(former, "topics"))
@@ -229,7 +231,8 @@ def _ports(states: Sequence[RosProxyOnNode]) -> str:
     if len(set(ranges.values())) <= 1:
         return next(iter(ranges.values()), "")
     return bounded(
-        ", ".join(f"{name}: {ports}" for name, ports in sorted(ranges.items())), _BY_NODE
+        ", ".join(f"{name}: {ports}" for name, ports in sorted(ranges.items())),
+        _MOST_BY_NODE_CHARACTERS,
     )
 
 
@@ -241,7 +244,7 @@ def _addresses(wanted: Sequence[RosProxyOnNode]) -> str:
         f"{name}: {host}{' (not ready)' if name in waiting else ''}"
         for name, host in sorted(hosts.items())
     )
-    return bounded(", ".join(lines), _BY_NODE)
+    return bounded(", ".join(lines), _MOST_BY_NODE_CHARACTERS)
 
 
 def _live_page(wanted: Sequence[RosProxyOnNode]) -> str:

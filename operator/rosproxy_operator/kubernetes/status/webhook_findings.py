@@ -18,8 +18,8 @@ from rosproxy_operator.kubernetes.status.operator_findings import describe_opera
 NAME = "wire.rosproxy.io"
 """The name of the webhook in the MutatingWebhookConfiguration."""
 _CHECK = "webhook"
-_ANEW = "then create unwired pods again: kubectl rollout restart"
-_INSTALL = "create the object again: helm upgrade, or kubectl apply -f manifests/install.yaml"
+_REWIRE = "then create unwired pods again: kubectl rollout restart"
+_REINSTALL = "create the object again: helm upgrade, or kubectl apply -f manifests/install.yaml"
 
 
 class WebhookFacts(msgspec.Struct, frozen=True):
@@ -66,11 +66,11 @@ def _missing(operators: tuple[Json, ...] | None) -> DoctorFinding:
         f"{INJECT} is wired"
     )
     if operators is None:
-        fix = f"unless the webhook is switched off (webhook.enabled=false), {_INSTALL}; {_ANEW}"
+        fix = f"unless the webhook is switched off (webhook.enabled=false), {_REINSTALL}; {_REWIRE}"
         return warning(_CHECK, _CHECK, text, fix)
     if any(_serves(pod) for pod in operators):
         text = f"{text}, although operators serve the webhook"
-        return error(_CHECK, _CHECK, text, f"{_INSTALL}; {_ANEW}")
+        return error(_CHECK, _CHECK, text, f"{_REINSTALL}; {_REWIRE}")
     text = f"{text}. The operators do not serve the webhook (webhook.enabled=false)"
     return note(_CHECK, _CHECK, text)
 
@@ -91,16 +91,16 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
             "the configuration has no caBundle, so the API server trusts no operator, and no pod "
             "is wired"
         )
-        yield error(_CHECK, subject, text, f"{_ca_fix(metadata, service)}; {_ANEW}")
+        yield error(_CHECK, subject, text, f"{_ca_fix(metadata, service)}; {_REWIRE}")
     if not service.name or service not in facts.ready:
         return
     ready = facts.ready[service]
     if ready is None:
         text = f"the Service {service} of the webhook does not exist, so no pod is wired"
-        yield error(_CHECK, subject, text, f"{_INSTALL}; {_ANEW}")
+        yield error(_CHECK, subject, text, f"{_REINSTALL}; {_REWIRE}")
     elif not ready:
         text = f"the Service {service} of the webhook has no ready endpoint, so no pod is wired"
-        yield error(_CHECK, subject, text, f"{describe_operators(service.namespace)}; {_ANEW}")
+        yield error(_CHECK, subject, text, f"{describe_operators(service.namespace)}; {_REWIRE}")
     elif not lacks_ca and facts.unreached:
         yield _cut_off(subject, service, facts.unreached)
     elif not lacks_ca:
@@ -118,7 +118,7 @@ def _cut_off(subject: str, service: Name, pods: Sequence[str]) -> DoctorFinding:
         "allow connections from the API server to the webhook port of the operator's pods in "
         "namespace "
         f"{service.namespace} (NetworkPolicy, firewall of the control plane); the API server's log "
-        f'has failed calling webhook "{NAME}"; {_ANEW}'
+        f'has failed calling webhook "{NAME}"; {_REWIRE}'
     )
     return error(_CHECK, subject, text, fix)
 

@@ -5,9 +5,9 @@ reads the RosProxies of the namespace and the RosProxy's Service from the API se
 chooses the RosProxy and the variables. If a user creates the pod together with the RosProxy, the
 Service may be missing. Then the injector wakes the operator, and the pod waits.
 
-The injector writes nothing: only the operator creates the Service, because only the operator knows
-the former address, the owner and the retries. The injector admits the pod in every case. If the pod
-is not wired, a warning gives the problem and the fix.
+The injector writes nothing. The Service is created by the plan of a look, which knows the former
+address, the owner and the retries. The injector admits the pod in every case. If the pod is not
+wired, a warning gives the problem and the fix.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import service_id
 from rosproxy_operator.kubernetes.resources.spec import rosproxies
 from rosproxy_operator.kubernetes.settings import ClusterSettings
-from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
+from rosproxy_operator.kubernetes.status.refusal_fixes import NOT_OURS
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +79,7 @@ class Injector:
         self._wake = wake
 
     async def wiring(self, body: Json, dry_run: bool) -> Wiring:
-        """The wiring of a pod; on any error a warning only. A ``dry_run`` waits for no Service."""
+        """The wiring of a pod, or a warning after an error. A ``dry_run`` waits for no Service."""
         deadline = time.monotonic() + ADMISSION_TIMEOUT_S
         try:
             wiring, hold = await self._wiring_by(body, dry_run, deadline)
@@ -101,7 +101,7 @@ class Injector:
         Tries until the deadline, because an API server may be starting, or the Service may be
         missing. Raises ApiError, NotWired.
         """
-        missing = (
+        timeout_text = (
             f"the API server did not answer within {ADMISSION_TIMEOUT_S:g} s. Create the pod again"
         )
         while True:
@@ -113,13 +113,14 @@ class Injector:
             except NoService as error:
                 if dry_run:
                     raise
-                missing = str(error)
+                timeout_text = str(error)
                 self._wake()
             except TimeoutError:
-                raise NotWired(missing) from None
+                raise NotWired(timeout_text) from None
             await asyncio.sleep(RETRY_INTERVAL_S)
 
     def _wiring(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
+        """The wiring of a pod, and the seconds to hold the pod. Raises ApiError, NotWired."""
         pod = objects.pod(body)
         namespace = pod.id.namespace
         # Without a namespace, the API server would list the RosProxies of all namespaces. An API
@@ -152,7 +153,7 @@ class Injector:
             raise self._missing(rosproxy) from None
         service = objects.service(manifest)
         if service is None:
-            text = f"a Service {id} exists already that {OF_ANOTHER}. Delete that Service, or use"
+            text = f"a Service {id} exists already that {NOT_OURS}. Delete that Service, or use"
             raise NotWired(f"{text} another name for the RosProxy")
         if service.owner != rosproxy.uid or service.deleting or not service.cluster_ip:
             raise self._missing(rosproxy)
@@ -165,7 +166,7 @@ class Injector:
         )
 
     def _missing(self, rosproxy: RosProxy) -> NotWired:
-        """The error for a RosProxy without a Service.
+        """The error for a RosProxy without a usable Service.
 
         NotWired if the RosProxy asks for more than the administrator allows. Else NoService: the
         operator is about to create the Service, and the pod waits.
@@ -179,7 +180,7 @@ class Injector:
         )
 
     def _consents(self, rosproxy: RosProxy) -> Consents:
-        """The namespaces whose RosProxies may name the Service of this RosProxy's master."""
+        """The other namespaces whose RosProxies may name the Service of this RosProxy's master."""
         service = rosproxy.spec.master.service
         if service is None:
             return {}

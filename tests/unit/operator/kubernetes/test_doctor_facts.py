@@ -28,7 +28,7 @@ from rosproxy_operator.kubernetes.resources.names import (
 )
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 from rosproxy_operator.kubernetes.status.event_findings import (
-    MOST,
+    MOST_EVENTS,
     RecentEvent,
     event_findings,
     recent_events,
@@ -373,9 +373,9 @@ def test_where_there_is_no_rosproxy_an_event_is_not_over() -> None:
 
 def test_events_are_bounded_and_harmless() -> None:
     proxy = proxy_obj()
-    events = [event(proxy, f"R{n}", "x" * 9000 + "\x1b", float(n)) for n in range(MOST + 5)]
+    events = [event(proxy, f"R{n}", "x" * 9000 + "\x1b", float(n)) for n in range(MOST_EVENTS + 5)]
     texts = found(events)
-    assert len(texts) == MOST
+    assert len(texts) == MOST_EVENTS
     assert all(len(text) < 600 and "\x1b" not in text for text in texts)
 
 

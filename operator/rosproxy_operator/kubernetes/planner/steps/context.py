@@ -26,7 +26,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     token_of,
 )
 from rosproxy_operator.kubernetes.settings import ClusterSettings
-from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
+from rosproxy_operator.kubernetes.status.refusal_fixes import NOT_OURS
 
 NODE_GONE_AFTER_S = 10.0
 """Seconds that a node must be missing before the operator deletes the node's proxies."""
@@ -68,25 +68,25 @@ class ClusterContext(msgspec.Struct, frozen=True):
         return service.cluster_ip if service and service.owner == rosproxy.uid else ""
 
     def grace_left(self, place: ProxyPlace) -> float:
-        """The seconds until ``spec.grace`` of a proxy ends that no pod wants any more."""
+        """The seconds that are left of ``spec.grace`` for a proxy that no pod wants any more."""
         grace = self.view.rosproxies[place.of].spec.grace
         return grace - (self.now - self.state.absent.get(place, self.now))
 
     def seconds_until_torn_down(self, place: ProxyPlace) -> float:
-        """The seconds until a proxy's former pod is sure to hold no UDP ports."""
+        """The seconds until a proxy's former pod is sure to hold no UDP ports; 0 or less: now."""
         since = self.observed.vanished.get(place)
         takes_udp = self.view.rosproxies[place.of].spec.takes_udp
         return 0.0 if since is None or not takes_udp else TORN_DOWN_WITHIN_S - (self.now - since)
 
     def seconds_until_lost(self, node: str) -> float:
-        """The seconds until a missing node counts as gone."""
+        """The seconds until a missing node counts as gone; 0 or less: now."""
         return NODE_GONE_AFTER_S - (self.now - self.state.lost.get(node, self.now))
 
 
 def master_of(rosproxy: RosProxy, observed: ClusterSnapshot) -> tuple[MasterSpec | None, str]:
     """Return the master for the proxies of a RosProxy, or None and the fault.
 
-    Without ROS 1 the master is empty.
+    For a Service, the URI has the Service's DNS name. Without ROS 1 the master is empty.
     """
     master = rosproxy.spec.master
     if master.service is None:
@@ -147,7 +147,7 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
         return Obstacle("PortsExhausted", context.ranges.exhausted[place])
     name = proxy_id(place.of, place.node)
     if name in context.view.other_pod_names:
-        text = f"a pod {name} exists already that {OF_ANOTHER}"
+        text = f"a pod {name} exists already that {NOT_OURS}"
         return Obstacle("NameTaken", f"{text}. Delete that pod, or create it under another name")
     publish = master.publish if place in context.ranges.published else 0
     token = token_of(context.observed.key, name, node.name)
