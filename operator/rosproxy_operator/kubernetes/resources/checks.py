@@ -18,7 +18,10 @@ def quoted(value: object) -> str:
 
 
 def host_problem(host: str) -> str:
-    """Return why outside can't reach a node at this host name or address, empty if outside can."""
+    """Return why a text can't be an advertised host, empty if the text can.
+
+    The check is of the form only: a host name or an address that is not loopback.
+    """
     try:
         parse_host("host", host)
     except SettingError:

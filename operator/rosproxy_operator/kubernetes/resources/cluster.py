@@ -114,7 +114,7 @@ class ProxyReport(msgspec.Struct, frozen=True):
     - ``error``: why the proxy does not answer, or does not reach its master.
     - ``nodes``: names of ROS 1 nodes, by the IP address of their pod.
     - ``topics``: names of all topics inside.
-    - ``problems``: texts of the proxy's current problems.
+    - ``problems``: texts of the proxy's present and recent problems, without denials.
     - ``refusal``: why the proxy refuses its policy.
     - ``participants``: GUID prefixes of ROS 2 participants, by the IP address of their pod.
     - ``leases``: ports of participants, by GUID prefix.
@@ -159,7 +159,7 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
     node without pods, so that the node gets the same ``range`` again. ``range`` is None if no range
     is free. ``proxy`` is the pod that serves the node, None if there is no such pod. ``lan_relay``
     is the proxy's LAN relay, ``image_check`` the check of the proxy's next image. ``answer`` is the
-    proxy's report.
+    proxy's report, None before the first report.
     """
 
     name: str

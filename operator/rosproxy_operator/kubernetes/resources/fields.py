@@ -13,7 +13,7 @@ from rosproxy_operator.kubernetes.resources.checks import quoted
 
 N = TypeVar("N", int, float)
 V = TypeVar("V")
-_NOTHING: Mapping[str, Any] = {}
+_EMPTY_MAP: Mapping[str, Any] = {}
 
 
 class InvalidField(Exception):
@@ -24,7 +24,8 @@ class Field(msgspec.Struct, frozen=True):
     """A field of an object. ``value`` is None if the field is missing.
 
     ``path`` names the field as Kubernetes does, for example ``spec.peers[0]``. All methods except
-    `error` raise InvalidField if the value has another type, or is out of bounds.
+    `error` raise InvalidField if the value has another type, or is out of bounds. For a missing
+    field, the methods return the default, or else an empty value.
     """
 
     path: str
@@ -37,7 +38,7 @@ class Field(msgspec.Struct, frozen=True):
     def __getitem__(self, key: str) -> "Field":
         return Field(f"{self.path}.{key}", self.map().get(key))
 
-    def map(self, default: Mapping[str, Any] = _NOTHING) -> Mapping[str, Any]:
+    def map(self, default: Mapping[str, Any] = _EMPTY_MAP) -> Mapping[str, Any]:
         """Return the value as a map, without a check of its entries."""
         return self._checked(dict, default, "a map of fields")
 
@@ -76,7 +77,10 @@ class Field(msgspec.Struct, frozen=True):
         return kind(self.value)
 
     def one_of(self, allowed: Mapping[str, V], default: str) -> V:
-        """Return the value that ``allowed`` has for the text. Another text is invalid."""
+        """Return the value that ``allowed`` has for the text. Another text is invalid.
+
+        So a missing field is invalid unless ``allowed`` has the default.
+        """
         text = self.text(default)
         if text not in allowed:
             fix = f"Write one of {', '.join(sorted(filter(None, allowed)))}"

@@ -17,7 +17,7 @@ from rosproxy_operator.kubernetes.resources.model import Json
 Kind = Literal["pods", "nodes", "Services of masters", "RosProxies"]
 
 
-class _Named(NamedTuple):
+class _KnownName(NamedTuple):
     """A name that users set: a label or an annotation (``place``), and the ``kind`` of object."""
 
     name: str
@@ -28,17 +28,17 @@ class _Named(NamedTuple):
         return f"the {self.place} {self.name} of {self.kind}"
 
 
-_USERS = (
-    _Named(names.INJECT, "label", "pods"),
-    _Named(names.ADVERTISE_HOST, "annotation", "nodes"),
-    _Named(names.ALLOW_FROM, "annotation", "Services of masters"),
-    _Named(names.REMAKE, "annotation", "RosProxies"),
+_NAMES_FOR_USERS = (
+    _KnownName(names.INJECT, "label", "pods"),
+    _KnownName(names.ADVERTISE_HOST, "annotation", "nodes"),
+    _KnownName(names.ALLOW_FROM, "annotation", "Services of masters"),
+    _KnownName(names.REMAKE, "annotation", "RosProxies"),
 )
-_BY_NAME = {named.name: named for named in _USERS}
-_BY_END = {named.name.partition("/")[2]: named for named in _USERS}
-_NEAR_END = 0.6
+_BY_NAME = {named.name: named for named in _NAMES_FOR_USERS}
+_BY_END = {named.name.partition("/")[2]: named for named in _NAMES_FOR_USERS}
+_LEAST_END_SIMILARITY = 0.6
 """Least similarity (`spelling.nearest`) of the part after the prefix, for a suggestion."""
-_OPERATORS = frozenset(
+_NAMES_OF_OPERATOR = frozenset(
     {
         *(names.PROXY_OF, names.NODE, names.PORT_RANGE, names.FINGERPRINT),
         *(names.MASTER_URI, names.REPLACED_URI, names.STATIC_PEERS),
@@ -54,7 +54,10 @@ MOST_CHECKED_NAMES = 256
 
 
 def misspelt_names(metadata: Json, kind: Kind) -> tuple[str, ...]:
-    """Return a warning for each misspelt name of an object, for at most `MOST_MISSPELT_NAMES`."""
+    """Return a warning for each misspelt name of an object, for at most `MOST_MISSPELT_NAMES`.
+
+    Empty for an object that the operator has created.
+    """
     if names.is_own(texts_at(metadata, "labels")):
         return ()
     return tuple(islice(_texts(metadata, kind), MOST_MISSPELT_NAMES))
@@ -65,13 +68,13 @@ def _texts(metadata: Json, kind: Kind) -> Iterator[str]:
         own_first = sorted(texts_at(metadata, key), key=lambda name: (not _is_ours(name), name))
         for name in own_first[:MOST_CHECKED_NAMES]:
             named = _BY_NAME.get(name)
-            if name in _OPERATORS or (named and (named.place, named.kind) == (place, kind)):
+            if name in _NAMES_OF_OPERATOR or (named and (named.place, named.kind) == (place, kind)):
                 continue
             shown = f"{place} {shorten(clean(name), 100)}"
             if named:
                 yield f"{shown} is ignored here. The operator reads only {named}"
             elif _is_ours(name) or nearest(name, tuple(_BY_NAME), LEAST_SIMILARITY):
-                yield f"{shown} is unknown and ignored. {_meant(name, kind)}"
+                yield f"{shown} is unknown and ignored. {_suggestion(name, kind)}"
 
 
 def _is_ours(name: str) -> bool:
@@ -79,10 +82,10 @@ def _is_ours(name: str) -> bool:
     return name.lower().startswith(_PREFIXES)
 
 
-def _meant(name: str, kind: Kind) -> str:
+def _suggestion(name: str, kind: Kind) -> str:
     # Only the part after the prefix is compared, because all names have the same prefix.
     _, slash, last = name.rpartition("/")
-    near = nearest(last if slash else name.partition(".")[2], tuple(_BY_END), _NEAR_END)
+    near = nearest(last if slash else name.partition(".")[2], tuple(_BY_END), _LEAST_END_SIMILARITY)
     if near:
         return f"Did you mean {_BY_END[near]}?"
-    return f"Known: {' and '.join(str(named) for named in _USERS if named.kind == kind)}"
+    return f"Known: {' and '.join(str(named) for named in _NAMES_FOR_USERS if named.kind == kind)}"

@@ -63,7 +63,7 @@ class MasterSpec(msgspec.Struct, frozen=True):
 
 
 class Ros2Spec(msgspec.Struct, frozen=True):
-    """The ROS 2 fields of a RosProxy. ``peers`` are hosts outside.
+    """The ROS 2 fields of a RosProxy. ``peers`` are hosts outside, or HOST:PORT of other proxies.
 
     With ``domain`` None, the domain is 0, and the webhook sets no ROS_DOMAIN_ID in pods.
     """
@@ -100,7 +100,8 @@ class MaxUnavailable(msgspec.Struct, frozen=True):
 class RosProxySpec(msgspec.Struct, frozen=True):
     """The spec of a RosProxy, with the fields of the custom resource definition.
 
-    With ``pod_selector`` None, the RosProxy selects pods whose label rosproxy.io/inject is "true"
+    ``ports`` is the number of ports in the range of each proxy. The ranges lie in ``window``. With
+    ``pod_selector`` None, the RosProxy selects pods whose label rosproxy.io/inject is "true"
     or the RosProxy's name. ``cleanup_after`` and ``grace`` are in seconds. An empty ``image`` means
     the operator's default. ``policy`` has at most a single layer.
 

@@ -22,7 +22,7 @@ PROXY_OF = "rosproxy.io/proxy-of"
 NODE = "rosproxy.io/node"
 """Annotation of the operator's pods: the node that the operator has chosen."""
 PORT_RANGE = "rosproxy.io/port-range"
-"""Annotation of proxies' pods."""
+"""Annotation of proxies' pods: the range."""
 FINGERPRINT = "rosproxy.io/fingerprint"
 """Annotation of the operator's pods and Services."""
 ADVERTISE_HOST = "rosproxy.io/advertise-host"
@@ -49,10 +49,12 @@ LAN_RELAY = "lan-relay"
 IMAGE_CHECK = "image-check"
 _FORMER_LAN_RELAY = "ear"
 """Component of LAN relays from operators before 0.1.0. The operator recreates such a relay."""
-_OWN = {NAME_LABEL: "rosproxy", MANAGED_BY_LABEL: "rosproxy-operator"}
+_OWN_LABELS = {NAME_LABEL: "rosproxy", MANAGED_BY_LABEL: "rosproxy-operator"}
 _COMPONENTS = (_FORMER_LAN_RELAY, IMAGE_CHECK, LAN_RELAY, PROXY)
-_EITHER = f"{COMPONENT_LABEL} in ({','.join(_COMPONENTS)})"
-OWN_SELECTOR = ",".join([*(f"{label}={value}" for label, value in _OWN.items()), _EITHER])
+_COMPONENT_SELECTOR = f"{COMPONENT_LABEL} in ({','.join(_COMPONENTS)})"
+OWN_SELECTOR = ",".join(
+    [*(f"{label}={value}" for label, value in _OWN_LABELS.items()), _COMPONENT_SELECTOR]
+)
 """Label selector of all objects that the operator creates."""
 
 MASTER_PORT = 11311
@@ -73,12 +75,12 @@ _MOST_NODE_NAME_CHARACTERS = 30
 
 def own_labels(rosproxy: str, component: str = PROXY) -> dict[str, str]:
     """Return the labels of an object that the operator creates for a RosProxy."""
-    return {**_OWN, COMPONENT_LABEL: component, PROXY_OF: rosproxy}
+    return {**_OWN_LABELS, COMPONENT_LABEL: component, PROXY_OF: rosproxy}
 
 
 def is_own(labels: Mapping[str, str]) -> bool:
     """Whether labels are the labels of an object that the operator has created."""
-    same = all(labels.get(label) == value for label, value in _OWN.items())
+    same = all(labels.get(label) == value for label, value in _OWN_LABELS.items())
     return same and labels.get(COMPONENT_LABEL) in _COMPONENTS and PROXY_OF in labels
 
 
@@ -97,7 +99,7 @@ def service_id(rosproxy: Name) -> Name:
 
 @lru_cache(maxsize=8192)
 def proxy_id(rosproxy: Name, node: str) -> Name:
-    """Return the name of a RosProxy's proxy on a node.
+    """Return the namespace and name of the pod for a RosProxy's proxy on a node.
 
     The name is always the same. So the API server refuses a second pod for the same place.
     """
@@ -112,13 +114,13 @@ def proxy_id(rosproxy: Name, node: str) -> Name:
 
 
 def lan_relay_id(rosproxy: Name, node: str) -> Name:
-    """Return the name of the LAN relay for a RosProxy's proxy on a node."""
+    """Return the namespace and name of the LAN relay for a RosProxy's proxy on a node."""
     proxy = proxy_id(rosproxy, node)
     return Name(proxy.namespace, f"{proxy.name}-lan-relay")
 
 
 def image_check_id(rosproxy: Name, node: str) -> Name:
-    """Return the name of the image check for a RosProxy's proxy on a node."""
+    """Return the namespace and name of the image check for a RosProxy's proxy on a node."""
     proxy = proxy_id(rosproxy, node)
     return Name(proxy.namespace, f"{proxy.name}-{IMAGE_CHECK}")
 

@@ -37,7 +37,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.pod_failures import pod_failure
 
-VARIABLE = "ROS_MASTER_URI"
+MASTER_VARIABLE = "ROS_MASTER_URI"
 ROS2_VARIABLES = frozenset(
     {
         "ROS_STATIC_PEERS",
@@ -55,7 +55,7 @@ MOST_LABELS = 128
 The operator keeps all pods of the cluster in memory, and a pod may have a megabyte of labels.
 """
 _TEMPLATE_HASH = "pod-template-hash"
-_RESTARTED = ("StatefulSet", "DaemonSet")
+_RESTARTABLE_KINDS = ("StatefulSet", "DaemonSet")
 """Kinds of pods' controllers that `kubectl rollout restart` takes directly."""
 MOST_CONTAINERS = 64
 """Containers that are kept of a pod, and as many values of ROS_MASTER_URI, to bound the memory."""
@@ -284,7 +284,7 @@ def _host_ports(spec: Json, protocol: str) -> Iterator[int]:
 def _masters(spec: Json) -> Iterator[str]:
     for container in (*submaps(spec, "initContainers"), *submaps(spec, "containers")):
         for variable in submaps(container, "env"):
-            if variable.get("name") == VARIABLE:
+            if variable.get("name") == MASTER_VARIABLE:
                 value = text_at(variable, "value")
                 is_indirect = variable.get("valueFrom") is not None or "$(" in value
                 yield VALUE_AT_RUNTIME if is_indirect else value
@@ -304,7 +304,7 @@ def _workload(meta: Json) -> str:
     controller = _controller(meta)
     kind = text_at(controller, "kind")
     name = _short(text_at(controller, "name"))
-    if kind in _RESTARTED:
+    if kind in _RESTARTABLE_KINDS:
         return f"{kind.lower()}/{name}"
     suffix = f"-{texts_at(meta, 'labels').get(_TEMPLATE_HASH, '')}"
     is_of_deployment = kind == "ReplicaSet" and len(suffix) > 1 and name.endswith(suffix)

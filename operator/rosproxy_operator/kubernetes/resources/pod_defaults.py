@@ -21,10 +21,10 @@ RESOURCES: Json = {
     "limits": {"memory": "512Mi"},
 }
 USER = 10001
-"""The user and the group of the proxy's image."""
-_RESERVED = (GROUP, NAME_LABEL.partition("/")[0])
+"""The uid and the gid in the proxy's image."""
+_RESERVED_PREFIXES = (GROUP, NAME_LABEL.partition("/")[0])
 """Prefixes of the labels and annotations that the operator writes itself."""
-_REPLACED = ("image_pull_secrets", "node_selector", "tolerations", "resources")
+_REPLACEABLE_FIELDS = ("image_pull_secrets", "node_selector", "tolerations", "resources")
 """Fields of a RosProxy's spec that replace defaults."""
 _QUANTITY = re.compile(r"[0-9]+(\.[0-9]*)?([KMGTPE]i|[numkMGTPE]|[eE][+-]?[0-9]+)?", re.ASCII)
 _OPERATORS = {operator: operator for operator in ("Equal", "Exists")}
@@ -50,7 +50,10 @@ class PodDefaults(msgspec.Struct, frozen=True):
 
 
 def pod_defaults(value: Any) -> PodDefaults:
-    """Return the defaults in the chart's value ``proxy.pod``. Raises InvalidField."""
+    """Return the defaults in the chart's value ``proxy.pod``. Raises InvalidField.
+
+    A field that the value lacks has no default, also ``resources`` and ``runAsUser``.
+    """
     field = Field("proxy.pod", stripped(value))
     _check_names(
         field,
@@ -82,7 +85,11 @@ def with_pod_defaults(observed: ClusterSnapshot, defaults: PodDefaults) -> Clust
 
 def _completed(rosproxy: RosProxy, defaults: PodDefaults) -> RosProxy:
     spec = rosproxy.spec
-    given = {name: getattr(defaults, name) for name in _REPLACED if getattr(spec, name) is None}
+    given = {
+        name: getattr(defaults, name)
+        for name in _REPLACEABLE_FIELDS
+        if getattr(spec, name) is None
+    }
     if not given:
         return rosproxy
     return msgspec.structs.replace(rosproxy, spec=msgspec.structs.replace(spec, **given))
@@ -96,7 +103,7 @@ def _check_names(field: Field, *names: str) -> None:
 
 def _check_prefixes(field: Field) -> None:
     for key in field.map():
-        if key.partition("/")[0] in _RESERVED:
+        if key.partition("/")[0] in _RESERVED_PREFIXES:
             problem = "has a prefix that the operator uses itself"
             raise Field(field.path, key).error(problem, "Choose another prefix")
 

@@ -18,7 +18,7 @@ PORTS_TAKEN = "didn't have free ports for the requested pod ports"
 
 The kubelet uses the same text with the reason ``NodePorts`` (pkg/kubelet/lifecycle/predicate.go).
 """
-_IMAGE = frozenset(
+_IMAGE_REASONS = frozenset(
     {
         "ErrImagePull",
         "ImagePullBackOff",
@@ -30,7 +30,7 @@ _IMAGE = frozenset(
     }
 )
 """Source: pkg/kubelet/images/types.go, and k8s.io/cri-api, pkg/errors/errors.go."""
-_SANDBOX = frozenset(
+_SANDBOX_REASONS = frozenset(
     {
         "CreateContainerConfigError",
         "PreCreateHookError",
@@ -43,7 +43,7 @@ _SANDBOX = frozenset(
     }
 )
 """Source in pkg/kubelet: kuberuntime/kuberuntime_container.go, container/sync_result.go."""
-_NOT_STARTED = ("StartError", "ContainerCannotRun")
+_NOT_STARTED_REASONS = ("StartError", "ContainerCannotRun")
 """Reasons of containerd and cri-dockerd if the container's program could not be started."""
 _BACK_OFF = re.compile(r'Back-off pulling image "[^"]*"(: )?')
 """Prefix that the kubelet puts before the last error while the kubelet waits for the next try.
@@ -51,8 +51,8 @@ _BACK_OFF = re.compile(r'Back-off pulling image "[^"]*"(: )?')
 Without the prefix, the message stays the same between tries (pkg/kubelet/images/image_manager.go).
 """
 _REASON = re.compile(r"(ErrImagePull|RegistryUnavailable|SignatureValidationFailed): ")
-_STAMP = re.compile(r"\d{4}-\d\d-\d\d[T ][\d:.,]+Z? *")
-_TAKEN = ("address already in use", "port is already allocated", "cannot open hostport")
+_TIMESTAMP = re.compile(r"\d{4}-\d\d-\d\d[T ][\d:.,]+Z? *")
+_PORT_TAKEN = ("address already in use", "port is already allocated", "cannot open hostport")
 """Texts of the runtimes that check a hostPort for listeners: CRI-O and cri-dockerd.
 
 The CNI plugin portmap reports nothing: its DNAT rules take the port over from the listener.
@@ -80,14 +80,14 @@ def pod_failure(status: Json) -> tuple[PodFailure | None, str]:
             return _unscheduled(text_at(condition, "reason"), text_at(condition, "message"))
     for container in submaps(status, "containerStatuses"):
         if container.get("name") in (CONTAINER, LAN_RELAY, IMAGE_CHECK):
-            return _waiting(container)
+            return _container_failure(container)
     return None, ""
 
 
 def stuck_by_event(message: str) -> PodFailure:
     """Return the cause in the message of a FailedCreatePodSandBox Event: PORTS or SANDBOX."""
     low = message.lower()
-    return PodFailure.PORTS if any(text in low for text in _TAKEN) else PodFailure.SANDBOX
+    return PodFailure.PORTS if any(text in low for text in _PORT_TAKEN) else PodFailure.SANDBOX
 
 
 def _failed(reason: str, message: str) -> tuple[PodFailure, str]:
@@ -110,7 +110,7 @@ def _unscheduled(reason: str, message: str) -> tuple[PodFailure | None, str]:
     )
 
 
-def _waiting(container: Json) -> tuple[PodFailure | None, str]:
+def _container_failure(container: Json) -> tuple[PodFailure | None, str]:
     """Return why a container does not run, also for a container that has ended at least twice.
 
     The kubelet reports CrashLoopBackOff only later, when the kubelet syncs the pod again. A proxy
@@ -126,10 +126,10 @@ def _waiting(container: Json) -> tuple[PodFailure | None, str]:
         last = submap(container, "lastState", "terminated")
         was_stopped = not int_at(last, "exitCode") and _was_stable(last)
         return (None, "") if was_stopped else _crashing(last)
-    if reason in _IMAGE:
+    if reason in _IMAGE_REASONS:
         bare = _REASON.sub("", _BACK_OFF.sub("", message), count=1)
         return PodFailure.IMAGE, _text("", bare) or reason
-    if reason in _SANDBOX:
+    if reason in _SANDBOX_REASONS:
         return PodFailure.SANDBOX, _text(reason, message)
     return None, ""
 
@@ -153,7 +153,7 @@ def _crashing(ended: Json) -> tuple[PodFailure, str]:
     """
     reason = text_at(ended, "reason")
     message = text_at(ended, "message")
-    if reason in _NOT_STARTED:
+    if reason in _NOT_STARTED_REASONS:
         return PodFailure.SANDBOX, _text("RunContainerError", message)
     ending = f"exit code {int_at(ended, 'exitCode')}"
     if ended and not int_at(ended, "exitCode"):
@@ -161,7 +161,7 @@ def _crashing(ended: Json) -> tuple[PodFailure, str]:
     if reason not in ("", "Error", "Completed"):
         ending = f"{reason}, {ending}"
     lines = message.strip().splitlines() or [""]
-    return PodFailure.CRASHING, _text(ending, _STAMP.sub("", lines[-1]))
+    return PodFailure.CRASHING, _text(ending, _TIMESTAMP.sub("", lines[-1]))
 
 
 def _text(reason: str, message: str) -> str:

@@ -40,7 +40,7 @@ Record = (
     | ProxyPolicy
 )
 Change = tuple[str, Record | None]
-"""An object's key, and the object's new record. None: the object is gone."""
+"""An object's key, and the object's new record. None: the object is gone, or has no record."""
 POLICIES = "networkpolicies"
 
 
@@ -91,7 +91,7 @@ def _shared(pod: Pod) -> Pod:
         phase=intern(pod.phase),
         controller=intern(pod.controller),
         labels={intern(key): intern(value) for key, value in pod.labels.items()},
-        # Most pods have a single address: then `ips` is shared with no copy.
+        # Most pods have a single address: then `ips` and `ip` share the text.
         ips=(pod.ip,) if pod.ips == (pod.ip,) else pod.ips,
         containers=tuple(replace(c, image=intern(c.image)) for c in pod.containers),
         misspelt=tuple(map(intern, pod.misspelt)),

@@ -53,7 +53,7 @@ from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, words
 MOST_PORTS = 500
 MOST_NAME_CHARACTERS = 46
 """Characters of a RosProxy's name. With more, a proxy's name would not fit in a host name."""
-_OF_ROS = {"1": ("master", WISHES["udp"].field), "2": ("domain", "peers", "multicast")}
+_FIELDS_BY_VERSION = {"1": ("master", WISHES["udp"].field), "2": ("domain", "peers", "multicast")}
 """The fields that belong to a single ROS version."""
 _POLICY_MODE = {"Enforce": PolicyMode.ENFORCE, "Audit": PolicyMode.AUDIT}
 _ACTION = {"Allow": RuleAction.ALLOW, "Deny": RuleAction.DENY}
@@ -82,7 +82,7 @@ _Value = TypeVar("_Value")
 def rosproxies(
     objs: Iterable[Json],
 ) -> tuple[dict[Name, RosProxy], dict[Name, InvalidRosProxy]]:
-    """Return the RosProxies, and the RosProxies with an invalid field."""
+    """Return the RosProxies, and the records of RosProxies with an invalid field, by name."""
     usable: dict[Name, RosProxy] = {}
     unusable: dict[Name, InvalidRosProxy] = {}
     for obj in objs:
@@ -109,7 +109,7 @@ def rosproxy(obj: Json) -> RosProxy:
         uid=text_at(meta, "uid"),
         generation=int_at(meta, "generation"),
         spec=_spec(Field("spec", stripped(obj.get("spec"))), id),
-        former_ranges=_former(status),
+        former_ranges=_former_ranges(status),
         cluster_ip=address if is_address(address) else "",
         status=status,
         deleting=is_deleted(meta),
@@ -131,7 +131,7 @@ def invalid(obj: Json, error: InvalidField) -> InvalidRosProxy:
 def _spec(field: Field, of: Name) -> RosProxySpec:
     ports = field["ports"].number(32, 1, MOST_PORTS)
     for_ros = _versions(field["ros"])
-    for ros, names in _OF_ROS.items():
+    for ros, names in _FIELDS_BY_VERSION.items():
         for name in names if ros not in for_ros else ():
             if field[name].value not in (None, [], False):
                 fix = "Remove the field" + (", or set spec.ros: 2" if ros == "2" else "")
@@ -261,7 +261,7 @@ def _rules(field: Field) -> Iterator[Rule]:
 
 
 def _glob(field: Field, ros_name: bool) -> str:
-    """Return a glob for ROS names, or else for methods of the slave API."""
+    """Return a glob: with ``ros_name`` for ROS names, else for methods of the slave API."""
     glob = field.text()
     if not _GLOB.fullmatch(glob) or (ros_name and glob[0] not in "/*?"):
         begins = ", with / or * at the beginning" if ros_name else ""
@@ -331,16 +331,16 @@ def _expression(field: Field) -> tuple[str, str, frozenset[str]]:
 
 def _check_key(field: Field, key: str) -> None:
     if not is_label_key(key):
-        raise Field(field.path, key).error("can't be the key of a label", _AS_LABEL)
+        raise Field(field.path, key).error("can't be the key of a label", _LABEL_FIX)
 
 
 def _check_value(field: Field) -> str:
     if not is_label_value(field.text()):
-        raise field.error("can't be the value of a label", _AS_LABEL)
+        raise field.error("can't be the value of a label", _LABEL_FIX)
     return field.text()
 
 
-_AS_LABEL = "Copy the text from the labels of the pod"
+_LABEL_FIX = "Copy the text from the labels of the pod"
 
 
 def _master(field: Field, of: Name) -> MasterSpec:
@@ -420,7 +420,7 @@ def _address(field: Field) -> str:
     return address or ""
 
 
-def _former(status: Json) -> dict[str, PortRange]:
+def _former_ranges(status: Json) -> dict[str, PortRange]:
     """Return the ranges in a status, by node name. An unreadable range counts as missing."""
     ranges = {
         text_at(line, "name"): port_range(line, "ports") for line in submaps(status, "perNode")

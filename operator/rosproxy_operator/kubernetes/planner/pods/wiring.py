@@ -35,7 +35,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     master_uri,
     service_id,
 )
-from rosproxy_operator.kubernetes.resources.objects import VARIABLE
+from rosproxy_operator.kubernetes.resources.objects import MASTER_VARIABLE
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 MIRROR = "kubernetes.io/config.mirror"
@@ -312,7 +312,7 @@ def _names_one(uri: str, masters: Collection[HostPort]) -> bool:
 def _replaced_uri(spec: Json, wanted: PodVariables) -> str:
     """The first ROS_MASTER_URI of a template that the webhook replaces; empty without one."""
     containers = (container for kind in _KINDS for container in submaps(spec, kind))
-    own = (v for c in containers for v in submaps(c, "env") if v.get("name") == VARIABLE)
+    own = (v for c in containers for v in submaps(c, "env") if v.get("name") == MASTER_VARIABLE)
     values = (text_at(variable, "value") for variable in own)
     return next((value for value in values if _names_one(value, wanted.masters)), "")
 
@@ -320,7 +320,7 @@ def _replaced_uri(spec: Json, wanted: PodVariables) -> str:
 def _address_variables(wanted: PodVariables) -> list[tuple[str, str, str]]:
     """The annotation, the variable and the value of each address for a pod."""
     variables = (
-        (MASTER_URI, VARIABLE, wanted.uri),
+        (MASTER_URI, MASTER_VARIABLE, wanted.uri),
         (STATIC_PEERS, "ROS_STATIC_PEERS", wanted.static_peers),
     )
     return [v for v in variables if v[2]]
@@ -333,7 +333,7 @@ def _wired(container: Json, wanted: PodVariables, annotations: Mapping[str, str]
     added: list[Json] = []
     for annotation, name, value in _address_variables(wanted):
         former = annotations.get(annotation)
-        masters = wanted.masters if name == VARIABLE else frozenset[HostPort]()
+        masters = wanted.masters if name == MASTER_VARIABLE else frozenset[HostPort]()
         for index, variable in enumerate(variables):
             own = text_at(variable, "value")
             is_ours = bool(former) and own == former
