@@ -1,4 +1,4 @@
-"""The ports besides the range on which a proxy listens."""
+"""The ports on which a proxy listens besides its range."""
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.ros1.registry.stand_ins import PORTS
@@ -13,17 +13,18 @@ STAND_INS = PortRange(PORTS[0], PORTS[-1])
 def fixed_ports(spec: RosProxySpec) -> frozenset[int]:
     """Return the master port, the admin port, and for ROS 2 the well-known ports of the domain.
 
-    A hostPort has the number of the container's port, so no range has these ports.
+    A port of the range has the same number on the node and in the pod. So no range may contain the
+    fixed ports.
     """
     ros2_ports = well_known_ports(spec.ros2.number) if spec.ros2 else ()
     return frozenset({MASTER_PORT, ADMIN_PORT, *ros2_ports})
 
 
 def stand_in_protocols(spec: RosProxySpec) -> tuple[str, ...]:
-    """Return the protocols of the stand-ins of a RosProxy's proxies, empty without stand-ins.
+    """Return "TCP" and "UDP", if the proxies of a RosProxy have stand-ins of that protocol.
 
-    ROS 1 has stand-ins only with ``direction: Both``. UDPROS from pods to outside goes through UDP
-    ports, also without ``spec.udp``.
+    ROS 1 has stand-ins only with ``direction: Both``. Then UDPROS from pods to outside goes through
+    UDP ports, also without ``spec.udp``.
     """
     is_bidirectional = spec.proxy.direction == "both"
     tcp = ("TCP",) if spec.ros1 and is_bidirectional else ()

@@ -12,14 +12,17 @@ from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.resources.model import Name
 
-LAG = 3.0
-"""Seconds from an action until the watches of the API server must show the effect."""
-FIRST = 1.0
-"""Seconds from the first failure to the next try."""
-LONGEST = 60.0
+WATCH_LAG_S = 3.0
+"""Seconds for the watches to show the effect of an action; the first pause without an error."""
+FIRST_PAUSE_S = 1.0
+"""Seconds from the first error of the API server to the next try.
+
+Also the first pause after `PROMPT_RECREATIONS` creations.
+"""
+LONGEST_PAUSE_S = 60.0
 """Longest pause between two tries, in seconds."""
 PROMPT_RECREATIONS = 3
-"""Creations of a pod that never runs well, before the operator pauses between creations."""
+"""Creations without a pause, for a pod that never runs well. Then the pauses grow."""
 
 
 class Task(msgspec.Struct, frozen=True):
@@ -37,6 +40,8 @@ class Task(msgspec.Struct, frozen=True):
 class RetryRecord(msgspec.Struct, frozen=True):
     """The number of tries of a task, and the time ``at`` of the last try.
 
+    ``at`` is in seconds of the operator's monotonic clock.
+
     With ``effect`` the task has had its effect, but may be due again: a created pod may fail.
     ``error`` is the error of the API server, empty without an error.
     """
@@ -52,15 +57,18 @@ class RetryRecord(msgspec.Struct, frozen=True):
         # The exponents have a limit, because 2.0 ** 1024 raises OverflowError.
         if self.effect and not self.error:
             excess = self.count - PROMPT_RECREATIONS
-            return min(FIRST * 2.0 ** min(excess, 10), LONGEST) if excess >= 0 else 0.0
-        first = FIRST if self.error else LAG
-        return min(first * 2.0 ** min(self.count - 1, 10), LONGEST)
+            return (
+                min(FIRST_PAUSE_S * 2.0 ** min(excess, 10), LONGEST_PAUSE_S) if excess >= 0 else 0.0
+            )
+        first = FIRST_PAUSE_S if self.error else WATCH_LAG_S
+        return min(first * 2.0 ** min(self.count - 1, 10), LONGEST_PAUSE_S)
 
 
 class Retries:
     """The records of one look. ``noted`` becomes the ``attempts`` of the next state.
 
-    ``failures`` has the errors of the API server, by RosProxy and object.
+    ``attempts`` and ``failures`` are from the looks before. ``failures`` has the errors of the API
+    server, by RosProxy and object. ``now`` is in seconds of the operator's monotonic clock.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.status.findings import finding
 
 TRIED_RANGE_REPORTED_S = 60.0
-"""Seconds that the status reports that a proxy got other ports than the operator tried first."""
+"""Seconds for which the status reports ports that a proxy has left before it served there."""
 
 
 class ClusterState(msgspec.Struct, frozen=True):
@@ -46,15 +46,15 @@ class ClusterState(msgspec.Struct, frozen=True):
     - ``lost``: the time since when a node with proxies is missing.
     - ``served``: the range on which the proxy of a place last served.
     - ``given``: the range that the operator gave the proxy of a place.
-    - ``refused``: the time since when a proxy that has served does not get its ports back.
+    - ``refused``: the time since when a proxy that has served waits to get its ports back.
     - ``taken``: by node and port, the time of the last refusal of a port.
     - ``moved``: ranges that proxies left after they had served.
     - ``tried``: ranges that proxies left before they had served.
     - ``attempts``: the records of `Retries`.
     - ``reported``: the findings that became Events, and when.
-    - ``addresses``: by node, the addresses of pods, and when a look last saw a pod with each.
-    - ``strange``: by node and address, the time since when a proxy reports an address that no pod
-      was seen with.
+    - ``addresses``: by node and address, the time when a look last saw a pod with this address.
+    - ``strange``: by node and address, the time since when a proxy reports this address, although
+      no look has seen a pod with it.
     - ``former``: see `former_ports`.
     - ``unselected``: the time since when no RosProxy selects a labelled pod.
     """

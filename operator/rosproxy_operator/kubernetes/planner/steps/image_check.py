@@ -30,7 +30,7 @@ _RESOURCES: Json = {"requests": {"cpu": "1m", "memory": "32Mi"}, "limits": {"mem
 class ImageState(Enum):
     """The result of the check of an image on a node."""
 
-    MISSING = "missing"  # no check of this image exists
+    MISSING = "missing"  # no check of this image exists, or the check is being deleted
     CHECKING = "checking"
     USABLE = "usable"
     UNUSABLE = "unusable"
@@ -61,7 +61,7 @@ def image_state(context: ClusterContext, proxy: ProxyPod, site: ProxySite) -> Im
 
 
 def check_image(context: ClusterContext, site: ProxySite) -> Iterator[Action]:
-    """Yield the action that creates a check of the next image on the node."""
+    """Yield the action that creates the check of a proxy's next image, if no check exists."""
     of = site.rosproxy.id
     id = image_check_id(of, site.node.name)
     # A check of another image has the same name. `remove_image_checks` deletes that check first.

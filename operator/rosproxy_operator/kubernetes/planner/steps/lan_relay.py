@@ -2,8 +2,8 @@
 
 A LAN relay is a pod in the host's network, because it has to receive the multicast of the LAN. The
 proxy reaches the LAN relay at the last port of the proxy's range. The operator creates the LAN
-relay once the proxy's pod has an address, and recreates it when this address changes. The LAN relay
-has no right but the host's network.
+relay once the proxy's pod has an address. When this address, the image or the settings change, the
+operator recreates the LAN relay. The LAN relay's only privilege is the host's network.
 """
 
 from collections.abc import Iterable, Iterator
@@ -33,7 +33,7 @@ _RESOURCES: Json = {"requests": {"cpu": "10m", "memory": "32Mi"}, "limits": {"me
 def lan_relay_pod(
     site: ProxySite, lan_relay: HostPort, proxy: ProxyPod, settings: ClusterSettings
 ) -> Json:
-    """The pod of a LAN relay that listens at ``lan_relay`` for this proxy.
+    """The pod of a LAN relay that listens at ``lan_relay`` and serves this proxy.
 
     The image is the present image of the proxy, which may not be the image of the site yet.
     """
@@ -63,14 +63,16 @@ def reconcile_lan_relays(context: ClusterContext, rosproxy: RosProxy) -> Iterato
     """
     places = {*context.view.places.get(rosproxy.id, ())}
     lan_relays_by_node = group_by_key(
-        (e.node, e) for e in context.observed.lan_relays if e.owner == rosproxy.uid
+        (relay.node, relay) for relay in context.observed.lan_relays if relay.owner == rosproxy.uid
     )
     for node_name in sorted({*lan_relays_by_node, *(place.node for place in places)}):
         place = ProxyPlace(rosproxy.id, node_name)
         lan_relays = lan_relays_by_node.get(node_name, ())
         node = context.observed.nodes.get(node_name)
         if node is None or not node.ready:
-            continue  # the garbage collector of the cluster deletes the pods of a gone node
+            # The cluster's garbage collector deletes the pods of a gone node. On a node that is not
+            # ready, the operator changes nothing.
+            continue
         if place not in places or not rosproxy.spec.multicast:
             yield from _delete_lan_relays(context, lan_relays, "no longer needed")
         else:

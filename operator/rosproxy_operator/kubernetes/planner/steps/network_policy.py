@@ -8,8 +8,8 @@
 - The sources in ``settings.admin_from``, such as the operator's pod: the admin port. Without this
   setting any source may reach the admin port.
 
-This policy does not limit to which addresses a proxy connects. The kubelet's probes need no rule,
-because Kubernetes always lets a node reach its own pods (``NetworkPolicySpec`` in k8s.io/api,
+The policy does not limit the addresses to which a proxy connects. The kubelet's probes need no
+rule, because Kubernetes always lets a node reach its own pods (``NetworkPolicySpec`` in k8s.io/api,
 networking/v1).
 
 The policy opens all of ``spec.portWindow``, not only the present ranges, so the ports of a new
@@ -51,7 +51,7 @@ from rosproxy_operator.kubernetes.resources.names import (
 from rosproxy_operator.kubernetes.resources.objects import name_of
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
-_OFF = "the operator has --no-network-policy"
+_OFF_REASON = "the operator has --no-network-policy"
 
 
 def policy(
@@ -90,7 +90,10 @@ def pods_policy(rosproxy: RosProxy) -> Json:
 def wanted_policies(
     rosproxy: RosProxy, settings: ClusterSettings, ranges: Collection[PortRange] = ()
 ) -> dict[Name, Json]:
-    """The NetworkPolicies that a RosProxy needs, by name. ``ranges`` are those of its proxies."""
+    """The NetworkPolicies that a RosProxy needs, by name; empty with --no-network-policy.
+
+    ``ranges`` are the ranges of its proxies.
+    """
     if not settings.network_policy:
         return {}
     wanted = {policy_id(rosproxy.id): policy(rosproxy, settings, ranges)}
@@ -112,10 +115,12 @@ def reconcile_policies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[
         if current.owner != rosproxy.uid:
             yield from _delete(context, current, "its former RosProxy is gone")
         elif current.id not in wanted:
-            on = context.settings.network_policy
-            yield from _delete(context, current, "spec.podEgress is not Proxy" if on else _OFF)
+            enabled = context.settings.network_policy
+            yield from _delete(
+                context, current, "spec.podEgress is not Proxy" if enabled else _OFF_REASON
+            )
     for name, body in wanted.items():
-        yield from _keep(context, rosproxy, body, existing.get(name))
+        yield from _create_or_correct(context, rosproxy, body, existing.get(name))
 
 
 def _ranges(context: ClusterContext, rosproxy: RosProxy) -> set[PortRange]:
@@ -126,18 +131,18 @@ def _ranges(context: ClusterContext, rosproxy: RosProxy) -> set[PortRange]:
     return {*present, *(given[place] for place in places if place in given)}
 
 
-def _keep(
+def _create_or_correct(
     context: ClusterContext, rosproxy: RosProxy, body: Json, current: ProxyPolicy | None
 ) -> Iterator[Action]:
     """Yield the action that creates a missing policy, or corrects the ``current`` policy."""
     name = name_of(body["metadata"])
-    ask = context.retries.is_due
+    is_due = context.retries.is_due
     if current is None:
-        if ask(Task(rosproxy.id, "create policy", name)):
+        if is_due(Task(rosproxy.id, "create policy", name)):
             yield CreatePolicy(rosproxy.id, body)
         return
     changed = current.owner == rosproxy.uid and current.spec != body["spec"]
-    if changed and ask(Task(rosproxy.id, "set policy", name, current.uid)):
+    if changed and is_due(Task(rosproxy.id, "set policy", name, current.uid)):
         yield SetPolicy(rosproxy.id, name, current.uid, body["spec"])
 
 
@@ -161,8 +166,8 @@ def _delete(context: ClusterContext, current: ProxyPolicy, why: str) -> Iterator
 def _spec(rosproxy: RosProxy, settings: ClusterSettings, ranges: Collection[PortRange]) -> Json:
     """The spec of a policy, in the form in which the API server returns the spec.
 
-    `_keep` compares this spec with the existing spec. With another form, the operator would correct
-    the policy at each look.
+    `_create_or_correct` compares this spec with the existing spec. With another form, the operator
+    would correct the policy at each look.
     """
     admin: dict[str, Any] = {"ports": [_port(ADMIN_PORT)]}
     if settings.admin_from is not None:

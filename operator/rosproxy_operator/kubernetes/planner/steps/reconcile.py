@@ -1,10 +1,10 @@
 """Plans the actions for the Service of a RosProxy, and for the proxy on each node.
 
 Each ``reconcile_…`` function compares the wanted objects with the existing objects, and yields the
-next actions. Later looks yield the actions after these. Of the settings of an object, the
-comparison reads only the fingerprint annotation and the image. A pod with another fingerprint is
-deleted, and a later look creates the pod again under the same name. If only the image differs, the
-operator sets the image of the pod. `Retries` delays the next try of an action that had no effect.
+next actions. Later looks yield the actions after these. The comparison reads only the fingerprint
+annotation and the image of an object. A pod with another fingerprint is deleted, and a later look
+creates the pod again under the same name. If only the image differs, the operator sets the image of
+the pod. `Retries` delays the next try of an action that had no effect.
 """
 
 from collections import Counter
@@ -60,8 +60,8 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
     static_peers = (pod.static_peers for pod in pods if not pod.wired_master_uri)
     hosts = Counter(host for host in (*wired, *static_peers) if is_address(host))
     # If the status has no address, the Service gets the address to which most pods are wired.
-    common = min(hosts, key=lambda host: (-hosts[host], host), default="")
-    body = manifests.service(rosproxy, rosproxy.cluster_ip or common)
+    most_wired = min(hosts, key=lambda host: (-hosts[host], host), default="")
+    body = manifests.service(rosproxy, rosproxy.cluster_ip or most_wired)
     service = context.observed.services.get(rosproxy.id)
     if service is None:
         if context.retries.is_due(Task(rosproxy.id, "create", service_id(rosproxy.id))):
@@ -95,9 +95,9 @@ def reconcile_proxies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
     places = context.view.places.get(rosproxy.id, ())
     wanted = [place for place in places if _is_creatable(context, place)]
     working = {place for place in wanted if _works(context, place, wanted)}
-    away = [p for p in wanted if p not in working and not _lacks_ports(context, p)]
+    down = [p for p in wanted if p not in working and not _lacks_ports(context, p)]
     checked = [place for place in working if _image_check_is_open(context, place)]
-    room = rosproxy.spec.max_unavailable.of(len(wanted)) - len(away) - len(checked)
+    room = rosproxy.spec.max_unavailable.of(len(wanted)) - len(down) - len(checked)
     for place in places:
         may_stop = room > 0 or place not in working
         actions = [*_reconcile_proxy(context, place, may_stop)]
@@ -118,7 +118,7 @@ def _image_check_is_open(context: ClusterContext, place: ProxyPlace) -> bool:
 
 
 def _lacks_ports(context: ClusterContext, place: ProxyPlace) -> bool:
-    """Whether a proxy waits for its ports.
+    """Whether a proxy's pod does not run because its ports are taken.
 
     A rollout does not count such a proxy as down: no rollout has caused the lack of ports.
     """
@@ -132,7 +132,10 @@ def _is_creatable(context: ClusterContext, place: ProxyPlace) -> bool:
 
 
 def _works(context: ClusterContext, place: ProxyPlace, places: Iterable[ProxyPlace]) -> bool:
-    """Whether a proxy serves and is ready. False right after a change of the image.
+    """Whether a proxy serves and is ready.
+
+    After a change of the image, the answer is False until the container restarts, for
+    `IMAGE_CHANGE_RESTART_S` seconds at most.
 
     If no proxy of ``places`` is ready, readiness does not count: the master may be down.
     """
@@ -140,7 +143,7 @@ def _works(context: ClusterContext, place: ProxyPlace, places: Iterable[ProxyPla
     if current is None or not serves(current) or current.stuck is not None:
         return False
     # After a change of the image, a pod stays ready until the kubelet ends the former container.
-    if context.retries.is_recent(_setting_image(current, current.image), IMAGE_CHANGE_RESTART_S):
+    if context.retries.is_recent(_image_task(current, current.image), IMAGE_CHANGE_RESTART_S):
         return False
     every = filter(None, map(context.view.current.get, places))
     return current.ready or not any(proxy.ready for proxy in every)
@@ -185,7 +188,7 @@ def _reconcile_wanted(
     elif (seconds := context.seconds_until_torn_down(place)) > 0:
         # A pod that was deleted by force may still hold its hostPorts: see `TORN_DOWN_WITHIN_S`.
         context.retries.look_again_in(seconds)
-    elif context.retries.is_due(_creation(place)):
+    elif context.retries.is_due(_creation_task(place)):
         yield CreateProxy(place.of, manifests.proxy_pod(site, context.settings))
 
 
@@ -232,11 +235,11 @@ def _replace_or_set_image(
         if proxy.range != site.ports:
             why = f"replaced, since the ports change from {proxy.range} to {site.ports}"
         yield from _delete_pod(context, proxy, why, retire=serves(proxy) and unregisters)
-    elif context.retries.is_due(_setting_image(proxy, image)):
+    elif context.retries.is_due(_image_task(proxy, image)):
         yield SetImage(proxy.of, proxy.pod.id, proxy.pod.uid, image)
 
 
-def _setting_image(proxy: ProxyPod, image: str) -> Task:
+def _image_task(proxy: ProxyPod, image: str) -> Task:
     """The task that sets an image.
 
     After each restart of the container this is another task, without a pause from earlier tries.
@@ -268,10 +271,10 @@ def _keep_creation_count(context: ClusterContext, place: ProxyPlace) -> None:
     """
     current = context.view.current.get(place)
     if current is None or not serves(current):
-        context.retries.note_effect(_creation(place))
+        context.retries.note_effect(_creation_task(place))
 
 
-def _creation(place: ProxyPlace) -> Task:
+def _creation_task(place: ProxyPlace) -> Task:
     return Task(place.of, "create", proxy_id(place.of, place.node))
 
 

@@ -2,11 +2,11 @@
 
 The webhook wires a pod only when the pod is created. If no operator answered the API server at that
 moment, only a new pod can be wired. So the operator evicts an unwired pod whose controller creates
-a new pod. PodDisruptionBudgets hold.
+a new pod. The evictions respect PodDisruptionBudgets.
 
 The operator evicts a single pod at a time, and waits while a selected pod starts or is being
-deleted. After the first evictions the pauses grow (`planner.retries`). So a webhook that does not
-work leads to at most one eviction a minute.
+deleted. The first evictions follow without a pause. Then the pauses grow, up to a minute
+(`planner.retries`). So a webhook that does not work causes few evictions.
 """
 
 from collections.abc import Iterator
@@ -44,5 +44,5 @@ def is_to_be_remade(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
 
     ``cluster_ip`` is the address of the RosProxy's Service.
     """
-    makes_anew = pod.controller in RECREATING_CONTROLLERS and not pod.deleting and not pod.ended
-    return makes_anew and needs_recreation(pod, rosproxy, cluster_ip)
+    is_recreated = pod.controller in RECREATING_CONTROLLERS and not pod.deleting and not pod.ended
+    return is_recreated and needs_recreation(pod, rosproxy, cluster_ip)
