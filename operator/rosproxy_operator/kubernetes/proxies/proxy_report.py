@@ -14,19 +14,19 @@ from rosproxy_operator.common.proxy_status import (
 )
 from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
 
-RECENT = 300.0
+RECENT_S = 300.0
 """Seconds for which a problem counts after the event. The proxy keeps listing its last problems."""
-_BY_POLICY = {problem_subject(reason) for reason in (DENIED, WOULD_BE_DENIED)}
+_DENIAL_SUBJECTS = {problem_subject(reason) for reason in (DENIED, WOULD_BE_DENIED)}
 """Subjects of problems by which a proxy reports denials. A denial is no fault of the proxy."""
-_LONGEST = 300
+_MOST_TEXT_CHARACTERS = 300
 """Characters that are kept of a problem or an error. The proxy may send texts of any size."""
 
 
 def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
     """Return the report on a proxy that has answered with a status.
 
-    ``refusal`` is the reason why the proxy refuses its policy. ``nodes`` of the report leaves out
-    nodes that the proxy has given up.
+    ``refusal`` is the reason why the proxy refuses its policy, empty without a refusal.
+    ``nodes`` of the report leaves out nodes that the proxy has given up.
     """
     master = status.master
     nodes = nodes_by_address(status)
@@ -50,15 +50,15 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
         },
         topics=frozenset(topics),
         refusal=refusal,
-        problems=tuple(short(f"{p.subject}: {p.text}") for p in status.problems if _counts(p)),
+        problems=tuple(short(f"{p.subject}: {p.text}") for p in status.problems if _is_reported(p)),
         range_probe=replace(status.range_probe, age=0.0) if status.range_probe else None,
         unregistered_addresses=inside_addresses(status) - nodes.keys() - participants.keys(),
     )
 
 
-def _counts(problem: ProblemStatus) -> bool:
+def _is_reported(problem: ProblemStatus) -> bool:
     """Whether a problem still holds or is recent, and is not a denial by the policy."""
-    return problem.subject not in _BY_POLICY and (problem.holds or problem.age <= RECENT)
+    return problem.subject not in _DENIAL_SUBJECTS and (problem.holds or problem.age <= RECENT_S)
 
 
 def no_answer(error: str) -> ProxyReport:
@@ -67,10 +67,13 @@ def no_answer(error: str) -> ProxyReport:
 
 
 def unreadable(last: ProxyReport, error: str) -> ProxyReport:
-    """Return the last report, with ``error`` as the only problem: the new answer is too long."""
+    """Return the last report, with ``error`` as the only problem.
+
+    The new answer of the proxy has more bytes than the operator reads.
+    """
     return replace(last, problems=(short(error),))
 
 
 def short(text: str) -> str:
     """Return a text from a proxy, cleaned and cut so that the operator may show the text."""
-    return bounded(clean(text), _LONGEST)
+    return bounded(clean(text), _MOST_TEXT_CHARACTERS)

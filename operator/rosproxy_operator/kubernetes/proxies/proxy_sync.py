@@ -48,7 +48,7 @@ LONGEST_CHANGE_WAIT_S = 1800.0
 TCP keep-alive finds a proxy that is cut off (`common.proxy_client`).
 """
 STARTING_S = 10.0
-"""Seconds for which a new proxy counts as starting. During this time, no answer is no fault."""
+"""Seconds for which a new proxy counts as starting. Meanwhile, a missing answer is no fault."""
 SILENT_AFTER_POLLS = 2
 """The number of polls in a row without an answer after which a proxy counts as silent."""
 MOST_SHORT_CALLS = 32
@@ -63,9 +63,9 @@ CALLERS_REPEAT_INTERVAL_S = 30.0
 
 The status of such a proxy does not show that another process of the proxy answers.
 """
-_OF_FORMER_RELEASE = (404, 405)
+_FORMER_RELEASE_STATUSES = (404, 405)
 """HTTP answers to ``/status/changes`` from a proxy of a former release."""
-_REFUSES_NOW = (403, 503)
+_REFUSED_NOW_STATUSES = (403, 503)
 """HTTP answers from a proxy that does not accept the token now, or has no free slot."""
 
 
@@ -147,8 +147,8 @@ class ProxyPoller:
                         long_poll = long_poll.result()  # None; raises the error of a failed task
                         await self._wait_for_update(LEAST_REPORT_INTERVAL_S)
                     continue
-                # The proxy may need a moment to act on gone pods. So only the next poll calls
-                # `changed` even if the report is the same.
+                # The proxy may need a moment to act on gone pods. So the next poll, not this poll,
+                # calls `changed` even if the report is the same.
                 self._recheck = self._recheck and not confirmed_gone
                 async with self._limits.short:
                     await self._read_status()
@@ -241,19 +241,19 @@ class ProxyPoller:
             self._changed()
 
     async def _fetch_status(self, within: float) -> ProxyStatus:
-        """Request the status with changes, else the plain status. Raises ProxyError.
+        """Request ``/status/changes``, or ``/status`` if the proxy refuses. Raises ProxyError.
 
-        If the proxy refuses changes now, the next poll asks for changes again.
+        After `_REFUSED_NOW_STATUSES`, the next poll requests ``/status/changes`` again.
         """
         if not self._is_former:
             try:
                 since = self._version if within else ""
                 self._version, status = await self.session.changes(since, within)
             except ProxyError as error:
-                if error.status not in (*_OF_FORMER_RELEASE, *_REFUSES_NOW):
+                if error.status not in (*_FORMER_RELEASE_STATUSES, *_REFUSED_NOW_STATUSES):
                     raise
                 self._tells_changes = False
-                self._is_former = error.status in _OF_FORMER_RELEASE
+                self._is_former = error.status in _FORMER_RELEASE_STATUSES
             else:
                 self._tells_changes = True
                 self._note_instance(status.instance)
@@ -342,7 +342,7 @@ class ProxyPoller:
 class ClusterProxySync:
     """The pollers of all proxies whose pods have an address.
 
-    A poller calls ``changed`` with a list of the proxy's namespace when the report has changed.
+    When a report has changed, the poller calls ``changed`` with a list: the proxy's namespace.
     """
 
     def __init__(
@@ -373,7 +373,8 @@ class ClusterProxySync:
     def follow(self, proxies: Iterable[ProxyPod], key: bytes = b"") -> None:
         """Poll exactly these proxies, with tokens computed from ``key``.
 
-        If the address or the token of a proxy changes, the proxy gets a new poller.
+        Proxies whose pod has no address or has ended are left out. If the address or the token of a
+        proxy changes, the proxy gets a new poller.
         """
         wanted = {p.pod.uid: p for p in proxies if p.pod.ip and not p.pod.ended}
         for uid in [*self._pollers]:
@@ -412,7 +413,7 @@ class ClusterProxySync:
 
 
 def _random_wait() -> float:
-    """Return the seconds to wait for a change, random because all pollers begin together."""
+    """Return the seconds to wait for a change: random, because all pollers begin together."""
     return LONGEST_CHANGE_WAIT_S * random.random()  # noqa: S311 - no secret
 
 

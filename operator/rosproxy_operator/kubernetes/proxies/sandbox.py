@@ -1,7 +1,7 @@
 """Events that say why the kubelet can't set up a proxy's pod, for example for a taken hostPort.
 
-The pod's status does not say so. The operator requests these Events while proxies wait for more
-than `WAIT_BEFORE_REQUEST_S` seconds: a single request for a namespace, at most every
+The pod's status does not give this reason. The operator requests these Events while proxies wait
+for more than `WAIT_BEFORE_REQUEST_S` seconds: one request for each namespace, at most every
 `REQUEST_INTERVAL_S` seconds.
 """
 
@@ -21,7 +21,7 @@ from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Prox
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
 
-FAILED = "FailedCreatePodSandBox"
+FAILED_REASON = "FailedCreatePodSandBox"
 """Reason of the kubelet's Event. Only this Event says that a hostPort was not free."""
 WAIT_BEFORE_REQUEST_S = 2.0
 """Seconds for which a proxy's pod waits on its node before the operator requests Events."""
@@ -43,7 +43,10 @@ class SandboxFailures:
         self._messages: dict[str, str] = {}
 
     async def read(self, observed: ClusterSnapshot) -> set[str]:
-        """Request the Events that are due. Return the namespaces with new messages."""
+        """Request the Events that are due. Return the namespaces with new messages.
+
+        Raises ApiError.
+        """
         now = time.monotonic()
         waiting = [proxy for proxy in observed.proxies if _waits(proxy)]
         uids = {p.pod.uid for p in waiting}
@@ -71,19 +74,19 @@ class SandboxFailures:
         return new
 
     def _events(self, namespace: str) -> list[dict[str, Any]]:
-        return self._api.list_fresh("events", namespace, f"reason={FAILED}")
+        return self._api.list_fresh("events", namespace, f"reason={FAILED_REASON}")
 
     def with_messages(self, observed: ClusterSnapshot) -> ClusterSnapshot:
         """Return the snapshot, with ``stuck`` and ``message`` of waiting proxies from Events."""
         if not self._messages:
             return observed
-        return replace(observed, proxies=tuple(map(self._shown, observed.proxies)))
+        return replace(observed, proxies=tuple(map(self._with_message, observed.proxies)))
 
     def again_in(self) -> float | None:
-        """Return the seconds until the next request for Events, None if no proxy waits."""
+        """Return the seconds after which to call `read` again, None if no proxy waits."""
         return REQUEST_INTERVAL_S if self._waiting_since else None
 
-    def _shown(self, proxy: ProxyPod) -> ProxyPod:
+    def _with_message(self, proxy: ProxyPod) -> ProxyPod:
         message = self._messages.get(proxy.pod.uid, "")
         if not message or not _waits(proxy):
             return proxy
@@ -93,7 +96,7 @@ class SandboxFailures:
 
 
 def _waits(proxy: ProxyPod) -> bool:
-    """Whether a proxy's pod is pending on its node, without an address and a known failure."""
+    """Whether a proxy's pod is pending on its node, without an address or a known failure."""
     pod = proxy.pod
     is_pending = pod.phase == "Pending" and bool(pod.node) and not pod.deleting
     return is_pending and not (proxy.stuck or pod.ip)

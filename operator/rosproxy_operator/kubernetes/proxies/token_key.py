@@ -4,8 +4,8 @@ A proxy's pod has only the hash of the token. So a user that may read pods can't
 the admin endpoint. The operator has no disk, and computes each token from the key, the proxy's name
 and the node (`names.token_of`). Operators that stand by compute the same tokens.
 
-The chart creates the Secret without data. So the operator needs the right to write only for this
-name. An upgrade of the chart does not change the Secret. If a user removes the key from the Secret,
+The chart creates the Secret without data. So the operator needs the right to write this Secret
+only. An upgrade of the chart does not change the Secret. If a user removes the key from the Secret,
 the operator creates a new key. Then the operator recreates the proxies of a RosProxy in turn, on
 the same ports.
 """
@@ -30,7 +30,7 @@ from rosproxy_operator.kubernetes.resources.model import Json, Name
 
 log = logging.getLogger(__name__)
 
-ENTRY = "key"
+KEY_ENTRY = "key"
 """Name of the key's entry in the Secret's data."""
 KEY_BYTES = 32
 """Bytes of the key: the length of a SHA-256 hash (RFC 2104, section 3)."""
@@ -72,7 +72,7 @@ class TokenKey:
 
         Raises ApiUnavailable if another program was faster: the next look reads the Secret again.
         """
-        entries = {ENTRY: base64.b64encode(key).decode()}
+        entries = {KEY_ENTRY: base64.b64encode(key).decode()}
         try:
             self._api.fill_secret(secret, manifest, entries)
         except (ApiInvalid, ApiConflict) as error:
@@ -97,7 +97,7 @@ class TokenKey:
 def _read(secret: Json) -> bytes:
     """Return the key in a Secret, empty if the key is missing, too short, or not base64."""
     try:
-        key = base64.b64decode(text_at(submap(secret, "data"), ENTRY), validate=True)
+        key = base64.b64decode(text_at(submap(secret, "data"), KEY_ENTRY), validate=True)
     except binascii.Error:
         return b""
     return key if len(key) >= KEY_BYTES else b""

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import RangeProbeStatus, read_status
-from rosproxy_operator.kubernetes.proxies.proxy_report import RECENT, no_answer, report
+from rosproxy_operator.kubernetes.proxies.proxy_report import RECENT_S, no_answer, report
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.checks import host_problem
 from rosproxy_operator.kubernetes.resources.model import VALUE_AT_RUNTIME, Name
@@ -297,8 +297,8 @@ STATUS = {
     ],
     "problems": [
         {"age": 3.0, "subject": "/talker", "text": "does not answer"},
-        {"age": RECENT + 1, "subject": "/old", "text": "long ago"},
-        {"age": RECENT + 1, "subject": "published range", "text": "dead", "holds": True},
+        {"age": RECENT_S + 1, "subject": "/old", "text": "long ago"},
+        {"age": RECENT_S + 1, "subject": "published range", "text": "dead", "holds": True},
         {"age": 1.0, "subject": "refused: policy", "text": "publish /camera of /a denied"},
         {"age": 1.0, "subject": "refused: policy audit", "text": "it would be denied"},
         {"age": 1.0, "subject": "refused: rate", "text": "too many calls"},
