@@ -39,13 +39,13 @@ RETRY_PAUSES_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 Each pause is random, between half and all of this time. A first lost watch has no pause.
 """
 STABLE_AFTER_S = 10.0
-"""Seconds. A watch that lasted longer resets the failure count."""
+"""A watch that lasted longer, in seconds, resets the failure count."""
 RELIST_INTERVAL_S = 1800.0
-"""Seconds after a list until the reflector lists again, once the present watch has ended."""
+"""Seconds from a list to the next list. The next list starts once the present watch has ended."""
 LEAST_RELIST_INTERVAL_S = 60.0
 """Least seconds from a list to a further list because the watched state was wrong (`relist`)."""
 LEAST_WATCH_S = 1.0
-"""Seconds. A shorter watch without events is an error: else the reflector would loop fast."""
+"""A shorter watch without events, in seconds, is an error: else the reflector would loop fast."""
 STOP_TIMEOUT_S = 3.0
 """Seconds that the thread of a reflector has to end."""
 
@@ -54,7 +54,7 @@ class Listener(Protocol):
     """Gets lists and changes in the event loop. ``place`` is a namespace, empty for all."""
 
     def changed(self, kind: str, place: str, changes: Sequence[Change]) -> None:
-        """Take changes of objects, in this order. A record None means that the object is gone.
+        """Take changes of objects, in this order. None: the object is gone, or has no record.
 
         A call without changes means that the watch works.
         """
@@ -67,7 +67,7 @@ class Listener(Protocol):
 
 
 class Reflector:
-    """Follows a kind in a namespace; ``collection`` names both.
+    """Follows the objects of ``collection``: a kind, and a namespace (empty for all).
 
     ``call_soon`` runs a function in the event loop. The thread of the reflector calls ``lost`` at
     each error.

@@ -64,7 +64,7 @@ class StoreChanges:
 class ClusterStore:
     """The records of all ``watches``. The operator manages ``namespaces``; all if ("",).
 
-    The store calls ``wake`` when a look is due, and ``back`` when a failed watch works again.
+    The store calls ``wake`` when a look is due, and ``recovered`` when a failed watch works again.
     ``corrected`` gets the number of objects in which a new list differs from the store. ``now``
     gives seconds of a monotonic clock.
     """
@@ -74,12 +74,12 @@ class ClusterStore:
         watches: Iterable[WatchKey],
         namespaces: tuple[str, ...],
         wake: Callable[[], None],
-        back: Callable[[], None],
+        recovered: Callable[[], None],
         corrected: Callable[[int], None] = lambda _: None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self._wake = wake
-        self._back = back
+        self._recovered = recovered
         self._corrected = corrected
         self._now = now
         self._namespaces = namespaces
@@ -87,7 +87,7 @@ class ClusterStore:
         self._errors: dict[WatchKey, ApiError] = {}
         self._listed: set[WatchKey] = set()
         self._pending = set(self._tables)
-        self._all_heard = asyncio.Event()
+        self._all_tried = asyncio.Event()
         self._pods: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._own_pods: dict[str, dict[str, OwnPod]] = defaultdict(dict)
         self._labelled: dict[str, dict[str, Pod]] = defaultdict(dict)
@@ -100,14 +100,14 @@ class ClusterStore:
     # For reflectors:
 
     def changed(self, kind: str, place: str, changes: Sequence[Change]) -> None:
-        """Apply changes in this order; None means that the object is gone.
+        """Apply changes in this order. None: the object is gone, or has no record.
 
         Each call shows that the watch works, also a call without changes.
         """
         watch = kind, place
-        self._note_heard(watch)
+        self._note_tried(watch)
         if self._errors.pop(watch, None):
-            self._back()
+            self._recovered()
         for key, record in changes:
             self._put(watch, key, record)
 
@@ -136,16 +136,16 @@ class ClusterStore:
         """Note an error of a list or watch; `check` raises the error while the watch fails."""
         if isinstance(error, ApiNotFound) and (text := crd_missing(kind)):
             error = ApiNotFound(text)
-        fresh = (kind, place) not in self._errors
+        is_first = (kind, place) not in self._errors
         self._errors[kind, place] = error
-        self._note_heard((kind, place))
-        if fresh:
+        self._note_tried((kind, place))
+        if is_first:
             self._wake()
 
-    def _note_heard(self, watch: WatchKey) -> None:
+    def _note_tried(self, watch: WatchKey) -> None:
         self._pending.discard(watch)
         if not self._pending:
-            self._all_heard.set()
+            self._all_tried.set()
 
     # For the controller:
 
@@ -155,7 +155,7 @@ class ClusterStore:
         NetworkPolicies are an exception: the operator may lack the right to read NetworkPolicies,
         and works without. Only ApiUnavailable counts there.
         """
-        await self._all_heard.wait()
+        await self._all_tried.wait()
         # RosProxies first: if the CRD is missing, this error has the fix.
         for (kind, _), error in sorted(self._errors.items(), key=lambda pair: pair[0][0] != PLURAL):
             if kind != POLICIES or isinstance(error, ApiUnavailable):
@@ -176,7 +176,7 @@ class ClusterStore:
             rosproxies=rosproxies,
             unusable={r.id: r for r in self._records_of(PLURAL, InvalidRosProxy)},
             nodes={node.name: node for node in self._records_of("nodes", ClusterNode)},
-            services={s.of: s for s in services if self._is_looked_after(s.of.namespace)},
+            services={s.of: s for s in services if self._is_managed(s.of.namespace)},
             masters={id: read_master(s, id, ports) for id, (s, ports) in masters.items()},
             consents={id: s.allowed if s else frozenset() for id, (s, _) in masters.items()},
             misspelt_services={id: s.misspelt for id, (s, _) in masters.items() if s},
@@ -188,7 +188,10 @@ class ClusterStore:
         return self._with_pods(snapshot)
 
     def pod_names(self) -> dict[str, str]:
-        """The names of pods by address, in namespaces with a RosProxy."""
+        """The names of pods by address, in namespaces with a RosProxy.
+
+        Ended pods and pods in the host's network are left out.
+        """
         return {
             plain_address(address): pod.id.name
             for namespace in self._rosproxies
@@ -252,7 +255,7 @@ class ClusterStore:
             if watch[0] == kind:
                 yield from (record for record in table.values() if isinstance(record, record_type))
 
-    def _is_looked_after(self, namespace: str) -> bool:
+    def _is_managed(self, namespace: str) -> bool:
         return self._namespaces == ("",) or namespace in self._namespaces
 
     def _is_selected(self, pod: Pod) -> bool:
@@ -281,7 +284,7 @@ class ClusterStore:
 
     def _without_foreign_ownership(self, record: Record | None) -> Record | None:
         """Treat a pod of another operator, which manages other namespaces, as an ordinary pod."""
-        if isinstance(record, OwnPod) and not self._is_looked_after(record.of.namespace):
+        if isinstance(record, OwnPod) and not self._is_managed(record.of.namespace):
             return record.pod
         return record
 
@@ -309,7 +312,7 @@ class ClusterStore:
 
     def _index_pod(self, pod: Pod, key: str, kept: Pod | None) -> None:
         _set(self._pods, pod.id.namespace, key, kept)
-        if self._is_looked_after(pod.id.namespace):
+        if self._is_managed(pod.id.namespace):
             if wants_proxy(pod):
                 _set(self._labelled, pod.id.namespace, key, kept)
             if pod.misspelt:
@@ -347,7 +350,7 @@ class ClusterStore:
         """Note a pod that a RosProxy selects, or that asks for a proxy or takes ports of a node."""
         selected = self._is_selected(pod)
         is_meant = wants_proxy(pod) or bool(pod.misspelt)
-        if selected or (is_meant and self._is_looked_after(pod.id.namespace)):
+        if selected or (is_meant and self._is_managed(pod.id.namespace)):
             self._touched.namespaces.add(pod.id.namespace)
             self._wake()
         if selected or pod.every_port:
@@ -363,7 +366,7 @@ class ClusterStore:
 
 
 def _requested(record: Record | None) -> object:
-    """The parts of a RosProxy without those that come from the status; None for other records."""
+    """The parts of a RosProxy that do not come from its status; None for other records."""
     if isinstance(record, RosProxy):
         asked = record.uid, record.generation, record.deleting, record.spec, record.remakes
         return *asked, record.misspelt
