@@ -17,12 +17,12 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-LIFE = timedelta(days=90)
+LIFETIME = timedelta(days=90)
 """Lifetime of a certificate and of the CA."""
-RENEW_AFTER = 2 / 3
+RENEW_AFTER_SHARE = 2 / 3
 """Share of the lifetime after which the operator replaces a certificate."""
-_BACKDATED = timedelta(hours=1)
-"""The validity starts this time before now, because the clock of an API server may be slow."""
+_CLOCK_TOLERANCE = timedelta(hours=1)
+"""How far before now the validity starts, because the clock of an API server may be slow."""
 CERTIFICATE = "tls.crt"
 KEY = "tls.key"
 CA = "ca.crt"
@@ -48,11 +48,11 @@ class KeyPair(msgspec.Struct, frozen=True):
         """The end of the certificate's lifetime."""
         return self._read().not_valid_after_utc
 
-    def due(self, now: datetime) -> bool:
-        """Whether the operator has to replace the certificate now (`RENEW_AFTER`)."""
+    def is_due(self, now: datetime) -> bool:
+        """Whether the operator has to replace the certificate now (`RENEW_AFTER_SHARE`)."""
         certificate = self._read()
         life = certificate.not_valid_after_utc - certificate.not_valid_before_utc
-        return now >= certificate.not_valid_before_utc + life * RENEW_AFTER
+        return now >= certificate.not_valid_before_utc + life * RENEW_AFTER_SHARE
 
     def names(self) -> set[str]:
         """The DNS names of the certificate; empty without the extension subjectAltName."""
@@ -183,8 +183,8 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _BACKDATED)
-        .not_valid_after(now + LIFE)
+        .not_valid_before(now - _CLOCK_TOLERANCE)
+        .not_valid_after(now + LIFETIME)
         .add_extension(constraints, critical=True)
         .add_extension(usage, critical=True)
     )

@@ -28,11 +28,11 @@ from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate
 
 log = logging.getLogger(__name__)
 
-EVERY = 20.0
+CHECK_INTERVAL_S = 20.0
 """Seconds between two checks for a certificate that is due, or a CA that was overwritten."""
-EVERY_DIRECTORY = 10.0
+DIRECTORY_CHECK_INTERVAL_S = 10.0
 """Seconds between two checks of a directory into which another program writes certificates."""
-OVERLAP = 10.0
+CA_TRUST_DELAY_S = 10.0
 """Least seconds from writing a new CA to serving the certificate of this CA.
 
 API servers learn of the CA by a watch.
@@ -43,7 +43,7 @@ _SUBJECT = "webhook"
 class CertificateDirectory:
     """A certificate that another program renews, such as cert-manager, in a mounted Secret."""
 
-    every = EVERY_DIRECTORY
+    check_interval_s = DIRECTORY_CHECK_INTERVAL_S
     problems: Sequence[Problem] = ()
 
     def __init__(self, directory: str) -> None:
@@ -74,7 +74,7 @@ class SelfSigned:
     serve the new certificate later. So API servers trust the served certificate during a renewal.
     """
 
-    every = EVERY
+    check_interval_s = CHECK_INTERVAL_S
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class SelfSigned:
             # API servers need time to learn of the new CA.
             if self._trusted is None or self._trusted[0] != self._pair:
                 self._trusted = self._pair, now
-            if (now - self._trusted[1]).total_seconds() >= OVERLAP:
+            if (now - self._trusted[1]).total_seconds() >= CA_TRUST_DELAY_S:
                 self._serving = self._pair
         return self._serving
 
@@ -159,7 +159,7 @@ class SelfSigned:
 
     def _is_usable(self, pair: KeyPair) -> bool:
         """Whether a pair has all our names and is not due."""
-        return not pair.due(self._now()) and pair.names() >= set(self._names)
+        return not pair.is_due(self._now()) and pair.names() >= set(self._names)
 
     def _put(self, secret: Name, pair: KeyPair, manifest: Json) -> None:
         """Write a pair into the Secret. Raises ApiUnavailable if another program has written first.
@@ -198,7 +198,10 @@ class SelfSigned:
             return None
 
     def _trust(self, authorities: bytes) -> bool:
-        """Write the CAs into the webhook's configuration. Return whether the CAs are there."""
+        """Write the CAs into the webhook's configuration. Return whether the CAs are there.
+
+        True without a configuration.
+        """
         if not self._configuration:
             return True
         try:
@@ -228,7 +231,7 @@ def _trust_patch(configuration: Json, authorities: bytes) -> list[Json]:
         if submap(webhook, "clientConfig").get("caBundle") != bundle:
             path = f"/webhooks/{index}"
             operations += [
-                # A JSON patch knows only the index, which changes if a webhook is added.
+                # A JSON patch names a webhook by its index, which changes if a webhook is added.
                 {"op": "test", "path": f"{path}/name", "value": webhook.get("name")},
                 {"op": "add", "path": f"{path}/clientConfig/caBundle", "value": bundle},
             ]
@@ -253,7 +256,7 @@ class CertificateRotation:
         """Keep the certificate valid until cancelled. Log all errors."""
         while True:
             await self.refresh()
-            await asyncio.sleep(self._source.every if self.pair else 2.0)
+            await asyncio.sleep(self._source.check_interval_s if self.pair else 2.0)
 
     async def refresh(self) -> None:
         """Check the certificate once, and renew the certificate if due."""

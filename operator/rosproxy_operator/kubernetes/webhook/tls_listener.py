@@ -1,4 +1,4 @@
-"""Accepts TLS connections for an HTTP server: a bounded number of all, and of each address.
+"""Accepts TLS connections for an HTTP server: a bounded number in all, and from each address.
 
 A connection takes memory before the HTTP server knows the connection: asyncio reserves 256 KiB for
 each handshake (`asyncio.sslproto.SSLProtocol.max_size`). Every pod of a cluster reaches the
@@ -33,7 +33,7 @@ An API server waits 10 s for a webhook by default, and 5 s with the chart (timeo
 
 @dataclass(slots=True, eq=False)
 class _Connection:
-    """A connection, with the task of the handshake, and then with the transport."""
+    """A connection: first with the task of the handshake, then with the transport."""
 
     source: str
     handshake: asyncio.Task[None] | None

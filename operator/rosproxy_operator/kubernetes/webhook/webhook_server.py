@@ -37,7 +37,7 @@ k8s.io/apiserver, pkg/server/config.go: MaxRequestBodyBytes.
 MOST_HELD_BYTES = 96 * 2**20
 """Bytes of all requests in memory at the same time, with `VALUE_BYTES` for each value."""
 MOST_HELD_BYTES_OF_SOURCE = 32 * 2**20
-"""Bytes of the requests of an address. A review of 20 KB counts as 80 KB."""
+"""Bytes of the requests of an address at most. A review of 20 KB counts as 80 KB."""
 VALUE_BYTES = 100
 """Bytes that a value of a JSON document takes in memory, besides the text."""
 BODY_TIMEOUT_S = 10.0
@@ -49,8 +49,8 @@ END_TIMEOUT_S = 2.0
 class WebhookServer:
     """The server for kopf's ``settings.admission.server``.
 
-    The event loop that does the handshakes also replaces the certificate, so never during a step of
-    a handshake. Established connections go on.
+    The handshakes and the replacement of the certificate run in the same event loop. So the
+    certificate never changes during a step of a handshake. Established connections go on.
     """
 
     def __init__(self, bind: HostPort, rotation: CertificateRotation) -> None:
@@ -71,7 +71,7 @@ class WebhookServer:
         return "the operator does not serve the webhook yet"
 
     def serving_since(self) -> str:
-        """Since when this operator serves the webhook, in RFC 3339; empty if it does not serve.
+        """Since when this operator serves the webhook, in RFC 3339; empty while it does not.
 
         Any thread may ask.
         """
@@ -108,7 +108,7 @@ class WebhookServer:
             self._serving_since = stamp(time.time())
             # kopf needs the URL only for a configuration of its own (`admission.managed`).
             yield kopf.WebhookClientConfig(url=f"https://{bind}")
-            await self._exchange(context, pair)
+            await self._replace_certificates(context, pair)
         finally:
             self._serving_since = ""
             await listener.close()
@@ -118,8 +118,8 @@ class WebhookServer:
         if self._draining:
             response.force_close()
 
-    async def _exchange(self, context: ssl.SSLContext, served: KeyPair) -> None:
-        """Serve another certificate within `CERTIFICATE_CHECK_INTERVAL_S` seconds."""
+    async def _replace_certificates(self, context: ssl.SSLContext, served: KeyPair) -> None:
+        """Serve each new certificate within `CERTIFICATE_CHECK_INTERVAL_S` seconds."""
         while True:
             await asyncio.sleep(CERTIFICATE_CHECK_INTERVAL_S)
             pair = self._rotation.pair

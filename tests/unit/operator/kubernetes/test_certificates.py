@@ -128,8 +128,8 @@ async def test_renewal_while_serving() -> None:
 def test_due_after_two_thirds_of_its_life() -> None:
     pair = certificates.make(NAMES, NOW)
     assert pair.expires == NOW + timedelta(days=90)
-    assert not pair.due(NOW + timedelta(days=59))
-    assert pair.due(NOW + timedelta(days=61))
+    assert not pair.is_due(NOW + timedelta(days=59))
+    assert pair.is_due(NOW + timedelta(days=61))
 
 
 def test_old_cas_are_dropped_when_they_expire() -> None:
