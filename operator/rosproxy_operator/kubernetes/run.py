@@ -1,8 +1,8 @@
 """Start and end of the Kubernetes operator.
 
 After a signal, an operator with a Lease object first stops acting and releases the Lease object.
-Then the operator serves the webhook for `WEBHOOK_DRAIN_S` seconds, until kube-proxy sends no more
-requests to this pod.
+Then the operator still serves the webhook for `WEBHOOK_DRAIN_S` seconds. After this time, no
+kube-proxy sends requests to this pod.
 """
 
 import asyncio
@@ -35,7 +35,10 @@ REQUESTS_END_TIMEOUT_S = 5.0
 If a request takes longer, the operator does not release the Lease object, which then expires.
 """
 WEBHOOK_DRAIN_S = 6.0
-"""Seconds for which the webhook is served after that, so that each kube-proxy notices the end."""
+"""Seconds for which the operator serves the webhook after the release of the Lease object.
+
+Meanwhile each kube-proxy notices that this pod ends.
+"""
 
 
 def run(settings: KubernetesSettings) -> None:
@@ -54,7 +57,7 @@ def logs_command(proxy: str) -> str:
 
 
 def _raise_limit() -> None:
-    """Allow as many open files as possible, because each proxy takes a connection that waits."""
+    """Allow as many open files as possible, because each proxy takes a waiting connection."""
     _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard_limit, hard_limit))
 
@@ -123,5 +126,5 @@ async def _drain(server: WebhookServer, stopped: asyncio.Event) -> None:
 
 
 def _first_reason(*checks: Callable[[], str | None]) -> Callable[[], str | None]:
-    """Return a check that gives the first reason of several checks."""
+    """Return a check that gives the first reason of several checks, None without a reason."""
     return lambda: next(filter(None, (check() for check in checks)), None)

@@ -32,13 +32,13 @@ log = logging.getLogger(__name__)
 
 WIRE = "wire"
 """Id of the handler that wires pods. kopf uses the id as the path of the webhook."""
-BACK_OFF = (1.0, 2.0, 5.0, 10.0)
+RESTART_PAUSES_S = (1.0, 2.0, 5.0, 10.0)
 """Seconds until the thread starts kopf again, after each failure in a row. The last repeats."""
-WELL = 60.0
-"""Seconds after which a run of kopf resets the count of failures."""
-STOPPING = 3.0
-"""Seconds for kopf to end."""
-_BETWEEN_TRIES = (1.0, 1.0, 2.0, 3.0, 5.0)
+STABLE_AFTER_S = 60.0
+"""A run of kopf that lasted longer resets the count of failures."""
+STOP_TIMEOUT_S = 3.0
+"""Seconds that the thread has to end."""
+_RETRY_PAUSES_S = (1.0, 1.0, 2.0, 3.0, 5.0)
 """Seconds between tries of a request. The last repeats."""
 
 
@@ -47,9 +47,9 @@ class EndlessBackoff:
 
     def __iter__(self) -> Iterator[float]:
         """Yield the seconds in order, and then the last value for ever."""
-        yield from _BETWEEN_TRIES
+        yield from _RETRY_PAUSES_S
         while True:
-            yield _BETWEEN_TRIES[-1]
+            yield _RETRY_PAUSES_S[-1]
 
 
 def quiet_library_logs() -> None:
@@ -89,10 +89,10 @@ class ClusterServing:
                 loop.call_soon_threadsafe(task.cancel)
 
     def stop(self) -> None:
-        """Stop serving, and wait up to `STOPPING` seconds for the thread."""
+        """Stop serving, and wait up to `STOP_TIMEOUT_S` seconds for the thread."""
         self._ending.set()
         self.restart()
-        self._thread.join(STOPPING)
+        self._thread.join(STOP_TIMEOUT_S)
 
     async def configure(self, settings: kopf.OperatorSettings, **_: Any) -> None:
         """Configure kopf (startup handler)."""
@@ -147,7 +147,7 @@ class ClusterServing:
             await web.TCPSite(liveness, bind.host, bind.port, backlog=MOST_BACKLOG).start()
             started = time.monotonic()
             await self._run_kopf()
-            failures = 1 if time.monotonic() - started > WELL else failures + 1
+            failures = 1 if time.monotonic() - started > STABLE_AFTER_S else failures + 1
             await asyncio.sleep(_pause(failures))
         finally:
             await liveness.cleanup()
@@ -190,7 +190,7 @@ class ClusterServing:
 
 def _pause(failures: int) -> float:
     """Return the seconds until the next run, after so many failures in a row."""
-    return BACK_OFF[min(failures, len(BACK_OFF)) - 1]
+    return RESTART_PAUSES_S[min(failures, len(RESTART_PAUSES_S)) - 1]
 
 
 def _reason(error: Exception) -> str:
@@ -221,5 +221,5 @@ def _register_webhook(handlers: kopf.OperatorRegistry, injector: Injector) -> No
 
 
 def _log_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log errors of tasks that kopf leaves behind. `_run_once` logs why kopf ends."""
+    """Log errors of tasks that kopf leaves behind. `_run_kopf` logs why kopf ends."""
     log.debug("kopf: %s: %r", context.get("message"), context.get("exception"))

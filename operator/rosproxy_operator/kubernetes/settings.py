@@ -137,7 +137,7 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     image_pull_policy: Annotated[
         Literal["", "Always", "IfNotPresent", "Never"],
         Option(
-            "The imagePullPolicy of that image.",
+            "The imagePullPolicy of the `--proxy-image`.",
             name="--proxy-image-pull-policy",
             default="Kubernetes' own",
         ),
@@ -182,8 +182,8 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     admin_from: Annotated[
         tuple[Json, ...] | None,
         Option(
-            "Sources that this NetworkPolicy admits to the proxies' admin port: a JSON list of "
-            "NetworkPolicyPeers.",
+            "Sources that the NetworkPolicy of the proxies admits to the admin port: a JSON list "
+            "of NetworkPolicyPeers.",
             option_values.NETWORK_PEERS,
             default="all",
         ),
@@ -236,8 +236,8 @@ class WebhookSettings(msgspec.Struct, frozen=True):
         str,
         Option(
             "Directory with a certificate that the operator does not make: `tls.crt` and "
-            "`tls.key`, in place of the last three options. The operator reads both files "
-            "again when they change.",
+            "`tls.key`, in place of `--webhook-service`, `--webhook-secret` and "
+            "`--webhook-configuration`. The operator reads both files again when they change.",
             option_values.DIRECTORY,
             name="--webhook-cert-dir",
             default="none",

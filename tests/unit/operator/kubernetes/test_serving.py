@@ -104,8 +104,8 @@ class Running:
 async def running(
     server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> AsyncIterator[Running]:
-    monkeypatch.setattr(serving, "BACK_OFF", (0.05,))
-    monkeypatch.setattr(serving, "_BETWEEN_TRIES", (0.05,))
+    monkeypatch.setattr(serving, "RESTART_PAUSES_S", (0.05,))
+    monkeypatch.setattr(serving, "_RETRY_PAUSES_S", (0.05,))
     serving.quiet_library_logs()
     started = Running(server, api)
     started.serving.start()
@@ -166,7 +166,7 @@ async def test_while_kopf_fails_the_operator_stays_alive(
     """Otherwise the kubelet would restart an operator of which only the webhook fails."""
 
     async def fail(**_: Any) -> None:
-        monkeypatch.setattr(serving, "BACK_OFF", (3600.0,))
+        monkeypatch.setattr(serving, "RESTART_PAUSES_S", (3600.0,))
         raise RuntimeError("no webhook")
 
     monkeypatch.setattr(kopf, "operator", fail)
