@@ -45,7 +45,7 @@ from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S
 from rosproxy.ros2.ports.store import port_store_key
 from rosproxy.ros2.protocol.relay_proof import RelayProof
 from rosproxy.ros2.servers.domain_server import EXPIRY_INTERVAL_S, DomainServer
-from rosproxy.ros2.sources.selected import UPDATE_TIMEOUT_S
+from rosproxy.ros2.sources.selected import FIRST_SELECTION_TIMEOUT_S
 from rosproxy.ros2.status import Ros2State
 from rosproxy.ros2.udp_probe import try_ports, try_udp
 from rosproxy.runtime import Runtime
@@ -60,7 +60,7 @@ REFRESH_INTERVAL_S = 5.0
 POLICY_INTERVAL_S = 0.5
 """Seconds between checks of the policy for changes."""
 RATE_INTERVAL_S = 2.0
-"""Seconds between samples of the rates."""
+"""Seconds between updates of the rates."""
 
 
 class Ros2:
@@ -140,7 +140,7 @@ class Ros2:
                 self._is_inside,
                 self.plane.syncer.note_change,
                 # With a token an operator is expected, which selects addresses.
-                UPDATE_TIMEOUT_S if settings.admin_token_hash else 0.0,
+                FIRST_SELECTION_TIMEOUT_S if settings.admin_token_hash else 0.0,
             )
             server.domain.ports.note_forwarded(self.plane.forwards)
             self.servers.append(server)
@@ -165,7 +165,9 @@ class Ros2:
         secret = secrets.token_bytes(16)
         port = settings.ports.advertised(settings.discovery_port)
         target = HostPort(self._hosts[0], port)
-        outcome = await server.hears(secret, lambda heard: try_udp(target, secret, heard))
+        outcome = await server.try_discovery_port(
+            secret, lambda heard: try_udp(target, secret, heard)
+        )
         advertised = str(HostPort(self._settings.advertise_host, port))
         return PortProbe(settings.discovery_port, advertised, outcome, "unknown", "udp")
 
@@ -354,7 +356,7 @@ class Ros2:
         # In a trial on a single machine, both sides may have the same loopback address.
         self._peer_addresses = frozenset(host for host in hosts if not addresses.is_loopback(host))
         for server in self.servers:
-            server.ask_outside(addresses_of_all)
+            server.set_peers(addresses_of_all)
 
     def _look_at_networks(self) -> None:
         own_networks = {network: address_into(network) for network in interface_networks()}
@@ -362,7 +364,7 @@ class Ros2:
         own_addresses = {address_into(network) for network in self.networks}
         gateways = default_gateways()
         for server in self.servers:
-            # The route to a network without the proxy begins at an address outside the network.
+            # If the proxy is not on an inside network, the route there begins at another address.
             server.join(address for address in own_addresses if self._is_inside(address))
             server.note_gateways(gateways)
 
@@ -370,7 +372,7 @@ class Ros2:
         now = self._runtime.now()
         for server in self.servers:
             for _, mapping in server.domain.mappings.by_port.values():
-                mapping.sample(now)
+                mapping.update_rates(now)
 
     async def _resolve_peer(self, peer: HostPort) -> list[HostPort]:
         subject = f"peer {peer.host}"
@@ -391,9 +393,9 @@ def advertised_hosts(
     """The addresses of the advertised host to announce: a single one, or one of each family.
 
     Locators have no host names. ``resolved`` are the addresses of the name now, and ``present`` the
-    announced addresses. The present addresses stay while the name has all of them, and if the name
-    can't be resolved: a name server may return several addresses in any order. An address of a
-    family that ``bind`` does not cover counts only if there is no other.
+    announced addresses. The present addresses stay while the name has all of them, because a name
+    server may return several addresses in any order. They also stay if the name can't be resolved.
+    An address of a family that ``bind`` does not cover counts only if there is no other.
     """
     if not resolved or (present and all(address in resolved for address in present)):
         return present

@@ -34,12 +34,12 @@ from rosproxy.ros2.registry.participants import (
 )
 from rosproxy.ros2.servers.domain_server import DomainServer
 
-MOST_ENDPOINTS = 8192
+MOST_LISTED_ENDPOINTS = 8192
 """Readers and writers of a side of a domain whose names are listed, with fair shares by address.
 
 A host with fifty nodes has some 1,000. Listing 8,192 takes 30 ms, and the event loop waits
 meanwhile."""
-MOST_MISMATCHES = 100
+MOST_LISTED_MISMATCHES = 100
 """Mismatches of a domain that are listed, with fair shares by the address inside."""
 _NO_SHORTAGE = PortShortage()
 _Participant = TypeVar("_Participant", bound=Participant)
@@ -146,7 +146,7 @@ class Ros2State(Collector):
         comparison = compare(domain.inside.by_prefix.values(), domain.outside.by_prefix.values())
         pairs = comparison.mismatched
         shortages = domain.mappings.shortages
-        shown_pairs = fair_choice(pairs, _address_inside, MOST_MISMATCHES)
+        shown_pairs = fair_choice(pairs, _address_inside, MOST_LISTED_MISMATCHES)
         return document.DomainStatus(
             domain=settings.number,
             discovery=str(HostPort(settings.host, discovery)),
@@ -176,7 +176,7 @@ class Ros2State(Collector):
     def _shares(self, participants: Iterable[_Participant]) -> Iterator[tuple[_Participant, int]]:
         """Each participant of a side, and the number of its readers and writers to list."""
         every = list(participants)
-        most = MOST_ENDPOINTS if self.with_names else 0
+        most = MOST_LISTED_ENDPOINTS if self.with_names else 0
         wanted = [len(participant.endpoints) for participant in every]
         owners = [participant.address for participant in every]
         return zip(every, fair_shares_by_owner(owners, wanted, most), strict=True)

@@ -1,8 +1,8 @@
-"""Does UDP to the advertised host reach the range? The proxy itself sends the probe.
+"""Probe whether UDP to the advertised host reaches the range. The proxy itself sends the probe.
 
 In ROS 2 the proxy can't ask a participant outside to send a probe. The probe of the proxy fails
-behind NAT without hairpinning, although outside may reach the range. So a success proves much, and
-a failure little.
+behind NAT without hairpinning, although outside may reach the range. So a failed probe does not
+prove that outside can't reach the range.
 """
 
 import asyncio
@@ -45,8 +45,8 @@ async def try_udp(target: HostPort, secret: bytes, heard: asyncio.Event) -> str:
 async def try_ports(runtime: Runtime) -> tuple[PortProbe, ...]:
     """Bind all ports of the range, and probe the discovery port of the first domain.
 
-    This is the first port of the range. Empty if this port is not available, or if the advertised
-    host has no address. Raises SettingError if no port is available.
+    This is the first port of the range. The result is empty if this port is not available, or if
+    the advertised host has no address. Raises SettingError if no port is available.
     """
     settings = runtime.settings
     addresses = await resolve(runtime.settings.advertise_host)

@@ -12,7 +12,7 @@ from rosproxy.ros2.servers.discovery_scheduler import (
     ROUND_BYTES,
     DiscoveryScheduler,
 )
-from rosproxy.ros2.sources.fair_queue import MOST_OF_SOURCE, OVERHEAD_BYTES
+from rosproxy.ros2.sources.fair_queue import MOST_BYTES_PER_SOURCE, OVERHEAD_BYTES
 from rosproxy.ros2.sources.rates import Standing
 
 
@@ -154,7 +154,7 @@ async def test_nothing_is_read_after_the_end() -> None:
 
 
 async def test_what_has_no_room_is_told() -> None:
-    count = MOST_OF_SOURCE // (ROUND_BYTES + OVERHEAD_BYTES)
+    count = MOST_BYTES_PER_SOURCE // (ROUND_BYTES + OVERHEAD_BYTES)
     reader = DiscoveryScheduler()
     names = list[str]()
     has_room = [

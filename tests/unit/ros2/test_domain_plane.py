@@ -45,9 +45,9 @@ def test_user_data_is_what_the_proxy_and_the_kernel_have_passed_on() -> None:
     mappings.domains.append(domain.mappings)
     participant = domain.inside.by_prefix[A]
     mapping = participant.mappings[HostPort(INSIDE, 7411)]
-    mapping.sample(NOW)
+    mapping.update_rates(NOW)
     mapping.note_passed(100, has_samples=True)
-    mapping.sample(NOW + 1)
+    mapping.update_rates(NOW + 1)
     plane = cast(KernelPlane, KernelForwards())
     status = DomainPlane(plane, mappings).locator(participant, mapping)
     assert status.user_datagrams == 10

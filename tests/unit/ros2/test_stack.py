@@ -72,7 +72,7 @@ class Listening:
     def move_to(self, hosts: tuple[str, ...]) -> None:
         self.hosts = hosts
 
-    def ask_outside(self, peers: tuple[HostPort, ...]) -> None:
+    def set_peers(self, peers: tuple[HostPort, ...]) -> None:
         self.peers = peers
 
     def join(self, addresses: Iterable[str]) -> None:

@@ -125,7 +125,7 @@ def test_a_participant_has_the_names_of_all_its_nodes(monkeypatch: pytest.Monkey
         domain.at_stand_in(stand_in, sedp(A, SUBSCRIPTIONS, topic, kind, 1), INSIDE, NOW)
     (inside,) = told(domain).inside
     assert inside.nodes == ("/arm/planner", "/driver")
-    monkeypatch.setattr("rosproxy.ros2.status.MOST_ENDPOINTS", 1)
+    monkeypatch.setattr("rosproxy.ros2.status.MOST_LISTED_ENDPOINTS", 1)
     (inside,) = told(domain).inside
     assert (inside.nodes, inside.services) == (("/driver",), ("/driver/get_parameters",))
 
@@ -165,11 +165,11 @@ def test_the_rate_of_a_port() -> None:
     domain = make_domain()
     announce(domain, 1)
     (_, mapping), *_ = domain.mappings.by_port.values()
-    mapping.sample(NOW)
+    mapping.update_rates(NOW)
     mapping.note_passed(1000, has_samples=False)
     for _ in range(4):
         mapping.note_passed(500, has_samples=True)
-    mapping.sample(NOW + 2)
+    mapping.update_rates(NOW + 2)
     (inside,) = told(domain).inside
     assert 1500.0 in {locator.rate for locator in inside.leases}
     assert (mapping.user_rate, mapping.user_datagram_rate) == (1000.0, 2.0)

@@ -164,7 +164,7 @@ class Domain:
 
     def heard_inside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """Handle a datagram from inside, at the multicast group or at the well-known port."""
-        is_answer = self.proofs.is_answer(source, datagram)
+        is_answer = self.proofs.is_first_answer(source, datagram)
         if not is_answer and not self._take_allowance(datagram, source, now):
             return []
         sent = list[Outgoing]()
@@ -189,7 +189,7 @@ class Domain:
             return self._heard_by_relay(relay, datagram, now)
         # Forged participants may fill the table, so that no participant is known at this address.
         # So the proxy accepts the first answer to a question from any source.
-        if not self.proofs.is_answer(source, datagram) and self.outside.is_strange(source):
+        if not self.proofs.is_first_answer(source, datagram) and self.outside.is_strange(source):
             return []
         return self._heard_at_discovery(datagram, source, False, now)
 
@@ -225,7 +225,7 @@ class Domain:
     def _heard_at_discovery(
         self, datagram: bytes, source: str, by_relay: bool, now: float
     ) -> list[Outgoing]:
-        is_answer = self.proofs.is_answer(source, datagram)
+        is_answer = self.proofs.is_first_answer(source, datagram)
         if not is_answer and not self._take_allowance(datagram, source, now):
             return []
         sent = list[Outgoing]()
@@ -246,7 +246,7 @@ class Domain:
         source is a peer, or the LAN relay has passed the datagram on. The first answer of a
         participant to a question does not wait.
         """
-        if self.proofs.is_answer(source, datagram):
+        if self.proofs.is_first_answer(source, datagram):
             return False
         return self.outside.is_met(source) or self.source_of(datagram, source) != source
 
@@ -255,7 +255,7 @@ class Domain:
 
         The first answer of a participant to a question does not wait.
         """
-        return not self.proofs.is_answer(source, datagram)
+        return not self.proofs.is_first_answer(source, datagram)
 
     def must_queue_at_range_port(self, port: int, datagram: bytes, source: str) -> bool:
         """Whether a datagram for `at_range_port` must wait in the queue of discovery."""
@@ -749,7 +749,7 @@ class Domain:
         """The datagrams for participants outside, as far as their credit allows."""
         sent = list[Outgoing]()
         for target, mapping in users:
-            if target.may_be_sent(len(datagram)):
+            if target.take_credit(len(datagram)):
                 sent.append(self._passed(mapping, datagram, False, is_user_data))
             else:
                 text = f"participant {target.guid_prefix} has not yet answered the proxy's question"

@@ -24,12 +24,12 @@ from rosproxy.ros2.protocol.qos import Liveliness
 from rosproxy.ros2.protocol.ros_names import ros_name, ros_type
 from rosproxy.ros2.registry.participants import DdsEndpoint, EndpointKind, Participant
 
-MOST_LOOKED_AT = 10_000
-"""Readers and writers of a side that are looked at, in at most 0.1 s. A participant of ROS 2 has
-some tens. The addresses of the side take turns."""
-MOST_COMPARED = 20_000
-"""Pairs that are compared at a time. The addresses inside take turns, and so do the readers and
-writers of an address. Each meets the endpoints outside in the order of the turns outside."""
+MOST_COMPARED_ENDPOINTS = 10_000
+"""Readers and writers of a side that one comparison reads, in at most 0.1 s. A participant of ROS 2
+has some tens. The addresses of the side take turns."""
+MOST_COMPARED_PAIRS = 20_000
+"""Pairs in one comparison. The addresses inside take turns, and so do the readers and writers of an
+address. The endpoints outside of each pair follow in the order of the turns outside."""
 _OPPOSITE = {
     EndpointKind.READER: EndpointKind.WRITER,
     EndpointKind.WRITER: EndpointKind.READER,
@@ -74,7 +74,8 @@ class Comparison(msgspec.Struct, frozen=True):
 def compare(inside: Iterable[Participant], outside: Iterable[Participant]) -> Comparison:
     """Compare the readers and writers inside with those outside, topic by topic.
 
-    The result has a mismatch of a policy between two participants once for each topic or service.
+    Two participants may have several pairs of the same topic or service that do not match by the
+    same policy. Then the result has only the first of these pairs.
     """
     insiders, not_looked_at_inside = _endpoints(inside)
     outsiders, not_looked_at_outside = _endpoints(outside)
@@ -91,7 +92,7 @@ def compare(inside: Iterable[Participant], outside: Iterable[Participant]) -> Co
         count += len(partners)
     pairs = _in_turn(map(_in_turn, by_address.values()))
     mismatched: dict[tuple[str, bytes, bytes, str], MismatchedPair] = {}
-    for insider, outsider in islice(pairs, MOST_COMPARED):
+    for insider, outsider in islice(pairs, MOST_COMPARED_PAIRS):
         is_written_inside = insider[1].kind is EndpointKind.WRITER
         (source, writer), (sink, reader) = (
             (insider, outsider) if is_written_inside else (outsider, insider)
@@ -99,7 +100,7 @@ def compare(inside: Iterable[Participant], outside: Iterable[Participant]) -> Co
         if reason := mismatch(writer, reader):
             key = ros_name(writer.topic), insider[0].prefix, outsider[0].prefix, reason.policy
             mismatched.setdefault(key, MismatchedPair(reason, writer.topic, source, sink))
-    left_out = max(count - MOST_COMPARED, 0) + not_looked_at_inside + not_looked_at_outside
+    left_out = max(count - MOST_COMPARED_PAIRS, 0) + not_looked_at_inside + not_looked_at_outside
     return Comparison(list(mismatched.values()), left_out)
 
 
@@ -118,15 +119,15 @@ def _endpoints(side: Iterable[Participant]) -> tuple[list[_Owned], int]:
         owned = zip(repeat(participant), participant.endpoints.values())
         by_address[participant.address].append(owned)
         count += len(participant.endpoints)
-    in_turn = islice(_in_turn(map(_in_turn, by_address.values())), MOST_LOOKED_AT)
+    in_turn = islice(_in_turn(map(_in_turn, by_address.values())), MOST_COMPARED_ENDPOINTS)
     different = {
         (participant.prefix, endpoint): (participant, endpoint) for participant, endpoint in in_turn
     }
-    return list(different.values()), max(count - MOST_LOOKED_AT, 0)
+    return list(different.values()), max(count - MOST_COMPARED_ENDPOINTS, 0)
 
 
 def _in_turn(sequences: Iterable[Iterable[_Item]]) -> Iterator[_Item]:
-    """Yield the first item of each sequence, then the second item of each, and so on."""
+    """Yield the first item of each sequence, then the second item of each sequence, and so on."""
     waiting = deque(map(iter, sequences))
     while waiting:
         items = waiting.popleft()

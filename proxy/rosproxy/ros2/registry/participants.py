@@ -30,7 +30,7 @@ VENDORS = {
 }
 """Names of implementations, by the vendor id in the header of each message (list of the OMG). The
 proxy's own participants have the id zero, which means "unknown"."""
-PROCESS_LENGTHS = {FAST_DDS: 8, CYCLONE_DDS: 4}
+PROCESS_PREFIX_BYTES = {FAST_DDS: 8, CYCLONE_DDS: 4}
 """Bytes at the start of a GUID prefix that all participants of a process have in common.
 
 Sources: Fast DDS: GuidUtils.hpp; Cyclone DDS: ddsi_generate_participant_guid (ddsi_participant.c).
@@ -67,7 +67,7 @@ class EndpointKind(StrEnum):
 
 
 class ShortageKind(StrEnum):
-    """What a locator lacks.
+    """Why a locator inside got no port.
 
     ``RANGE``: no port of the range is left for the locator. ``BOUND``: the participant has as many
     ports as one participant may have.
@@ -79,7 +79,7 @@ class ShortageKind(StrEnum):
 
 
 class PortShortage(msgspec.Struct, frozen=True):
-    """Why a locator inside got no port."""
+    """The shortage of a participant with a locator that got no port; ``text`` is for the status."""
 
     kind: ShortageKind = ShortageKind.NONE
     text: str = ""
@@ -148,10 +148,10 @@ class PortMapping:
     A locator inside has a port of the range. A locator outside has a *stand-in*, a port that inside
     reaches. ``is_read`` (only inside) means that a participant at the locator may act on discovery.
 
-    ``bytes`` and ``datagrams`` count what the proxy has passed on. ``user_bytes`` and
-    ``user_datagrams`` count the datagrams with samples of user data among this. ``rate`` and
+    ``bytes`` and ``datagrams`` count all datagrams that the proxy has passed on. ``user_bytes`` and
+    ``user_datagrams`` count only the datagrams with samples of user data. ``rate`` and
     ``user_rate`` are in bytes per second, ``user_datagram_rate`` in datagrams per second, as of the
-    last `sample`.
+    last `update_rates`.
     """
 
     port: int
@@ -165,20 +165,20 @@ class PortMapping:
     rate: float = 0.0
     user_rate: float = 0.0
     user_datagram_rate: float = 0.0
-    _sampled_at: float = 0.0
-    _sampled: tuple[int, int, int] = (0, 0, 0)
+    _rates_at: float = 0.0
+    _counts_at_rates: tuple[int, int, int] = (0, 0, 0)
 
-    def sample(self, now: float) -> None:
-        """Compute the rates since the last sample; ``now`` is in seconds."""
+    def update_rates(self, now: float) -> None:
+        """Compute the rates since the last call; the first call has none. ``now`` is in seconds."""
         counts = self.bytes, self.user_bytes, self.user_datagrams
-        elapsed = now - self._sampled_at
-        if self._sampled_at and elapsed > 0:
+        elapsed = now - self._rates_at
+        if self._rates_at and elapsed > 0:
             self.rate, self.user_rate, self.user_datagram_rate = (
                 round((count - last) / elapsed, 1)
-                for count, last in zip(counts, self._sampled, strict=True)
+                for count, last in zip(counts, self._counts_at_rates, strict=True)
             )
-        self._sampled_at = now
-        self._sampled = counts
+        self._rates_at = now
+        self._counts_at_rates = counts
 
     def note_passed(self, size: int, has_samples: bool) -> None:
         """Count a datagram of ``size`` bytes that the proxy passes on.
@@ -260,7 +260,10 @@ class EndpointNotes:
     size: int = 0
 
     def note(self, participant: Participant, entity: bytes, endpoint: DdsEndpoint | None) -> None:
-        """Remember a reader or writer; with None, forget a reader or writer that has ended."""
+        """Remember a reader or writer; with None, forget a reader or writer that has ended.
+
+        Without room, the reader or writer is not remembered, and a former entry is forgotten.
+        """
         former = participant.endpoints.pop(entity, None)
         if former is not None:
             self._count(participant.address, -former.size)
@@ -293,13 +296,14 @@ class EndpointNotes:
 class InsideParticipant(Participant):
     """A participant inside, with a port of the range for each of its locators.
 
-    ``verdicts`` tell by rule whether the policy allows a topic or service. There is a verdict for
-    each endpoint of the participant, and for each endpoint outside that the proxy was to announce
-    to the participant. ``has_more_verdicts`` means that some are not remembered. ``proxy_address``
-    is the proxy's address on the network of the participant. ``is_in_group`` means that the
-    participant was heard there by multicast. ``was_inside`` means that a former process of the
-    proxy served the participant, by better evidence than the participant's own word.
-    ``announced_at`` is the time of the last announcement to outside.
+    ``verdicts`` say whether the policy allows a topic or service, by kind of rule and name. There
+    is a verdict for each endpoint of the participant, and for each endpoint outside that the proxy
+    was to announce to the participant. ``has_more_verdicts`` means that the proxy does not remember
+    all verdicts. ``proxy_address`` is the proxy's address on the network of the
+    participant. ``is_in_group`` means that the participant was heard on this network by multicast.
+    ``was_inside`` means that a former process of the proxy served the participant, by better
+    evidence than the participant's own claim. ``announced_at`` is the time of the last announcement
+    to outside.
 
     The other attributes belong to `Rediscovery`, and are None outside of a rediscovery.
     ``separation_due_from`` is the time from which the participant waits for its separation.
@@ -329,7 +333,8 @@ class InsideParticipant(Participant):
 
 
 COMES_IN_WITHIN_S = 2.0
-"""Seconds within which a participant that announces itself sends discovery to the range."""
+"""Seconds in which discovery of a participant outside arrives at the range, if it arrives at all.
+The time begins with the first announcement."""
 ANSWERED_FACTOR = 3
 """Bytes that the proxy may send for each received byte, to a participant that has answered but
 whose address is not proven. With authentication by DDS Security, participants do not answer the
@@ -386,8 +391,11 @@ class OutsideParticipant(Participant):
             self.has_answered = True
         self.credit += size * (ANSWERED_FACTOR if self.has_answered else 1)
 
-    def may_be_sent(self, size: int) -> bool:
-        """Whether ``size`` bytes may go to the participant. If so, charge its credit."""
+    def take_credit(self, size: int) -> bool:
+        """Return whether the proxy may send ``size`` bytes to the participant.
+
+        If so, charge the credit, except for a participant that is trusted or proven.
+        """
         if self.is_known:
             return True
         if self.credit < size:
@@ -424,17 +432,17 @@ class ParticipantTable(Generic[AnyParticipant]):
     def former_processes(self, prefix: bytes, address: str) -> list[AnyParticipant]:
         """The participants of former processes at the port that a participant has now.
 
-        Empty if the participant is unknown, or if several processes may use the port.
+        Empty if the participant or its port is unknown, or if several processes may use the port.
         """
         holder = self.find(prefix, address)
         if holder is None or holder.metatraffic is None:
             return []
-        length = PROCESS_LENGTHS.get(holder.vendor)
+        length = PROCESS_PREFIX_BYTES.get(holder.vendor)
         return [
             participant
             for participant in self.at(address)
             if length is not None
-            and participant.vendor in PROCESS_LENGTHS
+            and participant.vendor in PROCESS_PREFIX_BYTES
             and participant.metatraffic == holder.metatraffic
             and participant.prefix[:length] != prefix[:length]
         ]

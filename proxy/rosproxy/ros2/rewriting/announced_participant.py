@@ -31,7 +31,7 @@ _VALID = 0x8000_0000
 
 
 def lease_duration(spdp: Announcement, datagram: bytes) -> float:
-    """The lease duration of a participant, from 1 second to LONGEST_LEASE_DURATION_S."""
+    """The lease duration of a participant in seconds, from 1 to LONGEST_LEASE_DURATION_S."""
     seconds = spdp.parameters.seconds(datagram, Pid.PARTICIPANT_LEASE_DURATION)
     return min(
         max(DEFAULT_LEASE_DURATION_S if seconds is None else seconds, 1.0), LONGEST_LEASE_DURATION_S
@@ -39,7 +39,7 @@ def lease_duration(spdp: Announcement, datagram: bytes) -> float:
 
 
 def first_metatraffic(spdp: Announcement, datagram: bytes, address: str) -> HostPort | None:
-    """The first metatraffic locator of a participant at an address; None if there is none."""
+    """The first metatraffic locator with this address; None if there is none."""
     locators = (
         locator
         for pid, locator in spdp.reached_at(datagram)
@@ -49,7 +49,7 @@ def first_metatraffic(spdp: Announcement, datagram: bytes, address: str) -> Host
 
 
 def traits(spdp: Announcement, datagram: bytes, address: str) -> ParticipantTraits:
-    """The traits of a participant at an address, which may prevent its discovery."""
+    """The traits of a participant; ``address`` is the source of its announcement."""
     domain = spdp.parameters.number(datagram, Pid.DOMAIN_ID)
     return ParticipantTraits(
         None if domain == _UNKNOWN_DOMAIN else domain,
@@ -73,7 +73,7 @@ def note_endpoints(
         topic = announcement.topic(datagram)
         type_name = announcement.parameters.text(datagram, Pid.TYPE_NAME) or ""
         qos = read_qos(datagram, announcement.parameters, kind is EndpointKind.WRITER)
-        # Only the status uses these texts. A topic of ROS 2 has at most 255 bytes.
+        # Only the status and findings use these texts. A topic of ROS 2 has at most 255 bytes.
         endpoint = DdsEndpoint(kind, topic[:256], type_name[:256], qos)
         notes.note(participant, entity, None if announcement.ended else endpoint)
 
@@ -91,7 +91,10 @@ def _security(spdp: Announcement, datagram: bytes) -> DdsSecurity:
 
 
 def _locator_fault(spdp: Announcement, datagram: bytes, address: str) -> LocatorFault:
-    """The first reason for which the proxy can't pass datagrams to a participant at an address."""
+    """Why the proxy can't pass datagrams to a participant at an address; NO if it can.
+
+    Metatraffic locators are checked before the locators for user data.
+    """
     for pid in (Pid.METATRAFFIC_UNICAST_LOCATOR, Pid.DEFAULT_UNICAST_LOCATOR):
         locators = [read_locator(datagram, spdp.parameters, p) for p in spdp.parameters.all(pid)]
         hosts = {locator.host_port.host for locator in locators if locator and locator.host_port}

@@ -1,4 +1,4 @@
-"""DDS discovery: read announcements, and replace the locators in these.
+"""DDS discovery: read announcements, and replace the locators in them.
 
 Participants discover each other by SPDP, and each other's readers and writers by SEDP. Both consist
 of samples of builtin writers, which have fixed entity ids (DDSI-RTPS 2.5, 8.5 and 9.3.1.2). The
@@ -64,14 +64,14 @@ _IDENTITIES = (Pid.PARTICIPANT_GUID, Pid.ENDPOINT_GUID, Pid.KEY_HASH)
 """Parameters that name the participant, reader or writer of an announcement. Each value begins with
 a GUID prefix. Receivers act on these values, whatever the source of the message is (Fast DDS:
 EDPSimplePUBListener)."""
-TAKEN_FOR_FAST_DDS = (FAST_DDS, NO_VENDOR)
+FAST_DDS_PARAMETER_VENDORS = (FAST_DDS, NO_VENDOR)
 """Vendors whose vendor-specific parameters Fast DDS interprets."""
 _DISPOSED_OR_UNREGISTERED = 0x03
-LONGEST_OF_PARTICIPANT = 8192
+LONGEST_SPDP_DATAGRAM_BYTES = 8192
 """Bytes of a datagram in which a participant announces itself. The proxy keeps this datagram. Some
-have 1,500 bytes."""
-_OF_ANOTHER = "the datagram announces another participant than its sender"
-LONGEST_TOPIC = 1024
+participants send 1,500 bytes."""
+_FOREIGN_ANNOUNCEMENT = "the datagram announces another participant than its sender"
+LONGEST_TOPIC_BYTES = 1024
 """Bytes of a topic's name. Names of ROS 2 have at most 255."""
 MOST_PARAMETERS_OF_ALL = 4096
 """Parameters of all announcements in a datagram. The announcement of a reader or writer has 25
@@ -79,7 +79,7 @@ parameters in 600 bytes, so a datagram of 64 KiB has 2,700."""
 MOST_LOCATORS_OF_ALL = 1024
 """Locators of all announcements in a datagram. Fast DDS announces five for a reader or writer."""
 
-MOST_ANNOUNCED = 48
+MOST_ANNOUNCED_PARTICIPANTS = 48
 """Participants that announce themselves in one datagram. The proxy announces each to all
 participants of the other side. Cyclone DDS sends at most 14,720 bytes (MaxMessageSize), 400 for
 each participant."""
@@ -175,13 +175,14 @@ class DiscoveryMessage(msgspec.Struct, frozen=True):
 def read_discovery(datagram: bytes) -> DiscoveryMessage:
     """Read the announcements in a datagram.
 
-    Raises RtpsError if the datagram or an announcement is malformed, and if an announcement is from
-    or about another participant than the sender.
+    Raises RtpsError if the datagram or an announcement is malformed, or if an announcement is from
+    or about another participant than the sender. Raises RtpsError also for a checksum, and for a
+    message with SPDP of more than LONGEST_SPDP_DATAGRAM_BYTES.
     """
     prefix = source_prefix(datagram)
     builtin_samples = [sample for sample in samples(datagram) if sample.writer in _BUILTIN_WRITERS]
     if any(sample.prefix != prefix for sample in builtin_samples):
-        raise RtpsError(_OF_ANOTHER)
+        raise RtpsError(_FOREIGN_ANNOUNCEMENT)
     if builtin_samples and has_checksum(datagram):
         raise RtpsError("the discovery has a checksum, so the proxy can't rewrite the discovery")
     for sample in builtin_samples:  # fragments have inline QoS as well
@@ -192,9 +193,9 @@ def read_discovery(datagram: bytes) -> DiscoveryMessage:
         _announcements(datagram, [s for s in builtin_samples if s.fragments is None]),
         tuple((s, s.fragments) for s in builtin_samples if s.fragments is not None),
     )
-    if len(datagram) > LONGEST_OF_PARTICIPANT and message.of_participant is not None:
+    if len(datagram) > LONGEST_SPDP_DATAGRAM_BYTES and message.of_participant is not None:
         text = f"the announcement of a participant has {len(datagram)} bytes"
-        raise RtpsError(f"{text}, at most {LONGEST_OF_PARTICIPANT} are accepted")
+        raise RtpsError(f"{text}, at most {LONGEST_SPDP_DATAGRAM_BYTES} are accepted")
     return message
 
 
@@ -203,8 +204,11 @@ def read_messages(datagram: bytes) -> Iterator[DiscoveryMessage]:
     announced_count = 0
     for message in map(read_discovery, by_source(datagram)):
         announced_count += message.of_participant is not None
-        if announced_count > MOST_ANNOUNCED:
-            text = f"the datagram has more than {MOST_ANNOUNCED} announcements of participants"
+        if announced_count > MOST_ANNOUNCED_PARTICIPANTS:
+            text = (
+                f"the datagram has more than {MOST_ANNOUNCED_PARTICIPANTS} announcements of "
+                "participants"
+            )
             raise RtpsError(text)
         yield message
 
@@ -213,8 +217,8 @@ def credited_messages(datagram: bytes) -> Iterator[tuple[DiscoveryMessage, int]]
     """Yield the message of each participant, and the count of received bytes for the message.
 
     The messages together may be longer than the datagram (`by_source`). The sum of the counts is at
-    most the length of the datagram. So the proxy sends a participant no more bytes than came in its
-    name. Raises RtpsError.
+    most the length of the datagram. So a datagram of several messages earns no additional
+    credit. Raises RtpsError.
     """
     remaining = len(datagram)
     for message in read_messages(datagram):
@@ -224,28 +228,30 @@ def credited_messages(datagram: bytes) -> Iterator[tuple[DiscoveryMessage, int]]
 
 
 def rewritten(
-    message: DiscoveryMessage, lead: LocatorRedirect, is_hidden: Callable[[Announcement], bool]
+    message: DiscoveryMessage, redirect: LocatorRedirect, is_hidden: Callable[[Announcement], bool]
 ) -> bytes:
     """The message with replaced locators, and with a GAP for each hidden announcement.
 
-    Raises ValueError if ``lead`` returns a host that is no address.
+    Raises ValueError if ``redirect`` returns a host that is no address.
     """
     edits = list[Overwrite]()
     for announcement in message.announcements:
         if is_hidden(announcement):
             edits.append(withheld(announcement.sample))
         else:
-            edits += _edits(message.datagram, announcement.parameters, lead)
+            edits += _edits(message.datagram, announcement.parameters, redirect)
     return apply(message.datagram, edits)
 
 
 def participant_alone(message: DiscoveryMessage) -> bytes:
     """The SPDP announcement in a message, without other submessages and without a destination.
 
+    If the message has no SPDP announcement, the result is the header alone.
+
     Cyclone DDS answers the discovery participant with an announcement for this participant alone
     (ddsi_discovery_spdp.c, respond_to_spdp). Without the destination, all participants accept the
-    announcement. If the message also announced readers and writers, other readers request these
-    announcements again (DDSI-RTPS 2.5, 8.4.9).
+    announcement. The message may also announce readers and writers. The participants then request
+    these announcements again (DDSI-RTPS 2.5, 8.4.9).
     """
     datagram = message.datagram
     spdp = message.of_participant
@@ -270,7 +276,7 @@ def require_rewritable(message: DiscoveryMessage) -> None:
     """
     if message.fragments:
         raise RtpsError("the message by which a participant announces itself has fragments")
-    rewritten(message, lambda *_: None, lambda told: bool(told.topic(message.datagram)))
+    rewritten(message, lambda *_: None, lambda a: bool(a.topic(message.datagram)))
 
 
 def _announcements(datagram: bytes, builtin_samples: Iterable[Sample]) -> tuple[Announcement, ...]:
@@ -296,7 +302,7 @@ def _announcements(datagram: bytes, builtin_samples: Iterable[Sample]) -> tuple[
 def _announcement(datagram: bytes, sample: Sample) -> Announcement:
     parameters = payload_parameters(datagram, sample)
     inline = inline_parameters(datagram, sample)
-    ended = sample.is_key_only or _tells_an_end(datagram, inline)
+    ended = sample.is_key_only or _reports_end(datagram, inline)
     # An end may have no payload. A payload has to be a parameter list, because the list may name
     # another participant (`_require_own`).
     if parameters is None and (sample.payload or not ended):
@@ -310,8 +316,8 @@ def _announcement(datagram: bytes, sample: Sample) -> Announcement:
     is_endpoint = sample.writer in _KINDS
     if is_endpoint and not ended and not parameters.text(datagram, Pid.TOPIC_NAME):
         raise RtpsError("a reader or writer has no topic")
-    if topics and topics[0].value.end - topics[0].value.start > LONGEST_TOPIC:
-        raise RtpsError(f"the name of a topic has more than {LONGEST_TOPIC} bytes")
+    if topics and topics[0].value.end - topics[0].value.start > LONGEST_TOPIC_BYTES:
+        raise RtpsError(f"the name of a topic has more than {LONGEST_TOPIC_BYTES} bytes")
     return Announcement(BuiltinWriter(sample.writer), sample, parameters, inline, ended)
 
 
@@ -321,10 +327,10 @@ def _require_own(datagram: bytes, sample: Sample, parameters: ParameterList | No
         start = parameter.value.start
         end = parameter.value.end
         if datagram[start : min(start + PREFIX_BYTES, end)] != sample.prefix:
-            raise RtpsError(_OF_ANOTHER)
+            raise RtpsError(_FOREIGN_ANNOUNCEMENT)
 
 
-def _tells_an_end(datagram: bytes, inline_qos: ParameterList | None) -> bool:
+def _reports_end(datagram: bytes, inline_qos: ParameterList | None) -> bool:
     """Whether the inline QoS reports the end of a participant, reader or writer (9.6.3.9)."""
     for param in inline_qos.all(Pid.STATUS_INFO) if inline_qos else ():
         if param.value.end - param.value.start >= 4:
@@ -335,18 +341,18 @@ def _tells_an_end(datagram: bytes, inline_qos: ParameterList | None) -> bool:
 
 
 def _edits(
-    datagram: bytes, parameters: ParameterList, lead: LocatorRedirect
+    datagram: bytes, parameters: ParameterList, redirect: LocatorRedirect
 ) -> Iterator[Overwrite]:
     for parameter in parameters.all(*UNICAST, *MULTICAST):
-        target = _target(datagram, parameters, parameter, lead)
+        target = _target(datagram, parameters, parameter, redirect)
         yield replaced(parameters, parameter, target) if target else parameters.removed(parameter)
     yield from (parameters.removed(parameter) for parameter in parameters.all(*OLD_LOCATORS))
-    if source_vendor(datagram) in TAKEN_FOR_FAST_DDS:
+    if source_vendor(datagram) in FAST_DDS_PARAMETER_VENDORS:
         yield from _edits_of_machine(parameters)
 
 
 def _edits_of_machine(parameters: ParameterList) -> Iterator[Overwrite]:
-    """Remove what makes two participants of Fast DDS assume that both run on one machine.
+    """Yield the edits that stop Fast DDS from assuming that two participants share a machine.
 
     Two containers may have the same machine id and the same MAC addresses, from which the id for
     data sharing follows. The participants would use shared memory, and no message would leave the
@@ -359,10 +365,10 @@ def _edits_of_machine(parameters: ParameterList) -> Iterator[Overwrite]:
 
 
 def _target(
-    datagram: bytes, parameters: ParameterList, parameter: Parameter, lead: LocatorRedirect
+    datagram: bytes, parameters: ParameterList, parameter: Parameter, redirect: LocatorRedirect
 ) -> HostPort | None:
     """The target for a locator; None if the edit removes the locator."""
     locator = read_locator(datagram, parameters, parameter)
     if locator is None or locator.host_port is None or parameter.pid in MULTICAST:
         return None
-    return lead(parameter.pid, locator.host_port)
+    return redirect(parameter.pid, locator.host_port)

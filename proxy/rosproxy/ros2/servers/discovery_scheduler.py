@@ -13,8 +13,7 @@ from rosproxy.ros2.sources.fair_queue import OVERHEAD_BYTES, DiscoveryQueue
 from rosproxy.ros2.sources.rates import Standing
 
 ROUND_BYTES = 8 * 1024
-"""Bytes that a round reads and sends. A datagram of the greatest length takes a round of 5 ms."""
-
+"""Bytes that a round reads and sends. A round with a datagram of the greatest length takes 5 ms."""
 LONGEST_ROUND_BYTES = 64 * 1024
 """Bytes of the longest round."""
 BYTES_PER_RECEIVED = 512
@@ -61,7 +60,7 @@ class DiscoveryScheduler:
     def put(
         self, source: str, standing: Standing, size: int, read: Read, key: Hashable = None
     ) -> bool:
-        """Let a datagram wait for the turn of the source; see `read`."""
+        """Let a datagram wait for the turn of the source. Return False if the queue has no room."""
         self._received += 1
         has_room = self._queue.put(source, standing, read, size, key)
         self._schedule()
@@ -90,14 +89,14 @@ class DiscoveryScheduler:
         self._received = 0
         try:
             while self._spent < budget and (waiting := self._queue.pop()):
-                led_to = _size_of(waiting.item())
-                self._queue.charge(waiting.source, led_to)
-                self._spent += waiting.size + led_to
+                sent_bytes = _size_of(waiting.item())
+                self._queue.charge(waiting.source, sent_bytes)
+                self._spent += waiting.size + sent_bytes
         finally:
             if self._spent or self._queue:
                 self._schedule()
 
 
 def _size_of(sent: Sequence[Outgoing]) -> int:
-    """The bytes that datagrams count for."""
+    """The bytes of datagrams, with an overhead for each datagram."""
     return sum(len(out.datagram) + OVERHEAD_BYTES for out in sent)

@@ -59,9 +59,10 @@ ADMISSION_TIMEOUT_S = 5.0
 """Seconds after which a waiting participant is queued again, unless already served."""
 DATAGRAMS_PER_TURN = 16
 """Datagrams that a socket passes on before other sockets follow."""
-QUEUED_FOR_PASSED = 8
-"""Datagrams that a socket may queue in place of a datagram that passes. Queueing is that much
-faster. Otherwise the kernel would drop datagrams, without fairness to the sources."""
+QUEUED_PER_PASSED = 8
+"""Datagrams that a socket may queue in the time in which it passes on one datagram.
+
+If sockets queued fewer, the kernel would drop datagrams, without fairness to the sources."""
 
 Take = Callable[[bytes, str, float], list[Outgoing]]
 """Handles a datagram with its source and the time, and returns the datagrams to send."""
@@ -73,8 +74,8 @@ class DomainServer:
     """Serves a domain.
 
     ``now`` is the clock in seconds, and ``is_inside`` tells the side of an address. ``changed`` is
-    called after each change of the port mappings. In the first ``awaited`` seconds no participant
-    is served, unless an operator has selected addresses.
+    called after each change of the port mappings. Before the first selection of an operator, no
+    participant is served for ``selection_timeout`` seconds. After that, all are served.
     """
 
     def __init__(
@@ -84,20 +85,20 @@ class DomainServer:
         now: Callable[[], float],
         is_inside: Callable[[str], bool],
         changed: Callable[[], None],
-        awaited: float = 0.0,
+        selection_timeout: float = 0.0,
     ) -> None:
         self._bind = bind
         self._now = now
         self._is_inside = is_inside
         self._changed = changed
-        self._told_changes = 0
+        self._reported_changes = 0
         pool = PortPool(settings.ports.listen)
         # A new prefix for each process: participants announce themselves at once only to an
         # unknown discovery participant, and repeat all announcements for this participant.
         self.domain = Domain(
             settings, pool, os.urandom(PREFIX_BYTES), os.urandom(32), now(), time.time()
         )
-        self._selected = SelectedAddresses(now() + awaited)
+        self._selected = SelectedAddresses(now() + selection_timeout)
         self._loop = asyncio.get_running_loop()
         self._sockets: list[socket.socket] = []
         self._stand_ins: dict[int, socket.socket] = {}
@@ -142,7 +143,9 @@ class DomainServer:
                 )
         return taken_ports
 
-    async def hears(self, secret: bytes, trial: Callable[[asyncio.Event], Awaitable[str]]) -> str:
+    async def try_discovery_port(
+        self, secret: bytes, trial: Callable[[asyncio.Event], Awaitable[str]]
+    ) -> str:
         """Return the outcome of a trial of the discovery port.
 
         The event that ``trial`` gets is set when ``secret`` arrives at the discovery port.
@@ -164,7 +167,7 @@ class DomainServer:
         """Note the gateways of the proxy's default routes."""
         self.domain.settings.gateways = gateways
 
-    def ask_outside(self, peers: tuple[HostPort, ...]) -> None:
+    def set_peers(self, peers: tuple[HostPort, ...]) -> None:
         """Replace the peers. After a change, announce the discovery participant outside."""
         if peers != self.domain.settings.peers:
             self.domain.settings.peers = peers
@@ -220,7 +223,7 @@ class DomainServer:
         self._send_and_go_on(self.domain.continue_pending(self._now()))
         self._send(self.domain.expire(self._now()))
         self._sync_stand_ins()
-        self._tell_changes()
+        self._report_changes()
 
     async def announce(self) -> None:
         """Announce the discovery participant to all, and send reminders of ports."""
@@ -270,7 +273,7 @@ class DomainServer:
     def _admit_waiting(self) -> None:
         """Queue the participants that may get ports now. After a start there are many at once."""
         now = self._now()
-        # The longest queue loses the last items without notice (`FairQueue`).
+        # `FairQueue` may drop the last items of a source without notice: queue them again later.
         admitting = {p: t for p, t in self._admitting.items() if now - t < ADMISSION_TIMEOUT_S}
         self._admitting = admitting
         former_ports = self.domain.former_ports
@@ -286,7 +289,7 @@ class DomainServer:
     def _admit(self, prefix: bytes) -> list[Outgoing]:
         self._admitting.pop(prefix, None)
         outgoing = self.domain.admit(prefix, self._now())
-        self._tell_changes()
+        self._report_changes()
         self._open_and_send(outgoing)
         return outgoing
 
@@ -363,10 +366,10 @@ class DomainServer:
         return sent
 
     def _is_let_in(self, datagram: bytes, source: str, now: float) -> bool:
-        """Whether the proxy handles discovery from an inside address now.
+        """Return whether the proxy handles discovery from a source now; False for outside.
 
-        If the address is not selected, hold announcements from there, because the operator may
-        select the address soon.
+        If an address inside is not selected, hold announcements from there, because the operator
+        may select the address soon.
         """
         if not self._is_inside(source):
             return False
@@ -390,7 +393,7 @@ class DomainServer:
         """Receive the datagrams at a socket: queue discovery, and pass all others at once.
 
         A turn ends after `DATAGRAMS_PER_TURN`, or after half the bytes of the longest datagram.
-        Then other sockets follow. A queued datagram counts less (`QUEUED_FOR_PASSED`).
+        Then other sockets follow. A queued datagram counts less (`QUEUED_PER_PASSED`).
         """
         spent_bytes = spent = 0.0
         with contextlib.suppress(BlockingIOError):
@@ -403,9 +406,9 @@ class DomainServer:
                 source = plain_address(sender[0])
                 key = self._replaceable_as(take, datagram, source)
                 if self._replaces(key, take, datagram, source):
-                    weight = 1 / QUEUED_FOR_PASSED
+                    weight = 1 / QUEUED_PER_PASSED
                 elif must_queue(datagram, source):
-                    weight = 1 / QUEUED_FOR_PASSED
+                    weight = 1 / QUEUED_PER_PASSED
                     self._read_in_turn(take, datagram, source, key)
                 else:
                     weight = 1.0
@@ -424,7 +427,7 @@ class DomainServer:
         return (take, source, stream) if stream else None
 
     def _replaces(self, key: Hashable, take: Take, datagram: bytes, source: str) -> bool:
-        """Replace the waiting datagram with a key by a later datagram. Return False without any."""
+        """Replace the waiting datagram with a key by a later one. Return False if none waits."""
         if key is None:
             return False
         return self._scheduler.replace(key, partial(self._carry_out, take, datagram, source))
@@ -441,7 +444,7 @@ class DomainServer:
     def _carry_out(self, take: Take, datagram: bytes, source: str) -> list[Outgoing]:
         """Handle a datagram. Send and return the resulting datagrams."""
         outgoing = take(datagram, source, self._now())
-        self._tell_changes()
+        self._report_changes()
         self._open_and_send(outgoing)
         return outgoing
 
@@ -480,11 +483,11 @@ class DomainServer:
                 self.lost += 1
                 log.debug("can't send a datagram to %s: %s", out.target, error)
 
-    def _tell_changes(self) -> None:
+    def _report_changes(self) -> None:
         """Call ``changed`` if the port mappings have changed."""
         changes = self.domain.mappings.changes
-        if changes != self._told_changes:
-            self._told_changes = changes
+        if changes != self._reported_changes:
+            self._reported_changes = changes
             self._changed()
 
     def _sync_stand_ins(self) -> list[int]:

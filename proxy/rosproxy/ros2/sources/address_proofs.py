@@ -43,8 +43,8 @@ MOST_ADDRESSES = 4096
 goes."""
 ANSWER_KEPT_S = 30.0
 """Seconds for which the answer of a participant counts after the participant has gone."""
-MOST_ANSWERED = 128
-"""Participants at an address whose answers count. Beyond this number, the first one goes."""
+MOST_ANSWERS_PER_ADDRESS = 128
+"""Participants at an address whose answers count. Beyond this number, the oldest answer goes."""
 LONGEST_ANSWER_BYTES = 256
 """Bytes of a first answer, which is read without an allowance. An answer of Fast DDS has 72."""
 _INFO_DST = bytes([SubmessageId.INFO_DST])
@@ -89,7 +89,7 @@ class AddressProofs:
             announcement(own, reached_at, LEASE_DURATION_S, WRITER_ENDPOINTS) + asks[HEADER_BYTES:]
         )
 
-    def is_answer(self, address: str, datagram: bytes) -> bool:
+    def is_first_answer(self, address: str, datagram: bytes) -> bool:
         """Return whether a datagram is the first answer of a participant, and nothing else.
 
         A flood of forged sources uses up the common allowance of unproven addresses. An answer
@@ -99,7 +99,7 @@ class AddressProofs:
         """
         answered = self._answered.get(address, {})
         return (
-            len(answered) < MOST_ANSWERED
+            len(answered) < MOST_ANSWERS_PER_ADDRESS
             and datagram[HEADER_BYTES - PREFIX_BYTES : HEADER_BYTES] not in answered
             and len(datagram) <= LONGEST_ANSWER_BYTES
             and datagram[HEADER_BYTES : HEADER_BYTES + 1] == _INFO_DST
@@ -119,7 +119,7 @@ class AddressProofs:
             self._answered.pop(first, None)
         answered = self._answered.setdefault(address, {})
         answered[source_prefix(datagram)] = now + ANSWER_KEPT_S
-        if len(answered) > MOST_ANSWERED:
+        if len(answered) > MOST_ANSWERS_PER_ADDRESS:
             del answered[next(iter(answered))]
         return True
 

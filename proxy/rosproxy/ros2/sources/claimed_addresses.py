@@ -16,8 +16,8 @@ _BROADCAST = "255.255.255.255"
 def claim_fault(address: str, settings: DomainSettings) -> str | None:
     """Return why no participant outside can be at an address; None if a participant can.
 
-    The advertised host may be claimed, also where the proxy itself has that address. Programs on
-    the LAN relay's machine are participants there, and `is_proxy_port` protects the proxy's ports.
+    The address of the advertised host may be claimed, even if the proxy itself has that address:
+    participants may run on the LAN relay's machine. `is_proxy_port` protects the proxy's ports.
     """
     parsed = as_ip(address)
     if parsed is None or is_loopback(address) or address == _BROADCAST or parsed.is_multicast:

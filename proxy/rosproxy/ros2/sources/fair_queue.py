@@ -1,10 +1,10 @@
 """The queue of discovery, in an order that is fair to the sources.
 
 Reading discovery takes long, and any machine on the network may send discovery. So datagrams wait,
-and the source that has had least of the reading goes first (start-time fair queueing; Goyal, Vin,
-Cheng: SIGCOMM 1996). Forged sources cost nothing, and a single machine may have thousands of
-addresses. So four groups of sources have a quarter of the reading each: peers and proven sources
-inside, proven sources outside, other sources inside, and other sources outside.
+and the source of which the proxy has read the fewest bytes goes first (start-time fair queueing;
+Goyal, Vin, Cheng: SIGCOMM 1996). Forged sources cost nothing, and a single machine may have
+thousands of addresses. So each of four groups of sources gets a quarter of the reading: peers and
+proven sources inside, proven sources outside, other sources inside, and other sources outside.
 """
 
 import heapq
@@ -15,20 +15,19 @@ from typing import Generic, TypeVar
 
 from rosproxy.ros2.sources.rates import Standing
 
-MOST_OF_SOURCE = 256 * 1024
+MOST_BYTES_PER_SOURCE = 256 * 1024
 """Bytes of a source that may wait.
 
 Participants repeat discovery that is late. So a longer queue makes an overload worse. With 1 MiB, a
 proxy with 0.3 of a processor read 100 participants of Cyclone DDS in 5 to 8 s instead of 3 to 4 s.
 With 128 KiB, discovery was lost that came again only after 2 s."""
-MOST_OF_ALL = 3 * 1024 * 1024
+MOST_BYTES_PER_STANDING = 3 * 1024 * 1024
 """Bytes of all sources with the same standing that may wait."""
-MOST_KNOWN = 2048
-"""Sources with the same proven standing that may wait. The proxy reads a few thousand datagrams in
-a
-second."""
-MOST_UNKNOWN = 256
-"""Sources with the same other standing that may wait."""
+MOST_PROVEN_SOURCES = 2048
+"""Sources that may wait, for each of the two proven standings. The proxy reads a few thousand
+datagrams in a second."""
+MOST_UNPROVEN_SOURCES = 256
+"""Sources that may wait, for each of the two other standings."""
 OVERHEAD_BYTES = 256
 """Bytes that are added to the length of each datagram."""
 
@@ -58,8 +57,8 @@ class FairQueue(Generic[Item]):
     """
 
     most_sources: int
-    most_of_source: int = MOST_OF_SOURCE
-    most_of_all: int = MOST_OF_ALL
+    most_bytes_per_source: int = MOST_BYTES_PER_SOURCE
+    most_bytes: int = MOST_BYTES_PER_STANDING
     _waiting: dict[str, deque[Waiting[Item]]] = field(default_factory=dict)
     _replaceable: dict[Hashable, Waiting[Item]] = field(default_factory=dict)
     _sizes: dict[str, int] = field(default_factory=dict)
@@ -78,7 +77,7 @@ class FairQueue(Generic[Item]):
         While an item with a ``key`` waits, `replace` may replace it.
         """
         waiting = Waiting(source, item, size + OVERHEAD_BYTES, key)
-        if not self._has_room(waiting):
+        if not self._make_room(waiting):
             return False
         if key is not None:
             self._replaceable[key] = waiting
@@ -125,18 +124,18 @@ class FairQueue(Generic[Item]):
             self._forget_silent()
         return waiting
 
-    def _has_room(self, waiting: Waiting[Item]) -> bool:
-        """Whether an item fits. If necessary, drop the last items of the largest source.
+    def _make_room(self, waiting: Waiting[Item]) -> bool:
+        """Return whether an item fits. If necessary, drop the last items of the largest source.
 
-        A source with fewer bytes than the largest source makes room in this way.
+        Only an item of a source with fewer bytes makes the largest source lose items.
         """
         source = waiting.source
         if source not in self._waiting and len(self._waiting) >= self.most_sources:
             return False
         size = self._sizes.get(source, 0) + waiting.size
-        if size > self.most_of_source:
+        if size > self.most_bytes_per_source:
             return False
-        while self._size + waiting.size > self.most_of_all:
+        while self._size + waiting.size > self.most_bytes:
             largest = max(self._sizes, key=self._sizes.__getitem__)
             # Leave an item of each source, because `_order` has an entry for the source.
             if self._sizes[largest] <= size or len(self._waiting[largest]) == 1:
@@ -172,9 +171,9 @@ class DiscoveryQueue(Generic[Item]):
     def __init__(self) -> None:
         self._queues = {
             standing: FairQueue[Item](
-                MOST_KNOWN
+                MOST_PROVEN_SOURCES
                 if standing in (Standing.PROVEN, Standing.PROVEN_OUTSIDE)
-                else MOST_UNKNOWN,
+                else MOST_UNPROVEN_SOURCES,
             )
             for standing in Standing
         }

@@ -1,4 +1,4 @@
-"""The allowance of each source for discovery: received datagrams, and those sent in consequence.
+"""The allowance of each source for discovery.
 
 Reading discovery costs a hundred times as much as passing on a datagram of user data, and an
 announcement goes to all participants of the other side. So each source has an allowance, which
@@ -48,13 +48,13 @@ def cost(size: int) -> int:
 
 @dataclass(slots=True)
 class _Allowance:
-    """The rest of an allowance at a time in seconds."""
+    """What is left of an allowance at the time ``since``, in seconds."""
 
     remaining: float
     since: float
 
     def refill(self, per_second: float, burst: float, now: float) -> float:
-        """Refill the allowance up to ``now``, and return the rest."""
+        """Refill the allowance up to ``now``, and return what is left."""
         passed = max(now - self.since, 0.0)
         self.remaining = min(self.remaining + passed * per_second, burst)
         self.since = now
@@ -86,7 +86,7 @@ class DiscoveryRates:
     ) -> bool:
         """Charge a source for a datagram of ``size`` bytes.
 
-        Return False if the allowance is used up.
+        Return False, without a charge, if the allowance of the source or its side is used up.
         """
         shared = self._of_unproven.get(standing)
         # Checked first, so that forged sources do not fill `_by_source`.

@@ -12,7 +12,7 @@ from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import FAST_DDS, HEADER_BYTES, VERSION, source_prefix
-from rosproxy.ros2.rewriting.discovery import MOST_ANNOUNCED, read_discovery
+from rosproxy.ros2.rewriting.discovery import MOST_ANNOUNCED_PARTICIPANTS, read_discovery
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NEAR,
@@ -136,9 +136,9 @@ def test_inside_is_told_what_a_participant_announces_of_itself_alone() -> None:
 def test_so_many_participants_announce_themselves_in_a_datagram() -> None:
     """The proxy announces each to all participants inside, in the same round of the event loop."""
     domain = make_domain()
-    domain.heard_outside(speaking(MOST_ANNOUNCED), ROBOT, NOW)
+    domain.heard_outside(speaking(MOST_ANNOUNCED_PARTICIPANTS), ROBOT, NOW)
     assert domain.refused.count == 0
-    assert len(domain.outside.by_prefix) == MOST_ANNOUNCED
-    domain.heard_outside(speaking(MOST_ANNOUNCED + 10), ROBOT, NOW)
+    assert len(domain.outside.by_prefix) == MOST_ANNOUNCED_PARTICIPANTS
+    domain.heard_outside(speaking(MOST_ANNOUNCED_PARTICIPANTS + 10), ROBOT, NOW)
     assert domain.refused.count == 1
-    assert len(domain.outside.by_prefix) == MOST_ANNOUNCED
+    assert len(domain.outside.by_prefix) == MOST_ANNOUNCED_PARTICIPANTS

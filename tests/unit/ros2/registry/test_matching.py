@@ -9,8 +9,8 @@ from msgspec.structs import replace
 from rosproxy.ros2.protocol.qos import Durability, EndpointQos, Liveliness
 from rosproxy.ros2.registry import matching
 from rosproxy.ros2.registry.matching import (
-    MOST_COMPARED,
-    MOST_LOOKED_AT,
+    MOST_COMPARED_ENDPOINTS,
+    MOST_COMPARED_PAIRS,
     Comparison,
     Mismatch,
     compare,
@@ -184,10 +184,10 @@ HONEST = make_participant(3, writer(kind=LOG))
 LISTENER = make_participant(4, reader())
 FLOODS: dict[str, tuple[list[Participant], list[Participant]]] = {
     "inside": ([many(1, 300, writer)], [many(2, 300, reader)]),
-    "outside": ([], [many(2, MOST_COMPARED + 100, reader)]),
+    "outside": ([], [many(2, MOST_COMPARED_PAIRS + 100, reader)]),
     "of other topics": (
-        [many(1, MOST_LOOKED_AT + 100, writer, "rt/other")],
-        [many(2, MOST_LOOKED_AT + 100, reader, "rt/other")],
+        [many(1, MOST_COMPARED_ENDPOINTS + 100, writer, "rt/other")],
+        [many(2, MOST_COMPARED_ENDPOINTS + 100, reader, "rt/other")],
     ),
 }
 
@@ -209,10 +209,10 @@ def test_so_many_are_compared_and_no_more(monkeypatch: pytest.MonkeyPatch) -> No
     compared = list[tuple[DdsEndpoint, DdsEndpoint]]()
     monkeypatch.setattr(matching, "mismatch", lambda *pair: compared.append(pair))
     comparison = compare([many(1, 200, writer)], [many(2, 200, reader), many(5, 7, writer)])
-    assert len(compared) == MOST_COMPARED
-    assert comparison.left_out == 200 * 200 - MOST_COMPARED
+    assert len(compared) == MOST_COMPARED_PAIRS
+    assert comparison.left_out == 200 * 200 - MOST_COMPARED_PAIRS
 
 
 def test_readers_and_writers_that_are_not_looked_at_are_counted() -> None:
-    comparison = compare([many(1, MOST_LOOKED_AT + 5, writer)], [LISTENER])
+    comparison = compare([many(1, MOST_COMPARED_ENDPOINTS + 5, writer)], [LISTENER])
     assert comparison.left_out == 5

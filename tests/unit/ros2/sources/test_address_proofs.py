@@ -30,7 +30,7 @@ from rosproxy.ros2.sources.address_proofs import (
     ANSWER_KEPT_S,
     LONGEST_ANSWER_BYTES,
     MOST_ADDRESSES,
-    MOST_ANSWERED,
+    MOST_ANSWERS_PER_ADDRESS,
     PROOF_KEPT_S,
     AddressProofs,
 )
@@ -238,8 +238,8 @@ def test_a_participant_that_only_answers_is_sent_three_times_as_much() -> None:
     said = sedp(B, LAPTOP, 7411, to=A)
     domain.at_range_port(port, said, LAPTOP, NOW)
     assert outsider.credit == before + ANSWERED_FACTOR * len(said)
-    assert outsider.may_be_sent(outsider.credit)
-    assert not outsider.may_be_sent(1)
+    assert outsider.take_credit(outsider.credit)
+    assert not outsider.take_credit(1)
 
 
 def test_a_question_is_no_longer_than_what_came() -> None:
@@ -504,7 +504,7 @@ def answers_what_it_is_asked(domain: Domain, now: float) -> None:
     """Announce A, and answer the question to A."""
     sent = domain.heard_inside(spdp(A, INSIDE), INSIDE, now)
     for asked in questions(sent, INSIDE):
-        if destination(asked) == A and domain.proofs.is_answer(INSIDE, answer(asked, A)):
+        if destination(asked) == A and domain.proofs.is_first_answer(INSIDE, answer(asked, A)):
             domain.heard_inside(answer(asked, A), INSIDE, now)
 
 
@@ -573,9 +573,9 @@ def test_answers_in_the_name_of_many_are_forgotten() -> None:
     domain = make_domain()
     prove(domain, INSIDE)
     domain.heard_inside(spdp(A, INSIDE, lease=LEASE), INSIDE, NOW)
-    prove(domain, OTHER, prefixes=map(named, range(2 * MOST_ANSWERED)))
+    prove(domain, OTHER, prefixes=map(named, range(2 * MOST_ANSWERS_PER_ADDRESS)))
     assert not domain.proofs.has_answered(OTHER, named(0))
-    assert domain.proofs.has_answered(OTHER, named(2 * MOST_ANSWERED - 1))
+    assert domain.proofs.has_answered(OTHER, named(2 * MOST_ANSWERS_PER_ADDRESS - 1))
     domain.expire(NOW + ANSWER_KEPT_S + 1)
-    assert not domain.proofs.has_answered(OTHER, named(2 * MOST_ANSWERED - 1))
+    assert not domain.proofs.has_answered(OTHER, named(2 * MOST_ANSWERS_PER_ADDRESS - 1))
     assert domain.proofs.has_answered(INSIDE, A)

@@ -5,7 +5,12 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.ros2.sources.fair_queue import MOST_KNOWN, OVERHEAD_BYTES, DiscoveryQueue, FairQueue
+from rosproxy.ros2.sources.fair_queue import (
+    MOST_PROVEN_SOURCES,
+    OVERHEAD_BYTES,
+    DiscoveryQueue,
+    FairQueue,
+)
 from rosproxy.ros2.sources.rates import Standing
 from tests.unit.ros2.discovery.domains import INSIDE, ROBOT, make_domain, prove
 
@@ -60,7 +65,7 @@ def test_a_datagram_may_take_the_place_of_the_one_that_waits_with_its_key() -> N
 
 
 def test_what_lost_its_place_to_another_source_is_not_replaced() -> None:
-    queue = FairQueue[int](most_sources=10, most_of_all=4 * OVERHEAD_BYTES)
+    queue = FairQueue[int](most_sources=10, most_bytes=4 * OVERHEAD_BYTES)
     for number in range(4):
         queue.put("many", number, 0, number)
     assert queue.put("few", 9, 0)
@@ -92,14 +97,14 @@ def test_silence_saves_nothing() -> None:
 
 
 def test_a_source_has_so_much_room() -> None:
-    queue = FairQueue[int](most_sources=2, most_of_source=10 * OVERHEAD_BYTES)
+    queue = FairQueue[int](most_sources=2, most_bytes_per_source=10 * OVERHEAD_BYTES)
     assert [queue.put("one", number, 0) for number in range(11)] == [True] * 10 + [False]
     assert queue.put("another", 0, 0)
     assert not queue.put("a third", 0, 0)
 
 
 def test_the_source_with_most_loses_what_does_not_fit() -> None:
-    queue = FairQueue[int](most_sources=10, most_of_all=10 * OVERHEAD_BYTES)
+    queue = FairQueue[int](most_sources=10, most_bytes=10 * OVERHEAD_BYTES)
     for number in range(9):
         queue.put("many", number, 0)
     assert [queue.put("few", number, 0) for number in range(9)] == [True] * 5 + [False] * 4
@@ -108,7 +113,7 @@ def test_the_source_with_most_loses_what_does_not_fit() -> None:
 
 @given(st.lists(st.tuples(st.sampled_from("abcd"), SIZES, st.booleans(), SIZES), max_size=60))
 def test_what_was_put_is_taken_in_its_order(steps: list[tuple[str, int, bool, int]]) -> None:
-    queue = FairQueue[int](most_sources=3, most_of_source=150_000, most_of_all=200_000)
+    queue = FairQueue[int](most_sources=3, most_bytes_per_source=150_000, most_bytes=200_000)
     last = Counter[str]()
     for number, (source, size, takes, led_to) in enumerate(steps, 1):
         queue.put(source, number, size)
@@ -138,7 +143,7 @@ def test_a_thousand_forged_sources_get_their_share_alone() -> None:
 def test_a_stranger_with_many_addresses_keeps_no_peer_from_being_read() -> None:
     """Peers and strangers have separate places in the queue."""
     domain = make_domain()
-    strangers = [f"2001:db8::{number:x}" for number in range(MOST_KNOWN)]
+    strangers = [f"2001:db8::{number:x}" for number in range(MOST_PROVEN_SOURCES)]
     prove(domain, INSIDE, *strangers)
     queue = DiscoveryQueue[int]()
     for number, stranger in enumerate(strangers):

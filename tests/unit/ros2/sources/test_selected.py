@@ -4,10 +4,10 @@ import pytest
 
 from rosproxy.ros2.protocol.rtps import RtpsError, message_header
 from rosproxy.ros2.sources.selected import (
+    FIRST_SELECTION_TIMEOUT_S,
     LONGEST_HELD_BYTES,
-    MOST_HELD,
-    MOST_HELD_EACH,
-    UPDATE_TIMEOUT_S,
+    MOST_HELD_ADDRESSES,
+    MOST_HELD_PER_ADDRESS,
     SelectedAddresses,
 )
 
@@ -24,16 +24,16 @@ def test_without_an_operator_all_are_let_in() -> None:
 
 
 def test_an_operator_is_waited_for() -> None:
-    selected = SelectedAddresses(UPDATE_TIMEOUT_S)
+    selected = SelectedAddresses(FIRST_SELECTION_TIMEOUT_S)
     selected.hold(ADDRESS, said(1))
     assert not selected.admits(ADDRESS, 1.0)
     assert selected.released(1.0) == []
-    assert selected.released(UPDATE_TIMEOUT_S) == [(ADDRESS, said(1))]
-    assert selected.released(UPDATE_TIMEOUT_S) == []
+    assert selected.released(FIRST_SELECTION_TIMEOUT_S) == [(ADDRESS, said(1))]
+    assert selected.released(FIRST_SELECTION_TIMEOUT_S) == []
 
 
 def test_who_is_selected_is_let_in_and_nobody_else() -> None:
-    selected = SelectedAddresses(UPDATE_TIMEOUT_S)
+    selected = SelectedAddresses(FIRST_SELECTION_TIMEOUT_S)
     selected.hold(ADDRESS, said(1))
     selected.hold(OTHER_ADDRESS, said(2, b"at first"))
     selected.hold(OTHER_ADDRESS, said(2, b"at last"))
@@ -47,14 +47,14 @@ def test_who_is_selected_is_let_in_and_nobody_else() -> None:
 
 
 def test_what_is_held_is_bounded() -> None:
-    selected = SelectedAddresses(UPDATE_TIMEOUT_S)
+    selected = SelectedAddresses(FIRST_SELECTION_TIMEOUT_S)
     selected.hold(ADDRESS, said(1, bytes(LONGEST_HELD_BYTES)))
     assert not selected.held_announcements
-    for number in range(2 * MOST_HELD_EACH):
+    for number in range(2 * MOST_HELD_PER_ADDRESS):
         selected.hold(ADDRESS, said(number))
-    assert len(selected.held_announcements[ADDRESS]) == MOST_HELD_EACH
-    for number in range(2 * MOST_HELD):
+    assert len(selected.held_announcements[ADDRESS]) == MOST_HELD_PER_ADDRESS
+    for number in range(2 * MOST_HELD_ADDRESSES):
         selected.hold(f"172.31.{number // 256}.{number % 256}", said(1))
-    assert len(selected.held_announcements) == MOST_HELD
+    assert len(selected.held_announcements) == MOST_HELD_ADDRESSES
     with pytest.raises(RtpsError):
         selected.hold(ADDRESS, b"nonsense")

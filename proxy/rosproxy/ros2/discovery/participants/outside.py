@@ -177,7 +177,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     ) -> list[Outgoing]:
         """Requests to a participant about its discovery, as many as its credit allows."""
         target = outsider.metatraffic
-        allowed = [q for q in questions if target and outsider.may_be_sent(len(q))]
+        allowed = [q for q in questions if target and outsider.take_credit(len(q))]
         return [Outgoing(target, question) for question in allowed] if target else []
 
     def forget(self, participant: OutsideParticipant) -> None:
