@@ -33,13 +33,13 @@ Direction = Literal["out", "both"]
 """Which side reaches the other through the proxy: out: outside reaches inside. both: both sides."""
 SlaveControl = Literal["any", "master"]
 """Which callers outside may call shutdown, publisherUpdate and paramUpdate at inside nodes."""
-DAY = 86400
+DAY_S = 86400
 ZENOH_PORT = 7447
 """The port at which rmw_zenohd listens by default."""
 _RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
 _TOKEN = re.compile(r"[!-~]{8,200}")
 _HASH = re.compile(r"[0-9a-f]{64}")
-_LONGEST = 40
+_LONGEST_QUOTE = 40
 """Characters of a bad value that a message repeats."""
 _Value = TypeVar("_Value")
 
@@ -48,7 +48,7 @@ _Value = TypeVar("_Value")
 class Text:
     """A kind of value that ``read`` parses from a text. ``form`` is the name in help texts.
 
-    ``separable``: spaces in a variable separate the values of a repeatable option.
+    ``separable``: spaces in an environment variable separate the values of a repeatable option.
     """
 
     form: str
@@ -58,7 +58,10 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """An integer within bounds, or a time with ``seconds``. ``form`` is the name in help texts."""
+    """An integer from ``least`` to ``most``; with ``seconds``, a time in seconds.
+
+    ``form`` is the name in help texts.
+    """
 
     form: str
     least: float
@@ -72,10 +75,10 @@ class Option:
 
     ``help``: the meaning in Markdown; command lines show ``help`` without marks and links.
     ``kind``: the kind of the text; without a kind, the type of the field decides: a flag, or a
-    choice of words. ``name``: the option on the command line, and ``variables``: the environment
-    variables, if the name of the field does not determine both. ``repeatable``: the option may
-    occur several times. ``default``: the effect without the option, if the default value does not
-    say so. ``note``: how to write several values in the variable.
+    choice of words. ``name``: the option on the command line; if empty, the name of the field
+    decides. ``variables``: the environment variables; if empty, the name of the option decides.
+    ``repeatable``: the option may occur several times. ``default``: the effect without the option,
+    if the default value does not say so. ``note``: how to write several values in the variable.
     """
 
     help: str
@@ -128,7 +131,10 @@ def declared(settings: type) -> list[Setting]:
 
 
 def make_settings(settings: type[_Value], given: Mapping[str, Any], **other: Any) -> _Value:
-    """Make settings from the ``given`` values, by parameter, and from ``other`` fields."""
+    """Make settings from the ``given`` values, by parameter, and from ``other`` fields.
+
+    A field whose given value is None gets the default.
+    """
     by_field = {setting.field: given[setting.parameter] for setting in declared(settings)}
     values = {field: value for field, value in by_field.items() if value is not None}
     return settings(**values, **other)
@@ -152,14 +158,14 @@ class SettingError(ValueError):
 
 def time(least: float) -> Number:
     """A kind of value: a time of ``least`` seconds to a day."""
-    return Number("S", least, DAY, seconds=True)
+    return Number("S", least, DAY_S, seconds=True)
 
 
 def read_range(text: str) -> PortRange:
     """Parse a range of ports, ``first-last``. Raises ValueError."""
     match = _RANGE.fullmatch(text)
     if match is None:
-        raise ValueError(f"{text[:_LONGEST]!r} is not a range such as 11000-11099")
+        raise ValueError(f"{text[:_LONGEST_QUOTE]!r} is not a range such as 11000-11099")
     ports = PortRange(int(match[1]), int(match[2]))
     if not 1 <= ports.first <= ports.last <= 65535:
         message = f"{text!r} must rise and stay between 1 and 65535, such as 11000-11099"
@@ -172,7 +178,7 @@ def read_host(text: str) -> str:
     bare = text.strip("[]")
     if parse_host_port(f"[{bare}]:1" if ":" in bare else f"{bare}:1") != HostPort(bare, 1):
         raise ValueError(
-            f"{text[:_LONGEST]!r} is neither a host name nor an address such as 192.0.2.7"
+            f"{text[:_LONGEST_QUOTE]!r} is neither a host name nor an address such as 192.0.2.7"
         )
     return bare
 
@@ -181,16 +187,16 @@ def read_address(text: str) -> str | None:
     """Parse an IP address, and return the plain form; None for an empty text. Raises ValueError."""
     address = addresses.parse_address(text)
     if text and address is None:
-        raise ValueError(f"{text[:_LONGEST]!r} is not an IP address such as 192.0.2.7")
+        raise ValueError(f"{text[:_LONGEST_QUOTE]!r} is not an IP address such as 192.0.2.7")
     return address
 
 
 def read_bind_address(text: str) -> str:
-    """Parse an IP address to listen on; the unspecified address is valid. Raises ValueError."""
+    """Parse an IP address to listen on; 0.0.0.0 and :: are valid. Raises ValueError."""
     try:
         return str(ip_address(text))
     except ValueError:
-        message = f"{text[:_LONGEST]!r} is not an IP address of this host, such as 0.0.0.0"
+        message = f"{text[:_LONGEST_QUOTE]!r} is not an IP address of this host, such as 0.0.0.0"
         raise ValueError(message) from None
 
 
@@ -198,7 +204,7 @@ def read_host_port(text: str, example: str = "127.0.0.1:11312") -> HostPort:
     """Parse ``host:port`` or ``[v6]:port``. Raises ValueError, with the example."""
     target = parse_host_port(text)
     if target is None:
-        raise ValueError(f"{text[:_LONGEST]!r} is not of the form {example}")
+        raise ValueError(f"{text[:_LONGEST_QUOTE]!r} is not of the form {example}")
     return target
 
 
@@ -223,14 +229,14 @@ def read_network(text: str) -> Network:
     try:
         return ip_network(text)
     except ValueError as error:
-        message = f"{text[:_LONGEST]!r} is not a network such as 172.18.0.0/16: {error}"
+        message = f"{text[:_LONGEST_QUOTE]!r} is not a network such as 172.18.0.0/16: {error}"
         raise ValueError(message) from None
 
 
 def read_master_uri(text: str) -> str:
     """Check the URI of a ROS master, and return the URI. Raises ValueError."""
     if not text.startswith("http://") or addresses.parse_authority(text) is None:
-        raise ValueError(f"{text[:_LONGEST]!r} is not of the form http://host:11311")
+        raise ValueError(f"{text[:_LONGEST_QUOTE]!r} is not of the form http://host:11311")
     return text
 
 

@@ -17,13 +17,13 @@ from rosproxy.net.addresses import HostPort, Network
 from rosproxy.setting_kinds import DataPlane, Direction, Option, SettingError, SlaveControl
 
 MEBIBYTE = 1024 * 1024
-LEAST_PER_DOMAIN = 4
+LEAST_PORTS_PER_DOMAIN = 4
 """Ports of the range for a domain of ROS 2: one for discovery, three for a participant."""
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DEFAULT_RANGE = PortRange(11000, 11099)
 DEFAULT_ZENOH_PORTS = PortRange(7448, 7467)
 MOST_ZENOH_PORTS = 256
-"""Routers of a proxy; each takes half a megabyte."""
+"""Routers for containers of a proxy; each takes half a megabyte."""
 MOST_ZENOH_PEERS = 64
 """Links of the hub router to other routers."""
 
@@ -33,10 +33,11 @@ class Settings:
     """All settings of ``rosproxy run``. Times are in seconds.
 
     Without ``inside_networks``, the networks of the proxy's own interfaces are inside. If the proxy
-    has several networks, two are left out: by ROS 1 with ``direction`` ``both`` the network of the
-    default route, by ROS 2 the network of the advertised host. The proxy announces participants to
-    a ``ros2_peer`` with port 0 at the well-known ports. Raises SettingError if two settings exclude
-    each other.
+    has several networks, one may count as outside. For ROS 1 with ``direction`` ``both``, this is
+    the network of the default route. For ROS 2, this is the network of the advertised host.
+
+    The proxy announces participants to a ``ros2_peer`` with port 0 at the well-known ports. Raises
+    SettingError if a necessary setting is missing, or if settings exclude each other.
     """
 
     ros: Annotated[
@@ -430,9 +431,9 @@ class Settings:
 
     def _check_ros2(self) -> None:
         count = len(self.domains)
-        if len(self.port_range) < LEAST_PER_DOMAIN * count:
+        if len(self.port_range) < LEAST_PORTS_PER_DOMAIN * count:
             text = f"{self.port_range} is too small: each of {count} domains needs"
-            raise SettingError("--port-range", f"{text} {LEAST_PER_DOMAIN} ports")
+            raise SettingError("--port-range", f"{text} {LEAST_PORTS_PER_DOMAIN} ports")
         # An announcement may lack the domain, so a port can serve only a single domain.
         fix = "start a proxy for each domain"
         if self.ros2_lan_relay and count > 1:
@@ -461,7 +462,7 @@ class Settings:
 
     @property
     def policy(self) -> tuple[PolicyLayer, ...]:
-        """The layer with the rules of the options; empty without rules."""
+        """The layer with the rules of ``--policy``; empty without rules."""
         rules = tuple(rule for given in self.policy_rules for rule in given)
         return (PolicyLayer("--policy", rules, PolicyMode(self.policy_mode)),) if rules else ()
 
@@ -481,7 +482,7 @@ class Settings:
         return "zenoh" in self.ros
 
     def zenoh_listeners(self) -> Iterator[tuple[str, int]]:
-        """The ports of zenoh routers, each with its option; none without rmw_zenoh."""
+        """Yield the option and the port of each zenoh listener; nothing without rmw_zenoh."""
         if self.for_zenoh:
             yield from (("--zenoh-ports", port) for port in self.zenoh_ports.ports())
         if self.for_zenoh and self.zenoh_listen is not None:

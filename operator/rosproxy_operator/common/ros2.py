@@ -6,13 +6,13 @@ import hmac
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST
 from rosproxy.setting_kinds import read_peer
-from rosproxy.settings import LEAST_PER_DOMAIN
+from rosproxy.settings import LEAST_PORTS_PER_DOMAIN
 
 LAST_DOMAIN = 232
 """The last domain whose well-known ports are below 65536 (DDSI-RTPS 2.5, 9.6.2.3)."""
 MOST_PEERS = 32
 """Hosts in a label or field at most. Each announcement goes to at least 32 ports of each host."""
-LEAST_PORTS = LEAST_PER_DOMAIN + 1
+LEAST_PORTS = LEAST_PORTS_PER_DOMAIN + 1
 """Ports of a ROS 2 proxy with a LAN relay at least: the proxy's ports, and a port of the relay."""
 ROS1_DISTROS = frozenset(
     {"fuerte", "groovy", "hydro", "indigo", "jade", "kinetic", "lunar", "melodic", "noetic"}

@@ -57,15 +57,15 @@ class Seconds(click.FloatRange):
     name = "s"
 
     def __init__(self, least: float) -> None:
-        super().__init__(least, kinds.DAY)
+        super().__init__(least, kinds.DAY_S)
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
         """The value of a text. Raises click.BadParameter."""
         seconds = float(click.FLOAT.convert(value, param, ctx))
-        if math.isnan(seconds) or not 0 <= (self.min or 0) <= seconds <= kinds.DAY:
-            self.fail(f"{seconds:g} s is not between {self.min:g} and {kinds.DAY} s", param, ctx)
+        if math.isnan(seconds) or not 0 <= (self.min or 0) <= seconds <= kinds.DAY_S:
+            self.fail(f"{seconds:g} s is not between {self.min:g} and {kinds.DAY_S} s", param, ctx)
         return seconds
 
 

@@ -16,7 +16,7 @@ from rosproxy.access.rules import Rule, RuleAction, RuleKind
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.settings import LEAST_PER_DOMAIN
+from rosproxy.settings import LEAST_PORTS_PER_DOMAIN
 from rosproxy_operator.common.policy import too_much
 from rosproxy_operator.common.ros2 import LAST_DOMAIN, LEAST_PORTS, MOST_PEERS, read_peer_name
 from rosproxy_operator.kubernetes.resources.checks import (
@@ -137,7 +137,7 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
                 fix = "Remove the field" + (", or set spec.ros: 2" if ros == "2" else "")
                 raise field[name].error(f"is for ROS {ros}, but spec.ros is {for_ros[0]}", fix)
     ros2 = _ros2_spec(field) if "2" in for_ros else None
-    least = LEAST_PORTS if ros2 and ros2.multicast else LEAST_PER_DOMAIN
+    least = LEAST_PORTS if ros2 and ros2.multicast else LEAST_PORTS_PER_DOMAIN
     if ros2 and ports < least:
         fix = f"Write at least {least}: a participant takes up to three ports"
         raise field["ports"].error("is too low for ROS 2", fix)
