@@ -26,21 +26,21 @@ from rosproxy.telemetry.problems import LONGEST_SUBJECT
 from rosproxy.telemetry.text import brief, clean
 
 LONGEST = 2000
-"""Characters of a message at most, and of the text of an exception. The proxy's own messages have
-up to 400."""
+"""Most characters of a message, and of the text of an exception. The proxy's own messages have up
+to 400."""
 SUBJECT_BURST = 20
 """Warnings and errors of one kind about one subject that are written in a burst. A real node causes
 a few messages a minute at most. An address may have several nodes with five topics each."""
-SUBJECT_INTERVAL = 5.0
-"""Seconds after a burst until one more message of the subject is written."""
+SUBJECT_INTERVAL_S = 5.0
+"""Seconds after a burst until one more message about the subject is written."""
 KIND_BURST = 2000
 """Messages of one kind that are written in a burst: a line for each of 1,000 nodes that start."""
-KIND_INTERVAL = 1.0
+KIND_INTERVAL_S = 1.0
 """Seconds after a burst until one more message of the kind is written."""
-USUAL = 200
-"""Characters of a message that counts as one message; a longer message counts several times."""
+USUAL_CHARACTERS = 200
+"""Characters for which a message counts once more: a long message counts several times."""
 MOST_BUCKETS = 1024
-"""Buckets of kinds and subjects. For a further bucket the one that was unused for longest goes."""
+"""Buckets of kinds and subjects. A further bucket replaces the one that was unused for longest."""
 
 _NAMES = {"levelname": "level", "name": "logger", "exc_info": "error"}
 
@@ -58,9 +58,9 @@ class LogRateLimit(logging.Filter):
     """Leaves out messages that come too often; the next message of the kind says how many.
 
     Messages of one kind come from the same call: logger, level and template are the same. The
-    subject is the first argument of the template. Each kind has a bound. Warnings and errors about
-    one subject have a lower bound. Long messages count several times. Debug messages have no bound:
-    a user reads along.
+    subject is the first argument of the template. Each kind has a bound. Warnings and errors of a
+    kind about one subject have a lower bound. Long messages count several times. Debug messages
+    have no bound, because a user reads them at once.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -74,22 +74,22 @@ class LogRateLimit(logging.Filter):
         if record.levelno < logging.INFO:
             return True
         kind = record.name, record.levelno, str(record.msg)[:LONGEST]
-        weight = 1 + min(len(record.getMessage()), LONGEST) // USUAL
+        weight = 1 + min(len(record.getMessage()), LONGEST) // USUAL_CHARACTERS
         with self._lock:
             if record.levelno >= logging.WARNING:
-                bucket = self._bucket((*kind, _subject(record)), SUBJECT_BURST, SUBJECT_INTERVAL)
+                bucket = self._bucket((*kind, _subject(record)), SUBJECT_BURST, SUBJECT_INTERVAL_S)
                 if not _take(bucket, record, weight):
                     return False
-            return _take(self._bucket(kind, KIND_BURST, KIND_INTERVAL), record, weight)
+            return _take(self._bucket(kind, KIND_BURST, KIND_INTERVAL_S), record, weight)
 
-    def _bucket(self, key: Hashable, burst: int, every: float) -> _Bucket:
-        """The bucket of a key, with the messages that the time has added; ``every`` is seconds."""
+    def _bucket(self, key: Hashable, burst: int, interval: float) -> _Bucket:
+        """The bucket of a key, refilled: one message for each ``interval`` (s), up to ``burst``."""
         now = self._clock()
         bucket = self._buckets.pop(key, None) or _Bucket(burst, now)
         if len(self._buckets) >= MOST_BUCKETS:
             del self._buckets[next(iter(self._buckets))]
         self._buckets[key] = bucket  # at the end: the first bucket was unused for longest
-        bucket.remaining = min(bucket.remaining + (now - bucket.since) / every, burst)
+        bucket.remaining = min(bucket.remaining + (now - bucket.since) / interval, burst)
         bucket.since = now
         return bucket
 
@@ -149,13 +149,15 @@ class JsonLines(JsonFormatter):
     def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
         """The fields with harmless texts, and with the level in lower case."""
         fields = {
-            name: brief(field, LONGEST) if isinstance(field, str) and name not in _SAFE else field
+            name: brief(field, LONGEST)
+            if isinstance(field, str) and name not in _HARMLESS_FIELDS
+            else field
             for name, field in log_data.items()
         }
         return {**fields, "level": log_data["level"].lower()}
 
 
-_SAFE = frozenset({"message", "error"})
+_HARMLESS_FIELDS = frozenset({"message", "error"})
 """The fields that `harmless` has made harmless. A further `brief` would join the lines of a
 traceback, and could cut the count of left-out messages."""
 
@@ -167,7 +169,7 @@ def set_up(form: str, level: str) -> None:
     # At the handler: the filter of a logger does not see the records of loggers below.
     handler.addFilter(LogRateLimit())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
-    # A stranger that sends no HTTP is not an error of the proxy.
+    # aiohttp logs a caller that sends no HTTP as an error. This is no error of the proxy.
     logging.getLogger("aiohttp.server").setLevel(logging.CRITICAL)
 
 

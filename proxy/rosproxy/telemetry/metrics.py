@@ -29,12 +29,13 @@ MOST_NAMES = 1000
 
 Nodes that are down have the same bound of names (`NamedNodes`).
 """
-BOUNDS = (
+BOUND_REASONS = (
     *("long_body", "slow_body", "compressed", "over_budget", "long_name", "too_many_names"),
     *("connections_per_source", "connections_per_lease", "silent_connections"),
     *("malformed", "participants", "rate", "stand_ins"),
 )
-"""Reasons of refusals (docs/reference/limits.md) that do not occur in a well-behaved system."""
+"""Reasons of refusals (docs/reference/limits.md) that do not occur in a system without faults or
+attacks."""
 RELAY_ERRORS = ("bad header", "denied", "node unreachable", "not offered")
 STRANGERS = ("outside", "unselected")
 
@@ -72,7 +73,7 @@ class NamedNodes:
         self._names: set[str] = set()
 
     def tally(self, names: Iterable[str]) -> Mapping[str, int]:
-        """How often each name occurs; ``other`` stands for all further names."""
+        """How often each name occurs; ``other`` stands for all names above the bound."""
         counts: dict[str, int] = {}
         for name in names:
             if len(self._names) < MOST_NAMES:
@@ -116,7 +117,7 @@ class Metrics:
         self.strangers = counter("strangers", strangers, "standing")
         for family, values in (
             (self.relay_errors, RELAY_ERRORS),
-            (self.refused, BOUNDS),
+            (self.refused, BOUND_REASONS),
             (self.strangers, STRANGERS),
         ):
             for value in values:

@@ -10,8 +10,8 @@ import msgspec
 
 from rosproxy.telemetry.text import brief
 
-MOST = 50
-"""Problems that are kept at most."""
+MOST_PROBLEMS = 50
+"""Most problems that are kept."""
 LONGEST_SUBJECT = 200
 """Characters of a subject; a longer subject loses its middle. Names of nodes have some tens."""
 LONGEST_TEXT = 500
@@ -33,21 +33,21 @@ class NotedProblem(msgspec.Struct, frozen=True):
 
 
 class Problems:
-    """The last MOST problems, newest last. A repeated problem replaces the older entry.
+    """The last MOST_PROBLEMS problems, newest last. A repeated problem replaces the older entry.
 
-    Above MOST the oldest event goes, and without events the oldest problem that holds.
+    Beyond MOST_PROBLEMS, the oldest event goes. If all problems hold, the oldest of all goes.
     """
 
     def __init__(self) -> None:
         self._problems: list[NotedProblem] = []
 
     def add(self, subject: str, text: str, port: int | None = None, holds: bool = False) -> None:
-        """Note a problem. For a problem that ``holds``, the caller calls `solved` later."""
+        """Note a problem. For a problem that ``holds``, the caller has to call `solved` later."""
         subject = brief(subject, LONGEST_SUBJECT)
         text = brief(text, LONGEST_TEXT)
         remaining = [p for p in self._problems if (p.subject, p.text) != (subject, text)]
         noted = [*remaining, NotedProblem(time.time(), subject, text, port, holds)]
-        if len(noted) > MOST:
+        if len(noted) > MOST_PROBLEMS:
             noted.remove(next((p for p in noted if not p.holds), noted[0]))
         self._problems = noted
 
@@ -57,7 +57,7 @@ class Problems:
         self._problems = [p for p in self._problems if p.subject != noted_subject]
 
     def solved_at(self, port: int) -> None:
-        """Remove the problems of the node with a lease."""
+        """Remove the problems of the node that holds ``port``."""
         self._problems = [p for p in self._problems if p.port != port]
 
     def all(self) -> list[NotedProblem]:
@@ -65,5 +65,5 @@ class Problems:
         return self._problems
 
     def at(self, port: int) -> list[NotedProblem]:
-        """The problems of the node with a lease."""
+        """The problems of the node that holds ``port``."""
         return [p for p in self._problems if p.port == port]

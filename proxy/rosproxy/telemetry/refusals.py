@@ -1,8 +1,8 @@
 """Refusals above a bound: counted, logged, and shown in the status.
 
-A metric counts each refusal by reason (docs/reference/limits.md has the reasons). The log gets a
-line for a reason and source, then no such line for QUIET seconds. In the same time the log gets
-LINES lines for a reason at most. `rosproxy status` shows the last refusal of each reason until
+A metric counts each refusal by reason (docs/reference/limits.md has the reasons). The log gets at
+most one line for a reason and source in QUIET seconds. In the same time the log gets at most
+MOST_LINES lines for a reason. `rosproxy status` shows the last refusal of each reason until
 there was no refusal for OVER_AFTER seconds.
 """
 
@@ -23,33 +23,33 @@ QUIET = 60.0
 """Seconds after a line in the log without another line for the same source and reason."""
 OVER_AFTER = 300.0
 """Seconds without a refusal after which the status no longer shows the last refusal."""
-OF_STARTS = frozenset(
+START_REASONS = frozenset(
     {"not_a_peer", "hidden_source", "unproven", "unknown_participant", "no_locator"}
 )
-"""Reasons that occur at each start of a ROS 2 node, for a second or two: a datagram of a
-participant overtakes the announcement of that participant."""
+"""Reasons that occur at each start of a ROS 2 node, for a second or two: datagrams of a participant
+overtake the announcement of this participant."""
 RATE = "rate"
 """The reason if a source sends more discovery of ROS 2 than the proxy reads. Fast DDS sends a
 thousand heartbeats a second while participants discover each other. A busy proxy drops some, and
 participants send these again."""
 PATIENCE = 10.0
-"""Seconds that a span of a reason of `OF_STARTS`, or of `RATE`, lasts before the log and the status
-report a refusal."""
+"""Seconds of a span after which the log and the status report a refusal, for `RATE` and for the
+reasons in `START_REASONS`. Refusals for other reasons are reported at once."""
 PAUSE = 15.0
 """Seconds without a refusal after which a new span begins. Cyclone DDS announces every 8 s."""
-LINES = 20
+MOST_LINES = 20
 """Lines in the log for a reason in QUIET seconds: sources of datagrams may be forged."""
-MOST = 1000
+MOST_REMEMBERED_LINES = 1000
 """Pairs of reason and source whose last line is remembered."""
 MOST_SOURCES = 256
-"""Sources of a span that are remembered. Only a pause ends a span with more sources."""
+"""Sources of a span that are remembered. Only a pause ends a span with this many sources."""
 
 
 @dataclass(slots=True)
 class _Span:
     """A series of refusals for one reason. ``first`` and ``last`` are times in seconds.
 
-    ``sources``: the sources whose participants the proxy has not met since the refusal.
+    ``sources``: the refused sources. A source leaves when the proxy has met its participant.
     """
 
     first: float
@@ -67,7 +67,10 @@ class _Span:
             self.sources.add(source)
 
     def settle(self, source: str) -> bool:
-        """Note that the proxy has met the participant of a source; True for the last source."""
+        """Note that the proxy has met the participant of a source.
+
+        Return whether this was the last source of the span.
+        """
         if len(self.sources) >= MOST_SOURCES or source not in self.sources:
             return False
         self.sources.discard(source)
@@ -102,7 +105,7 @@ class Refusals:
         key = reason, source
         span = self._spans.setdefault(reason, _Span(now, now))
         span.extend(source, now)
-        if (reason in OF_STARTS or reason == RATE) and span.length < PATIENCE:
+        if (reason in START_REASONS or reason == RATE) and span.length < PATIENCE:
             return
         if now - self._logged_at.get(key, -QUIET) < QUIET:
             return
@@ -110,11 +113,11 @@ class Refusals:
         if now - since >= QUIET:
             since = now
             lines = 0
-        if lines >= LINES:
+        if lines >= MOST_LINES:
             return
         self._lines[reason] = since, lines + 1
         self._logged_at.pop(key, None)
-        if len(self._logged_at) >= MOST:
+        if len(self._logged_at) >= MOST_REMEMBERED_LINES:
             del self._logged_at[next(iter(self._logged_at))]
         self._logged_at[key] = now
         subject = problem_subject(reason)
@@ -129,7 +132,7 @@ class Refusals:
         and after a start of the proxy a running robot announces itself late. So the status drops
         such a refusal once the proxy has met the participants of all sources.
         """
-        for reason in OF_STARTS & self._spans.keys():
+        for reason in START_REASONS & self._spans.keys():
             if self._spans[reason].settle(source):
                 self._problems.solved(problem_subject(reason))
 

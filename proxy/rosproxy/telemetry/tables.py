@@ -20,7 +20,7 @@ _CONSOLE = Console(file=io.StringIO(), color_system=None, width=80, height=25, l
 
 
 def table(rows: Sequence[Sequence[str]], left: int, room: int) -> list[str]:
-    """Lines of a table with its heading in the first row.
+    """The lines of a table. The first row is the heading; there must be at least one row.
 
     The first ``left`` columns are aligned left, the rest right. The first cell of each row gets
     ``room`` terminal columns at most; a wider cell is shortened.

@@ -1,8 +1,8 @@
 """Text for logs and terminals: harmless, and measured in terminal columns.
 
 Pure functions from values to text and lines. `rosproxy.telemetry.tables` makes tables, and
-`rosproxy.cli.terminal` prints lines. Nodes choose the names of nodes and topics, so call `clean`
-before all other functions here.
+`rosproxy.cli.terminal` prints lines. Nodes choose the names of nodes and topics. So call `clean`
+before all other functions here; only `brief` and `quoted` call `clean` themselves.
 """
 
 import shlex
@@ -20,7 +20,10 @@ _UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
 def clean(text: object) -> str:
-    """A text in which all characters are escaped that move the cursor, or hide or reorder text."""
+    """The text with escapes for all characters that are not printable.
+
+    Such characters could move the cursor, or hide or reorder text.
+    """
     shown = str(text)
     if shown.isprintable():
         return shown
@@ -28,7 +31,7 @@ def clean(text: object) -> str:
 
 
 def brief(text: object, most: int) -> str:
-    """A clean text of at most ``most`` characters; a longer text has a mark for its middle.
+    """A clean text of at most ``most`` characters; in a longer text, ``…`` replaces the middle.
 
     For texts that are kept, sent or logged. `shorten` bounds terminal columns instead.
     """
@@ -40,9 +43,9 @@ def brief(text: object, most: int) -> str:
 
 
 def quoted(name: str) -> str:
-    """A name as a single word of a shell, for commands that users paste.
+    """A clean name as a single word of a shell, for commands that users paste.
 
-    Names of real nodes and topics stay unquoted. NAME stands for a name that is too long.
+    Names of real nodes and topics stay unquoted. The result is NAME for a name that is too long.
     """
     word = shlex.quote(clean(name))
     return word if len(word) <= LONGEST_QUOTED else "NAME"
@@ -54,7 +57,10 @@ def width(text: str) -> int:
 
 
 def shorten(text: str, most: int) -> str:
-    """The text in ``most`` columns; a wider text loses its middle: names differ at the ends."""
+    """The text in at most ``most`` columns; a wider text loses its middle.
+
+    The ends stay, because names differ at the ends.
+    """
     if width(text) <= most:
         return text
     room = max(most - 1, 0)
@@ -67,8 +73,9 @@ def wrap(
 ) -> list[str]:
     """Lines of at most ``columns``, each with ``indent``; the first line with ``first`` if given.
 
-    At most ``most`` lines; a shortened text ends in an ellipsis. Words stay whole, even if longer
-    than a line: users may copy commands.
+    There are at most ``most`` lines; a shortened text ends in an ellipsis. A line always has room
+    for 20 columns after the indent. Words stay whole, even if longer than a line: users may copy
+    commands.
     """
     return textwrap.wrap(
         text,

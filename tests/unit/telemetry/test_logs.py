@@ -10,12 +10,12 @@ import pytest
 
 from rosproxy.telemetry.logs import (
     KIND_BURST,
-    KIND_INTERVAL,
+    KIND_INTERVAL_S,
     LONGEST,
     MOST_BUCKETS,
     SUBJECT_BURST,
-    SUBJECT_INTERVAL,
-    USUAL,
+    SUBJECT_INTERVAL_S,
+    USUAL_CHARACTERS,
     JsonLines,
     LogRateLimit,
     TextLines,
@@ -135,7 +135,7 @@ def test_the_same_warning_again_and_again_is_written_now_and_then(clock: Clock) 
     floods = LogRateLimit(clock)
     assert len(written(floods, (record("%s: gone", "/a") for _ in range(1000)))) == SUBJECT_BURST
     assert len(written(floods, [record("%s: gone", "/b")])) == 1
-    clock.now += SUBJECT_INTERVAL
+    clock.now += SUBJECT_INTERVAL_S
     (again,) = written(floods, (record("%s: gone", "/a") for _ in range(1000)))
     assert (
         TextLines()
@@ -143,7 +143,7 @@ def test_the_same_warning_again_and_again_is_written_now_and_then(clock: Clock) 
         .endswith(f"/a: gone ({1000 - SUBJECT_BURST} more like it were left out)")
     )
     assert json.loads(JsonLines().format(again))["left_out"] == 1000 - SUBJECT_BURST
-    clock.now += 1000 * SUBJECT_INTERVAL
+    clock.now += 1000 * SUBJECT_INTERVAL_S
     assert len(written(floods, (record("%s: gone", "/a") for _ in range(99)))) == SUBJECT_BURST
 
 
@@ -162,7 +162,7 @@ def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int
     names = [record("%s is new", f"/{n}", level=level) for n in range(KIND_BURST + more)]
     assert len(written(floods, names)) == KIND_BURST
     assert len(written(floods, [record("%s is old", "/a", level=level)])) == 1
-    clock.now += KIND_INTERVAL
+    clock.now += KIND_INTERVAL_S
     (later,) = written(floods, (record("%s is new", f"/{n}", level=level) for n in range(9)))
     assert later.__dict__["left_out"] == more
 
@@ -170,7 +170,7 @@ def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int
 def test_long_names_fill_no_disk_either(clock: Clock) -> None:
     floods = LogRateLimit(clock)
     names = (record("%s is new", f"/{n}" + "x" * LONGEST, level=logging.INFO) for n in range(5000))
-    assert len(written(floods, names)) * LONGEST < 2 * KIND_BURST * USUAL
+    assert len(written(floods, names)) * LONGEST < 2 * KIND_BURST * USUAL_CHARACTERS
 
 
 def test_what_is_logged_once_and_for_debugging_is_written(clock: Clock) -> None:

@@ -7,7 +7,7 @@ from prometheus_client.exposition import generate_latest
 
 from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.telemetry.metrics import (
-    BOUNDS,
+    BOUND_REASONS,
     MOST_NAMES,
     RELAY_ERRORS,
     STRANGERS,
@@ -29,7 +29,7 @@ def test_no_series_tells_when_a_counter_began() -> None:
 def test_what_alerts_count_begins_with_nothing() -> None:
     """Prometheus sees no increase in a series that begins with 1."""
     value = Metrics().registry.get_sample_value
-    for reason in BOUNDS:
+    for reason in BOUND_REASONS:
         assert value("rosproxy_refused_total", {"reason": reason}) == 0
     for reason in RELAY_ERRORS:
         assert value("rosproxy_relay_errors_total", {"reason": reason}) == 0
@@ -46,9 +46,9 @@ def test_every_reason_is_one_that_the_code_gives() -> None:
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     }
-    assert {*BOUNDS, *RELAY_ERRORS} <= words
+    assert {*BOUND_REASONS, *RELAY_ERRORS} <= words
     documented = (ROOT / "docs/reference/metrics.md").read_text()
-    assert not [reason for reason in BOUNDS if f"`{reason}`" not in documented]
+    assert not [reason for reason in BOUND_REASONS if f"`{reason}`" not in documented]
 
 
 def test_names_of_nodes_are_bounded() -> None:

@@ -1,24 +1,24 @@
 """Problems: the newest stay, and texts are bounded."""
 
-from rosproxy.telemetry.problems import LONGEST_SUBJECT, LONGEST_TEXT, MOST, Problems
+from rosproxy.telemetry.problems import LONGEST_SUBJECT, LONGEST_TEXT, MOST_PROBLEMS, Problems
 
 
 def test_only_the_newest_are_kept() -> None:
     problems = Problems()
-    for number in range(MOST + 10):
+    for number in range(MOST_PROBLEMS + 10):
         problems.add(f"/n{number}", "gone")
-    assert [p.subject for p in problems.all()] == [f"/n{n}" for n in range(10, MOST + 10)]
+    assert [p.subject for p in problems.all()] == [f"/n{n}" for n in range(10, MOST_PROBLEMS + 10)]
 
 
 def test_one_that_holds_stays_until_it_is_solved() -> None:
     problems = Problems()
     problems.add("published range", "dead", holds=True)
-    for number in range(MOST + 10):
+    for number in range(MOST_PROBLEMS + 10):
         problems.add(f"/n{number}", "gone")
-    assert len(problems.all()) == MOST
+    assert len(problems.all()) == MOST_PROBLEMS
     assert (problems.all()[0].subject, problems.all()[0].holds) == ("published range", True)
     problems.solved("published range")
-    assert len(problems.all()) == MOST - 1
+    assert len(problems.all()) == MOST_PROBLEMS - 1
 
 
 def test_the_same_again_replaces_the_older_one() -> None:

@@ -5,15 +5,15 @@ import pytest
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import (
-    LINES,
-    MOST,
+    MOST_LINES,
+    MOST_REMEMBERED_LINES,
     MOST_SOURCES,
-    OF_STARTS,
     OVER_AFTER,
     PATIENCE,
     PAUSE,
     QUIET,
     RATE,
+    START_REASONS,
     Refusals,
 )
 
@@ -43,9 +43,9 @@ def test_each_refusal_counts_and_the_first_of_a_source_is_told(
 
 def test_many_sources_are_forgotten() -> None:
     refusals = Refusals(Metrics(), Problems(), lambda: 0.0)
-    for number in range(MOST + 10):
-        refusals.note(f"reason_{number // LINES}", str(number), "x")
-    assert len(refusals._logged_at) == MOST
+    for number in range(MOST_REMEMBERED_LINES + 10):
+        refusals.note(f"reason_{number // MOST_LINES}", str(number), "x")
+    assert len(refusals._logged_at) == MOST_REMEMBERED_LINES
 
 
 def test_forged_sources_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
@@ -54,10 +54,10 @@ def test_forged_sources_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) ->
     for number in range(1000):
         refusals.note("long_body", str(number), "x")
     refusals.note("malformed", "10.0.0.5", "another reason")
-    assert len(caplog.records) == LINES + 1
+    assert len(caplog.records) == MOST_LINES + 1
     clock[0] = QUIET
     refusals.note("long_body", "10.0.0.5", "x")
-    assert len(caplog.records) == LINES + 2
+    assert len(caplog.records) == MOST_LINES + 2
 
 
 def test_a_refusal_that_is_over_is_not_shown() -> None:
@@ -77,7 +77,7 @@ def test_a_refusal_that_is_over_is_not_shown() -> None:
     assert problems.all(), "a new refusal is a problem again"
 
 
-@pytest.mark.parametrize("reason", [*sorted(OF_STARTS), RATE])
+@pytest.mark.parametrize("reason", [*sorted(START_REASONS), RATE])
 def test_what_a_start_brings_for_a_moment_is_not_told(
     reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -106,7 +106,7 @@ def test_what_goes_on_after_a_start_is_told(caplog: pytest.LogCaptureFixture) ->
     assert len(caplog.records) == 1
 
 
-@pytest.mark.parametrize("reason", sorted(OF_STARTS))
+@pytest.mark.parametrize("reason", sorted(START_REASONS))
 def test_a_node_that_restarts_again_and_again_is_no_problem(reason: str) -> None:
     """The proxy admits the node's participant each time."""
     problems = Problems()
@@ -130,7 +130,7 @@ def test_a_source_that_floods_is_told_though_it_is_met_again_and_again() -> None
     assert problems.all()
 
 
-@pytest.mark.parametrize("reason", sorted(OF_STARTS))
+@pytest.mark.parametrize("reason", sorted(START_REASONS))
 def test_a_start_beside_a_running_robot_is_over_once_all_have_been_met(reason: str) -> None:
     """The robot sends datagrams all the time, and announces itself late."""
     problems = Problems()
