@@ -1,6 +1,6 @@
-"""What is wrong with the routers for rmw_zenoh: rules from their status to findings.
+"""Findings about the routers for rmw_zenoh, made from the status of the routers.
 
-The proxy reports these faults by itself, and the doctor reports them, too.
+The proxy reports these findings by itself, and the doctor reports them, too.
 """
 
 from collections.abc import Iterator
@@ -13,8 +13,8 @@ from rosproxy.zenoh.links import LinkFault
 
 ROUTERS = "zenoh routers"
 LINK_GRACE_S = 5.0
-"""Time that a link has to come up before it counts as a fault."""
-_REMOTE = "check the address, the port and the firewall of the peer"
+"""Seconds in which a link has to come up before it counts as a fault."""
+_CHECK_PEER = "check the address, the port and the firewall of the peer"
 _LINK_FAULTS = {
     LinkFault.UNRESOLVABLE: (
         "the host name can't be resolved here",
@@ -24,8 +24,11 @@ _LINK_FAULTS = {
         "connection refused: no router listens there",
         "start a router at the peer: ros2 run rmw_zenoh_cpp rmw_zenohd",
     ),
-    LinkFault.SILENT: ("no answer: a firewall drops the packets, or the machine is off", _REMOTE),
-    LinkFault.UNREACHABLE: ("there is no route to this address", _REMOTE),
+    LinkFault.SILENT: (
+        "no answer: a firewall drops the packets, or the machine is off",
+        _CHECK_PEER,
+    ),
+    LinkFault.UNREACHABLE: ("there is no route to this address", _CHECK_PEER),
     LinkFault.NO_SESSION: (
         "a program accepts connections there, but zenoh opens no session. The program is no zenoh "
         "router, or two peers lead to the same router",
@@ -35,7 +38,7 @@ _LINK_FAULTS = {
 
 
 def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
-    """What keeps nodes apart, the first cause first."""
+    """Yield the faults that keep nodes apart. If the routers do not run, this is the only fault."""
     if zenoh.failure:
         text = f"do not run: {zenoh.failure}"
         fix = "wait some seconds, since the proxy starts the routers again. If the finding stays, "
@@ -51,12 +54,15 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
 
 def _link_fault(link: ZenohLinkStatus) -> DoctorFinding:
     known = {fault.value: texts for fault, texts in _LINK_FAULTS.items()}
-    text, fix = known.get(link.error, (link.error or "no session", _REMOTE))
+    text, fix = known.get(link.error, (link.error or "no session", _CHECK_PEER))
     return error("link", f"zenoh peer {link.peer}", f"{text}. The hub tries again", fix)
 
 
 def _shared_routers(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
-    """Routers with peers of several containers: a router does not pass data between its peers."""
+    """Yield a warning for each router with peers at several addresses.
+
+    A router does not pass data between its peers.
+    """
     hosts_by_port: dict[int | None, set[str]] = {}
     for session in zenoh.sessions:
         remote = parse_host_port(session.remote)

@@ -8,7 +8,11 @@ from rosproxy.zenoh.links import LinkFault
 
 
 async def try_link(addresses: Collection[str], port: int) -> LinkFault:
-    """What keeps the hub from a session with a router, as far as a connection tells."""
+    """Return why the hub has no session with a router, as far as a TCP connection shows.
+
+    Without addresses: UNRESOLVABLE. If an address accepts: NO_SESSION. Otherwise the fault of the
+    last address.
+    """
     fault = LinkFault.UNRESOLVABLE
     for address in addresses:
         try:

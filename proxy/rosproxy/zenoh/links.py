@@ -27,7 +27,8 @@ class LinkFault(Enum):
 class Link:
     """A link to a peer. ``addresses``: the addresses of the peer's host name.
 
-    ``fault``: None if the link is up. ``since``: the time at which the link went up or down.
+    ``fault``: None if the link is up. ``since``: the time in seconds at which the link went up or
+    down.
     """
 
     peer: HostPort
@@ -36,7 +37,7 @@ class Link:
     fault: LinkFault | None = LinkFault.NOT_TRIED
 
     def note(self, fault: LinkFault | None, now: float) -> bool:
-        """Note the state of the link; returns whether the state differs."""
+        """Note the state of the link. Return whether the state or the fault has changed."""
         if fault == self.fault:
             return False
         if fault is None or self.fault is None:
@@ -50,7 +51,8 @@ def is_linked(
 ) -> bool:
     """Whether one of the hub's sessions with ``routers`` is with a peer at these addresses.
 
-    The peer may have dialed the hub, at the port ``listen``. Two routers keep a single session.
+    The peer may have dialed the hub, at the port ``listen``; None: the hub has no such port. Two
+    routers keep a single session.
     """
     return any(
         ends.remote.host in addresses

@@ -63,10 +63,10 @@ class RouterPlan:
     directory: str = ""
 
     def configs(self, access: Mapping[int, object]) -> list[RouterConfig]:
-        """A router for each port, in order, and the hub as the last.
+        """The configurations of a router for each port, in order, and of the hub as the last.
 
-        ``access`` has the access control of routers by port. Raises ValueError for access control
-        without a directory.
+        ``access`` has the access control of routers by port. Raises ValueError if there is access
+        control, but no directory.
         """
         if access and not self.directory:
             raise ValueError("access control needs a directory for sockets")

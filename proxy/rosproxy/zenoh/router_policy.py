@@ -1,4 +1,4 @@
-"""The policy at each port for a container: the access control, and the names that it denies.
+"""The policy at each port for a container: the access control, and reports of denied names.
 
 The access control of zenoh reports nothing. So the proxy compares the names in the tokens of nodes
 inside with the rules, and reports each denial once.
@@ -19,7 +19,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.zenoh.policy.access_control import access_control
 from rosproxy.zenoh.policy.name_sets import layers_at
 
-MOST_JUDGED = 200
+MOST_JUDGED_NAMES = 200
 """Names that the proxy compares with the rules at a time. With 1,000 rules, a name takes 0.7 ms."""
 
 
@@ -42,11 +42,11 @@ class RouterPolicy:
         self._addresses: dict[int, frozenset[str]] = {}
         self._layers: dict[int, tuple[PolicyLayer, ...]] = {}
         self._access: dict[int, object] = {}
-        self._made_of: object = None
+        self._access_inputs: object = None
         self._verdicts: dict[InsideName, Verdict] = {}
 
     def note(self, sessions: Iterable[tuple[int, str]]) -> None:
-        """Note the ports and addresses of sessions.
+        """Note the ports and addresses of sessions, for the addresses that a layer names.
 
         A port keeps the layers of an address that once had a session there. Otherwise the layers
         would end with the session, and the next session would begin without layers.
@@ -56,15 +56,17 @@ class RouterPolicy:
         for port, address in sessions:
             if address in named:
                 seen[port] = seen.get(port, frozenset()) | {address}
-        self._addresses = {port: kept for port, every in seen.items() if (kept := every & named)}
+        self._addresses = {port: kept for port, found in seen.items() if (kept := found & named)}
 
     def access(self) -> dict[int, object]:
-        """The access control by port, of ports with any: the same object if nothing has changed.
+        """The access control by port, for the ports that have any.
+
+        If nothing has changed since the last call, the result is the same object.
 
         Raises ValueError as `check_layers` does.
         """
-        made_of = self._policy.version, self._addresses
-        if made_of == self._made_of:
+        inputs = self._policy.version, self._addresses
+        if inputs == self._access_inputs:
             return self._access
         access: dict[int, object] = {}
         made: dict[tuple[PolicyLayer, ...], object] = {}
@@ -76,14 +78,14 @@ class RouterPolicy:
                 access[port] = made[layers]
             self._note_layers(port, layers)
         self._access = access
-        self._made_of = made_of
+        self._access_inputs = inputs
         return access
 
     def _note_layers(self, port: int, layers: Sequence[PolicyLayer]) -> None:
         # `layers_at` has decided for which nodes the layers hold. So a verdict needs no address.
-        every = tuple(replace(layer, addresses=None) for layer in layers)
-        if every != self._layers.get(port):
-            self._layers[port] = every
+        at_port = tuple(replace(layer, addresses=None) for layer in layers)
+        if at_port != self._layers.get(port):
+            self._layers[port] = at_port
             self._verdicts = {n: v for n, v in self._verdicts.items() if n.port != port}
 
     def look(self, names: Iterable[InsideName]) -> None:
@@ -91,7 +93,7 @@ class RouterPolicy:
         current = dict.fromkeys(names)
         self._verdicts = {name: v for name, v in self._verdicts.items() if name in current}
         new = [name for name in current if name not in self._verdicts]
-        for name in fair_choice(new, lambda name: name.address, MOST_JUDGED):
+        for name in fair_choice(new, lambda name: name.address, MOST_JUDGED_NAMES):
             verdict = decide(self._layers.get(name.port, ()), name.kind, name.name, "", "")
             subject = f"{name.name} of {name.node}"
             self._verdicts[name] = self._policy.report(verdict, name.kind, subject, name.address)

@@ -5,8 +5,8 @@ the proxy alone. The proxy then starts the process again (`rosproxy.zenoh.router
 
 Each line of standard input is JSON: a revision, and a list of `RouterConfig`. With each further
 line, the process restarts the routers with changed configurations, and leaves the other routers
-alone. Standard output gets a `Report` each second, and at once after a line. The process ends with
-an error in the last report if a router cannot be opened, or does not answer.
+alone. Standard output gets a `Report` each second, and at once after a line. If a router cannot be
+opened or does not answer, the last report has the error, and the process ends.
 
 Nodes wait for the process, so the process loads little: msgspec would take as long as all the rest.
 """
@@ -27,7 +27,7 @@ from rosproxy.zenoh.protocol.liveliness import ALL_TOKENS, LONGEST_TOKEN, MOST_T
 
 REPORT_INTERVAL_S = 1.0
 ANSWER_TIMEOUT_S = 5.0
-"""Time in which a router has to describe itself. A router takes less than a millisecond."""
+"""Seconds in which a router has to describe itself. A router takes less than a millisecond."""
 _PR_SET_PDEATHSIG = 1
 _NO_LINE = "\n"
 
@@ -53,8 +53,8 @@ class Tokens:
             self.left_out += not is_kept
         self._changed = True
 
-    def look(self) -> bool:
-        """Whether a token has changed since the last call."""
+    def take_change(self) -> bool:
+        """Return whether a token has changed since the last call."""
         changed = self._changed
         self._changed = False
         return changed
@@ -65,9 +65,9 @@ class Tokens:
 
 
 class Router:
-    """An open router, with the tokens of the graph if it is the hub or has access control.
+    """An open router. The hub, and each router with access control, has the tokens of the graph.
 
-    Behind access control are tokens that do not reach the hub. Raises zenoh.ZError.
+    Access control keeps some tokens from the hub. Raises zenoh.ZError.
     """
 
     def __init__(self, config: Mapping[str, str], *, is_hub: bool) -> None:
@@ -106,14 +106,15 @@ class Routers:
     def report(self) -> dict[str, Any]:
         """The fields of a report. Raises ValueError if a router does not answer."""
         described = [describe(router.session) for router in self._routers]
-        tokens = [router.tokens for router in self._routers]
+        by_router = [router.tokens for router in self._routers]
         keys = None
-        looks = [told.look() for told in tokens]  # `look` of every router, so a list
-        if any(looks):
-            union = sorted(set[str]().union(*(told.keys() for told in tokens)))
+        # A list, because `take_change` has to be called for every router.
+        changes = [tokens.take_change() for tokens in by_router]
+        if any(changes):
+            union = sorted(set[str]().union(*(tokens.keys() for tokens in by_router)))
             keys = union[:MOST_TOKENS]
             self._left_out = len(union) - len(keys)
-        left_out = max(told.left_out for told in tokens) + self._left_out
+        left_out = max(tokens.left_out for tokens in by_router) + self._left_out
         return {"routers": described, "tokens": keys, "tokens_left_out": left_out}
 
 
@@ -126,11 +127,14 @@ def open_router(config: Mapping[str, str]) -> Any:
 
 
 def describe(router: Any) -> dict[str, Any]:
-    """What a router says of itself. Raises ValueError if it does not answer."""
+    """The zenoh ID and the sessions of a router, from the router's admin space.
+
+    Raises ValueError if the router does not answer.
+    """
     for reply in router.get(f"@/{router.info.zid()}/router", timeout=ANSWER_TIMEOUT_S):
         if reply.ok is not None:
-            told = json.loads(reply.ok.payload.to_bytes())
-            return {"zid": told["zid"], "sessions": told["sessions"]}
+            answer = json.loads(reply.ok.payload.to_bytes())
+            return {"zid": answer["zid"], "sessions": answer["sessions"]}
     raise ValueError(f"a router does not answer within {ANSWER_TIMEOUT_S:g} s")
 
 
@@ -147,15 +151,20 @@ def read_lines(lines: "queue.SimpleQueue[str]") -> None:
 
 
 def run(lines: "queue.SimpleQueue[str]", output: TextIO) -> None:
-    """Run routers and report, without end. Raises zenoh.ZError, ValueError, BrokenPipeError."""
+    """Run the routers of each line, and report, without end.
+
+    Raises zenoh.ZError if a router cannot be opened, ValueError if a router does not answer or the
+    input has ended, and BrokenPipeError.
+    """
     routers = Routers()
     revision = 0
     line = lines.get()
     while True:
         if line != _NO_LINE:
-            told = json.loads(line)  # not valid at the end of the input, which ends the process
-            routers.use(told["routers"])
-            revision = told["revision"]
+            # The empty text at the end of the input is no JSON. So ValueError ends the process.
+            message = json.loads(line)
+            routers.use(message["routers"])
+            revision = message["revision"]
         report(output, revision=revision, **routers.report())
         try:
             line = lines.get(timeout=REPORT_INTERVAL_S)
@@ -164,7 +173,7 @@ def run(lines: "queue.SimpleQueue[str]", output: TextIO) -> None:
 
 
 def main() -> int:
-    """The exit status."""
+    """Run the routers until an error, or the end of the proxy. Return the exit status."""
     # The kernel ends this process with the proxy, whose next process needs the ports.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     # Ctrl-C goes to all programs of a terminal; the proxy ends this process.

@@ -24,19 +24,19 @@ from rosproxy.zenoh.router_configs import RouterConfig
 log = logging.getLogger(__name__)
 
 REPORT_TIMEOUT_S = 10.0
-"""Time without a report after which the process counts as hung."""
+"""Seconds without a report after which the process counts as hung."""
 START_TIMEOUT_S = 30.0
-"""Time without a first report after which a new process counts as hung."""
+"""Seconds without a first report after which a new process counts as hung."""
 CHANGE_TIMEOUT_S = 5.0
-"""Time in which a process has to open routers with other configurations."""
+"""Seconds in which a process has to open routers with other configurations."""
 LEAST_START_INTERVAL_S = 1.0
-"""A process that has lived longer starts again at once."""
+"""Seconds between two starts of the process. A process that has run longer starts again at once."""
 MOST_LOG_LINES = 20
 """Lines of the library's own log that the proxy logs, for each process."""
 LONGEST_LOG_LINE = 300
 """Characters of such a line that the proxy logs."""
 LAST_LINES_TIMEOUT_S = 0.2
-"""Time to read such lines after the end of the process."""
+"""Seconds to read such lines after the end of the process."""
 _Stream = TypeVar("_Stream")
 PROGRAM = (sys.executable, "-m", "rosproxy.zenoh.router_process")
 
@@ -48,8 +48,8 @@ class RoutersFailed(Exception):
 class RouterSupervisor:
     """Runs the router process of a proxy.
 
-    ``failure``: why no routers run; empty while the routers run. ``restarts``: the number of
-    processes that have ended.
+    ``take_report`` gets each report. ``failure``: why no routers run; empty while the routers run.
+    ``restarts``: the number of processes that have ended.
     """
 
     def __init__(
@@ -63,24 +63,28 @@ class RouterSupervisor:
         self._confirmed = 0
         self._process: Process | None = None
         self._take_report = take_report
-        self._changed = asyncio.Event()
+        self._first_outcome = asyncio.Event()
         self._reported = asyncio.Event()
         self.program: Sequence[str] = PROGRAM
         self.failure = "the routers have not started yet"
         self.restarts = 0
 
     async def start(self, configs: Sequence[RouterConfig]) -> None:
-        """Start the process, and wait until the routers run. Raises RoutersFailed."""
+        """Start the process, and wait until the routers run.
+
+        Raises RoutersFailed if the first process fails. Later processes start nevertheless.
+        """
         self._line = _line(self._revision, configs)
         self._tasks.spawn(self._keep_running(), "running the zenoh routers")
-        await self._changed.wait()
+        await self._first_outcome.wait()
         if self.failure:
             raise RoutersFailed(self.failure)
 
     async def use(self, configs: Sequence[RouterConfig]) -> None:
         """Put other configurations in force: the process restarts the routers with changes.
 
-        Returns when no router runs with a former configuration.
+        Returns when no router runs with a former configuration. If the process does not confirm the
+        change, this method kills the process, and the next process uses the new configurations.
         """
         self._revision += 1
         revision = self._revision
@@ -106,13 +110,13 @@ class RouterSupervisor:
         while True:
             began = loop.time()
             self.failure = await self._run_once()
-            self._changed.set()
+            self._first_outcome.set()
             self.restarts += 1
             log.error("zenoh routers ended: %s; starting the routers again", self.failure)
             await asyncio.sleep(max(began + LEAST_START_INTERVAL_S - loop.time(), 0.0))
 
     async def _run_once(self) -> str:
-        """Run a process to the end; return the reason of the end."""
+        """Run a process, and return why the process has ended."""
         try:
             process = await asyncio.create_subprocess_exec(
                 *self.program, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=LONGEST_REPORT
@@ -127,7 +131,7 @@ class RouterSupervisor:
             _piped(process.stdin).write(self._line)
             return await self._read_reports(process)
         finally:
-            # Zenoh's own end of a session may hang. Nodes see their connections end in both cases.
+            # zenoh may hang while it ends sessions, so kill it. Nodes see the end in both cases.
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             await process.wait()
@@ -138,27 +142,27 @@ class RouterSupervisor:
             logging_task.cancel()
 
     async def _read_reports(self, process: Process) -> str:
-        """Take reports until the process ends, fails or hangs; return the reason."""
+        """Take reports until the process ends, fails or hangs. Return the reason."""
         reports = _piped(process.stdout)
-        patience = START_TIMEOUT_S
+        timeout = START_TIMEOUT_S
         while True:
             try:
-                async with asyncio.timeout(patience):
+                async with asyncio.timeout(timeout):
                     line = await reports.readline()
                 if not line:
                     return _exit_reason(await process.wait())
                 report = read_report(line)
             except TimeoutError:
-                return f"no report for {patience:g} s"
+                return f"no report for {timeout:g} s"
             except ValueError as error:  # not valid, or longer than the limit
                 return brief(error, LONGEST_LOG_LINE)
             if report.error:
                 return brief(report.error, LONGEST_LOG_LINE)
-            patience = REPORT_TIMEOUT_S
+            timeout = REPORT_TIMEOUT_S
             self._take_report(report)
             self.failure = ""
             self._confirmed = max(self._confirmed, report.revision)
-            self._changed.set()
+            self._first_outcome.set()
             self._reported.set()
 
 

@@ -6,8 +6,8 @@ import tempfile
 from pathlib import Path
 
 PARENTS = ("/dev/shm", "/run", "/tmp")  # noqa: S108 - mkdtemp makes a private directory
-"""The first that is writable. With a read-only file system, containers can write to /dev/shm."""
-
+"""Parents of the directory; the first that is writable is used. With a read-only file system,
+containers can write to /dev/shm."""
 NO_DIRECTORY = (
     "rules on rmw_zenoh need a directory for sockets, and none of "
     f"{', '.join(PARENTS)} is writable. Mount a tmpfs at /dev/shm"
@@ -23,6 +23,6 @@ def make_socket_directory() -> str:
 
 
 def remove_socket_directory(path: str) -> None:
-    """Remove a directory, with the sockets in it."""
+    """Remove a directory of `make_socket_directory`, with the sockets in it. Ignore other paths."""
     if path and Path(path).name.startswith("rosproxy-zenoh-"):
         shutil.rmtree(path, ignore_errors=True)

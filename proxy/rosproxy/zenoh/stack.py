@@ -69,7 +69,10 @@ class Zenoh:
         self.state = ZenohState(settings, self.supervisor, runtime.now)
 
     async def start(self) -> None:
-        """Start the routers and the periodic checks. Raises SettingError."""
+        """Start the routers and the periodic checks. Raises SettingError.
+
+        If the proxy waits for a policy, the routers start later.
+        """
         _check_package()
         _check_ports(self._settings)
         self._plan = replace_plan(self._plan, directory=make_socket_directory())
@@ -127,16 +130,20 @@ class Zenoh:
         return ()
 
     async def try_ports(self) -> tuple[PortProbe, ...]:
-        """Bind the ports and close them again, without a start. Raises SettingError."""
+        """Bind the ports and close them again, without a start. Return no results.
+
+        Raises SettingError if a port is taken, eclipse-zenoh is missing, or a rule is impossible.
+        """
         _check_package()
         _check_ports(self._settings)
         self._check_policy()
         return ()
 
     async def apply_policy(self) -> EnforcementCounts:
-        """Restart the routers with changed access control, and wait until these routers run.
+        """Restart the routers whose access control has changed.
 
-        Returns no counts: the routers have no registrations.
+        Returns when no router runs with former access control. Returns no counts, because the
+        routers have no registrations. Raises ValueError as `RouterPolicy.access` does.
         """
         if self._awaiting:  # the routers start with the policy
             return EnforcementCounts()
@@ -168,7 +175,7 @@ class Zenoh:
 
     async def _look_at_policy(self) -> None:
         """Apply changes of the policy and of the containers at ports. Report denied names."""
-        self._policy.note(self.state.places)
+        self._policy.note(self.state.container_sessions)
         await self.apply_policy()
         self._policy.look(self.state.inside_names())
 
@@ -225,7 +232,7 @@ class Zenoh:
 
 
 def _check_package() -> None:
-    """Raises SettingError if eclipse-zenoh, the library of the routers, is not installed."""
+    """Raise SettingError if eclipse-zenoh, the library of the routers, is not installed."""
     try:
         metadata.distribution("eclipse-zenoh")
     except metadata.PackageNotFoundError:
@@ -234,7 +241,7 @@ def _check_package() -> None:
 
 
 def _check_ports(settings: Settings) -> None:
-    """Raises SettingError if another program has one of the ports."""
+    """Raise SettingError if another program has one of the ports."""
     for option, port in settings.zenoh_listeners():
         with setting_error_if_taken(option, f"port {port}"):
             sockets.listen(settings.bind, port).close()

@@ -26,7 +26,7 @@ _PlacedSession = tuple[int | None, RouterSession, Ends]
 
 
 class RouterProcess(Protocol):
-    """What the status tells of the process of the routers (`RouterSupervisor`)."""
+    """What the status needs from the `RouterSupervisor`."""
 
     failure: str
     restarts: int
@@ -48,7 +48,7 @@ class ZenohState(Collector):
         self.links = [Link(peer, now()) for peer in dict.fromkeys(settings.zenoh_peer)]
 
     def take(self, report: Report) -> None:
-        """Take in a report."""
+        """Replace the sessions by those of a report, and also the nodes if the tokens changed."""
         self._sessions = tuple(self._sessions_of(report.routers))
         self._hub_routers = tuple(
             ends
@@ -62,18 +62,18 @@ class ZenohState(Collector):
             self._left_out = report.tokens_left_out + len(entities) - len(known)
 
     def is_up(self, link: Link) -> bool:
-        """Whether the hub has a session with the peer of a link."""
+        """Whether the routers run, and the hub has a session with the peer of a link."""
         return not self._process.failure and is_linked(
             link.peer, link.addresses, self._hub_routers, self._settings.zenoh_listen
         )
 
     @property
-    def places(self) -> list[tuple[int, str]]:
+    def container_sessions(self) -> list[tuple[int, str]]:
         """The port and the address of each session with a container."""
         return [(port, ends.remote.host) for port, _, ends in self._sessions if port is not None]
 
     def inside_names(self) -> list[InsideName]:
-        """The topics and services of the nodes inside."""
+        """The topics and services of the nodes with a session at a port for containers."""
         place_by_zid = {s.peer: (port, ends.remote.host) for port, s, ends in self._sessions}
         names: list[InsideName] = []
         for node in self._nodes:

@@ -111,7 +111,7 @@ def test_audit_tells_what_it_would_deny() -> None:
 
 
 def test_names_are_judged_in_bounded_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(router_policy, "MOST_JUDGED", 2)
+    monkeypatch.setattr(router_policy, "MOST_JUDGED_NAMES", 2)
     policy, _, _ = make(PolicyLayer("common", parse_rules("deny publish *")))
     policy.access()
     names = [name(f"/{number}") for number in range(5)]

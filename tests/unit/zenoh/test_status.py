@@ -6,7 +6,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.admin.status_document import ZenohSessionStatus
-from rosproxy.zenoh.protocol.report import Link, Report, RouterReport, RouterSession
+from rosproxy.zenoh.protocol.report import Report, RouterReport, RouterSession, SessionConnection
 from rosproxy.zenoh.router_policy import InsideName
 from rosproxy.zenoh.status import ZenohState
 from tests.run_options import parse_settings
@@ -29,7 +29,7 @@ class FakeProcess:
 
 
 def session(zid: str, mode: str, local: str, remote: str) -> RouterSession:
-    return RouterSession(zid, mode, (Link(f"tcp/{local}", f"tcp/{remote}"),))
+    return RouterSession(zid, mode, (SessionConnection(f"tcp/{local}", f"tcp/{remote}"),))
 
 
 REPORT = Report(
@@ -89,7 +89,7 @@ def test_nodes_here_have_an_address() -> None:
 
 def test_names_of_nodes_inside_have_port_and_address() -> None:
     state = make_state(FakeProcess())
-    assert state.places == [(7448, "172.18.0.3")]
+    assert state.container_sessions == [(7448, "172.18.0.3")]
     assert state.inside_names() == [
         InsideName(7448, "172.18.0.3", "/talker", RuleKind.PUBLISH, "/chatter")
     ]

@@ -33,18 +33,19 @@ _OUT = "egress"
 
 
 class _Check(NamedTuple):
-    """Messages of a direction, seen from the router, whose names are checked."""
+    """Messages that a rule checks. ``flow`` is the direction: ingress or egress of the router."""
 
     messages: tuple[str, ...]
     flow: str
 
 
 class _Kind(NamedTuple):
-    """What a kind of rules is about: data, latched topics, and tokens of both sides.
+    """What a kind of rules checks: data, latched topics, and tokens of both sides.
 
     ``of_cache`` has the checks for latched topics by the owner of the key: ``pub`` or ``sub``.
     Readers ask for the keys of both, so a question has ``**`` in this place (zenoh-ext,
     advanced_subscriber.rs).
+
     ``inside`` is the kind of the tokens of nodes inside. ``outside`` is the kind of the tokens of
     the nodes outside that the nodes inside would find.
     """
@@ -136,7 +137,7 @@ def _rules(kind: RuleKind, names: NameSet) -> list[dict[str, Any]]:
 def _rules_about(
     kind: RuleKind, globs: Sequence[str] | None, permission: str
 ) -> list[dict[str, Any]]:
-    """Rules that allow or deny the names of globs; None: all names, and keys of no name."""
+    """Rules that allow or deny the names of globs; None: all keys, also keys without a name."""
     if globs is not None and not globs:
         return []
     about = _MESSAGES[kind]

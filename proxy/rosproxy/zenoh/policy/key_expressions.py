@@ -19,7 +19,7 @@ from functools import lru_cache
 from itertools import product
 
 MOST_STARS = 3
-"""``*`` with text on both sides, in a glob. Each doubles the number of key expressions."""
+"""Most ``*`` with text on both sides in a glob. Each doubles the number of key expressions."""
 _FOREIGN = re.compile(r"[$#%@]|//|/$")
 """Texts that no name of ROS 2 has."""
 
@@ -34,8 +34,8 @@ def check_glob(glob: str) -> None:
         raise ValueError(f"{text}. Shorten the glob")
 
 
-def is_of_no_name(glob: str) -> bool:
-    """Whether a glob matches no name of ROS 2, as it has characters that names cannot have."""
+def matches_no_name(glob: str) -> bool:
+    """Whether a glob has characters that no name of ROS 2 has, and so matches no name."""
     return _FOREIGN.search(glob) is not None
 
 
@@ -46,9 +46,9 @@ def data_keys(glob: str) -> tuple[str, ...]:
 
 
 def in_cache(key: str, owner: str) -> str:
-    """The key expression for latched topics with this key; ``owner`` is ``pub``, ``sub`` or all.
+    """The key expression for the caches of latched topics with this key.
 
-    All is ``**``.
+    ``owner`` is ``pub`` or ``sub``; ``**`` stands for both.
     """
     return f"{key}/@adv/**" if owner == "**" else f"{key}/@adv/{owner}/**"
 
@@ -90,7 +90,10 @@ def _chunks(part: str) -> list[list[str]]:
 
 
 def _with_star(chunks: Sequence[str], text: str, *, is_last: bool) -> Iterator[list[str]]:
-    """Chunks with a ``*`` and a text behind. The ``*`` stays in the chunk, or has slashes."""
+    """Yield chunks with a ``*`` and a text appended.
+
+    One alternative has the ``*`` within a chunk. In the other, the ``*`` also stands for slashes.
+    """
     *before, last = chunks
     if not last and not before:  # at the begin of a part
         yield ["**", f"$*{text}"]
@@ -102,7 +105,7 @@ def _with_star(chunks: Sequence[str], text: str, *, is_last: bool) -> Iterator[l
 
 
 def _joined(chunks: Sequence[str]) -> str:
-    """A canonical key expression: ``**`` stands behind each ``*`` next to it, and only once."""
+    """A canonical key expression: of adjacent ``**`` one is kept, and each ``*`` precedes it."""
     result: list[str] = []
     for chunk in chunks:
         if chunk == "**" and result and result[-1] == "**":

@@ -1,4 +1,4 @@
-"""The names that the policy allows, in the form that zenoh's access control has.
+"""The names that the policy allows, in the form of zenoh's access control.
 
 In a layer of the policy, the first rule that matches decides. In zenoh's access control, the order
 of rules does not count: a name passes if a rule allows the name and no rule denies the name. So the
@@ -12,15 +12,16 @@ from typing import NamedTuple
 
 from rosproxy.access.layers import PolicyLayer, PolicyMode
 from rosproxy.access.rules import Rule, RuleAction, RuleKind, matches
-from rosproxy.zenoh.policy.key_expressions import check_glob, is_of_no_name
+from rosproxy.zenoh.policy.key_expressions import check_glob, matches_no_name
 
 KINDS = (RuleKind.PUBLISH, RuleKind.SUBSCRIBE, RuleKind.SERVE, RuleKind.CALL)
 """The kinds of rules that hold on rmw_zenoh."""
 _EVERY_NAME = ("*", "/*")
 MOST_MIXED_RULES = 300
-"""Rules of a kind in a layer that both allows and denies. All pairs are compared in 0.1 s."""
+"""Most rules of a kind in a layer that both allows and denies. Comparing all pairs takes 0.1 s."""
 MOST_COMPARISONS = 50_000
-"""Pairs of globs that are compared between two layers. A pair takes 1 µs."""
+"""Most pairs of globs that are compared between two layers. A pair takes 1 µs. With more pairs,
+only the globs that both layers have count as allowed."""
 
 
 class NameSet(NamedTuple):
@@ -39,7 +40,8 @@ ALL_NAMES = NameSet()
 def allowed_names(layers: Iterable[PolicyLayer], kind: RuleKind) -> NameSet:
     """The names of a kind that all enforced layers allow. Raises ValueError as `check_layers`.
 
-    Lists of two layers may overlap in part, such as ``/a*`` and ``/*b``. Such names are denied.
+    Globs of two layers may overlap in part, such as ``/a*`` and ``/*b``. Names that only such globs
+    allow are denied.
     """
     names = ALL_NAMES
     for layer in layers:
@@ -53,7 +55,7 @@ def layers_at(
 ) -> tuple[PolicyLayer, ...]:
     """The layers that hold for the container at a port.
 
-    ``addresses`` have been the other ends of sessions at the port. A node may use the port of
+    ``addresses`` are those of nodes that have had sessions at the port. A node may use the port of
     another container, and keeps its own rules there.
     """
     return tuple(
@@ -78,7 +80,7 @@ def _names_of(layer: PolicyLayer, kind: RuleKind) -> NameSet:
     for rule in layer.rules:
         # Nodes of rmw_zenoh do not tell their names with data. So a rule with a name after `by`
         # matches nothing, as for DDS.
-        if rule.kind is not kind or not matches(rule.by, "") or is_of_no_name(rule.glob):
+        if rule.kind is not kind or not matches(rule.by, "") or matches_no_name(rule.glob):
             continue
         try:
             check_glob(rule.glob)
@@ -94,7 +96,10 @@ def _names_of(layer: PolicyLayer, kind: RuleKind) -> NameSet:
 
 
 def _as_set(rules: Sequence[Rule]) -> NameSet:
-    """The set of names that rules allow, of which the first decides. Raises ValueError."""
+    """The set of names that rules allow. The first rule that matches a name decides.
+
+    Raises ValueError if there is no such set, or if the rules are too many.
+    """
     denies_rest = bool(rules) and rules[-1].glob in _EVERY_NAME
     denies_rest = denies_rest and rules[-1].action is RuleAction.DENY
     globs = [rule for rule in rules if rule.glob not in _EVERY_NAME]
@@ -144,7 +149,7 @@ def covers(wide: str, narrow: str) -> bool:
 
 
 def may_overlap(one: str, other: str) -> bool:
-    """Whether two globs may match the same name: their begins and their ends do not differ."""
+    """Whether two globs may match the same name: their beginnings and their ends are compatible."""
     if "*" not in one:
         return matches(other, one)
     if "*" not in other:

@@ -1,4 +1,4 @@
-"""Liveliness tokens of rmw_zenoh: the keys by which nodes tell what they publish and serve.
+"""Liveliness tokens of rmw_zenoh: the keys by which nodes announce what they publish and serve.
 
 A token of a node has nine parts, a token of a topic or service has thirteen
 (rmw_zenoh_cpp/src/detail/liveliness_utils.cpp, Entity::Entity):
@@ -16,8 +16,8 @@ from typing import NamedTuple
 ALL_TOKENS = "@ros2_lv/**"
 """The key expression of all tokens."""
 LONGEST_TOKEN = 1024
-"""Characters. The proxy ignores longer tokens. A name of ROS 2 has at most 255 characters, a type
-some tens."""
+"""Characters of a token. The proxy ignores longer tokens. A name of ROS 2 has at most 255
+characters, a type some tens."""
 MOST_TOKENS = 8192
 """The highest number of tokens that the router process reports. A host with fifty nodes has some
 1,000."""
@@ -77,7 +77,7 @@ class ZenohNode(NamedTuple):
 
 
 def parse_token(key: str) -> Entity | None:
-    """The entity of a token; None if the key is no token of rmw_zenoh."""
+    """The entity of a token; None if the key is too long, or no token of rmw_zenoh."""
     parts = key.split("/") if len(key) <= LONGEST_TOKEN else []
     kind = _KINDS.get(parts[5]) if len(parts) in (_NODE_PARTS, _TOPIC_OR_SERVICE_PARTS) else None
     if kind is None or parts[0] != "@ros2_lv" or not all(parts):

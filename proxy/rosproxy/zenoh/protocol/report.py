@@ -11,13 +11,13 @@ import msgspec
 from rosproxy.net.addresses import HostPort, parse_authority, plain_address
 
 LONGEST_REPORT = 16 * 1024 * 1024
-"""Bytes of a line. All sessions that routers accept, and all tokens, take some 10 MB."""
+"""Bytes of a line. A report with the most sessions and the most tokens has some 10 MB."""
 MOST_SESSIONS = 1000
 """Most sessions of a router: the setting ``transport/unicast/max_sessions``."""
 
 
-class Link(msgspec.Struct, frozen=True):
-    """A connection of a session, with both ends as ``tcp/address:port``."""
+class SessionConnection(msgspec.Struct, frozen=True):
+    """A connection of a session, with both ends as ``tcp/address:port``. zenoh calls it a link."""
 
     src: str = ""
     dst: str = ""
@@ -28,7 +28,7 @@ class RouterSession(msgspec.Struct, frozen=True):
 
     peer: str = ""
     whatami: str = ""
-    links: tuple[Link, ...] = ()
+    links: tuple[SessionConnection, ...] = ()
 
 
 class RouterReport(msgspec.Struct, frozen=True):
@@ -69,7 +69,7 @@ def read_report(line: bytes) -> Report:
 
 
 def ends_of(session: RouterSession) -> Ends | None:
-    """The two ends of the first link of a session; None if the session has no link of TCP."""
+    """The two ends of a session's first connection by TCP, TLS or QUIC; None if there is none."""
     for link in session.links:
         local = _end(link.src)
         remote = _end(link.dst)
@@ -79,7 +79,10 @@ def ends_of(session: RouterSession) -> Ends | None:
 
 
 def _end(locator: str) -> HostPort | None:
-    """The address and port of a locator such as ``tcp/192.0.2.7:7447?prio=1-7``."""
+    """The address and port of a locator such as ``tcp/192.0.2.7:7447?prio=1-7``.
+
+    None if the locator is not of TCP, TLS or QUIC, or has no address.
+    """
     protocol, _, rest = locator.partition("/")
     address = rest.partition("?")[0].partition("#")[0]
     end = parse_authority(f"//{address}") if protocol in ("tcp", "tls", "quic") else None

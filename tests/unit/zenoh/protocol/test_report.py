@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from rosproxy.net.addresses import HostPort
 from rosproxy.zenoh.protocol.report import (
     Ends,
-    Link,
     Report,
     RouterSession,
+    SessionConnection,
     ends_of,
     read_report,
 )
@@ -36,17 +36,17 @@ def test_a_report_without_changes_of_the_graph_has_no_tokens() -> None:
 
 @pytest.mark.parametrize("locator", ["unixpipe/x", "tcp/", "tcp/1.2.3.4", "tcp/1.2.3.4:0", "x"])
 def test_a_session_without_a_link_of_tcp_has_no_ends(locator: str) -> None:
-    assert ends_of(RouterSession("a", "peer", (Link(locator, locator),))) is None
+    assert ends_of(RouterSession("a", "peer", (SessionConnection(locator, locator),))) is None
 
 
 def test_an_address_of_ipv4_is_plain() -> None:
-    link = Link("tcp/[::ffff:172.18.0.2]:7448", "tcp/[::ffff:172.18.0.3]:5")
+    link = SessionConnection("tcp/[::ffff:172.18.0.2]:7448", "tcp/[::ffff:172.18.0.3]:5")
     ends = Ends(HostPort("172.18.0.2", 7448), HostPort("172.18.0.3", 5))
     assert ends_of(RouterSession("a", "peer", (link,))) == ends
 
 
 def test_what_follows_an_address_does_not_count() -> None:
-    link = Link("tcp/1.2.3.4:5?prio=1-7", "tcp/1.2.3.5:6#iface=eth0")
+    link = SessionConnection("tcp/1.2.3.4:5?prio=1-7", "tcp/1.2.3.5:6#iface=eth0")
     ends = Ends(HostPort("1.2.3.4", 5), HostPort("1.2.3.5", 6))
     assert ends_of(RouterSession("a", "peer", (link,))) == ends
 
