@@ -12,19 +12,23 @@ _SETTINGS = {setting.field: setting for setting in declared(Settings)}
 
 def variable(field: str) -> str:
     """The variable for a field of the proxy's `Settings`."""
-    # With another variable of the setting, the fingerprint would change, and the operator would
-    # recreate the proxies of former operators.
+    # Always this one of the setting's variables. Another one would change the fingerprint, and the
+    # operator would recreate the proxies that an earlier version of the operator has started.
     return "ROS_MASTER_URI" if field == "master_uri" else _SETTINGS[field].variables[0]
 
 
-def environment(operator: str, told: Mapping[str, Any], always: Collection[str]) -> dict[str, str]:
-    """The variables of a proxy for values of fields of the proxy's `Settings`, in the given order.
+def environment(
+    operator: str, values: Mapping[str, Any], always: Collection[str]
+) -> dict[str, str]:
+    """The variables of a proxy, in the order of ``values``.
 
-    Empty values and the proxy's defaults have no variable, except defaults of the fields in
-    ``always``. A change of variables or order changes the fingerprint, and recreates proxies.
+    ``operator``: ``docker`` or ``kubernetes``, for the words of fixes. ``values``: by field of the
+    proxy's `Settings`. Empty values and the proxy's defaults have no variable, except defaults of
+    the fields in ``always``. Other variables, or another order, change the fingerprint, and the
+    operator then recreates the proxies.
     """
     variables = {fixes.VARIABLE: operator}
-    for field, value in told.items():
+    for field, value in values.items():
         text = _text(value)
         if text and (field in always or value != _SETTINGS[field].default):
             variables[variable(field)] = text
@@ -32,7 +36,7 @@ def environment(operator: str, told: Mapping[str, Any], always: Collection[str])
 
 
 def _text(value: Any) -> str:
-    """A value as the text of a variable; empty for False, None and empty values."""
+    """A value as the text of a variable; empty for False, None, an empty text or tuple."""
     if isinstance(value, tuple):
         return " ".join(map(str, value))
     if isinstance(value, bool | None):

@@ -9,10 +9,10 @@ from rosproxy import fixes
 from rosproxy_operator.proxy_spec.environment import variable
 
 LIVE_VARIABLES = frozenset({fixes.VARIABLE, *map(variable, ("await_policy", "policy_layers"))})
-"""Variables in no fingerprint.
+"""Variables that no fingerprint contains: a change of these recreates no proxy.
 
-The operator sends a running proxy a new policy. The operator's name only selects the words of fixes
-(`rosproxy.fixes`).
+A running proxy gets a new policy from the operator, without a restart. The name of the operator
+only selects the words of fixes (`rosproxy.fixes`).
 """
 
 

@@ -22,10 +22,11 @@ class Wish:
 
     - ``field``: the field below a RosProxy's ``spec``.
     - ``precedence``: of several values that the containers ask for, the first one here counts.
-    - ``yields``: a container without the label takes any value. Else the default counts as asked.
+    - ``yields``: a container without the label accepts any value. If False, such a container asks
+      for the default.
     - ``ros``: the only version of ROS with this option; empty for both versions.
     - ``fix``: the text after ``label=`` in a fix.
-    - ``free``: the values that need no permission of the administrator; empty for all values.
+    - ``free``: the values that need no permission of the administrator; empty: no value needs it.
     """
 
     label: str
@@ -61,7 +62,7 @@ class ProxySpec(msgspec.Struct, frozen=True):
         Wish(
             "rosproxy.direction",
             "direction",
-            # A container with a route outwards also works through the proxy.
+            # both first: a container that has its own route outwards also works through the proxy.
             ("both", "out"),
             fix="both if the nodes reach outside only through the proxy, or remove the label",
         ),
@@ -85,17 +86,19 @@ OWN_SPEC = ProxySpec()
 """The proxy's own defaults."""
 _HINTS = get_type_hints(ProxySpec, include_extras=True)
 WISHES: Mapping[str, Wish] = {name: hint.__metadata__[0] for name, hint in _HINTS.items()}
+"""The options, by the fields of `ProxySpec`."""
 
 
 def words(name: str) -> tuple[str, ...]:
-    """The words that are values of an option; empty for a flag."""
+    """The words that a user may give as the value of an option; empty for a flag."""
     return get_args(get_args(_HINTS[name])[0])
 
 
 def merged(wishes: Iterable[Wishes], defaults: ProxySpec) -> ProxySpec:
-    """The options of a proxy for the wishes of the containers.
+    """The options of a proxy for the wishes of its containers.
 
-    ``udp`` counts only with direction both: UDPROS from outside needs both directions.
+    ``defaults`` has the value of each option for which no container asks. ``udp`` counts only with
+    direction both: UDPROS from outside needs both directions.
     """
     every = [*wishes]
     spec: dict[str, Any] = {}
