@@ -25,17 +25,18 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, Refusals
 
-OUTWARDS = frozenset({RuleKind.PUBLISH, RuleKind.SERVE})
+OUTWARD_KINDS = frozenset({RuleKind.PUBLISH, RuleKind.SERVE})
 """The kinds of rules that the proxy enforces on TCPROS connections from outside."""
-PARAMETERS = frozenset({RuleKind.GET_PARAM, RuleKind.SET_PARAM})
+PARAMETER_KINDS = frozenset({RuleKind.GET_PARAM, RuleKind.SET_PARAM})
+"""The kinds of rules about parameters."""
 
 
 class AccessPolicy:
     """The layers in force: of the options, of the policy file and of an operator.
 
-    ``version`` grows by 1 with each change of the layers. ``empty``: there is no rule. ``checks``
-    are called with all layers before new layers are put in force, and raise ValueError for a rule
-    that cannot be enforced.
+    ``version`` grows by 1 with each change of the layers. ``empty``: no layer has a rule. Before
+    new layers are put in force, the policy calls each of ``checks`` with all layers. A check raises
+    ValueError for a rule that the proxy cannot enforce.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class AccessPolicy:
         self._option_layers = tuple(option_layers)
         self._operator_layers = tuple(operator_layers)
         self._file_layers = tuple[PolicyLayer, ...]()
-        self._operator_told = asyncio.Event()
+        self._has_operator_layers = asyncio.Event()
         self.checks: list[Callable[[Sequence[PolicyLayer]], None]] = []
         self._by_kind: dict[RuleKind, tuple[PolicyLayer, ...]] = {}
         self.version = 0
@@ -73,20 +74,20 @@ class AccessPolicy:
         self._check((*self._option_layers, *self._file_layers, *layers))
         self._operator_layers = tuple(layers)
         self._note_change()
-        self._operator_told.set()
+        self._has_operator_layers.set()
 
     async def wait_for_operator(self, seconds: float) -> None:
-        """Wait for the first layers of an operator, for so many seconds at most.
+        """Wait until an operator has sent layers, but at most ``seconds``.
 
-        Only the first call waits.
+        After the end of a wait, further calls return at once.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
-                await self._operator_told.wait()
-        self._operator_told.set()
+                await self._has_operator_layers.wait()
+        self._has_operator_layers.set()
 
     def judge(self, kind: RuleKind, name: str, callers: Sequence[str], address: str) -> Verdict:
-        """Whether the policy allows a name to all callers at a node inside, without a report.
+        """The verdict on a name for all of ``callers``, without a report.
 
         ``address`` is the address of the node inside. Callers at one URI are indistinguishable, so
         a denial for one caller is a denial for all.
@@ -113,11 +114,14 @@ class AccessPolicy:
         return self.report(verdict, kind, subject, source or address)
 
     def judge_below(self, kind: RuleKind, prefix: str, caller: str, address: str) -> Verdict:
-        """Whether the policy allows all names that begin with a prefix, without a report."""
+        """The verdict on all names that begin with ``prefix``, without a report.
+
+        The policy denies these names if it may deny one of them.
+        """
         return decide_below(self._layers_for(kind), kind, prefix, caller, address)
 
     def report(self, verdict: Verdict, kind: RuleKind, subject: str, source: str) -> Verdict:
-        """Report a verdict in metrics, log and status, if a rule denies or would deny."""
+        """Return the verdict. If a rule denies or would deny, report it in metrics, log, status."""
         if verdict.rule is not None:
             is_audit = verdict.mode is PolicyMode.AUDIT
             self._metrics.policy_denied.labels(kind.value, verdict.mode.value).inc()

@@ -33,8 +33,8 @@ class PolicyMode(Enum):
 class PolicyLayer(msgspec.Struct, frozen=True):
     """Rules of one author, for the nodes inside at ``addresses``; None: for all nodes inside.
 
-    On rmw_zenoh, a layer with addresses holds at the ``ports`` of the proxy that its nodes use, and
-    None stands for all ports.
+    On rmw_zenoh, a layer with addresses holds only at ``ports``: the ports of the proxy to which
+    the nodes of the layer connect. None stands for all ports.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Verdict(msgspec.Struct, frozen=True):
 
     @property
     def mode(self) -> PolicyMode:
-        """The mode of the layer with the rule."""
+        """The mode of the layer with the rule; meaningless without a rule."""
         return PolicyMode.AUDIT if self.allowed else PolicyMode.ENFORCE
 
     @property
@@ -85,7 +85,7 @@ ALLOWED = Verdict()
 def decide(
     layers: Iterable[PolicyLayer], kind: RuleKind, name: str, caller: str, address: str
 ) -> Verdict:
-    """Whether the layers allow a name to ``caller``, for the node inside at ``address``."""
+    """The verdict on a name for ``caller``, by the layers for the node inside at ``address``."""
     return _verdict(
         (layer, next((rule for rule in layer.rules if rule.matches(kind, name, caller)), None))
         for layer in layers
@@ -96,7 +96,7 @@ def decide(
 def decide_below(
     layers: Iterable[PolicyLayer], kind: RuleKind, prefix: str, caller: str, address: str
 ) -> Verdict:
-    """Whether the layers allow all names that begin with ``prefix``; if uncertain, denied."""
+    """The verdict on all names that begin with ``prefix``: a denial if a rule may deny one."""
     return _verdict(
         (layer, _first_below(layer, kind, prefix, caller))
         for layer in layers
@@ -111,7 +111,7 @@ def of_kind(layers: Iterable[PolicyLayer], kind: RuleKind) -> tuple[PolicyLayer,
 
 
 def strictest(verdicts: Iterable[Verdict]) -> Verdict:
-    """The strictest of several verdicts: first a denial, then a would-be denial."""
+    """The strictest verdict: a denial, else a denial in audit mode. Needs at least one verdict."""
     return min(verdicts, key=lambda verdict: (verdict.allowed, verdict.rule is None))
 
 
@@ -136,7 +136,7 @@ def may_deny(
 
 
 def read_layer(written: WrittenLayer) -> PolicyLayer:
-    """The layer that JSON describes. Raises ValueError, which names layer and rule."""
+    """The layer that JSON describes. Raises ValueError, which names the layer and the fault."""
     shown = written.name[:40]
     if not written.name.strip() or len(written.name) > LONGEST_LAYER_NAME:
         text = f"the name of a layer must have 1 to {LONGEST_LAYER_NAME} characters"
@@ -151,7 +151,7 @@ def read_layer(written: WrittenLayer) -> PolicyLayer:
 
 
 def read_layers(value: object) -> tuple[PolicyLayer, ...]:
-    """The layers of decoded JSON, a list. Raises ValueError, which names what is wrong."""
+    """The layers in ``value``, a list of decoded JSON. Raises ValueError, which names the fault."""
     try:
         written = msgspec.convert(value, tuple[WrittenLayer, ...])
     except msgspec.ValidationError as error:
@@ -174,7 +174,7 @@ def layers_as_json(layers: Iterable[PolicyLayer]) -> list[dict[str, Any]]:
 
 
 def check_bounds(layers: Sequence[PolicyLayer]) -> tuple[PolicyLayer, ...]:
-    """The layers. Raises ValueError for more than MOST_LAYERS layers or MOST_RULES rules."""
+    """Return the layers. Raises ValueError for more than MOST_LAYERS or MOST_RULES."""
     if len(layers) > MOST_LAYERS:
         raise ValueError(f"the policy has {len(layers)} layers, at most {MOST_LAYERS} are accepted")
     count = sum(len(layer.rules) for layer in layers)

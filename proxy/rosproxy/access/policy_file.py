@@ -15,10 +15,10 @@ from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
 
-LOOK_INTERVAL = 1.0
-"""Seconds between checks whether the file has changed."""
-LONGEST_FILE = 1024 * 1024
-"""Bytes that the file has at most."""
+CHECK_INTERVAL_S = 1.0
+"""Time between two checks whether the file has changed, in seconds."""
+LONGEST_FILE_BYTES = 1024 * 1024
+"""Largest file that the proxy reads, in bytes."""
 OPTION = "--policy-file"
 
 
@@ -35,14 +35,18 @@ class PolicyFile:
         self._last_signature: tuple[int, ...] | None = None
 
     def read(self) -> None:
-        """Put the rules of the file in force. Raises ValueError, which names the fault."""
+        """Put the rules of the file in force.
+
+        Raises ValueError, which names the fault: of the file, of a rule, or of a check of the
+        policy.
+        """
         try:
             with self._path.open("rb") as file:
-                # Before the read: after a change during the read, the next check reads again.
+                # Before the read: if the file changes during the read, the next check reads again.
                 self._last_signature = _signature(os.fstat(file.fileno()))
-                text = file.read(LONGEST_FILE + 1)
-            if len(text) > LONGEST_FILE:
-                raise ValueError(f"{self._path} is longer than {LONGEST_FILE} bytes")
+                text = file.read(LONGEST_FILE_BYTES + 1)
+            if len(text) > LONGEST_FILE_BYTES:
+                raise ValueError(f"{self._path} is longer than {LONGEST_FILE_BYTES} bytes")
             rules = parse_rules(text.decode())
         except OSError as error:
             raise ValueError(f"{self._path} can't be read: {error.strerror}") from None
@@ -51,7 +55,7 @@ class PolicyFile:
         self._policy.use_file(PolicyLayer(f"{OPTION} {self._path}", rules, self._mode))
 
     async def look(self) -> None:
-        """Read the file again if it has changed."""
+        """Read the file again if it has changed; report a fault as a problem."""
         try:
             if _signature(self._path.stat()) == self._last_signature:
                 return
@@ -61,7 +65,7 @@ class PolicyFile:
             self.read()
         except ValueError as error:
             text = f"{error}. The rules that were read before stay in force"
-            # Each check tries a file that can't be opened again, but reports the fault once.
+            # While the file can't be opened, each check tries to read it. Report the fault once.
             if text not in (problem.text for problem in self._problems.all()):
                 log.error("%s: %s", OPTION, text)
                 self._problems.solved(OPTION)
@@ -72,5 +76,5 @@ class PolicyFile:
 
 
 def _signature(stat: os.stat_result) -> tuple[int, ...]:
-    """A value that differs after a change of the file, or if another file has the name."""
+    """A value that differs if the file has changed, or if another file has replaced it."""
     return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns

@@ -20,9 +20,9 @@ from functools import lru_cache
 import msgspec
 
 LONGEST_GLOB = 256
-"""Characters of a glob. Names in large systems have a hundred."""
+"""Characters of a glob at most. Names in large systems have a hundred."""
 MOST_RULES = 1000
-"""Rules of all layers together."""
+"""Rules of all layers together, at most."""
 _LONGEST_SHOWN = 80
 """Characters of a bad rule that a message repeats."""
 _EXAMPLE = "such as: deny publish /camera/* by /driver"
@@ -38,8 +38,8 @@ class RuleAction(Enum):
 class RuleKind(Enum):
     """What a rule is about, as seen from the nodes inside.
 
-    ``by`` matches the name of the node inside. For SLAVE, ``by`` matches the name that a caller
-    outside gives, which proves nothing.
+    ``by`` matches the name of the node inside. For SLAVE, ``by`` matches the name that the caller
+    outside states, which proves nothing.
     """
 
     PUBLISH = "publish"

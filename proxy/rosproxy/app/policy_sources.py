@@ -1,8 +1,8 @@
 """The sources of the policy in a running proxy: options, policy file, operator.
 
-The rules of the options stay. The rules of the file and of the operator may change at any time. The
-stacks look for changes of the file themselves. When an operator posts rules, the stacks apply the
-rules before the proxy answers.
+The rules of the options stay. The rules of the file and of the operator may change at any time.
+After a change of the file, each stack notices the new version of the policy by itself. When an
+operator posts rules, the stacks apply the rules before the proxy answers.
 """
 
 import logging
@@ -13,7 +13,7 @@ from typing import Any
 
 from rosproxy.access.access_policy import AccessPolicy
 from rosproxy.access.layers import PolicyMode, read_layer
-from rosproxy.access.policy_file import LOOK_INTERVAL, OPTION, PolicyFile
+from rosproxy.access.policy_file import CHECK_INTERVAL_S, OPTION, PolicyFile
 from rosproxy.admin.requests import BodyError, PolicyUpdate, read_body
 from rosproxy.admin.status_document import to_json
 from rosproxy.app.stacks import Stack
@@ -28,7 +28,7 @@ from rosproxy.zenoh.policy.name_sets import check_layers
 log = logging.getLogger(__name__)
 
 OPERATOR_POLICY = "the operator's policy"
-"""The subject of the problem that the proxy has refused a policy of the operator."""
+"""The subject of a problem: the proxy has refused a policy of the operator."""
 
 
 class PolicySources:
@@ -39,7 +39,10 @@ class PolicySources:
         self._stacks = stacks
 
     def start(self) -> None:
-        """Read the policy file, and check the file for changes from now on. Raises SettingError."""
+        """Read the policy file, if one is set, and check the file for changes from now on.
+
+        Raises SettingError for a file that can't be read or has a mistake.
+        """
         runtime = self._runtime
         settings = self._runtime.settings
         if not settings.policy_file:
@@ -48,7 +51,7 @@ class PolicySources:
             settings.policy_file, PolicyMode(settings.policy_mode), runtime.policy, runtime.problems
         )
         _read(file)
-        runtime.tasks.repeat(file.look, LOOK_INTERVAL, "checking the policy file")
+        runtime.tasks.repeat(file.look, CHECK_INTERVAL_S, "checking the policy file")
 
     async def post(self, body: Any) -> dict[str, Any]:
         """``POST /policy``: put the layers in force, and return the EnforcementCounts as JSON.
@@ -80,7 +83,7 @@ class PolicySources:
 
 
 def read_policy_file(settings: Settings) -> None:
-    """Check the policy file of the settings, if any. Raises SettingError.
+    """Check the policy file of the settings, if one is set. Raises SettingError.
 
     The bounds hold for the rules of file and options together, as in a running proxy.
     """

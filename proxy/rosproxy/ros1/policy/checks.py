@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Sequence
 from dataclasses import replace
 
-from rosproxy.access.access_policy import OUTWARDS, PARAMETERS, AccessPolicy
+from rosproxy.access.access_policy import OUTWARD_KINDS, PARAMETER_KINDS, AccessPolicy
 from rosproxy.access.layers import Verdict, strictest
 from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
@@ -90,7 +90,7 @@ class Ros1Policy:
 
     def reads_parameters(self, source: str | None) -> bool:
         """Whether the proxy must read calls for parameters from an address (None: any address)."""
-        return self.rules.may_deny(PARAMETERS, (), source)
+        return self.rules.may_deny(PARAMETER_KINDS, (), source)
 
     def reads_reply(self, request: Request) -> bool:
         """Whether the proxy may have to change the master's reply to a request."""
@@ -277,7 +277,7 @@ class Ros1Policy:
 
     def may_bypass(self, endpoint: Endpoint) -> bool:
         """Whether the kernel may forward a node's topics, so that the proxy reads no header."""
-        return not self.rules.may_deny(OUTWARDS, endpoint.caller_ids, endpoint.address)
+        return not self.rules.may_deny(OUTWARD_KINDS, endpoint.caller_ids, endpoint.address)
 
     # What a node inside asks of outside
 
