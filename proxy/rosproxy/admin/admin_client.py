@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from rosproxy.admin.status_document import ProxyStatus
 
 DEFAULT_URL = "http://127.0.0.1:11312"
-MAX_REPLY = 64 * 1024 * 1024
-"""Bytes of a reply that the client reads at most."""
+MAX_REPLY_BYTES = 64 * 1024 * 1024
+"""Bytes of a reply that the client reads; the client drops further bytes."""
 _WILDCARD_TO_LOOPBACK = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 class AdminError(Exception):
-    """The admin endpoint gave no usable answer; the message is a line that says what to do."""
+    """The admin endpoint gave no usable answer; the message says why."""
 
 
 class AdminClient:
@@ -83,7 +83,7 @@ class AdminClient:
             headers = {"Host": str(HostPort(address, port)), **_authorization()}
             connection.request(method, path, headers=headers)
             reply = connection.getresponse()
-            text = reply.read(MAX_REPLY).decode("utf-8", "replace")
+            text = reply.read(MAX_REPLY_BYTES).decode("utf-8", "replace")
         except (OSError, http.client.HTTPException) as error:
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise AdminError(
@@ -107,7 +107,10 @@ class AdminClient:
 
 
 def _authorization() -> dict[str, str]:
-    """The header with the token, which callers that are not on loopback need for changes."""
+    """The header with the token of this environment; empty without a usable token.
+
+    A caller that is not on loopback needs the token for changes.
+    """
     token = os.environ.get("ROSPROXY_ADMIN_TOKEN", "")
     # http.client raises ValueError for a header with other characters (putheader). Without the
     # header the proxy answers 403 and names the missing token.

@@ -4,11 +4,11 @@ The endpoint listens on loopback by default. Which callers it serves:
 
 - GET only reads, and serves every caller that reaches the endpoint. The live page has a rule of its
   own (`rosproxy.page`).
-- POST changes the proxy. Callers need the token, or call from loopback and are no web page. The
-  same rule holds for ``GET /status/changes`` (`status_changes`). The proxy holds only the hash of
-  the token.
-- No path answers a request that names the endpoint by a name which a stranger may have registered
-  (`host_rule`).
+- POST changes the proxy. A caller without the token must call from loopback, and not from a web
+  page. The same rule holds for ``GET /status/changes`` (`status_changes`). The proxy holds only the
+  hash of the token.
+- All paths refuse a ``Host`` that a stranger may have registered (`host_rule`). Exceptions:
+  requests with the token, and the live page if the proxy has a token.
 
 Callers are few and friendly, so the bounds are tight, and no options change the bounds. A source
 with too many connections loses the oldest connection. The endpoint ends the connection of a caller
@@ -43,13 +43,13 @@ from rosproxy.net.sockets import MOST_BACKLOG
 
 log = logging.getLogger(__name__)
 
-CHANGES = "/status/changes"
-MAX_BODY = 1024 * 1024
-"""Bytes in the body of a POST at most."""
+CHANGES_PATH = "/status/changes"
+MAX_BODY_BYTES = 1024 * 1024
+"""Largest body of a POST, in bytes."""
 MOST_CONNECTIONS = 32
 """Connections from one address: an operator, a health check and Prometheus have one or two each."""
 MOST_REPLIES = 16
-"""Replies with the status or the metrics that are under way at most."""
+"""Replies with the status or the metrics that may be under way at the same time."""
 MOST_REPLIES_EACH = 4
 """Replies with status or metrics to one address: operator, Prometheus and a user have one each."""
 JSON = {"Content-Type": "application/json; charset=utf-8"}
@@ -62,7 +62,10 @@ FORBIDDEN = (
 
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 Action = Callable[[Any], Awaitable[dict[str, Any]]]
-"""Carries out a POST, given the decoded JSON body. Raises BodyError, CallFailed."""
+"""Carries out a POST, given the decoded JSON body, and returns the JSON of the reply.
+
+Raises BodyError, CallFailed.
+"""
 
 
 @dataclass(slots=True, eq=False)
@@ -71,8 +74,8 @@ class AdminServer:
 
     ``status`` returns the state of the proxy. ``unready`` returns why the proxy is not ready; None
     if ready. ``actions`` carry out POST calls, by path. ``token_hash`` is the SHA-256, in hex
-    digits, of the token; None: only callers on loopback may post. ``routes`` are further handlers,
-    by method and path. ``own_names`` are the host names of the proxy, in lower case.
+    digits, of the token; None: only callers on loopback may post. ``routes`` are the handlers of
+    the live page, by method and path. ``own_names`` are the host names of the proxy, in lower case.
     """
 
     _metrics: CollectorRegistry
@@ -116,19 +119,19 @@ class AdminServer:
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         method = "GET" if request.method == "HEAD" else request.method
-        page = self._pages().get(request.path)
+        read_handler = self._read_handlers().get(request.path)
         route = self._routes.get((method, request.path))
         if not self._answers_to_host(request, route):
             return web.Response(status=403, text=refusal(request.headers.get("Host", "")))
-        if page is not None and method == "GET":
-            return await page(request)
+        if read_handler is not None and method == "GET":
+            return await read_handler(request)
         if route is not None:
             return await route(request)
         has_action = request.path in self._actions
         if has_action and method == "POST":
             return await self._post(request)
         allowed = {verb for verb, path in self._routes if path == request.path}
-        allowed |= ({"GET"} if page else set()) | ({"POST"} if has_action else set())
+        allowed |= ({"GET"} if read_handler else set()) | ({"POST"} if has_action else set())
         if not allowed:
             return web.Response(status=404, text="404: Not Found")
         methods = ",".join(sorted(allowed | ({"HEAD"} if "GET" in allowed else set())))
@@ -144,13 +147,13 @@ class AdminServer:
         is_own = is_own_host(request.headers.get("Host", ""), self._own_names)
         return is_own or page_asks_for_token or self._knows_token(request)
 
-    def _pages(self) -> dict[str, Handler]:
+    def _read_handlers(self) -> dict[str, Handler]:
         return {
             "/healthz": _tell_health,
             "/readyz": self._tell_readiness,
             "/metrics": self._tell_metrics,
             "/status": self._tell_status,
-            CHANGES: self._wait,
+            CHANGES_PATH: self._wait,
         }
 
     async def _tell_metrics(self, request: web.BaseRequest) -> web.StreamResponse:
@@ -174,9 +177,9 @@ class AdminServer:
         return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
 
     async def _wait(self, request: web.BaseRequest) -> web.StreamResponse:
-        """Answer once the version of the state differs from ``since``, or ``within`` is over."""
+        """Answer once the version of the state differs from ``since``, or after ``within`` s."""
         if not self._may_post(request):
-            return self._forbidden(f"GET {CHANGES}")
+            return self._forbidden(f"GET {CHANGES_PATH}")
         since = request.query.get("since", "")
         transport = request.transport
         try:
@@ -202,7 +205,7 @@ class AdminServer:
             return self._forbidden("POST")
         try:
             async with asyncio.timeout(BODY_TIMEOUT):
-                raw_body = await read_bounded(request.content, MAX_BODY)
+                raw_body = await read_bounded(request.content, MAX_BODY_BYTES)
         except TimeoutError:
             return web.Response(status=408, text=f"the body took over {BODY_TIMEOUT:g} s\n")
         except TooLong as error:
@@ -217,7 +220,7 @@ class AdminServer:
             return web.Response(status=503, text=f"rosproxy: {error}; try again\n")
 
     def _may_post(self, request: web.BaseRequest) -> bool:
-        """Whether a caller may post.
+        """Whether a caller may post: with the token, or from loopback and not from a web page.
 
         A browser on this host calls from loopback, too, for any web page. The headers show that the
         caller is a browser: a request of a page has ``Origin``, and a request for an image or

@@ -22,7 +22,7 @@ from rosproxy.telemetry.problems import Problems
 MOST_HIDDEN = 2000
 """Hidden names that the status lists for each version of ROS, with fair shares by address.
 
-To find the rule that hides a name takes up to some microseconds.
+The reason for the bound: the search for the rule that hides a name takes up to some microseconds.
 """
 
 
@@ -46,7 +46,7 @@ def common_status(runtime: Runtime) -> ProxyStatus:
             if settings.range_versions
             else PortsStatus()
         ),
-        policy=_layers(runtime),
+        policy=_policy(runtime),
         problems=_problems(runtime.problems),
     )
 
@@ -54,13 +54,13 @@ def common_status(runtime: Runtime) -> ProxyStatus:
 def with_hidden(
     policy: PolicyStatus | None, hidden: Sequence[HiddenStatus], left_out: int
 ) -> PolicyStatus:
-    """The policy with more names that it hides, and how many of these names are left out."""
+    """Add ``hidden`` names to the policy, and the number of further names that are left out."""
     policy = policy or PolicyStatus()
     every = (*policy.hidden, *hidden)
     return replace(policy, hidden=every, left_out=policy.left_out + left_out)
 
 
-def _layers(runtime: Runtime) -> PolicyStatus:
+def _policy(runtime: Runtime) -> PolicyStatus:
     return PolicyStatus(
         tuple(
             LayerStatus(
@@ -76,7 +76,7 @@ def _layers(runtime: Runtime) -> PolicyStatus:
 
 def _problems(problems: Problems) -> tuple[ProblemStatus, ...]:
     """The noted problems, with their ages."""
-    # Not below 0, which readers refuse (`Seconds`): the clock may have been set back meanwhile.
+    # Readers refuse an age below 0 (`Seconds`), but the clock may have been set back meanwhile.
     return tuple(
         ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text, p.holds)
         for p in problems.all()

@@ -12,7 +12,7 @@ import msgspec
 
 
 class Severity(IntEnum):
-    """How bad a finding is. ERROR: at least one connection fails."""
+    """How bad a finding is. ERROR: at least one connection fails. INFO: a note."""
 
     OK = 0
     INFO = 1
@@ -21,7 +21,7 @@ class Severity(IntEnum):
 
 
 UNKNOWN_NAME = "unknown name"
-"""The check of a finding that no node, topic or service has the name in the user's question."""
+"""The ``check`` of this finding: the name in the user's question is no node, topic or service."""
 
 
 class DoctorFinding(msgspec.Struct, frozen=True):

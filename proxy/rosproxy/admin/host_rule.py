@@ -13,7 +13,7 @@ from collections.abc import Collection
 from rosproxy.net.addresses import is_address, parse_authority
 from rosproxy.telemetry.text import brief
 
-LOCAL = (".localhost", ".local", ".internal", ".svc")
+LOCAL_SUFFIXES = (".localhost", ".local", ".internal", ".svc")
 """Ends of names that no stranger can register on the Internet. Names of Kubernetes Services end in
 ``.svc`` or ``.svc.cluster.local``."""
 LONGEST_SHOWN = 100
@@ -21,7 +21,7 @@ LONGEST_SHOWN = 100
 
 
 def is_own_host(host: str, own_names: Collection[str] = ()) -> bool:
-    """Whether no stranger can have registered the ``Host`` of a request.
+    """Whether ``Host`` has an address, a name that no stranger can register, or an own name.
 
     ``own_names`` are the names of the proxy, in lower case. True for an empty ``Host``: browsers
     always send ``Host``, so the request comes from a program.
@@ -29,7 +29,10 @@ def is_own_host(host: str, own_names: Collection[str] = ()) -> bool:
     host_port = parse_authority(f"//{host}")
     name = (host_port.host if host_port else host.partition(":")[0]).lower().rstrip(".")
     return (
-        is_address(name.strip("[]")) or "." not in name or name.endswith(LOCAL) or name in own_names
+        is_address(name.strip("[]"))
+        or "." not in name
+        or name.endswith(LOCAL_SUFFIXES)
+        or name in own_names
     )
 
 

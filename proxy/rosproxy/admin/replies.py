@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 
 from aiohttp import web
 
-PIECE = 64 * 1024
-"""Bytes of a piece; aiohttp waits for the reader after two pieces at the latest."""
+PIECE_BYTES = 64 * 1024
+"""Size of a piece; aiohttp waits for the reader after two pieces at the latest."""
 REPLY_TIMEOUT = 60.0
 """Seconds in which a reader must take a reply: 1 MiB at 140 kbit/s."""
 
@@ -20,8 +20,8 @@ REPLY_TIMEOUT = 60.0
 async def write_pieces(response: web.StreamResponse, body: bytes) -> None:
     """Write bytes at the speed of the reader. Raises ConnectionError."""
     shared = memoryview(body)
-    for start in range(0, len(shared), PIECE):
-        await response.write(shared[start : start + PIECE])
+    for start in range(0, len(shared), PIECE_BYTES):
+        await response.write(shared[start : start + PIECE_BYTES])
 
 
 async def send_shared(

@@ -1,7 +1,8 @@
 """The bodies of the POST calls of the admin endpoint, and of the answers.
 
 Each body has a type. `read_body` converts decoded JSON, or raises a BodyError, which names the
-wrong field and the expected value in a line. Addresses become plain, host names lower case.
+wrong field and the expected value in a line. Addresses get the form of `parse_address`, and host
+names become lower case.
 """
 
 import re
@@ -21,8 +22,8 @@ _PREFIX = re.compile(r"[0-9a-f]{2}(\.[0-9a-f]{2}){11}")
 """A GUID prefix as `/status` writes it."""
 MOST_PEERS = 1024
 """Peers of a proxy at most: the proxy sends each peer the announcements of all participants."""
-_LONGEST = 150
-"""Characters of a message at most, since messages repeat texts of the body."""
+_LONGEST_MESSAGE = 150
+"""Characters of a message at most. The bound is needed: messages repeat texts of the body."""
 
 
 class BodyError(ValueError):
@@ -30,7 +31,7 @@ class BodyError(ValueError):
 
 
 class EmptyBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An empty object, or no body at all, as of ``POST /probe`` and ``POST /retire``."""
+    """The body of ``POST /probe`` and ``POST /retire``: an empty object, or no body at all."""
 
 
 class MasterAddress(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -85,7 +86,7 @@ class ContainerUpdate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return None if self.peers is None else tuple(map(read_peer, self.peers))
 
     @property
-    def tells_events(self) -> bool:
+    def has_events(self) -> bool:
         """Whether a container has gone, moved or arrived."""
         return bool(self.gone or self.moved or self.arrived)
 
@@ -129,10 +130,11 @@ class EnforcementCounts(msgspec.Struct, frozen=True):
 class PortProbe(msgspec.Struct, frozen=True):
     """The results when the proxy itself and the master tried to reach a port of the range.
 
-    ``from_proxy`` is ok, refused, silent, unreachable, unresolvable, closed (the connection is
-    accepted, but does not reach the proxy) or stranger (another program answers). ``from_master``
-    is ok, missed (the call of the master did not arrive) or unknown (the master could not be
-    asked). ``transport`` is tcp, or udp for ROS 2, where only the proxy itself can try.
+    ``advertised``: the host and port at which outside should reach the port. ``from_proxy`` is ok,
+    refused, silent, unreachable, unresolvable, closed (the connection is accepted, but does not
+    reach the proxy) or stranger (another program answers). ``from_master`` is ok, missed (the call
+    of the master did not arrive) or unknown (the master could not be asked). ``transport`` is tcp,
+    or udp for ROS 2, where only the proxy itself can try.
     """
 
     port: int = 0
@@ -175,7 +177,7 @@ def read_body(body: object, kind: type[Body]) -> Body:
             text = f"{field or 'the body'}: {fault}" + (hint if "unknown field" in fault else "")
         else:
             text = f"{field}.{fault}" if field else fault
-        raise BodyError(shorten(clean(text), _LONGEST)) from None
+        raise BodyError(shorten(clean(text), _LONGEST_MESSAGE)) from None
 
 
 def _address(field: str, text: str) -> str:

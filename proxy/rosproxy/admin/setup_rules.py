@@ -15,13 +15,14 @@ from rosproxy.telemetry.text import listed, plural, quoted
 
 LOOPBACK_MEANING = "Other machines reach only themselves at this address"
 """The reason why a loopback address is wrong, for findings."""
-FEW_FREE = 0.1
-"""Share of the range that should be free at least."""
+LEAST_FREE_SHARE = 0.1
+"""The smallest share of free ports in the range without a warning."""
 
 HOST = "advertised host"
 RANGE = "published range"
+"""HOST and RANGE: the checks of findings, and also their subjects."""
 _NO_WAY_BACK = ("refused", "silent", "unreachable")
-"""Results of the proxy's own try that prove no fault: NAT without hairpin causes the same."""
+"""Failures of the proxy's own try that prove no fault: NAT without hairpin causes the same."""
 TEXT_BY_OUTCOME = {
     "refused": (
         "connection refused. The range is not published, or the address is not that of this host"
@@ -35,14 +36,16 @@ TEXT_BY_OUTCOME = {
     ),
     "stranger": "another program accepts the connection, not this proxy",
 }
+"""What a failure in `PortProbe.from_proxy` means, for findings."""
 
 
-def by_address() -> str:
-    """The fix for an advertised host that can't be resolved."""
+def _fix_by_address() -> str:
+    """The fix for a host name that can't be resolved, or that leads to loopback here."""
     return f"give an address instead of the name: {how_to('advertised host')}"
 
 
-def _of_this_host() -> str:
+def _fix_by_own_address() -> str:
+    """The fix for an advertised host that is a loopback address."""
     address = how_to("advertised host")
     return f"give the address of this host in the network of the robots: {address}"
 
@@ -55,16 +58,16 @@ def advertised_host(host: str, addresses: Sequence[str], all_here: bool) -> Iter
     loopback = [address for address in addresses if is_loopback(address)]
     if is_loopback(host) and not all_here:
         text = f"{host} is a loopback address. {LOOPBACK_MEANING}"
-        yield error(HOST, HOST, text, _of_this_host())
+        yield error(HOST, HOST, text, _fix_by_own_address())
     elif not addresses:
-        yield error(HOST, HOST, f"the host name {host} can't be resolved here", by_address())
+        yield error(HOST, HOST, f"the host name {host} can't be resolved here", _fix_by_address())
     elif len(loopback) == len(addresses) and not all_here:
         text = (
             f"{host} leads to {listed(loopback)} here, a loopback address (in /etc/hosts, many "
             "systems give their own name such an address). Outside must resolve the name to "
             "another address"
         )
-        yield warning(HOST, HOST, text, by_address())
+        yield warning(HOST, HOST, text, _fix_by_address())
 
 
 def published_range(probe: RangeProbe, host: str, ports: PortsStatus) -> Iterator[DoctorFinding]:
@@ -98,7 +101,7 @@ def probe_result(probe: RangeProbe) -> RangeProbeStatus | None:
 
 
 def _is_reached(trial: PortProbe) -> bool | None:
-    """Whether outside reaches a port; None if only the proxy tried, and NAT may be the cause."""
+    """Whether outside reaches a port; None if unknown: only the proxy tried, and NAT may fail."""
     if trial.from_master != "unknown":
         return trial.from_master == "ok"
     if trial.from_proxy == "ok":
@@ -106,7 +109,7 @@ def _is_reached(trial: PortProbe) -> bool | None:
     return None if trial.transport == "udp" or trial.from_proxy in _NO_WAY_BACK else False
 
 
-def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
+def free_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
     """The findings about free ports, and about ports that other programs hold."""
     used = ports.used
     free = ports.free
@@ -128,7 +131,7 @@ def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
     if not free:
         text = f"no port is free, {used} used. Further nodes get no port"
         yield error("ports", "ports", text, larger_range)
-    elif free < FEW_FREE * (used + free + blocked):
+    elif free < LEAST_FREE_SHARE * (used + free + blocked):
         yield warning("ports", "ports", f"only {free} free, {used} used", larger_range)
     else:
         text = f"{ports.listen}, advertised as {ports.advertise}: {used} used, {free} free"
@@ -163,7 +166,7 @@ def _not_reached(
     ports_name = "range" if is_uniform else "whole range"
     publish = how_to("publish", ports=ports_name, published=published)
     if from_proxy == "unresolvable":
-        fix = by_address()
+        fix = _fix_by_address()
     elif is_uniform:
         address = how_to("advertised host")
         fix = f"{publish}; or correct the advertised host, now {quoted(host)}: {address}"

@@ -1,10 +1,11 @@
 """A document that is costly to make: callers that ask at the same time share a document.
 
 A caller always gets a document that is made after the call. So a caller that asks after an action
-sees the effect of that action. A cache by age could answer with the earlier state. After each
-document there is a pause, so that documents take SHARE of the processor, or more if LONGEST_PAUSE
-cuts the pause short. Callers that ask in the pause wait for the next document, and all these
-callers get the same bytes.
+sees the effect of that action. A cache by age could answer with the earlier state.
+
+After each document there is a pause, so that documents take at most SHARE of the processor. They
+take more only if LONGEST_PAUSE cuts the pause short. Callers that ask in the pause wait for the
+next document, and all these callers get the same document.
 """
 
 import asyncio
@@ -13,9 +14,9 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 SHARE = 0.1
-"""Share of a processor that the documents take, as long as a pause is within LONGEST_PAUSE."""
+"""Share of a processor that the documents take, unless LONGEST_PAUSE cuts the pause short."""
 LONGEST_PAUSE = 1.0
-"""Seconds of a pause at most: an operator waits 3 s for an answer."""
+"""Longest pause, in seconds: an operator waits 3 s for an answer."""
 Document = TypeVar("Document")
 
 
@@ -38,7 +39,7 @@ class SharedDocument(Generic[Document]):
         return await asyncio.shield(self._next)
 
     def close(self) -> None:
-        """End the pause, and cancel the callers that wait."""
+        """End the pause. Waiting callers get CancelledError."""
         if self._next is not None:
             self._next.cancel()
 

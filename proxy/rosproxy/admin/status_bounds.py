@@ -1,11 +1,11 @@
 """The bound of the document at ``/status``: MOST_BYTES of JSON, whatever names nodes choose.
 
 Nodes choose names and the number of names, and any address outside can add connections. A document
-within the bound stays the same. In a longer document each source address gets an equal share, and
-an address that needs less keeps all rows and lists. So no address can hide the rows of another.
+within the bound stays the same. In a longer document each address gets a fair share of the bytes.
+An address that needs less keeps all rows and lists. So no address can hide the rows of another.
 
-An address that needs more first keeps rows (nodes, participants and so on) without lists, then as
-much of each list as fits. Counters named ``left_out`` count the missing entries.
+An address that needs more than its share first keeps rows (nodes, participants and so on) without
+lists, then as much of each list as fits. Counters named ``left_out`` count the missing entries.
 """
 
 import json
@@ -28,15 +28,15 @@ from rosproxy.net.addresses import parse_authority
 
 MOST_BYTES = 1024 * 1024
 """Bytes of JSON. A hundred nodes with ten topics and as many connections each have 250,000."""
-_COUNTER = 10
-"""Bytes by which the counter of a row may grow."""
+_ROW_COUNTER_BYTES = 10
+"""Bytes by which the ``left_out`` of a row may grow."""
 _MOST_LISTS = 8
-"""Lists of a row at most."""
-_COUNTERS = 4096
-"""Bytes by which all counters together may grow that belong to no row."""
-_FIRST = ("nodes", "inside", "outside", "sessions", "stand_ins", "udpros", "layers", "peers")
-"""Tables whose rows an owner keeps before those of the other tables."""
-_NOT_COUNTED = "types"
+"""Lists of a row at most; `_fit` reserves a byte for each, for a comma."""
+_OTHER_COUNTERS_BYTES = 4096
+"""Bytes by which all other counters together may grow: counters that belong to no row."""
+_FIRST_TABLES = ("nodes", "inside", "outside", "sessions", "stand_ins", "udpros", "layers", "peers")
+"""Tables, in the order in which an owner keeps the rows; rows of other tables come last."""
+_UNCOUNTED_LIST = "types"
 """The list whose entries ``left_out`` does not count: each entry belongs to a name."""
 _NOT_ASCII = re.compile(r"[^\x00-\x7f]+")
 Item = TypeVar("Item")
@@ -56,7 +56,7 @@ def bounded(status: ProxyStatus, most: int = MOST_BYTES) -> ProxyStatus:
     wanted: defaultdict[str, int] = defaultdict(int)
     for entry in entries:
         wanted[entry.owner] += entry.size
-    room = max(sum(wanted.values()) - excess - _COUNTERS, 0)
+    room = max(sum(wanted.values()) - excess - _OTHER_COUNTERS_BYTES, 0)
     shares = dict(zip(wanted, fair_shares(list(wanted.values()), room), strict=True))
     for owner, share in shares.items():
         if share < wanted[owner]:
@@ -71,7 +71,7 @@ def bounded(status: ProxyStatus, most: int = MOST_BYTES) -> ProxyStatus:
 
 
 def left_out(status: ProxyStatus) -> int:
-    """How many rows and names were left out of the status."""
+    """The number of rows and names that were left out of the status."""
     policy = status.policy or PolicyStatus()
     counts = [status.left_out, policy.left_out, policy.layers_left_out]
     counts += [node.left_out for node in status.nodes]
@@ -85,7 +85,7 @@ def left_out(status: ProxyStatus) -> int:
 
 
 def encode(value: object) -> bytes:
-    """JSON in ASCII of a document or a part, which is harmless on a terminal."""
+    """A document or a part as JSON in ASCII, which is harmless on a terminal."""
     encoded = msgspec.json.encode(value)
     if encoded.isascii():
         return encoded
@@ -108,7 +108,7 @@ def fair_shares(wanted: Sequence[int], most: int) -> list[int]:
 
 
 def fair_shares_by_owner(owners: Sequence[str], wanted: Sequence[int], most: int) -> list[int]:
-    """Fair shares of ``most`` for owners, then fair shares of these for the items of an owner.
+    """Divide ``most`` fairly among the owners, then each owner's share among the owner's items.
 
     The item ``i`` belongs to ``owners[i]`` and wants ``wanted[i]``. Returns the share of each item.
     """
@@ -124,7 +124,7 @@ def fair_shares_by_owner(owners: Sequence[str], wanted: Sequence[int], most: int
 
 
 def fair_choice(items: Iterable[Item], owner: Callable[[Item], str], most: int) -> list[Item]:
-    """The first items of each owner, with fair shares of ``most``, in the order of ``items``."""
+    """The first items of each owner, ``most`` in all, with fair shares; the order stays."""
     every = list(items)
     if len(every) <= most:
         return every
@@ -206,7 +206,7 @@ def _with_tables(parent: Parent, visit: VisitTable, **owners: Callable[[Row], st
 
 
 def _owners_of_mismatches(domain: DomainStatus) -> Callable[[Row], str]:
-    """A function from a mismatch to the address of the participant inside."""
+    """A function from a mismatch to the address of the participant inside; empty if unknown."""
     addresses = {participant.guid_prefix: participant.address for participant in domain.inside}
     return lambda mismatch: addresses.get(mismatch.writer, addresses.get(mismatch.reader, ""))
 
@@ -218,16 +218,16 @@ def _host(uri: str) -> str:
 
 def _fit(entries: Sequence[_Entry], room: int) -> None:
     """Shorten the rows of one owner, or leave rows out, until ``room`` bytes are enough."""
-    ranks = {table: rank for rank, table in enumerate(_FIRST)}
+    ranks = {table: rank for rank, table in enumerate(_FIRST_TABLES)}
     ordered = sorted(entries, key=lambda entry: ranks.get(entry.table, len(ranks)))
-    bare_sizes = [_size(_shortened(entry.row, 0)) + 1 + _COUNTER for entry in ordered]
+    bare_sizes = [_size(_shortened(entry.row, 0)) + 1 + _ROW_COUNTER_BYTES for entry in ordered]
     kept = sum(1 for used in accumulate(bare_sizes) if used <= room)
     for entry in ordered[kept:]:
         entry.is_left_out = True
     room -= sum(bare_sizes[:kept])
     # `_shortened` counts a comma for the last entry of each list, too.
     in_lists = [
-        max(entry.size - bare, 0) + _COUNTER + _MOST_LISTS
+        max(entry.size - bare, 0) + _ROW_COUNTER_BYTES + _MOST_LISTS
         for entry, bare in zip(ordered[:kept], bare_sizes, strict=False)
     ]
     for entry, share in zip(ordered[:kept], fair_shares(in_lists, room), strict=True):
@@ -244,7 +244,7 @@ def _shortened(row: Row, room: int) -> Row:
             used = [size for size in accumulate(_size(e) + 1 for e in entries) if size <= room]
             lists[name] = entries[: len(used)]
             room -= used[-1] if used else 0
-            left_out += 0 if name == _NOT_COUNTED else len(entries) - len(used)
+            left_out += 0 if name == _UNCOUNTED_LIST else len(entries) - len(used)
     if not lists:
         return row
     return msgspec.structs.replace(row, **lists, left_out=row.left_out + left_out)

@@ -1,7 +1,7 @@
 """Waits for changes of the proxy's state, so that callers need not poll.
 
 The state is in many modules, which do not report changes. So the proxy polls the state for each
-waiting caller: twice a second at most, and seldom enough to take a hundredth of a processor.
+waiting caller: twice a second at most, and with at most a hundredth of a processor.
 """
 
 import asyncio
@@ -18,11 +18,11 @@ from rosproxy.admin.status_version import version_of
 from rosproxy.net.fair_slots import FairSlots
 
 POLL_INTERVAL = 0.5
-"""Seconds between two polls of a caller at least."""
+"""Shortest time between two polls for a caller, in seconds."""
 SHARE = 0.01
 """Share of a processor that polling may take for each waiting caller."""
-LONGEST = 1800.0
-"""Seconds that a caller may wait."""
+LONGEST_WAIT_S = 1800.0
+"""Longest wait of a caller, in seconds, even if the caller asks for more."""
 MOST_WAITING = 8
 """Callers that may wait at the same time: a single operator, or a few while operators restart."""
 MOST_WAITING_EACH = 4
@@ -31,7 +31,7 @@ MOST_WAITING_EACH = 4
 
 @dataclass(frozen=True)
 class StatusSnapshot:
-    """The state at one moment, with the JSON ``body``. ``took``: seconds to collect both."""
+    """The state at one moment, and the same state as JSON. ``took``: seconds to make both."""
 
     status: ProxyStatus
     body: bytes
@@ -70,12 +70,13 @@ class StatusChanges:
     async def after(
         self, since: str, within: float, connected: Callable[[], bool]
     ) -> StatusSnapshot:
-        """Return the state once its version differs from ``since``.
+        """Return a snapshot once the version of the state differs from ``since``.
 
-        Return earlier after ``within`` seconds, or when the caller is no longer ``connected``.
+        Return earlier after ``within`` seconds, after `end`, or when the caller is no longer
+        ``connected``. An infinite or NaN ``within`` counts as 0.
         """
         clock = asyncio.get_running_loop().time
-        until = clock() + (min(within, LONGEST) if math.isfinite(within) else 0.0)
+        until = clock() + (min(within, LONGEST_WAIT_S) if math.isfinite(within) else 0.0)
         while True:
             snapshot = await self._newest()
             is_over = clock() >= until or self._ending.is_set() or not connected()

@@ -28,8 +28,10 @@ Rate = Annotated[float, msgspec.Meta(ge=0, le=1e18)]
 Names = tuple[str, ...]
 Document = TypeVar("Document", bound=msgspec.Struct)
 MOST_ROWS = 50_000
-"""JSON objects in a document that a reader accepts. In a status of 1 MiB an object has 21 bytes at
-least."""
+"""JSON objects at most in a document that a reader accepts.
+
+An object in a status has 21 bytes at least, so a status of 1 MiB has fewer objects.
+"""
 
 
 # msgspec raises UnicodeEncodeError for half of a surrogate pair, which json.loads accepts.
@@ -121,7 +123,11 @@ class DataPlaneStatus(msgspec.Struct, frozen=True):
 
 
 class NodePlaneStatus(msgspec.Struct, frozen=True):
-    """What the kernel forwards through the fast ``port`` of a node; bytes are of IP packets."""
+    """What the kernel forwards through the fast ``port`` of a node or stand-in.
+
+    ``reason``: why the kernel does not forward. ``sent`` and ``received`` count the bytes of IP
+    packets.
+    """
 
     plane: str = ""
     port: Count | None = None
@@ -201,7 +207,7 @@ class EndpointStatus(msgspec.Struct, frozen=True):
 
     @property
     def given_up(self) -> bool:
-        """Whether the proxy has unregistered the nodes, because they are gone."""
+        """Whether the proxy counts the nodes as gone: cleaned up, or ended with the container."""
         return self.state == "cleaned" or self.has_ended
 
     @property
@@ -436,7 +442,10 @@ class ProxyStatus(msgspec.Struct, frozen=True):
 
 
 def parse_status(text: str | bytes) -> ProxyStatus:
-    """The status in the text of an answer. Raises NotAStatus for the text of another program."""
+    """The status in the text of an answer.
+
+    Raises NotAStatus for the text of another program, and for more than MOST_ROWS objects.
+    """
     try:
         document = json.loads(text)
     except (ValueError, RecursionError):
@@ -447,7 +456,10 @@ def parse_status(text: str | bytes) -> ProxyStatus:
 
 
 def read_status(document: object) -> ProxyStatus:
-    """The status in decoded JSON. Raises NotAStatus for more than MOST_ROWS objects."""
+    """The status in decoded JSON, with defaults for all that does not fit.
+
+    Raises NotAStatus for more than MOST_ROWS objects.
+    """
     if _has_too_many_rows(document):
         raise NotAStatus(f"a status of more than {MOST_ROWS} objects")
     return _convert_leniently(document, ProxyStatus)
@@ -489,7 +501,7 @@ def _convert_leniently(value: object, kind: type[Document]) -> Document:
 
 
 _fields = cache(msgspec.structs.fields)
-"""The fields of a struct. Without the cache this takes a hundred times as long as a conversion."""
+"""The fields of a struct. Without the cache, this call takes as long as a hundred conversions."""
 
 
 def _convert_field(value: Any, kind: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The version of a proxy's status, which changes with nodes, ports and problems, not with rates.
+"""The version of a proxy's status. Nodes, ports and problems change the version, rates do not.
 
 ``/status/changes`` answers waiting callers when the version differs.
 """
@@ -13,7 +13,7 @@ from rosproxy.admin.status_document import DomainStatus, EndpointStatus, ProxySt
 
 def version_of(status: ProxyStatus) -> str:
     """A hash of the parts of the status that matter to an operator."""
-    told = (
+    parts = (
         status.instance,
         status.retired,
         status.master.up,
@@ -24,7 +24,7 @@ def version_of(status: ProxyStatus) -> str:
         sorted((problem.subject, problem.text) for problem in status.problems),
         replace(status.range_probe, age=0.0) if status.range_probe else None,
     )
-    return hashlib.sha256(msgspec.json.encode(told)).hexdigest()[:16]
+    return hashlib.sha256(msgspec.json.encode(parts)).hexdigest()[:16]
 
 
 def _node(node: EndpointStatus) -> object:

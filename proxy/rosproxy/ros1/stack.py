@@ -241,7 +241,7 @@ class Ros1:
         update = read_body(body, ContainerUpdate)
         if update.selected is not None:
             self._callers.select(update.selected)
-        if not update.tells_events:
+        if not update.has_events:
             return {"moved": 0, "unregistered": 0, "adopted": 0}
         arrived = [(container.address, container.names) for container in update.arrived]
         return {**await self._containers.handle(update.gone, update.moved, arrived)}

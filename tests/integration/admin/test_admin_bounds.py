@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from examples.demo.fake_node import FakeNode
 from rosproxy.admin.admin_client import AdminClient
 from rosproxy.admin.admin_server import MOST_CONNECTIONS, MOST_REPLIES, MOST_REPLIES_EACH
-from rosproxy.admin.replies import PIECE, REPLY_TIMEOUT
+from rosproxy.admin.replies import PIECE_BYTES, REPLY_TIMEOUT
 from rosproxy.admin.status_bounds import MOST_BYTES
 from rosproxy.admin.status_document import ProblemStatus
 from tests.clock import pass_time
@@ -148,7 +148,7 @@ async def test_readers_that_take_nothing_share_the_document(large: Proxy) -> Non
     async with stalled(large, MOST_REPLIES_EACH) as wires:
         await until(lambda: replies.taken == MOST_REPLIES_EACH, "the readers are served")
         await until(lambda: all(buffered(large)), "the readers stall")
-        assert max(buffered(large)) <= 3 * PIECE
+        assert max(buffered(large)) <= 3 * PIECE_BYTES
         for wire in wires:
             wire.reader._transport.resume_reading()  # type: ignore[attr-defined]
             body = (await wire.reply()).body

@@ -6,7 +6,7 @@ import pytest
 
 from rosproxy.admin.doctor_finding import Severity
 from rosproxy.admin.requests import PortProbe, RangeProbe
-from rosproxy.admin.setup_rules import advertised_host, few_ports, probe_result, published_range
+from rosproxy.admin.setup_rules import advertised_host, free_ports, probe_result, published_range
 from rosproxy.admin.status_document import PortsStatus
 
 
@@ -72,7 +72,7 @@ def test_no_try_proves_nothing() -> None:
 
 def test_another_proxy_on_the_range_is_named() -> None:
     ports = PortsStatus("1-9", "1-9", free=5, blocked=4, held_by=("another rosproxy (x)",))
-    told = next(iter(few_ports(ports)))
+    told = next(iter(free_ports(ports)))
     assert "other programs hold 4 ports of the range 1-9: another rosproxy (x)" in told.text
     assert "another --port-range" in told.fix
 
@@ -80,6 +80,6 @@ def test_another_proxy_on_the_range_is_named() -> None:
 def test_what_a_proxy_calls_its_range_is_no_command() -> None:
     """A proxy in hostile hands ended the quote that stood in the fix, and began a command."""
     ports = PortsStatus("1' ; touch pwned #-2", "1-9", free=5, blocked=4)
-    told = next(iter(few_ports(ports)))
+    told = next(iter(free_ports(ports)))
     command = told.fix.removeprefix("find the programs: ").partition("; or set another")[0]
     assert shlex.split(command) == ["ss", "-ltnp", "sport >= :1' ; touch pwned # and sport <= :2"]

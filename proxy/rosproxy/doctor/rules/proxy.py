@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from urllib.parse import urlsplit
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
-from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, few_ports, published_range
+from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, free_ports, published_range
 from rosproxy.admin.status_bounds import left_out
 from rosproxy.doctor.facts import DoctorFacts, MasterFacts, ReachOutcome
 from rosproxy.fixes import how_to
@@ -32,13 +32,16 @@ def setup(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def running(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """Findings for the live page, without a try of the range (`rosproxy.app.self_check` tries)."""
+    """Findings for the live page: master and ports. `rosproxy.app.self_check` tests the range."""
     yield from _master(facts)
     yield from _ports(facts)
 
 
 def alive(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """The finding whether the proxy answers."""
+    """The finding whether the proxy answers, and a note if the status is not complete.
+
+    No finding if the doctor has asked no proxy.
+    """
     if facts.status is not None:
         up = duration(facts.status.uptime)
         yield ok("admin", "proxy", f"rosproxy {facts.status.version} at {facts.admin}, up {up}")
@@ -115,7 +118,7 @@ def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         return
     probes = facts.probe.probes if facts.probe else ()
     if not is_loopback(host) and any(probe.from_master == "ok" for probe in probes):
-        return  # the master reaches the host by this name, whatever the name means here
+        return  # the master reaches the host by this name; here the name may mean another host
     # A loopback address is right if the master is on this machine. Without facts about the master
     # this is unknown.
     if facts.master or not facts.proxy.settings.for_ros1 or not is_loopback(host):
@@ -145,23 +148,23 @@ def _range(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 def _ports(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if facts.status is not None and facts.status.ports.listen:  # rmw_zenoh alone has no range
-        yield from few_ports(facts.status.ports)
+        yield from free_ports(facts.status.ports)
 
 
 def _published_master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     port = facts.proxy.settings.publish_master
     if port is None:
         return
-    check = "published master"
+    check_name = "published master"
     attempt = facts.published_master
     text = f"http://{facts.advertise_host}:{port} for nodes outside: {attempt.reach.value}"
     fix = how_to("publish", ports="port", published=f"{port}:{port}")
     if not attempt.failed:
-        yield ok(check, check, text)
+        yield ok(check_name, check_name, text)
     elif facts.probe and any(probe.from_proxy == "ok" for probe in facts.probe.probes):
-        yield error(check, check, text, fix)
+        yield error(check_name, check_name, text, fix)
     else:
         text += ". This proves little, since no port of this host was reached from here"
         host = quoted(facts.advertise_host)
         fix += f"; test from outside: nc -vz {host} {port}"
-        yield warning(check, check, text, fix)
+        yield warning(check_name, check_name, text, fix)
