@@ -37,8 +37,9 @@ def setting_error_if_taken(
 def report_taken_ports(
     ros: str, settings: Settings, taken: Sequence[int], problems: Problems
 ) -> None:
-    """Report taken ports in the log and as a problem, for one version of ROS.
+    """Report the ports that other programs hold, in the log and as a problem.
 
+    ``ros`` 1 stands for TCP ports, any other for UDP ports. Does nothing if ``taken`` is empty.
     Raises SettingError if all ports of the range are taken: no node could use the proxy.
     """
     ports = settings.ports.listen

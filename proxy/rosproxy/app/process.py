@@ -76,11 +76,12 @@ class App:
     async def start(self) -> None:
         """Bind all ports, and start all stacks. Raises SettingError if a port is taken."""
         settings = self.settings
-        # Bind any free port, so that an address which this host does not have is an error of
-        # --bind. Otherwise all ports of the range would seem taken.
+        # First bind any free port: if this host does not have the address, the error names --bind.
+        # Otherwise all ports of the range would seem taken.
         with setting_error_if_taken("--bind", settings.bind):
             sockets.bind(settings.bind, 0).close()
-        # Before a node registers, and before the recovery finds the nodes of an earlier process.
+        # The policy comes first: a stack lets nodes register, and recovers the nodes of an earlier
+        # process.
         self._policy.start()
         for stack in self.stacks:
             await stack.start()
@@ -118,7 +119,7 @@ class App:
     def _actions(self) -> dict[str, Action]:
         """The POST actions of all stacks, by path; several stacks may have an action for a path.
 
-        The action of ROS 2 goes first: the action of ROS 1 may fail while the master is away.
+        The action of ROS 1 comes last, because it may fail while the master is away.
         """
         action_maps = [stack.actions for stack in reversed(self.stacks)]
         paths = {path for actions in action_maps for path in actions}
@@ -135,7 +136,7 @@ def _own_names(settings: Settings) -> frozenset[str]:
 
 
 def _together(actions: list[Action]) -> Action:
-    """An action that carries out several actions in order, and adds up the counts."""
+    """An action that carries out several actions in order, and adds up their replies (counts)."""
     if len(actions) == 1:
         return actions[0]
 

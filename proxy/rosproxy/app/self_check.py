@@ -1,16 +1,16 @@
 """The self-check of a proxy: whether outside reaches the advertised host and the range.
 
 1. At the start, the proxy resolves the advertised host.
-2. After SETTLE_TIME, and once the master answers, the proxy tests whether outside reaches the range
-   (`rosproxy.ros1.range_probe`). For ROS 2 the proxy tries by UDP: success proves that outside
-   reaches the range, failure proves nothing.
+2. After SETTLE_TIME_S, and once the master answers, the proxy tests whether outside reaches the
+   range (`rosproxy.ros1.range_probe`). For ROS 2 the proxy tries by UDP: success proves that
+   outside reaches the range, failure proves nothing.
 3. Then the log says ``ready``, or reports the faults.
 
 The log and ``rosproxy status`` report faults in the words of the doctor. The proxy tests again
-until a test proves that outside reaches the range. Later changes cause another test: the master was
-away or has another address, or the advertised host resolves to other addresses. A fault blocks
-nothing: the proxy serves all connections that arrive. The field ``range_probe`` of the status has
-the last result.
+until a test proves that outside reaches the range. After that, only a change causes another test:
+the master was away or has another address, or the advertised host resolves to other addresses. A
+fault blocks nothing: the proxy serves all connections that arrive. The field ``range_probe`` of the
+status has the last result.
 """
 
 import asyncio
@@ -38,13 +38,16 @@ from rosproxy.runtime import Runtime
 
 log = logging.getLogger(__name__)
 
-SETTLE_TIME = 3.0
-"""Seconds before the first test of the range, so that nodes can register again first."""
-RETRY_INTERVAL = 300.0
-"""Seconds between tests without a proof. If the call of the master does not arrive, one of the
-master's three threads waits for two minutes."""
-LEAST_INTERVAL = 30.0
-"""Seconds between two tests at least, even if there are many changes."""
+SETTLE_TIME_S = 3.0
+"""Seconds between the start and the first test of the range. Nodes can register again meanwhile."""
+RETRY_INTERVAL_S = 300.0
+"""Seconds between tests, as long as no test has proven that outside reaches the range.
+
+Tests are rare: if the call of the master does not arrive, one of the master's three threads waits
+for two minutes.
+"""
+LEAST_INTERVAL_S = 30.0
+"""Seconds between a change and the next test, so that many changes cause a single test."""
 
 
 class SelfCheck:
@@ -62,7 +65,7 @@ class SelfCheck:
 
     @property
     def findings(self) -> list[DoctorFinding]:
-        """The current faults."""
+        """The current faults: findings of severity WARNING or ERROR."""
         return [finding for findings in self._findings.values() for finding in findings]
 
     @property
@@ -82,7 +85,7 @@ class SelfCheck:
         return to_json(await self._try_range(or_fast=True))
 
     async def _keep_trying(self) -> None:
-        await asyncio.sleep(SETTLE_TIME)
+        await asyncio.sleep(SETTLE_TIME_S)
         for stack in self._stacks:
             await stack.settle()
         while not any(stack.retired for stack in self._stacks):
@@ -94,13 +97,13 @@ class SelfCheck:
             await self._until_due()
 
     async def _until_due(self) -> None:
-        """Wait until the next test: after a change, or after RETRY_INTERVAL without a proof."""
+        """Wait until the next test: after a change, or after RETRY_INTERVAL_S without a proof."""
         changed = self._runtime.outside_changed
         while True:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(RETRY_INTERVAL):
+                async with asyncio.timeout(RETRY_INTERVAL_S):
                     await changed.wait()
-                    await asyncio.sleep(LEAST_INTERVAL)
+                    await asyncio.sleep(LEAST_INTERVAL_S)
             former_addresses = self._addresses
             await self._look_at_host()
             if changed.is_set() or self._addresses != former_addresses or not self._is_proven:
@@ -112,6 +115,7 @@ class SelfCheck:
         return not self.findings and self._result is not None and self._result.reached is True
 
     async def _look_at_host(self) -> None:
+        """Resolve the advertised host, and report its faults."""
         host = self._runtime.settings.advertise_host
         if not host:  # rmw_zenoh alone advertises no host
             return
@@ -120,7 +124,10 @@ class SelfCheck:
         self._note(HOST, advertised_host(host, self._addresses, all_here))
 
     async def _all_here(self) -> bool:
-        """Whether master and peers are all on loopback, as in a trial on a single machine."""
+        """Whether master and peers are all on loopback, as in a trial on a single machine.
+
+        False if there is neither a master nor a peer.
+        """
         settings = self._runtime.settings
         hosts = [peer.host for peer in settings.ros2_peer] if settings.for_ros2 else []
         if settings.for_ros1:
@@ -131,7 +138,10 @@ class SelfCheck:
         return bool(resolved) and all(any(map(is_loopback, addresses)) for addresses in resolved)
 
     async def _try_range(self, or_fast: bool) -> RangeProbe:
-        """Test ports of the range, and note faults. Raises OSError if a port was just taken."""
+        """Test ports of the range, and report faults.
+
+        ``or_fast``: see `Stack.probe`. Raises OSError if another program has just taken a port.
+        """
         async with self._probing:
             probes = [await stack.probe(or_fast) for stack in self._stacks]
         probed = RangeProbe(tuple(probe for of_stack in probes for probe in of_stack))

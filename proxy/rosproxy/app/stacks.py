@@ -21,7 +21,7 @@ class Stack(Protocol):
 
     @property
     def greeting(self) -> str:
-        """How nodes use the stack, for the log."""
+        """How nodes use the stack, for the line ``listening`` in the log."""
 
     @property
     def actions(self) -> Mapping[str, Action]:
@@ -41,7 +41,10 @@ class Stack(Protocol):
         """Wait until `probe` gives useful results, for example until the master answers."""
 
     async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
-        """Test whether outside reaches some ports; ``or_fast``: see `probe_range`."""
+        """Test whether outside reaches some ports; without results if nothing could be tried.
+
+        ``or_fast``: if no port is free, ROS 1 tries a fast port (`probe_range`).
+        """
 
     async def try_ports(self) -> tuple[PortProbe, ...]:
         """Bind all ports, test the ports, and close all, without a start. Raises SettingError."""
@@ -53,7 +56,7 @@ class Stack(Protocol):
         """The reason why nodes can't use the stack now; None if nodes can."""
 
     def extended_status(self, status: ProxyStatus) -> ProxyStatus:
-        """The status of the proxy, with the parts of this stack."""
+        """A copy of ``status`` with the parts of this stack."""
 
 
 def make_stacks(runtime: Runtime) -> tuple[Stack, ...]:

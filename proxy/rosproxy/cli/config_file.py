@@ -1,8 +1,8 @@
 """The file of ``--config``: options by name, in TOML.
 
 The command line and the variables override the file. The program parses and checks a value of the
-file as a text of the option on the command line. An unknown key is an error, as on the command
-line.
+file like the value of the same option on the command line. An unknown key is an error, like an
+unknown option.
 """
 
 import difflib
@@ -13,10 +13,10 @@ from typing import Any
 
 import click
 
-LONGEST_FILE = 1024 * 1024
-"""Bytes that the file has at most."""
+LONGEST_FILE_BYTES = 1024 * 1024
+"""Largest file that the program reads, in bytes."""
 _COMMAND_LINE_ONLY = frozenset({"config", "check", "deep", "once", "help", "version"})
-"""Options that choose what a single run does, so that a file may not have them."""
+"""Options that a file may not have, because they choose what a single run does."""
 
 
 def read_config(path: str, options: Mapping[str, click.Option]) -> dict[str, Any]:
@@ -27,9 +27,9 @@ def read_config(path: str, options: Mapping[str, click.Option]) -> dict[str, Any
     """
     try:
         with Path(path).open("rb") as file:
-            text = file.read(LONGEST_FILE + 1)
-        if len(text) > LONGEST_FILE:
-            raise ValueError(f"{path} is longer than {LONGEST_FILE} bytes")
+            text = file.read(LONGEST_FILE_BYTES + 1)
+        if len(text) > LONGEST_FILE_BYTES:
+            raise ValueError(f"{path} is longer than {LONGEST_FILE_BYTES} bytes")
         table = tomllib.loads(text.decode())
     except OSError as error:
         raise ValueError(f"{path} can't be read: {error.strerror}") from None
@@ -54,7 +54,7 @@ def _unknown(key: str, options: Mapping[str, click.Option]) -> str:
 
 
 def _value(label: str, value: Any, option: click.Option) -> Any:
-    """Convert a TOML value for the option. Raises ValueError."""
+    """Convert a TOML value for the option. Raises ValueError, which begins with ``label``."""
     if option.is_flag:
         if not isinstance(value, bool):
             raise ValueError(f"{label} must be true or false")

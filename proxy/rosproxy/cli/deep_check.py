@@ -26,7 +26,7 @@ from rosproxy.settings import Settings
 
 
 def deep_check(settings: Settings) -> list[DoctorFinding]:
-    """All findings about settings, the first cause first."""
+    """All findings about the settings, the first cause first. Binds and closes all ports."""
     return asyncio.run(_check(settings))
 
 
@@ -81,7 +81,7 @@ async def _try_ports(runtime: Runtime) -> RangeProbe:
 
 
 async def _own_address(host: str) -> str:
-    """The address of the admin endpoint. Raises SettingError for an unresolvable name."""
+    """The address to which a host of ``--admin-bind`` resolves. Raises SettingError if to none."""
     addresses = await resolve(host)
     if not addresses:
         raise SettingError("--admin-bind", f"the host name {host} can't be resolved here")

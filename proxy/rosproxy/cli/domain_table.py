@@ -21,8 +21,8 @@ def domain_lines(domain: document.DomainStatus, columns: int) -> Iterator[str]:
     if not participants:
         yield "No participant has been heard yet."
         return
-    # If there are participants inside, a participant outside should send to the range. Until
-    # then the table has a question mark.
+    # If there are participants inside, a participant outside should send to the range. Until it
+    # does, its side has a question mark.
     unheard = "outside?" if domain.inside else "outside"
     sides = ["inside"] * len(domain.inside)
     sides += ["outside" if p.proven else unheard for p in domain.outside]
@@ -98,7 +98,7 @@ def _details(
 
 
 def _kernel(participant: document.ParticipantStatus) -> str:
-    """What the kernel forwards to a participant, and why not the other ports for user data."""
+    """What the kernel forwards to a participant, and the reason for each port without a forward."""
     forwarded = [lease for lease in participant.leases if lease.plane == KERNEL]
     ports = listed(str(lease.port) for lease in forwarded)
     datagrams = plural(sum(lease.kernel_datagrams for lease in forwarded), "datagram")

@@ -106,8 +106,8 @@ def _check(settings: Any, deep: bool) -> None:
 def lan_relay(log_format: str, log_level: str, **given: Any) -> None:
     """Pass ROS 2 discovery on between a LAN and the proxy.
 
-    Run this command in the host's network. User data does not pass the LAN relay, but the ports
-    that the host publishes.
+    Run this command in the host's network. User data passes through the ports that the host
+    publishes, not through the LAN relay.
     """
     from rosproxy.app.lan_relay_program import run_lan_relay
     from rosproxy.ros2.lan_relay.relay import LanRelaySettings

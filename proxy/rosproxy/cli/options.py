@@ -1,8 +1,8 @@
 """Kinds of values and usage errors, for the command lines of the proxy and of the operator.
 
-Each kind of value is a click type. So the program reports a bad value before the start, from the
-command line and from the environment alike. A usage error is a single line, for logs of containers:
-the program, the option, what is wrong, and a valid value. The exit status is 2.
+Each kind of value is a click type. So the program reports a bad value before the start, whether the
+value comes from the command line or from the environment. A usage error is a single line, for logs
+of containers: the program, the option, what is wrong, and a valid value. The exit status is 2.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ class Parsed(click.ParamType):  # type: ignore[type-arg] # no generic type befor
     """A kind of value that the pure function ``read`` parses from a text.
 
     Help texts show ``name``. ``read`` raises ValueError. The message says what is wrong with the
-    text, and gives an example.
+    text, and gives an example. ``separable``: in a variable, spaces separate several values.
     """
 
     def __init__(self, name: str, read: Callable[[str], Any], separable: bool = True) -> None:
@@ -157,7 +157,7 @@ def variables_of(option: click.Option, prefix: str | None) -> list[str]:
 class Commands(CommandShowingVariables, click.Group):
     """Commands whose usage errors are a single line that begins with the name of the program.
 
-    click prints four lines.
+    Without this class, click prints four lines.
     """
 
     program = "rosproxy"
@@ -223,9 +223,9 @@ def _use_config(context: click.Context, option: click.Parameter, path: str | Non
 
 
 def unknown_variables(*groups: click.Command, log: bool = True) -> list[UnknownVariable]:
-    """The variables of this environment that no option of the programs reads.
+    """The variables of this environment that seem meant for rosproxy, but that no option reads.
 
-    ``log``: log a warning for each.
+    ``groups``: the commands whose options count. ``log``: log a warning for each variable.
     """
     known_names = {name for group in groups for name in _variable_names(group, None)}
     known_names.add(VARIABLE)

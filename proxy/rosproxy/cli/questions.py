@@ -14,7 +14,7 @@ import click
 from rosproxy import setting_kinds as kinds
 from rosproxy.cli import options
 
-WAIT_INTERVAL = 0.5
+WAIT_INTERVAL_S = 0.5
 """Seconds between two requests of ``status --wait``."""
 
 
@@ -30,7 +30,10 @@ def _admin_client(context: click.Context, option: click.Parameter, url: str | No
 
 
 def _bound_by_file() -> str | None:
-    """The ``admin-bind`` in the file of ROSPROXY_CONFIG; None or empty if missing."""
+    """The ``admin-bind`` in the file of ROSPROXY_CONFIG.
+
+    Empty if the file does not have the option; None without a file that can be read.
+    """
     path = os.environ.get("ROSPROXY_CONFIG")
     if not path:
         return None
@@ -83,7 +86,7 @@ def status(admin: Any, as_json: bool, watch: bool, wait: float, opens: bool) -> 
         return
     end = time.monotonic() + wait
     while (error := _why_not_ready(admin)) and time.monotonic() < end:
-        time.sleep(WAIT_INTERVAL)
+        time.sleep(WAIT_INTERVAL_S)
     _or_exit(lambda: terminal.show_status(admin, as_json))
     if error:
         _fail(error)
@@ -182,7 +185,7 @@ def doctor(
     print_findings([*findings, *(rules.unknown_variable(v.name, v.text) for v in unknown)], as_json)
 
 
-def print_findings(diagnosis: Any, as_json: bool) -> NoReturn:
+def print_findings(findings: Any, as_json: bool) -> NoReturn:
     """Print findings, and exit with 1 if there is an error, else with 0."""
     import json
 
@@ -191,10 +194,10 @@ def print_findings(diagnosis: Any, as_json: bool) -> NoReturn:
     from rosproxy.doctor import presentation
 
     if as_json:
-        terminal.write(json.dumps(presentation.as_json(diagnosis), indent=2))
+        terminal.write(json.dumps(presentation.as_json(findings), indent=2))
     else:
-        terminal.write(presentation.render(diagnosis, terminal.size()[0]))
-    sys.exit(1 if failed(diagnosis) else 0)
+        terminal.write(presentation.render(findings, terminal.size()[0]))
+    sys.exit(1 if failed(findings) else 0)
 
 
 def _or_exit(ask: Callable[[], object]) -> None:

@@ -1,8 +1,8 @@
 """``/status`` as text: first the proxy, then a table of the nodes behind the proxy.
 
 Below the row of a node are topics, services and connections. A narrow terminal has the addresses
-of nodes in separate lines. A short terminal (``--watch``) may have no details. `clean` makes all
-texts harmless that nodes have chosen.
+of nodes in separate lines. A short terminal (``--watch``) may have no details. Nodes choose the
+names in the status, so `clean` makes these names harmless.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,20 +16,21 @@ from rosproxy.telemetry.tables import GAP, besides_first, table
 from rosproxy.telemetry.text import clean, duration, listed, plural, size, wrap
 
 HEADING = ("NODE", "INSIDE", "OUTSIDE", "STATE", "PUB", "SUB", "SRV", "CONN", "OUT", "IN")
-LEAST_NAME = 20
-"""Columns for names at least. If the addresses leave fewer, the addresses get separate lines."""
+LEAST_NAME_COLUMNS = 20
+"""Columns for names at least. If the addresses leave fewer, each address gets a separate line."""
 MOST_LINES = 3
 """Lines for the topics of a node at most; the same for services and for connections."""
 MOST_CONNECTIONS = 8
+"""Connections of a node that are listed at most."""
 MOST_HIDDEN = 20
 """Hidden names that are listed at most."""
 INDENT = "    "
 
 
 def render(status: document.ProxyStatus, columns: int, lines: int | None = None) -> str:
-    """The status as text, wrapped to ``columns``. ``lines``: the bound; None: no bound.
+    """The status as text, wrapped to ``columns``, with at most ``lines`` lines; None: no bound.
 
-    A text above the bound loses details first, then the last lines.
+    A longer text first loses the details of nodes and the hidden names, then the last lines.
     """
     # Each line of the head begins with a label of nine characters. Further lines are indented.
     head = [line for row in _head(status) for line in wrap(row[9:], columns, " " * 9, row[:9])]
@@ -155,7 +156,7 @@ def _nodes(status: document.ProxyStatus, columns: int, details: bool) -> Iterato
         yield "No node has registered through the proxy yet."
         return
     rows = [HEADING, *map(_row, nodes)]
-    narrow = columns - besides_first(rows) < LEAST_NAME
+    narrow = columns - besides_first(rows) < LEAST_NAME_COLUMNS
     if narrow:
         rows = [(row[0], *row[3:]) for row in rows]
     room = max(columns - besides_first(rows), len(HEADING[0]))

@@ -20,7 +20,7 @@ from rich.live import Live
 from rosproxy.admin.admin_client import AdminClient, AdminError
 from rosproxy.cli.status_table import render
 
-WATCH_INTERVAL = 2.0
+WATCH_INTERVAL_S = 2.0
 """Seconds between two drawings, and between two measurements of rates in the proxy."""
 WIDTH_WITHOUT_TERMINAL = 120
 
@@ -45,7 +45,7 @@ def show_status(admin: AdminClient, as_json: bool) -> None:
 
 
 def watch_status(admin: AdminClient) -> None:
-    """Draw the status every WATCH_INTERVAL until Ctrl-C, also while no proxy answers."""
+    """Draw the status every WATCH_INTERVAL_S until Ctrl-C, also while no proxy answers."""
 
     def draw(columns: int, lines: int | None) -> str:
         try:
@@ -57,9 +57,9 @@ def watch_status(admin: AdminClient) -> None:
 
 
 def watch(draw: Callable[[int, int | None], str]) -> None:
-    """Show the text of ``draw`` every WATCH_INTERVAL until Ctrl-C.
+    """Show the text of ``draw`` every WATCH_INTERVAL_S until Ctrl-C.
 
-    ``draw`` takes columns and lines; without a terminal, lines are None.
+    ``draw`` takes the columns and lines of `size`.
     """
     console = _console()
     live = Live(console=console, screen=True, auto_refresh=False)
@@ -71,7 +71,7 @@ def watch(draw: Callable[[int, int | None], str]) -> None:
             else:
                 # Into a pipe or a file: all texts, with an empty line after each.
                 console.print(text, "", sep="\n", soft_wrap=True)
-            time.sleep(WATCH_INTERVAL)
+            time.sleep(WATCH_INTERVAL_S)
 
 
 def write(text: str) -> None:
@@ -80,7 +80,10 @@ def write(text: str) -> None:
 
 
 def size() -> tuple[int, int | None]:
-    """Columns and lines of the terminal; without a terminal, lines are None."""
+    """Columns and lines of the terminal.
+
+    Lines are None without a terminal, or if the terminal has 5 lines or fewer.
+    """
     columns, lines = shutil.get_terminal_size((WIDTH_WITHOUT_TERMINAL, 0))
     return columns, lines if sys.stdout.isatty() and lines > 5 else None
 

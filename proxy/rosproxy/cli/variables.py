@@ -28,13 +28,17 @@ class UnknownVariable(msgspec.Struct, frozen=True):
 
 
 def unknown(environment: Mapping[str, str], known_names: Collection[str]) -> list[UnknownVariable]:
-    """The variables of an environment that are probably meant for an option, but unknown."""
+    """The variables that are not in ``known_names``, but are probably meant for an option.
+
+    Such a variable begins with ROSPROXY_, or is very similar to a known name.
+    """
     variables = []
     for name, value in sorted(environment.items()):
         upper = name.upper()
         prefixed = name.upper().startswith(_PREFIX)
-        # Kubernetes sets NAME_PORT=tcp://10.96.0.7:11311 for a Service, too
-        # (pkg/kubelet/envvars/envvars.go, makeLinkVariables). Without a URL, NAME_PORT counts.
+        # Kubernetes also sets NAME_PORT=tcp://10.96.0.7:11311 for a Service
+        # (pkg/kubelet/envvars/envvars.go, makeLinkVariables). A NAME_PORT without a URL is from the
+        # user.
         linked = _SERVICE_LINK.search(upper) or (upper.endswith("_PORT") and "://" in value)
         if name in known_names or linked or not upper.startswith("ROS"):
             continue
@@ -45,7 +49,10 @@ def unknown(environment: Mapping[str, str], known_names: Collection[str]) -> lis
 
 
 def _nearest(name: str, known_names: Collection[str]) -> str:
-    """The known variable most similar to a name, without the common prefix; empty if none is."""
+    """The known variable that is most similar to a name; empty if none is similar enough.
+
+    If the name begins with ROSPROXY_, only the parts behind this prefix count.
+    """
     if not name.startswith(_PREFIX):
         return next(iter(difflib.get_close_matches(name, known_names, 1, _VERY_NEAR)), "")
     name_by_suffix = {n.removeprefix(_PREFIX): n for n in known_names if n.startswith(_PREFIX)}

@@ -187,7 +187,7 @@ async def test_the_range_is_tried_until_outside_gets_in(
         return tries[-1]
 
     monkeypatch.setattr("rosproxy.ros1.stack.probe_range", probe)
-    monkeypatch.setattr("rosproxy.app.self_check.RETRY_INTERVAL", 3.0)
+    monkeypatch.setattr("rosproxy.app.self_check.RETRY_INTERVAL_S", 3.0)
     proxy = await make_proxy()
     assert proxy.app.state().range_probe is None
     for count, reached in ((1, False), (2, False), (3, True)):
@@ -219,7 +219,7 @@ async def test_a_proven_range_is_tried_again_after_changes(
 
     monkeypatch.setattr("rosproxy.ros1.stack.probe_range", probe)
     monkeypatch.setattr("rosproxy.app.self_check.resolve", resolve)
-    monkeypatch.setattr("rosproxy.app.self_check.RETRY_INTERVAL", 40.0)
+    monkeypatch.setattr("rosproxy.app.self_check.RETRY_INTERVAL_S", 40.0)
     proxy = await make_proxy()
     await pass_time(3.1)
     await pass_time(100)
