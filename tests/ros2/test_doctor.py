@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosproxy.doctor.rules.participant import SETTLED
+from rosproxy.doctor.rules.participant import SETTLED_AFTER_S
 from rosproxy.net.addresses import HostPort
 from tests.ros.processes import wait_until
 from tests.ros.topology import run_command
@@ -44,7 +44,7 @@ def doctor_of_networks(lab: Lab) -> str:
     """The doctor's output once the proxy has settled. Before, the doctor reports no
     participants.
     """
-    wait_until("the proxy has settled", lambda: lab.status().uptime > SETTLED, 30)
+    wait_until("the proxy has settled", lambda: lab.status().uptime > SETTLED_AFTER_S, 30)
     return " ".join(lab.tool("doctor").split())
 
 

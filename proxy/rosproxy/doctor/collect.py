@@ -1,12 +1,12 @@
 """Gathers the facts for ``rosproxy doctor``.
 
-The doctor first asks the proxy (`AdminClient`), which knows its nodes, and whether outside reaches
-its ports. Then the doctor asks the master and the nodes of ROS 1 (`graph_survey`), and for ROS 2
+The doctor first asks the proxy (`AdminClient`) for its nodes, and whether outside reaches its
+ports. Then the doctor asks the master and the nodes of ROS 1 (`graph_survey`), and for ROS 2
 the participants on the networks inside (`domain_survey`). The rules judge the facts.
 
 The doctor changes nothing, except for a short-lived parameter at the master. With this parameter,
-the proxy has the master try the ports of the range (`range_probe`). The doctor tries names and
-addresses from the place where the doctor runs, which should be the place of the proxy.
+the proxy has the master try the ports of the range (`range_probe`). The doctor resolves names
+and tries addresses from where the doctor itself runs. It should run where the proxy runs.
 """
 
 import asyncio
@@ -82,7 +82,7 @@ async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
 
 
 def _all_here(status: ProxyStatus) -> bool:
-    """Whether the proxy does not serve ROS 1, has no LAN relay, and has only peers on loopback."""
+    """Whether all peers are on loopback; False with ROS 1 or with a LAN relay."""
     peers = [peer for domain in status.domains for peer in domain.peers]
     hosts = [target.host if (target := parse_host_port(peer)) else peer for peer in peers]
     lan_relays = [domain.lan_relay for domain in status.domains if domain.lan_relay]
@@ -94,8 +94,8 @@ async def collect_running(
 ) -> DoctorFacts:
     """Gather the facts for the live page, which may ask repeatedly.
 
-    ``choose`` picks the names to examine from the state of the master. The range is not tried, and
-    only a few questions to nodes are under way at once.
+    ``choose`` picks the names to examine from the state of the master. ``admin``: the URL of the
+    admin endpoint. The doctor does not try the range, and asks only a few nodes at once.
     """
     host = status.settings.advertise_host
     master = status.master

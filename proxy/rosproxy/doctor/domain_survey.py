@@ -3,7 +3,7 @@
 The proxy hears announcements to the multicast group of its own domains. The proxy hears neither a
 participant in another domain, nor a participant that announces itself only to its own machine
 (``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST``). But each participant answers the announcement of a
-new participant at once. So the doctor becomes a participant for WITHIN seconds. The doctor
+new participant at once. So the doctor becomes a participant for ANSWER_TIMEOUT_S. The doctor
 announces itself to the groups of all domains, and to all hosts (224.0.0.1, ff02::1) at the
 well-known ports of the proxy's domains. The doctor collects the answers, and ends with a dispose
 message. The doctor has no reader and no writer, so participants send nothing else.
@@ -34,12 +34,12 @@ from rosproxy.ros2.rewriting.announced_participant import traits
 from rosproxy.ros2.rewriting.discovery import Announcement, read_discovery
 from rosproxy.ros2.servers.groups import family_of, groups_of, send_through
 
-DOMAINS = 233
+DOMAIN_COUNT = 233
 """The number of domains: 0 to 232. The ports of further domains would exceed 65535."""
 ALL_HOSTS = {socket.AF_INET: "224.0.0.1", socket.AF_INET6: "ff02::1"}
-WITHIN = 2.0
-"""Seconds in which participants answer."""
-LEASE = 5.0
+ANSWER_TIMEOUT_S = 2.0
+"""Seconds for which the doctor collects answers."""
+LEASE_DURATION_S = 5.0
 """The lease duration of the doctor in seconds. Participants that miss the dispose message forget
 the doctor after this time."""
 MOST_HEARD = 200
@@ -47,9 +47,10 @@ MOST_HEARD = 200
 
 
 def ask_participants(network: str, domains: Collection[int]) -> list[HeardParticipant]:
-    """The participants that answer on a network (CIDR) of this machine. Takes WITHIN seconds.
+    """The participants that answer on a network (CIDR) of this machine, within ANSWER_TIMEOUT_S.
 
     ``domains``: in these domains, the doctor also asks participants that don't hear the group.
+    Empty if this machine is not in the network, or if the network has no multicast.
     """
     with contextlib.suppress(ValueError, OSError):  # no valid network; gone, or no multicast
         inside_network = ip_network(network)
@@ -60,7 +61,10 @@ def ask_participants(network: str, domains: Collection[int]) -> list[HeardPartic
 
 
 def heard_participant(datagram: bytes, source: str) -> HeardParticipant | None:
-    """The participant that announces itself in a datagram; None without participant or domain."""
+    """The participant that announces itself in a datagram.
+
+    None for any other datagram, for a dispose message, and if the domain is unknown.
+    """
     try:
         message = read_discovery(datagram)
         prefix = message.prefix
@@ -84,8 +88,8 @@ def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
         prefix = os.urandom(PREFIX_BYTES)
         targets = list(_targets(own_address, domains))
         own_locator = HostPort(own_address, sock.getsockname()[1])
-        _send(sock, announcement(prefix, [own_locator], LEASE, SPDP_ENDPOINTS), targets)
-        deadline = time.monotonic() + WITHIN
+        _send(sock, announcement(prefix, [own_locator], LEASE_DURATION_S, SPDP_ENDPOINTS), targets)
+        deadline = time.monotonic() + ANSWER_TIMEOUT_S
         while len(by_prefix) < MOST_HEARD and (remaining := deadline - time.monotonic()) > 0:
             sock.settimeout(remaining)
             with contextlib.suppress(TimeoutError):
@@ -97,7 +101,7 @@ def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
 
 
 def _targets(own_address: str, domains: Collection[int]) -> Iterator[tuple[str, int]]:
-    for domain in range(DOMAINS):
+    for domain in range(DOMAIN_COUNT):
         for group in groups_of(own_address):
             yield group, SPDP_MULTICAST + PORTS_PER_DOMAIN * domain
     for domain in domains:
@@ -114,7 +118,10 @@ def _send(sock: socket.socket, datagram: bytes, targets: Iterable[tuple[str, int
 
 
 def _domain(announced: Announcement, datagram: bytes, source: str) -> int | None:
-    """The domain that a participant announces, else the domain of its well-known port, or None."""
+    """The domain that a participant announces, else the domain of its port for discovery.
+
+    None without such a port.
+    """
     domain = traits(announced, datagram, source).domain
     if domain is not None:
         return domain

@@ -47,9 +47,9 @@ class Attempt(msgspec.Struct, frozen=True):
 class MasterFacts(msgspec.Struct, frozen=True):
     """The facts about the master.
 
-    ``addresses``: the addresses of the host. ``at_root``: the master answers at the path ``/``,
-    although not at the path of ``uri``. ``is_this_proxy``: ``uri`` leads back to the proxy.
-    ``round_trip``: seconds of a call.
+    ``addresses``: the addresses of the host in ``uri``. ``at_root``: the master answers at the path
+    ``/``, although not at the path of ``uri``. ``is_this_proxy``: ``uri`` leads back to the proxy.
+    ``round_trip``: seconds until the call ended; None without a call.
     """
 
     uri: str
@@ -126,7 +126,7 @@ class NodeFacts(msgspec.Struct, frozen=True):
 
     @property
     def slave(self) -> HostPort | None:
-        """Host and port of the slave URI."""
+        """Host and port of the slave URI; None if the URI is empty or malformed."""
         return parse_slave_uri(self.uri)
 
 
@@ -201,7 +201,7 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
         for subscriber in graph.subscribers.get(topic, ())
         if _is_asked_for({publisher, subscriber}, {*nodes})
     ]
-    lonely = [
+    one_sided = [
         topic
         for topic in candidates
         if not (graph.publishers.get(topic) and graph.subscribers.get(topic))
@@ -212,7 +212,7 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
     asked_nodes = {*nodes, *(node for name in services for node in graph.services[name])}
     sides = {node for _, *ends in pairs for node in ends}
     sides |= {node for topic in topics for node in graph.sides(topic)}
-    return Scope(nodes, pairs, lonely, services, unknown, frozenset(asked_nodes | sides))
+    return Scope(nodes, pairs, one_sided, services, unknown, frozenset(asked_nodes | sides))
 
 
 def _is_asked_for(pair: set[str], nodes: set[str]) -> bool:
@@ -279,12 +279,12 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def leases(self) -> dict[int, EndpointStatus]:
-        """The endpoints in ``status``, by advertised port."""
+        """The endpoints of ROS 1 in ``status``, by advertised port."""
         slaves = ((parse_slave_uri(n.advertised_uri), n) for n in self.proxy.nodes)
         return {slave.port: node for slave, node in slaves if slave}
 
     def lease(self, host_port: HostPort | None) -> EndpointStatus | None:
-        """The endpoint at an address from the master, if the address belongs to this proxy."""
+        """The endpoint of this proxy at an address from the master; None if there is none."""
         return self.leases.get(host_port.port) if host_port and self.is_ours(host_port) else None
 
     def is_ours(self, host_port: HostPort | None) -> bool:

@@ -2,8 +2,9 @@
 
 1. Ask the master for all publishers, subscribers and services (``getSystemState``, ``lookupNode``).
 2. Ask every node, or the nodes in the scope, whether the node answers (``getPid``).
-3. Ask the nodes in the scope for topics and connections (``getBusInfo``), and try the TCPROS ports
-   of unconnected pairs.
+3. With names in the user's question: ask the nodes in the scope for topics and connections
+   (``getPublications``, ``getSubscriptions``, ``getBusInfo``, ``getBusStats``). Try the TCPROS
+   ports of unconnected pairs, and the services in the scope.
 """
 
 import asyncio
@@ -36,20 +37,23 @@ from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, pa
 from rosproxy.ros1.registry.remembered_leases import NAMESPACE, lease_at
 from rosproxy.telemetry.metrics import Metrics
 
-PARALLEL = 32
-"""Questions under way at once; fewer than the look-ups of names (`rosproxy.net.resolver`)."""
-FEW_PARALLEL = 4
-"""Questions under way at once for the live page, which asks repeatedly."""
-WITHIN = 3.0
+MOST_QUESTIONS = 32
+"""Nodes asked at once; fewer than the look-ups of names (`rosproxy.net.resolver`)."""
+MOST_PAGE_QUESTIONS = 4
+"""Nodes asked at once for the live page, which asks repeatedly."""
+ANSWER_TIMEOUT_S = 3.0
 """Seconds in which a node must answer."""
 
 Key = TypeVar("Key")
 Result = TypeVar("Result")
 
 
-async def look_at_master(uri: str, name: str, address: str | None) -> MasterFacts:
-    """Ask the master, as the proxy with the instance ``name``. ``address`` replaces the host."""
-    client = MasterClient(uri, name, Metrics(), address)
+async def look_at_master(uri: str, instance: str, address: str | None) -> MasterFacts:
+    """Ask the master, in the name of the proxy with this ``instance``.
+
+    ``address``: the IP address to use instead of the host in ``uri``; None: resolve the host.
+    """
+    client = MasterClient(uri, instance, Metrics(), address)
     try:
         return await _Collector(client, client).master()
     finally:
@@ -62,7 +66,10 @@ async def ask_graph(
     address: str | None = None,
     choose: Callable[[SystemState], tuple[str, ...]] | None = None,
 ) -> DoctorFacts:
-    """Add the facts about the master and the nodes.
+    """Add the facts about the master and the nodes; without ``uri``, add nothing.
+
+    ``address``: see `look_at_master`. ``choose``: picks the names to examine from the state of the
+    master.
 
     The doctor calls the master in the name of the proxy's instance. So a proxy whose master URI
     leads to itself refuses the call as a loop. The doctor calls nodes in another name, since calls
@@ -97,7 +104,7 @@ class _Collector:
         self._master = master
         self._nodes = nodes
         self._choose = choose
-        self._limit = asyncio.Semaphore(FEW_PARALLEL if choose else PARALLEL)
+        self._limit = asyncio.Semaphore(MOST_PAGE_QUESTIONS if choose else MOST_QUESTIONS)
 
     async def master(self) -> MasterFacts:
         """Examine the master: host name, answer, path, and whether the URI leads to the proxy."""
@@ -120,12 +127,15 @@ class _Collector:
         return master
 
     async def published_master(self, facts: DoctorFacts) -> Attempt:
-        """Try the master at the advertised host and the port of ``--publish-master``."""
+        """Try the master at the advertised host and the port of ``--publish-master``, if set."""
         port = facts.proxy.settings.publish_master
         return await self._ask_pid(HostPort(facts.advertise_host, port)) if port else Attempt()
 
     async def master_state(self, facts: DoctorFacts) -> DoctorFacts:
-        """Add the graph, and which nodes answer. Raises Unreachable, MasterError."""
+        """Add the graph, and which nodes answer; examine the names in the user's question.
+
+        Raises Unreachable, MasterError.
+        """
         graph = system_state(await self._master.call_master("getSystemState"))
         names = sorted(graph.names())
         uris = await self._master.look_up("lookupNode", names)
@@ -189,7 +199,7 @@ class _Collector:
         return replace(node, addresses=addresses, attempt=attempt)
 
     async def _ask_pid(self, target: HostPort) -> Attempt:
-        attempt, pid = await _attempt(self._nodes.call_node(target, WITHIN, "getPid"))
+        attempt, pid = await _attempt(self._nodes.call_node(target, ANSWER_TIMEOUT_S, "getPid"))
         if attempt.failed or isinstance(pid, int):
             return attempt
         return Attempt(ReachOutcome.STRANGER, "the answer is not that of a node")
@@ -203,10 +213,10 @@ class _Collector:
         methods = ("getPublications", "getSubscriptions", "getBusInfo")
         try:
             async with self._limit:
-                pubs, subs, bus = [await ask(slave, WITHIN, method) for method in methods]
+                pubs, subs, bus = [await ask(slave, ANSWER_TIMEOUT_S, method) for method in methods]
                 at = time.monotonic()
                 # Last: some client libraries do not answer getBusStats.
-                _, stats = await _attempt(ask(slave, WITHIN, "getBusStats"))
+                _, stats = await _attempt(ask(slave, ANSWER_TIMEOUT_S, "getBusStats"))
         except (Unreachable, MasterError):
             return node
         return replace(node, report=slave_report(pubs, subs, bus, stats, at))
@@ -214,13 +224,17 @@ class _Collector:
     async def _try_data_port(
         self, facts: DoctorFacts, publisher: str, topic: str
     ) -> tuple[str, Attempt]:
-        """The TCPROS address of a publisher for a topic, and the attempt to connect."""
+        """The TCPROS address of a publisher for a topic, and the attempt to connect.
+
+        The address is empty if the publisher gives none. The attempt is UNTRIED for a publisher
+        behind this proxy, and for a publisher that has sent no report.
+        """
         node = facts.nodes[publisher]
         slave = _reached_at(facts, node.slave)
         if slave is None or node.report is None:
             return "", Attempt()
         attempt, answer = await _attempt(
-            self._nodes.call_node(slave, WITHIN, "requestTopic", topic, [["TCPROS"]])
+            self._nodes.call_node(slave, ANSWER_TIMEOUT_S, "requestTopic", topic, [["TCPROS"]])
         )
         target = data_port(answer)
         if attempt.failed:
@@ -270,7 +284,7 @@ async def _shake_hands(target: HostPort, header: Mapping[str, str]) -> Attempt:
     if not addresses:
         return Attempt(ReachOutcome.UNRESOLVABLE)
     try:
-        async with asyncio.timeout(WITHIN):
+        async with asyncio.timeout(ANSWER_TIMEOUT_S):
             reply = await _exchange(HostPort(addresses[0], target.port), header)
     except (ConnectionError, EOFError):
         return Attempt(ReachOutcome.REFUSED)
@@ -304,7 +318,7 @@ def _node_facts(name: str, uri: str, leases: object) -> NodeFacts:
 
 
 async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
-    """How a question ended, and the answer; None without an answer."""
+    """How a question ended, and the answer. The answer is None if the question failed."""
     try:
         return Attempt(ReachOutcome.ANSWERED), await question
     except (Unreachable, MasterError) as error:

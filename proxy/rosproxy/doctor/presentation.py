@@ -9,11 +9,11 @@ from rosproxy.admin.doctor_finding import DoctorFinding, Severity, failed
 from rosproxy.telemetry.text import clean, plural, wrap
 
 MOST_ALIKE = 10
-"""Findings of the same check with the same fix that are shown in full."""
+"""Findings of the same check with the same fix that are shown at most."""
 INDENT = " " * 9
 
 
-_WORDS = {
+_SEVERITY_WORDS = {
     Severity.OK: "ok",
     Severity.INFO: "note",
     Severity.WARNING: "WARNING",
@@ -28,7 +28,7 @@ def as_json(findings: Sequence[DoctorFinding]) -> dict[str, Any]:
 
 
 def render(findings: Sequence[DoctorFinding], columns: int) -> str:
-    """The findings as text. The worst are last, next to the prompt."""
+    """The findings as text, wrapped to ``columns``. The worst are last, next to the prompt."""
     lines: list[str] = []
     for severity in Severity:
         lines += _grouped([f for f in findings if f.severity is severity], columns)
@@ -43,7 +43,7 @@ def _grouped(findings: Sequence[DoctorFinding], columns: int) -> Iterator[str]:
     for (check, fix), group in alike.items():
         for finding in group[:MOST_ALIKE]:
             subject = f"{clean(finding.subject)}: " if finding.subject else ""
-            first = f"{_WORDS[finding.severity]:<{len(INDENT)}}"
+            first = f"{_SEVERITY_WORDS[finding.severity]:<{len(INDENT)}}"
             yield from wrap(subject + clean(finding.text), columns, INDENT, first)
         if len(group) > MOST_ALIKE:
             yield f"{INDENT}... and {len(group) - MOST_ALIKE} more like this ({check}): see --json"
@@ -58,7 +58,7 @@ def _summary(findings: Sequence[DoctorFinding]) -> str:
         return "Nothing wrong was found."
     counts = f"{plural(errors, 'error')}, {plural(warnings, 'warning')}."
     worst = [f for f in findings if f.severity is max(severities)]
-    # A single fix for all findings needs no advice where to begin.
+    # If a single fix corrects all findings, no advice where to begin is needed.
     if len({f.fix for f in findings if f.severity >= Severity.WARNING}) == 1:
         return counts
     first = clean(worst[0].subject or worst[0].check)

@@ -336,7 +336,7 @@ async def test_many_nodes_are_looked_at_together(
     proxy: Proxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A hundred nodes that do not answer must not take a hundred time-outs."""
-    monkeypatch.setattr("rosproxy.doctor.graph_survey.WITHIN", 0.5)
+    monkeypatch.setattr("rosproxy.doctor.graph_survey.ANSWER_TIMEOUT_S", 0.5)
     silent = FakeHttpServer(hang)
     await silent.start(OUTSIDE)
     for number in range(100):

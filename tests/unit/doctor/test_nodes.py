@@ -97,7 +97,7 @@ def test_nobody_uses_the_proxy() -> None:
 
 
 def test_a_proxy_that_has_just_started_misses_no_node_yet() -> None:
-    young = {**make_status(), "uptime": node_rules.FIRST_NODE - 0.1}
+    young = {**make_status(), "uptime": node_rules.FIRST_NODE_TIMEOUT_S - 0.1}
     findings = check(make_facts(status=young, nodes={}))
     assert [f.severity for f in findings if f.check == "inside node"] == [Severity.INFO]
 

@@ -21,10 +21,13 @@ OUTSIDE = "node"
 STALE = "stale registration"
 TWO_PROXIES = "two proxies"
 _ENDED = ("refused", "silent", "failing", "cleaned")
-FIRST_NODE = 10.0
-"""Seconds after the start of the proxy in which a proxy without nodes is no fault: an operator
-starts the proxy and the nodes at the same time."""
+FIRST_NODE_TIMEOUT_S = 10.0
+"""Seconds after the start in which a proxy without nodes is no fault.
+
+An operator starts the proxy and the nodes at the same time.
+"""
 CLEANUP = "run rosnode cleanup (answer y)"
+"""The fix that unregisters all nodes that do not answer."""
 # The default host name of a container (moby daemon/container.go).
 _CONTAINER_ID = re.compile(r"[0-9a-f]{12}")
 
@@ -41,9 +44,10 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def _cause_first(findings: list[DoctorFinding]) -> list[DoctorFinding]:
-    """The findings, without the advice to clean up if two proxies share host and ports.
+    """Put findings about two proxies first, and remove CLEANUP from the fixes of the others.
 
-    A clean-up would then unregister nodes that are alive.
+    If two proxies share host and ports, a clean-up would unregister nodes that are alive. Without
+    such a finding, nothing changes.
     """
     first = [f for f in findings if f.check == TWO_PROXIES]
     if not first:
@@ -65,7 +69,7 @@ def _counts(facts: DoctorFacts, findings: list[DoctorFinding]) -> Iterator[Docto
         yield report(INSIDE, "inside nodes", text)
     elif facts.status is not None:
         text = "no node has registered through the proxy"
-        report = warning if facts.proxy.uptime >= FIRST_NODE else note
+        report = warning if facts.proxy.uptime >= FIRST_NODE_TIMEOUT_S else note
         yield report(INSIDE, "inside nodes", text, _start_inside(facts, "the nodes"))
     if facts.graph is not None:
         faulty = {f.subject for f in findings if f.severity is Severity.ERROR}
@@ -77,7 +81,7 @@ def _counts(facts: DoctorFacts, findings: list[DoctorFinding]) -> Iterator[Docto
 def _present_and_ended(
     nodes: Sequence[EndpointStatus],
 ) -> tuple[list[EndpointStatus], list[EndpointStatus]]:
-    """The nodes that are present or should be, and the nodes that have ended properly.
+    """The nodes that are present or should be, and the nodes whose end is no fault.
 
     A node has ended if its container is gone, if the node has no registrations any more, or if a
     node with the same name answers at another address. An ended node keeps its port for a while.
@@ -137,7 +141,7 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
 
 
 def _only_on_loopback(node: EndpointStatus) -> bool:
-    """Whether a node gives a loopback address, but is not on the loopback of the proxy."""
+    """Whether a node states a loopback address, but the proxy reaches the node at another one."""
     claimed = parse_slave_uri(node.uri)
     actual = parse_host_port(node.address)
     return bool(claimed and actual and is_loopback(claimed.host) and not is_loopback(actual.host))
@@ -237,7 +241,7 @@ def _unresolvable(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> Docto
 
 
 def _fix_proxied(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> str:
-    """The fix for a node behind a proxy that does not answer.
+    """The fix for a node that is registered through a proxy, but does not answer.
 
     A clean-up is the last resort: a proxy that starts again takes its nodes back.
     """
@@ -259,7 +263,7 @@ def _fix_proxied(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> str:
 
 
 def _past_the_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
-    """Whether a node's address is in an inside network that the master is not in."""
+    """Whether a node's address is in an inside network, and the master is not in that network."""
     if facts.master is None:
         return False
     networks = [ip_network(text) for text in facts.proxy.settings.inside_networks]

@@ -12,7 +12,8 @@ from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.telemetry.text import listed, quoted, size
 
 PAIR = "pair"
-ANY = "*"
+"""The check of all findings here, except UNKNOWN_NAME."""
+ANY_TYPE = "*"
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
@@ -25,7 +26,7 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         return
     scope = facts.scope
     yield from (_unknown(facts, name) for name in scope.unknown)
-    yield from (_lonely(facts, topic) for topic in scope.one_sided_topics)
+    yield from (_one_sided_topic(facts, topic) for topic in scope.one_sided_topics)
     yield from (judge_pair(facts, *pair) for pair in scope.pairs)
     yield from (_service(facts, service) for service in scope.services)
     together = [name for name in facts.names if name not in {*scope.services, *scope.unknown}]
@@ -48,7 +49,7 @@ def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
     return error(UNKNOWN_NAME, name, text, fix)
 
 
-def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
+def _one_sided_topic(facts: DoctorFacts, topic: str) -> DoctorFinding:
     graph = facts.system
     published = bool(graph.publishers.get(topic))
     verb, lacks = ("published", "subscribes to") if published else ("subscribed to", "publishes")
@@ -65,7 +66,7 @@ def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
 
 
 def judge_pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) -> DoctorFinding:
-    """The finding whether a publisher and a subscriber are connected, or why not."""
+    """The finding that a publisher and a subscriber are connected, or why they are not."""
     publisher_node = facts.nodes[publisher]
     subscriber_node = facts.nodes[subscriber]
     label = f"{topic} from {publisher} to {subscriber}"
@@ -73,7 +74,7 @@ def judge_pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) 
         return ok(
             PAIR, label, "connected" + _traffic(facts, topic, publisher_node, subscriber_node)
         )
-    text, fix = _why(facts, topic, publisher_node, subscriber_node)
+    text, fix = _reason_unconnected(facts, topic, publisher_node, subscriber_node)
     return error(PAIR, label, f"not connected: {text}", fix)
 
 
@@ -98,10 +99,10 @@ def _traffic(facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: N
     return ""
 
 
-def _why(
+def _reason_unconnected(
     facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: NodeFacts
 ) -> tuple[str, str]:
-    """Reason and fix for an unconnected pair; the most certain reason first."""
+    """Reason and fix for an unconnected pair: the most certain reason."""
     for node in (publisher, subscriber):
         if _unreachable(facts, node):
             return (
@@ -110,8 +111,8 @@ def _why(
             )
     # Without a report, the types count as equal. A subscriber of any type has the type *
     # (rospy.AnyMsg).
-    offered = publisher.report.publishes.get(topic) if publisher.report else ANY
-    wanted = subscriber.report.subscribes.get(topic) if subscriber.report else ANY
+    offered = publisher.report.publishes.get(topic) if publisher.report else ANY_TYPE
+    wanted = subscriber.report.subscribes.get(topic) if subscriber.report else ANY_TYPE
     if offered is None:
         return (
             f"{publisher.name} is registered as a publisher, but does not publish {topic}",
@@ -122,11 +123,11 @@ def _why(
             f"{subscriber.name} is registered as a subscriber, but does not subscribe to {topic}",
             f"restart {quoted(subscriber.name)}",
         )
-    if ANY not in (offered, wanted) and offered != wanted:
+    if ANY_TYPE not in (offered, wanted) and offered != wanted:
         text = f"types differ: {publisher.name} publishes {offered}, "
         text += f"{subscriber.name} subscribes to {wanted}"
         return text, "use the same message type on both sides"
-    return _why_no_transport(facts, topic, publisher, subscriber)
+    return _reason_without_transport(facts, topic, publisher, subscriber)
 
 
 def _unreachable(facts: DoctorFacts, node: NodeFacts) -> bool:
@@ -136,7 +137,7 @@ def _unreachable(facts: DoctorFacts, node: NodeFacts) -> bool:
     return node.attempt.failed or node.slave is None
 
 
-def _why_no_transport(
+def _reason_without_transport(
     facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: NodeFacts
 ) -> tuple[str, str]:
     address, attempt = facts.data_ports.get((publisher.name, topic), ("", Attempt()))
@@ -162,12 +163,12 @@ def _why_no_transport(
             f"nc -vz {quoted(slave.host)} {slave.port}; then {restart}",
         )
     if facts.is_ours(subscriber.slave) and not facts.is_ours(publisher.slave):
-        return _why_not_from_inside(facts, address, publisher, subscriber)
+        return _reason_from_inside(facts, address, publisher, subscriber)
     text = "both nodes answer and the types match. Perhaps the message definitions differ (md5sum)"
     return text, f"read the log of {quoted(subscriber.name)}; {restart}"
 
 
-def _why_not_from_inside(
+def _reason_from_inside(
     facts: DoctorFacts, address: str, publisher: NodeFacts, subscriber: NodeFacts
 ) -> tuple[str, str]:
     """Reason and fix if a subscriber behind the proxy has not connected to a sound publisher."""

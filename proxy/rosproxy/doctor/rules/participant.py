@@ -14,16 +14,20 @@ from rosproxy.net.addresses import parse_host_port
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, participant_label
 from rosproxy.telemetry.text import listed, plural
 
-RECENT = 120.0
-"""Seconds for which the doctor reports a refusal. Lasting refusals are noted again sooner."""
-SETTLED = 10.0
-"""Seconds after the start of the proxy in which the status may lack participants. The proxy may
-still ask these participants for their former ports (`rosproxy.ros2.ports.former_ports`)."""
+RECENT_S = 120.0
+"""Seconds for which the doctor reports a refusal. The proxy notes a lasting refusal more often."""
+SETTLED_AFTER_S = 10.0
+"""Seconds after the start of the proxy in which the status may lack participants.
+
+The proxy may still ask these participants for their former ports
+(`rosproxy.ros2.ports.former_ports`).
+"""
 OTHER_DOMAIN = "domain"
 """The check for a participant on a network inside that is in another domain."""
 OWN_MACHINE = "range"
-"""The check for a participant on a network inside that announces itself on its own machine."""
+"""The check for a participant on a network inside that announces itself only on its own machine."""
 HIDDEN = "refused: hidden source"
+"""The subject of the only refusal that is an error."""
 _REFUSED = {
     "refused: no locator": (
         "where the participant runs: for (tcp) unset FASTDDS_BUILTIN_TRANSPORTS; for (loopback) "
@@ -44,7 +48,7 @@ _REFUSED = {
 def check(facts: DoctorFacts) -> list[DoctorFinding]:
     """All findings about the domains."""
     domains = facts.proxy.domains
-    is_settled = facts.proxy.uptime >= SETTLED
+    is_settled = facts.proxy.uptime >= SETTLED_AFTER_S
     findings = [finding for domain in domains for finding in _domain(domain, is_settled)]
     if is_settled:
         findings += [
@@ -55,7 +59,7 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
             "refused", problem.subject, problem.text, _refused_fix(problem.subject)
         )
         for problem in facts.proxy.problems
-        if domains and problem.subject in _REFUSED and problem.age < RECENT
+        if domains and problem.subject in _REFUSED and problem.age < RECENT_S
     ]
     if domains and not facts.proxy.settings.for_ros1:
         findings += [finding for name in facts.names for finding in _name_in_domains(name, domains)]
@@ -95,7 +99,10 @@ def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
 
 
 def _silence(domain: DomainStatus) -> Iterator[DoctorFinding]:
-    """The findings about peers, or all of outside, without a participant that was heard."""
+    """A note for each peer at which no participant was heard.
+
+    If none was heard outside at all: a single note.
+    """
     fix = (
         "start a participant there with the same ROS_DOMAIN_ID, and "
         f"{how_to('publish for UDP')}. Cyclone DDS with multicast takes ports that the proxy does "

@@ -11,7 +11,7 @@ from rosproxy.zenoh.findings import ROUTERS, faults
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """All findings; none without routers."""
+    """All findings about rmw_zenoh; none if the proxy has no routers."""
     zenoh = facts.proxy.zenoh
     if zenoh is None:
         return
@@ -22,9 +22,9 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     yield from _nodes(zenoh)
     is_alone = not facts.proxy.settings.for_ros1 and not facts.proxy.domains
     for name in facts.names:
-        told = [*_about(zenoh, name)]
-        yield from told
-        if not told and is_alone:
+        about_name = [*_about(zenoh, name)]
+        yield from about_name
+        if not about_name and is_alone:
             text = "no node has this name, and no node has a topic or service of this name"
             fix = f"compare with the names in the status: {how_to('status')}"
             yield error(UNKNOWN_NAME, name, text, fix)
