@@ -1,13 +1,14 @@
 """Fixes: the options that correct a fault, or the labels and fields that an operator reads instead.
 
-The fix depends on the program that has started the proxy. An operator sets the variable VARIABLE of
-its proxies. Without this variable, a user has started the proxy by hand.
+The fix depends on the program that has started the proxy. An operator sets VARIABLE in the
+environment of its proxies. Without this variable, a user has started the proxy by hand.
 """
 
 from enum import IntEnum
 from typing import NamedTuple
 
 VARIABLE = "ROSPROXY_OPERATOR"
+"""The environment variable with the name of the operator: ``docker`` or ``kubernetes``."""
 
 
 class Operator(IntEnum):
@@ -19,7 +20,7 @@ class Operator(IntEnum):
 
 
 class Fix(NamedTuple):
-    """An imperative for each operator, without a full stop, with fields of `str.format`."""
+    """An imperative for each operator, without a full stop at the end, with `str.format` fields."""
 
     by_hand: str
     docker: str
@@ -190,20 +191,27 @@ FIXES = {
 """The fixes by a key, which names what to set or to run."""
 
 _speaks_for = [Operator.NONE]
+"""The operator whose fixes this process gives; a list, so that `speak_for` can replace it."""
 
 
 def speak_for(operator: str) -> None:
-    """Have this process give the fixes of an operator, by its name in VARIABLE."""
+    """Have this process give the fixes of an operator, named as in VARIABLE.
+
+    Any other text stands for a proxy that a user has started by hand.
+    """
     names = {o.name.lower(): o for o in (Operator.DOCKER, Operator.KUBERNETES)}
     _speaks_for[0] = names.get(operator, Operator.NONE)
 
 
 def how_to(key: str, **fields: object) -> str:
-    """What to do, an imperative in lower case without a full stop; ``key`` is that of FIXES."""
+    """What to do: an imperative that begins in lower case, without a full stop at the end.
+
+    ``key``: a key of FIXES. ``fields``: all fields in the text of this fix.
+    """
     return FIXES[key][_speaks_for[0]].format(**fields)
 
 
 def how_to_in_a_sentence(key: str, **fields: object) -> str:
-    """What to do, an imperative with a capital letter, without a full stop."""
+    """`how_to`, with a capital letter at the beginning."""
     text = how_to(key, **fields)
     return text[:1].upper() + text[1:]

@@ -16,8 +16,9 @@ from rosproxy.net.addresses import HostPort, plain_address
 log = logging.getLogger(__name__)
 
 DATAGRAMS_PER_TURN = 64
-"""Datagrams that a relay forwards in a round of the event loop."""
+"""Datagrams that a relay reads at most in a round of the event loop."""
 LARGEST_DATAGRAM = 65_536
+"""Bytes of a datagram that are read at most."""
 RECEIVE_BUFFER_BYTES = 1024 * 1024
 """Bytes that wait while the event loop is busy; Linux grants rmem_max at most."""
 
@@ -38,11 +39,12 @@ def bind(address: str, port: int) -> socket.socket:
 
 
 class DatagramRelay:
-    """Forwards the datagrams that some addresses send to a bound socket to a target.
+    """Forwards datagrams from the addresses ``sources`` to ``target``.
 
-    ``sent`` counts forwarded bytes, ``dropped`` the datagrams of other sources. ``ended`` is called
-    when the target refuses, and has to `close` the relay. Raises OSError if the kernel refuses the
-    target. Needs a running event loop.
+    ``sock`` is the bound socket that receives the datagrams. ``sent`` counts forwarded bytes,
+    ``dropped`` the datagrams of other sources. If the target refuses, the relay calls ``ended``,
+    which has to `close` the relay. If the kernel refuses the target, raises OSError and closes
+    ``sock``. Needs a running event loop.
     """
 
     def __init__(

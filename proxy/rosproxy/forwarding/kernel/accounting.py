@@ -9,7 +9,7 @@ from rosproxy.forwarding.kernel.nft import Counters, Counts
 from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
 
 SILENCE_WINDOW_S = 2.0
-"""Seconds at least in which the proxy waits for bytes from the node behind a port."""
+"""Shortest window, in seconds, in which a node must send bytes (`UnansweredPorts`)."""
 
 
 @dataclass(slots=True)
@@ -105,7 +105,11 @@ class KernelAccounts:
         return any(owner is endpoint for owner in self.owners.values())
 
     def count(self, counters: Counters, now: float) -> list[tuple[str, Counts]]:
-        """Add a reading of the counters; return the counts since the last reading, by node name."""
+        """Add a reading of the counters at ``now`` (s); return the counts since the last reading.
+
+        The counts stand by node name. ``sent`` are bytes from inside to outside, for nodes of both
+        sides.
+        """
         elapsed = now - self._counted_at
         self._counted_at = now
         for account in self._accounts.values():
@@ -140,7 +144,7 @@ class KernelAccounts:
             endpoint.fast_peers = dict(counts)
 
     def account(self, endpoint: LeaseHolder) -> Account:
-        """The traffic through the fast ports of an endpoint so far."""
+        """The traffic through the fast ports of an endpoint so far; zeros without traffic."""
         return self._accounts.get(endpoint, Account())
 
     def ports_of(self, endpoint: LeaseHolder) -> list[int]:

@@ -1,8 +1,8 @@
 """The table for TCP: the kernel tracks each connection, and forwards it by DNAT and masquerade.
 
 The table has the mark of each port, and sets that count bytes by mark. ``cut`` has the marks of
-connections that are being ended. ``inward`` has the ports of nodes outside, and ``near4`` and
-``near6`` the networks that may use those ports. Three chains use them:
+connections that are being ended. ``inward`` has the ports that lead to nodes outside. ``near4`` and
+``near6`` have the networks that may use the ports in ``inward``. The table has three chains:
 
 - prerouting: a connection to an address of this machine gets the mark of its port, and leads to the
   node. New connections have a limit, and those over the limit stay with the proxy's own socket;

@@ -19,7 +19,7 @@ from rosproxy.net.addresses import HostPort
 MOST_PEERS = 256
 """Addresses of peers of a port that have separate counts; OTHERS counts all further connections."""
 OTHERS = "others"
-"""The name of all further peers."""
+"""The name that stands for all further peers of a port."""
 MOST_WAITING = 64
 """Unanswered connections of a port that are watched at most; a single one proves the fault."""
 
@@ -57,7 +57,7 @@ class Survey:
 
     @property
     def open(self) -> OpenConnections:
-        """The numbers of open connections."""
+        """The numbers of open (established) connections."""
         return self._open
 
     @property
@@ -96,6 +96,10 @@ class Watch:
         self._since: dict[Flow, float] = {}
 
     def look(self, waiting: Iterable[Flow], now: float) -> list[Flow]:
-        """Return these connections, given all unanswered connections at the time ``now``."""
+        """The connections that have been unanswered for ``patience`` seconds.
+
+        ``waiting``: all unanswered connections at the time ``now``, in seconds. A connection that
+        is missing there counts as new if it appears again.
+        """
         self._since = {flow: self._since.get(flow, now) for flow in waiting}
         return [flow for flow, since in self._since.items() if now - since >= self._patience]

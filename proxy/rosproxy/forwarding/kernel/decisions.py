@@ -39,7 +39,8 @@ def destination(
 
     The target has the address at which the proxy has found the node, and the port that the node
     itself has named. So a forged registration can't make the kernel forward to another host.
-    ``route`` is the route to that address.
+    ``route`` is the route to that address. ``has_connections``: the kernel tracks connections, as
+    for TCP.
     """
     ports = endpoint.node_ports
     if endpoint.is_down or not endpoint.trusted:
@@ -80,8 +81,8 @@ def forwards_to_keep(
 ) -> dict[int, HostPort]:
     """The forwards of the earlier process that stay for now.
 
-    Until the registry is rebuilt (``recovered``), all forwards stay. Afterwards a forward stays if
-    the proxy has not heard the node yet, and the forward leads to the address of the endpoint.
+    ``recovered``: the registry is rebuilt. Until then, all forwards stay. Afterwards a forward
+    stays if the endpoint is not ``trusted`` yet, and the forward leads to the endpoint's address.
     """
     if not recovered:
         return dict(current)
@@ -133,7 +134,7 @@ class Pauses:
         self._until: dict[tuple[int, HostPort], tuple[float, float, str]] = {}
 
     def note(self, port: int, target: HostPort, why: str, now: float) -> None:
-        """Note a failure at the time ``now``; each further pause is twice as long."""
+        """Note a failure at the time ``now`` (s); each further pause is twice as long."""
         _, pause, _ = self._until.get((port, target), (0.0, FIRST_PAUSE_S / 2, ""))
         pause = min(2 * pause, LONGEST_PAUSE_S)
         self._until[port, target] = now + pause, pause, why
@@ -144,5 +145,5 @@ class Pauses:
         return why if now < until else None
 
     def keep(self, ports: Collection[int]) -> None:
-        """Forget the failures of all other ports."""
+        """Forget the failures of all ports that are not in ``ports``."""
         self._until = {key: value for key, value in self._until.items() if key[0] in ports}

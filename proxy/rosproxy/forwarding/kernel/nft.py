@@ -53,8 +53,8 @@ class TableState(msgspec.Struct, frozen=True):
 class Surroundings(msgspec.Struct, frozen=True):
     """Facts that a table needs besides the forwards.
 
-    ``near`` are the networks that may use the forwards to nodes outside. ``sources`` has the
-    address of this machine from which packets go to each host, by the host's address.
+    ``near`` are the networks that may use the forwards to nodes outside. ``sources``, by the
+    address of a host: the address of this machine from which packets go to this host.
     """
 
     near: Near = ()
@@ -147,7 +147,7 @@ class Table(ABC):
         }
 
     def element_document(self, verb: str, elements: Elements) -> str:
-        """The document that adds or deletes elements."""
+        """The document that adds or deletes elements; ``verb`` is ``add`` or ``delete``."""
         return "".join(
             f"{verb} element inet {self.name} {name} {{ {', '.join(listed)} }}\n"
             for name, listed in elements.items()
@@ -176,7 +176,7 @@ _NOTHING = 0, 0
 
 
 def checked(host: str) -> str:
-    """A host that is an address; "?" for any other host, so that nft refuses the whole document."""
+    """The host if it is an address without a zone, else "?": nft then refuses the document."""
     return host if is_address(host) and "%" not in host else "?"
 
 
@@ -202,7 +202,7 @@ def _objects(text: str, kind: str) -> list[dict[str, Json]]:
 
 
 def pairs(elements: Json) -> dict[int, Json]:
-    """Return the elements of a map, without malformed elements."""
+    """The elements of a map in nft's JSON, values by key, without malformed elements."""
     items = elements if isinstance(elements, list) else []
     couples = (item for item in items if isinstance(item, list) and len(item) == 2)
     return {key: value for key, value in couples if isinstance(key, int)}

@@ -1,4 +1,4 @@
-"""The kernel plane, as the other packages of the proxy use the plane.
+"""The kernel plane: the interface for the other packages of the proxy.
 
 The kernel forwards the *fast port* of an endpoint (`rosproxy.leases.fast_ports`) directly to the
 TCPROS port of the node. For ROS 2, the kernel forwards a port mapping directly to a locator of the
@@ -93,7 +93,7 @@ class KernelPlane:
             self._tasks.repeat(self.look, READ_INTERVAL_S, "reading the kernel's counters")
 
     async def stop(self) -> None:
-        """Remove the table, and the tracked connections. Call this after the end of all tasks."""
+        """Remove the table, and end the connections. Call this after the end of all tasks."""
         was_usable = self.syncer.usable
         self.syncer.why_not = "the proxy has stopped"
         await self._table.tools.settled()
@@ -108,7 +108,8 @@ class KernelPlane:
     def recovered(self, endpoints: Sequence[LeaseHolder]) -> None:
         """Note that the registry is rebuilt, and give the endpoints their earlier fast ports.
 
-        Do so even if the kernel may not forward now: subscribers may use the fast ports.
+        The endpoints get the ports even if the kernel may not forward now, because subscribers may
+        use these ports.
         """
         if self._is_wanted:
             for endpoint in endpoints:
@@ -141,7 +142,10 @@ class KernelPlane:
         return {"mode": mode, "plane": plane, "reason": self.syncer.why_not or ""}
 
     def status_of(self, endpoint: LeaseHolder) -> dict[str, Any]:
-        """The plane of an endpoint, as the fields of NodePlaneStatus; bytes are of IP packets."""
+        """The plane of an endpoint, as the fields of NodePlaneStatus; bytes are of IP packets.
+
+        In addition, ``received_packets`` and ``packet_rate`` (per second), for datagrams.
+        """
         account = self._accounts.account(endpoint)
         reason = self.syncer.reason(endpoint)
         port = endpoint.fast_port
