@@ -145,16 +145,16 @@ def test_a_forward_without_answer_is_not_made_for_longer_each_time() -> None:
     pauses = Pauses()
     now = 0.0
     lasted = []
-    assert pauses.why(45050, THERE, now) is None
+    assert pauses.reason(45050, THERE, now) is None
     for _ in range(12):
         pauses.note(45050, THERE, "no answer", now)
         start = now
-        while pauses.why(45050, THERE, now):
+        while pauses.reason(45050, THERE, now):
             now += 2.5
         lasted.append(now - start)
     assert lasted[:3] == [5.0, 10.0, 20.0]
     assert lasted[-2:] == [LONGEST_PAUSE_S] * 2
-    assert pauses.why(45050, HostPort(NODE, 50001), now) is None
+    assert pauses.reason(45050, HostPort(NODE, 50001), now) is None
 
 
 def test_pauses_of_ports_that_nobody_has_are_forgotten() -> None:
@@ -162,5 +162,5 @@ def test_pauses_of_ports_that_nobody_has_are_forgotten() -> None:
     for port in (45050, 45051):
         pauses.note(port, THERE, "no answer", 0.0)
     pauses.keep({45051})
-    assert pauses.why(45050, THERE, 1.0) is None
-    assert pauses.why(45051, THERE, 1.0) == "no answer"
+    assert pauses.reason(45050, THERE, 1.0) is None
+    assert pauses.reason(45051, THERE, 1.0) == "no answer"

@@ -131,19 +131,20 @@ class Pauses:
     """Pauses of forwards after the node has not answered through the kernel."""
 
     def __init__(self) -> None:
-        self._until: dict[tuple[int, HostPort], tuple[float, float, str]] = {}
+        # By port and target: the end, the length in seconds, and the reason.
+        self._pauses: dict[tuple[int, HostPort], tuple[float, float, str]] = {}
 
-    def note(self, port: int, target: HostPort, why: str, now: float) -> None:
+    def note(self, port: int, target: HostPort, reason: str, now: float) -> None:
         """Note a failure at the time ``now`` (s); each further pause is twice as long."""
-        _, pause, _ = self._until.get((port, target), (0.0, FIRST_PAUSE_S / 2, ""))
+        _, pause, _ = self._pauses.get((port, target), (0.0, FIRST_PAUSE_S / 2, ""))
         pause = min(2 * pause, LONGEST_PAUSE_S)
-        self._until[port, target] = now + pause, pause, why
+        self._pauses[port, target] = now + pause, pause, reason
 
-    def why(self, port: int, target: HostPort, now: float) -> str | None:
+    def reason(self, port: int, target: HostPort, now: float) -> str | None:
         """The reason for the pause of a forward; None without a pause."""
-        until, _, why = self._until.get((port, target), (now, 0.0, ""))
-        return why if now < until else None
+        until, _, reason = self._pauses.get((port, target), (now, 0.0, ""))
+        return reason if now < until else None
 
     def keep(self, ports: Collection[int]) -> None:
         """Forget the failures of all ports that are not in ``ports``."""
-        self._until = {key: value for key, value in self._until.items() if key[0] in ports}
+        self._pauses = {key: value for key, value in self._pauses.items() if key[0] in ports}

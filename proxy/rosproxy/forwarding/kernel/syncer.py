@@ -222,7 +222,7 @@ class ForwardSyncer:
         target = decisions.destination(endpoint, self._host, route, has_connections)
         if isinstance(target, str) or endpoint.fast_port is None:
             return target
-        return self._pauses.why(endpoint.fast_port, target, self._clock()) or target
+        return self._pauses.reason(endpoint.fast_port, target, self._clock()) or target
 
     def _route(self, address: str) -> Route:
         route = self._routes.get(address) or route_towards(address)
