@@ -37,7 +37,7 @@ AFTERWARDS = 22
 
 @pytest.fixture(autouse=True)
 def _early(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resubscriber, "LOOK_DELAYS", LOOKS)
+    monkeypatch.setattr(resubscriber, "LOOK_DELAYS_S", LOOKS)
     monkeypatch.setattr(stack, "RESUBSCRIBE_INTERVAL_S", 0.05)
 
 

@@ -40,7 +40,10 @@ class LeaseMemory:
         return remembered_leases.read_leases(self._stored, self._context.settings.ports)
 
     async def write(self) -> None:
-        """Store changed leases at the master. Raises Unreachable."""
+        """Store the leases at the master if they have changed. Raises Unreachable.
+
+        If the master refuses the parameter, the proxy reports a problem.
+        """
         registry = self._context.registry
         while self._written_changes != registry.lease_changes:
             async with self._lock:  # a caller that has waited here usually finds the write done
@@ -52,7 +55,7 @@ class LeaseMemory:
                     self._written_changes = changes
 
     async def look(self) -> None:
-        """Write the parameter again if the master has lost or another program has changed it.
+        """Write the parameter again if the master has lost it, or another program has changed it.
 
         Raises Unreachable.
         """

@@ -1,9 +1,9 @@
 """Watch the real master: does it answer, is it the same process, does it know the nodes inside?
 
 At each ``--master-interval`` the proxy asks the master for the pid. After the first answer the
-proxy rebuilds the registry from the master (`recovery`). After an outage, after a change of the
-pid, and at every few looks besides, the proxy makes the registrations again that the master has
-lost. Nodes of ROS 1 do not notice such a loss.
+proxy rebuilds the registry from the master (`recovery`). The proxy makes lost registrations again
+after an outage, after a change of the pid, and after every `PID_CALLS_PER_CHECK` answers. Nodes of
+ROS 1 do not notice that the master has lost their registrations.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 PID_TIMEOUT_S = 5.0
 """Seconds within which a healthy master answers getPid."""
 PID_CALLS_PER_CHECK = 5
-"""Looks at the master from one check of the registrations to the next."""
+"""Answers of the master from one check of the registrations to the next."""
 
 
 MASTER_PATHS = ("", "/", "/RPC2")
@@ -33,8 +33,9 @@ MASTER_PATHS = ("", "/", "/RPC2")
 class MasterMonitor:
     """Polls the master, and starts the repair of lost registrations.
 
-    ``up`` is None before the first look. ``since`` is the time of the last change, ``round_trip``
-    the duration of the last getPid in seconds. ``answered`` is set after the first answer.
+    ``up`` is None before the first look. ``since`` is the time of the last change of ``up``.
+    ``round_trip`` is the duration of the last answered getPid in seconds. ``answered`` is set
+    after the first look without an error.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class MasterMonitor:
             self._mark(False, f"master {uri}: no answer in {PID_TIMEOUT_S:g} s")
 
     def _path_hint(self, error: Exception) -> str:
-        """What to do if a program answers, but not at the path of the master URI."""
+        """What to do if a program answers, but not at the path of the master URI; else empty."""
         uri = urlsplit(self._context.settings.master_uri)
         if uri.path in MASTER_PATHS or "HTTP status 404" not in str(error):
             return ""
@@ -100,7 +101,7 @@ class MasterMonitor:
 
 
 def _port_hint(error: Exception) -> str:
-    """What to do if no program listens at the port."""
+    """What to do if no program listens at the port; empty for other errors."""
     if isinstance(error, Unreachable) and error.probe is ProbeResult.REFUSED:
         return ". No roscore listens there. Check the port; roscore listens on 11311 by default"
     return ""

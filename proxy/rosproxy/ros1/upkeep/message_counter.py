@@ -3,7 +3,8 @@
 Neither the relay nor the kernel reads messages, but nodes count the messages of their connections.
 While a program reads the metrics, the proxy asks the healthy nodes for these counts
 (``getBusStats``), at most `MOST_ASKED_NODES` a second. The count of a node begins with its first
-answer after a start or an error: messages before this answer do not count.
+answer after the start, after an error, or after a pause in the reads of the metrics. Messages
+before this answer do not count.
 """
 
 import asyncio
@@ -90,11 +91,11 @@ class MessageCounter:
     async def _ask(self, endpoint: Endpoint) -> None:
         former = self._records.get(endpoint, _Record(0.0))
         slave = endpoint.slave
-        within = self._context.settings.probe_timeout
+        timeout = self._context.settings.probe_timeout
         try:
             async with self._limit:
                 reply = await self._context.upstream.call_node(
-                    slave, within, "getBusStats", limits=BUS_STATS
+                    slave, timeout, "getBusStats", limits=BUS_STATS
                 )
         except (Unreachable, MasterError) as error:
             log.debug("%s gives no message counts: %s", endpoint.label, error)
@@ -113,7 +114,7 @@ class MessageCounter:
     def _after_failure(self, former: _Record, error: Exception) -> _Record:
         """The record after a failed question.
 
-        If the node was only silent, its last counts remain the base of the next growth.
+        If the node gave no answer, its last counts remain the base of the next growth.
         """
         now = self._context.now()
         if isinstance(error, Unreachable) and error.probe is not ProbeResult.ANSWERED:

@@ -9,8 +9,8 @@
   check what the kernel forwards. If a rule concerns nodes outside, all stand-ins lose the second
   port that the kernel forwards.
 
-All other connections and registrations stay, so the proxy can repeat the enforcement. The proxy
-does so until all steps have worked.
+All other connections and registrations stay, so the proxy can repeat the enforcement. It does so
+until all steps have worked.
 """
 
 import asyncio
@@ -109,7 +109,8 @@ class PolicyEnforcer:
     def _withdraw_fast_ports(self) -> int:
         """Withdraw the fast ports of nodes with a topic that the policy may deny.
 
-        Return the number of cut connections.
+        If the policy may deny a topic of outside to inside, also close the fast ports of all
+        stand-ins. Return the number of cut connections.
         """
         policy = self._context.policy
         count = 0 if policy.inside_may_bypass() else self._stand_ins.close_fast_ports()

@@ -10,8 +10,8 @@ After two failures in a row the port refuses connections, so that a dead node lo
 proxy serves the node again, and registers the node if necessary. A new pid means a new process: the
 proxy then takes back the registrations that the former process left.
 
-`Health.note` says how the node is after a probe, `liveness` what is due. The `Registrar` and the
-modules beside this module act.
+`Health.note` records the result of a probe, and `liveness` says what is due. The `Registrar` and
+the modules beside this module act.
 """
 
 import asyncio
@@ -88,11 +88,11 @@ class Prober:
             self._begin_probe(endpoint)
 
     def _note_result(self, endpoint: Endpoint, result: ProbeResult | None, now: float) -> None:
-        """Record what a kept connection has shown; None: the node has ended the connection."""
+        """Record the result of a kept connection; None: the node has ended the connection."""
         if result is None:
             endpoint.health.note_hung_up()
         elif endpoint in self._probing or not liveness.may_be_kept(endpoint):
-            return  # the node is suspected meanwhile: a call asks the node
+            return  # meanwhile the node needs a probe by a call, or such a probe runs
         elif result is ProbeResult.ANSWERED:
             endpoint.health.note(result, now)
         else:
@@ -106,7 +106,7 @@ class Prober:
         try:
             async with self._limit:
                 await self._look_after(endpoint, answer)
-        except (Unreachable, MasterError) as error:  # the next probe finds the same due
+        except (Unreachable, MasterError) as error:  # the next probe finds the same work
             log.debug("%s: the proxy could not act on the probe yet: %s", endpoint.label, error)
         finally:
             self._probing.discard(endpoint)
@@ -142,7 +142,7 @@ class Prober:
             await self._registrar.unregister_left_over(endpoint)
         elif due is AfterAnswer.RECONCILE:
             await self._registrar.reconcile(endpoint)
-        # Last: if a call to the master has failed, the next probe finds the same due.
+        # Last: if a call to the master has failed, the next probe finds the same work.
         endpoint.health.pid = pid
         if not self._leases.is_open(endpoint):
             log.info("%s answers again", endpoint.label, extra=endpoint.log_fields)

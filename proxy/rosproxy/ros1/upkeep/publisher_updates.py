@@ -1,4 +1,4 @@
-"""Send subscribers inside the publishers of a topic, with publishers that the master does not know.
+"""Send subscribers the publishers of a topic, also those that the master does not know.
 
 The list for a node inside has the publishers of the master and the hidden publishers
 (`rosproxy.ros1.policy`). When hidden publishers change, the proxy tells the subscribers inside. For
@@ -40,9 +40,9 @@ class PublisherUpdates:
         self._changed_topics: dict[str, bool] = {}
 
     async def update(self, subscriber: str, topic: str, publishers: Sequence[str]) -> bool:
-        """Send the publishers of a topic to the node at a slave URI; whether the node has answered.
+        """Send the publishers of a topic to the node at a slave URI, inside or outside.
 
-        All URIs are in the form that the master has.
+        All URIs are in the form that the master has. Return whether the node has answered.
         """
         endpoint = self._context.addressing.endpoint_of(subscriber)
         if endpoint:
@@ -53,10 +53,10 @@ class PublisherUpdates:
     async def update_inside(
         self, endpoint: Endpoint, topic: str, publishers: Sequence[str]
     ) -> bool:
-        """Send the node of an endpoint the publishers of a topic; whether the node has answered.
+        """Send the publishers of a topic to the node of an endpoint.
 
         ``publishers`` are URIs in the form that the master holds. The method adds the hidden
-        publishers, and imports all URIs.
+        publishers, and imports all URIs. Return whether the node has answered.
         """
         caller = self._context.caller_at(endpoint)
         addressing = self._context.addressing
@@ -66,7 +66,7 @@ class PublisherUpdates:
         return await self._update(endpoint.slave, topic, [*imported])
 
     def note_registration(self, registration: Registration) -> None:
-        """Tell the affected subscribers inside that a registration was made or has ended."""
+        """Tell the affected subscribers inside if a publisher was registered or has ended."""
         if registration.kind is Kind.PUBLISHER:
             self.update_subscribers([registration.name], registration.hidden)
 
@@ -90,7 +90,7 @@ class PublisherUpdates:
                 inside = self._context.registry.subscriptions(topic)
                 inside = [(e, r) for e, r in inside if e.answers and (all_inside or r.hidden)]
                 try:
-                    await self._hand_out(inside)
+                    await self._update_all(inside)
                 except Unreachable as error:
                     text = (
                         "topic %s: the proxy could not send the publishers to subscribers yet: %s"
@@ -101,8 +101,8 @@ class PublisherUpdates:
         finally:
             self._topics_underway.discard(topic)
 
-    async def _hand_out(self, subscribers: Sequence[EndpointRegistration]) -> None:
-        """Send subscribers of one topic the publishers. Raises Unreachable."""
+    async def _update_all(self, subscribers: Sequence[EndpointRegistration]) -> None:
+        """Send the publishers of one topic to its subscribers. Raises Unreachable."""
         addressing = self._context.addressing
         shown = [(e, r) for e, r in subscribers if not r.hidden]
         calls = [decisions.register_call(r, addressing.advertised_uri(e), "") for e, r in shown]
@@ -111,9 +111,11 @@ class PublisherUpdates:
             e: value if isinstance(value, list) else []
             for (e, _), value in zip(shown, values, strict=True)
         }
-        await asyncio.gather(*(self._hand(e, r.name, lists.get(e, [])) for e, r in subscribers))
+        await asyncio.gather(
+            *(self._update_one(e, r.name, lists.get(e, [])) for e, r in subscribers)
+        )
 
-    async def _hand(self, endpoint: Endpoint, topic: str, publishers: Sequence[str]) -> None:
+    async def _update_one(self, endpoint: Endpoint, topic: str, publishers: Sequence[str]) -> None:
         await self._context.wait_for_registration(endpoint)
         await self.update_inside(endpoint, topic, publishers)
 

@@ -1,8 +1,8 @@
 """After a start: find the nodes behind this proxy, and their ports, at the master.
 
 The proxy keeps nothing on disk; the master is the database. `Recovery.ensure` reads the graph of
-the master once, and the parameter of the proxy (`LeaseMemory`). It finds the URIs that this proxy
-advertised (`recovery_claims.find_claims`), and rebuilds the endpoints on their former ports. Calls
+the master once, and the parameter of the proxy (`LeaseMemory`). `recovery_claims.find_claims` finds
+the URIs that this proxy advertised. `Recovery` rebuilds the endpoints on their former ports. Calls
 that register wait for the recovery. Otherwise a node would get another port, and the master would
 shut the node down because of the changed URI. First the recovery waits for the policy of an
 operator (``--await-policy``). Without the policy, the proxy would register denied names for a
@@ -14,9 +14,10 @@ subscribers connect again (`Resubscriber.announce`). If a node does not answer y
 verifies the node when a probe gets an answer (`Prober`).
 
 A claim never keeps a port from a live node. If the range is used up, a new node waits a moment for
-pending verifications, and gets the port of a claim whose node is dead (`wait_for_dead_claim`). Some
-registrations at the master have the address of this proxy, but no node got their port again. A
-former proxy left these registrations, and the proxy takes them back (`_sweep`).
+pending verifications, and gets the port of a claim whose node is dead (`wait_for_dead_claim`).
+
+A registration at the master may have the address of this proxy, although no node got its port
+again. A former proxy left this registration, and the proxy takes it back (`_sweep`).
 
 If nodes have other ports after a start, the log names each refused claim and the reason.
 """
@@ -48,7 +49,7 @@ log = logging.getLogger(__name__)
 MOST_PARALLEL_INSPECTIONS = 64
 CLAIM_GRACE_S = 1.0
 """Seconds that a node has to confirm its claim once a live node waits for the port."""
-DOUBT = (
+UNCONFIRMED_CLAIM = (
     "answers, but the proxy can't tell whether this is the node that the master has at this port: "
     "the client library lacks getPublications or getSubscriptions, and the node has no topic or "
     "service to ask for. The port stays closed until the node registers again. Restart the node"
@@ -132,9 +133,10 @@ class Recovery:
                 await self._resubscriber.announce(endpoints)
 
     async def wait_for_dead_claim(self) -> None:
-        """Wait up to `CLAIM_GRACE_S` until a node under verification turns out dead.
+        """Wait up to `CLAIM_GRACE_S` for a free port or a dead node.
 
-        Nodes that were silent during the whole wait count as failing afterwards.
+        The wait also ends with the last pending verification. Nodes that were silent during the
+        whole wait count as failing afterwards.
         """
         end = self._context.now() + CLAIM_GRACE_S
         awaited = set(self.verifying)
@@ -169,7 +171,7 @@ class Recovery:
             self._context.tasks.spawn(self._resume(endpoints), "recovery")
 
     async def _settle(self, claims: Sequence[Claim]) -> list[Claim]:
-        """Choose one claim for each port. The nodes of contested claims are asked first."""
+        """Choose one claim for each port. First ask the nodes inside with contested claims."""
 
         async def ask(claim: Claim) -> None:
             log.warning(
@@ -186,7 +188,10 @@ class Recovery:
         return recovery_claims.choose_claims(claims)
 
     def _restore(self, claim: Claim) -> Endpoint | None:
-        """The untrusted endpoint of a claim; None if the node is outside, or the port is taken."""
+        """The untrusted endpoint of a claim.
+
+        None if the node is outside, or if the port or the address is taken.
+        """
         address = claim.slave.host
         if self._context.client_kind(address) is ClientKind.OUTSIDE:
             text = "port %d: not recovered: the node's address %s is not in an inside network"
@@ -220,9 +225,9 @@ class Recovery:
     ) -> None:
         """After ``--cleanup-after``, take back registrations at the master that have no endpoint.
 
-        If the node of a claim confirms its registrations, and is inside by now, the node gets the
-        port if this is free. An operator may have reported the node meanwhile. The proxy leaves a
-        node alone that answers, but neither confirms nor refutes the claim.
+        If the node of a claim is inside by now, and confirms its registrations, the node gets the
+        port if the port is free. The proxy leaves the registrations if the node answers, but
+        neither confirms nor refutes the claim.
         """
         await asyncio.sleep(self._context.settings.cleanup_after)
         self._context.refresh_networks()
@@ -243,7 +248,8 @@ class Recovery:
     async def _is_borne_out(self, claim: Claim) -> bool | None:
         """Whether the node of a claim is inside and confirms its registrations.
 
-        None if the node answers, but neither confirms nor refutes the claim.
+        False if the node does not answer. None if the node answers, but neither confirms nor
+        refutes the claim.
         """
         if self._context.client_kind(claim.slave.host) is ClientKind.OUTSIDE:
             return False
@@ -253,6 +259,7 @@ class Recovery:
         return False if info is None else borne_out
 
     async def _verify(self, endpoint: Endpoint) -> None:
+        """Open the port if the node confirms the claim; end the lease if the node refutes it."""
         self._inspecting.add(endpoint)
         registrations = list(endpoint.registrations.values())
         try:
@@ -295,6 +302,6 @@ class Recovery:
         await self._registrar.register_missing(endpoint, info)
 
     def _note_doubt(self, endpoint: Endpoint) -> None:
-        """Record that the node answers, but does not confirm its claim: it stays registered."""
+        """Record that the node answers, but neither confirms nor refutes its claim."""
         endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
-        self._context.problems.add(endpoint.label, DOUBT, endpoint.port)
+        self._context.problems.add(endpoint.label, UNCONFIRMED_CLAIM, endpoint.port)

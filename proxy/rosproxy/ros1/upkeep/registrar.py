@@ -1,7 +1,7 @@
 """Register nodes at the master again, and unregister nodes that are gone.
 
-All registrations that the proxy makes or takes back by itself pass the `Registrar`. The modules
-beside this module decide when. `Registrar.register` works in these steps:
+All registrations that the proxy makes or takes back on its own initiative pass the `Registrar`. The
+modules beside this module decide when. `Registrar.register` works in these steps:
 
 1. Ask the master for the present URI of each name. If another node has the name by now, do not
    register the name. If the master has a former URI of the same node, take back the registrations
@@ -32,7 +32,7 @@ from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 log = logging.getLogger(__name__)
 
 FormerUris = Mapping[str, tuple[Endpoint, str]]
-"""For each name its endpoint, and the former URI that the master has for the name."""
+"""By node name: the endpoint, and the former URI that the master has for the name."""
 MOST_CHECKS_PER_TURN = 100
 """Registrations that the proxy checks before other tasks run: a policy may have many rules."""
 UPDATE_ARRIVAL_S = 2.0
@@ -53,10 +53,11 @@ class Registrar:
         changes of the registry, and ports of the nodes that answered."""
 
     async def register(self, registrations: Sequence[EndpointRegistration]) -> None:
-        """Register again what the master has lost. Raises Unreachable, MasterError.
+        """Make registrations at the master again. Raises Unreachable, MasterError.
 
-        If another node has a name by now, the name stays with this node. If the master has a former
-        URI of the same node, the proxy first takes back the registrations with this URI.
+        If another node has a name by now, the proxy leaves the name to the other node, and drops
+        the name from the registry. If the master has a former URI of the same node, the proxy first
+        takes back the registrations with this URI.
         """
         names = {r.caller_id for _, r in registrations}
         uris = await self._context.upstream.look_up("lookupNode", names)
@@ -98,7 +99,10 @@ class Registrar:
             endpoint.unsettled = False
 
     async def register_missing(self, endpoint: Endpoint, info: NodeInfo) -> None:
-        """Register the topics that a node has and the master does not know. Raises Unreachable."""
+        """Register the topics that a node has, but that the registry lacks.
+
+        Does nothing if several node names share the slave API. Raises Unreachable, MasterError.
+        """
         missing = decisions.unregistered_topics(endpoint, info)
         for registration in missing:
             self._context.registry.register(endpoint, registration)
@@ -109,8 +113,8 @@ class Registrar:
     async def register_lost(self) -> None:
         """Register what the master no longer has of live nodes. Raises Unreachable, MasterError.
 
-        The comparison is left out if master and registry are unchanged since no registration was
-        missing.
+        Also register nodes anew that have moved (`resettle`). The method skips the comparison if
+        master and registry have not changed since the last comparison without a lost registration.
         """
         registry = self._context.registry
         started = self._context.now()
@@ -134,7 +138,7 @@ class Registrar:
             self._complete_state = digest, *our_state
 
     async def clean_up(self, endpoint: Endpoint) -> None:
-        """Unregister a node that is gone at the master. Raises Unreachable."""
+        """Unregister at the master a node that is gone. Raises Unreachable."""
         started = self._context.now()
         registrations = list(endpoint.registrations.values())
         await self._unregister(endpoint, registrations)
@@ -182,7 +186,7 @@ class Registrar:
             endpoint.former_callers.pop(registration.caller_id, None)
 
     async def come_back(self, endpoint: Endpoint, pid: int | None) -> None:
-        """Register an unregistered node again that answers as process ``pid``.
+        """Register a node again that was unregistered, and that answers now as process ``pid``.
 
         Raises Unreachable, MasterError.
         """
@@ -223,9 +227,10 @@ class Registrar:
             await self.register_missing(endpoint, info)
 
     async def apply_policy(self, has_changed: bool = False) -> tuple[int, int]:
-        """Hide what the policy denies now, and show what it allows again; the numbers of both.
+        """Hide what the policy denies now, and show what it allows again. Return both numbers.
 
-        If the policy ``has_changed``, also report which registrations audit rules would deny.
+        Only registrations of live nodes are shown again. If the policy ``has_changed``, also report
+        which registrations audit rules would deny.
         Raises Unreachable, MasterError.
         """
         policy = self._context.policy
@@ -292,7 +297,7 @@ class Registrar:
     async def _register(self, registrations: Sequence[EndpointRegistration]) -> None:
         """Register at the master, and send subscribers the publishers that the replies name.
 
-        Hides what the policy denies.
+        Hides what the policy denies. Does nothing if the proxy has retired.
         """
         if self._context.retired:
             return

@@ -39,7 +39,7 @@ from rosproxy.ros1.upkeep.registrar import Registrar
 
 log = logging.getLogger(__name__)
 
-LOOK_DELAYS = (4.0, 10.0, 25.0, 75.0, 165.0)
+LOOK_DELAYS_S = (4.0, 10.0, 25.0, 75.0, 165.0)
 """Seconds from an outage to each look at the affected endpoints.
 
 Before the first look, a proxy that is replaced by force has ended, and roscpp's first retries are
@@ -76,10 +76,10 @@ class Resubscriber:
         self._look_times: dict[Endpoint, list[float]] = {}
 
     def watch(self, endpoints: Iterable[Endpoint]) -> None:
-        """Schedule looks at endpoints, after each of `LOOK_DELAYS`."""
+        """Schedule looks at endpoints, after each of `LOOK_DELAYS_S`."""
         now = self._context.now()
         for endpoint in endpoints:
-            self._look_times[endpoint] = [now + delay for delay in LOOK_DELAYS]
+            self._look_times[endpoint] = [now + delay for delay in LOOK_DELAYS_S]
 
     async def announce(self, endpoints: Sequence[Endpoint]) -> None:
         """Repair connections after an outage of the proxy. Raises Unreachable, MasterError."""
@@ -90,10 +90,11 @@ class Resubscriber:
         )
 
     async def remind(self, endpoint: Endpoint) -> None:
-        """Repair connections after the port of a node refused. Raises Unreachable, MasterError.
+        """Repair connections after the port of a node has refused some.
 
         After a refused requestTopic, a subscriber does not ask again. When a publisher registers,
         the master sends the subscriber all publishers once more. Existing connections stay.
+        Raises Unreachable, MasterError.
         """
         self.watch([endpoint])
         kinds = (Kind.PUBLISHER, Kind.SUBSCRIBER)
@@ -101,7 +102,7 @@ class Resubscriber:
         await self._registrar.register([(endpoint, r) for r in registrations])
 
     async def look(self) -> None:
-        """Reconnect subscribers that still lack a publisher after `announce`."""
+        """Reconnect subscribers that still lack a publisher, for endpoints due now (`watch`)."""
         endpoints = [] if self._context.retired else self._due()
         try:
             topics = await self._withdraw(endpoints) if endpoints else set()
@@ -110,7 +111,7 @@ class Resubscriber:
                 log.info(text, len(topics))
                 pairs = [*one_publisher_per_topic(endpoints), *_subscribers(endpoints)]
                 await self._registrar.register([pair for pair in pairs if pair[1].name in topics])
-        except (Unreachable, MasterError) as error:  # later looks follow (LOOK_DELAYS)
+        except (Unreachable, MasterError) as error:  # later looks follow (LOOK_DELAYS_S)
             log.debug("the proxy could not look for subscribers without a connection: %s", error)
 
     def _due(self) -> list[Endpoint]:
@@ -124,10 +125,11 @@ class Resubscriber:
         return [e for e in due if e.answers and not e.health.cleaned]
 
     async def _withdraw(self, endpoints: Sequence[Endpoint], ask: bool = True) -> set[str]:
-        """Tell subscribers without a connection that these publishers have gone; return the topics.
+        """Tell subscribers without a connection that their publishers have gone. Return the topics.
 
-        The subscribers connect again when the master announces the publishers again. With ``ask``,
-        the proxy asks the publishers for their connections, and spares subscribers with UDPROS.
+        This concerns publishers and subscribers at ``endpoints``. The subscribers connect again
+        when the master announces the publishers again. With ``ask``, the proxy asks the publishers
+        for their connections, and spares subscribers with UDPROS.
         Raises Unreachable, MasterError.
         """
         state = await self._context.upstream.read_registrations()

@@ -9,8 +9,10 @@ from rosproxy.ros1.registry.endpoint import Endpoint
 SIDES = {OUT: "published", IN: "received"}
 """What a node does with a topic, by the direction of the connection."""
 MOST_NAMES = 1000
-"""The highest number of topics with separate sums. All further topics share a sum."""
+"""The highest number of separate sums, each of a topic and a side. On each side, all further topics
+share a sum."""
 OTHERS = "other"
+"""The topic name of these shared sums."""
 OVERFLOW_DIFFERENCE = 2**32
 """The difference after an overflow: roscpp's numbers are signed 32-bit integers."""
 
@@ -26,8 +28,8 @@ def growth(former: BusStats, newest: BusStats) -> Mapping[tuple[str, str], Count
     """The bytes and messages added between two answers, by direction and topic.
 
     A publisher sends a message over each of its connections, but the message counts once. So the
-    messages of a publisher are those of the connection with the most. The bytes are the sum of all
-    connections, as on the network.
+    number of its messages is that of the connection with the most messages. The bytes are the sum
+    of all connections, as on the network.
     """
     return {
         key: _sum_up(key[0], list(_grown(key[0], former.get(key, {}), connections)))
@@ -36,7 +38,7 @@ def growth(former: BusStats, newest: BusStats) -> Mapping[tuple[str, str], Count
 
 
 class TopicSums:
-    """The sums of all nodes by topic and side. Sums never shrink."""
+    """The bytes and messages of all nodes, by topic and side (`SIDES`). Sums never shrink."""
 
     def __init__(self) -> None:
         self.by_topic: dict[tuple[str, str], Count] = {}
@@ -71,7 +73,10 @@ def _grown(
 
 
 def _difference(former: int, newest: int) -> int:
-    """The growth of a number. A smaller number started anew, or overflowed if negative."""
+    """The growth of a count. A count that is smaller than before overflowed or began again at zero.
+
+    Only an overflow makes a count negative.
+    """
     if newest >= former:
         return newest - former
     return newest - former + OVERFLOW_DIFFERENCE if newest < 0 <= former else max(newest, 0)
