@@ -19,11 +19,12 @@ from rosproxy.ros2.protocol.rtps import samples
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 LEASE_DURATION_S = 12.0
-"""Seconds after the last announcement until other participants forget the discovery participant. It
+"""Seconds after the last announcement until others forget the discovery participant. The duration
 is short because the proxy may be killed."""
 ANNOUNCE_INTERVAL_S = 3.0
 """Seconds between announcements of the discovery participant."""
 SEDP_WRITERS = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
+"""The writers whose samples the discovery participant requests."""
 
 
 @dataclass(slots=True)
@@ -31,8 +32,8 @@ class _Received:
     """The samples of a writer that have come: all before ``base``, and some of the following.
 
     ``later`` has a bit for each of the `MOST_ASKED` samples from ``base`` on. Samples beyond these
-    are requested later. ``behind`` counts the last heartbeats in a row whose last sample is before
-    the last received one.
+    are requested later. ``behind`` counts the latest heartbeats in a row whose last number is less
+    than the last received number.
     """
 
     base: int = 1

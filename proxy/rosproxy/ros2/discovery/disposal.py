@@ -1,9 +1,12 @@
 """The end of participants: the proxy forgets a participant, and informs the other side.
 
-A participant that ends regularly sends a dispose message. This module has the other ends. The
-process was killed, or the container is gone. Or the proxy gives the place, the ports or the GUID
-prefix to another participant. Then the proxy sends the dispose message on behalf of the
-participant. The participant may be alive all the same, and come back.
+A participant that ends regularly sends a dispose message. This module is for all other ends:
+
+- the process was killed, or the container is gone;
+- the proxy gives the place, the ports or the GUID prefix to another participant.
+
+In these cases the proxy sends the dispose message on behalf of the participant. The participant may
+still be alive, and come back.
 """
 
 from collections.abc import Iterable
@@ -40,8 +43,8 @@ class Disposal:
 
         A crashed process sends no dispose message, and would stay known until the end of its lease
         duration. A participant that has answered has bound the port, so the former process is gone.
-        The answer of the former process does not count any longer, because its announcement may be
-        repeated.
+        The proxy also forgets the answer of the former process: if its announcement is repeated,
+        the answer must not count. Empty if the participant has not answered.
         """
         if not self.proofs.has_answered(source, prefix):
             return []
@@ -60,19 +63,22 @@ class Disposal:
         The participant may be alive, and come back with other ports. Outside then has to rediscover
         it.
         """
-        ended = _dispose_message_of(insider)
+        message = _dispose_message_of(insider)
         self.forget_inside(insider)
         self.former_ports.displace(insider.prefix)
-        return self.settings.to_outside(ended)
+        return self.settings.to_outside(message)
 
     def end_outside(
         self, outsider: OutsideParticipant, inside: Iterable[InsideParticipant]
     ) -> list[Outgoing]:
-        """Forget a participant outside, and send a dispose message to these participants inside."""
-        ended = _dispose_message_of(outsider)
-        told = list(inside) if outsider.is_announced else []
+        """Forget a participant outside, and send a dispose message to the participants ``inside``.
+
+        Empty if the participant was never announced inside.
+        """
+        message = _dispose_message_of(outsider)
+        receivers = list(inside) if outsider.is_announced else []
         self.forget_outside(outsider)
-        return [sent for insider in told for sent in sent_to(insider.metatraffic, [ended])]
+        return [sent for insider in receivers for sent in sent_to(insider.metatraffic, [message])]
 
     def give_prefix_to_inside(self, prefix: bytes, source: str) -> list[Outgoing]:
         """End the participant outside, if any, with the prefix of a participant inside.

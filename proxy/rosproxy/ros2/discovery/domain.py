@@ -189,7 +189,7 @@ class Domain:
             return self._heard_by_relay(relay, datagram, now)
         # Forged participants may fill the table, so that no participant is known at this address.
         # So the proxy accepts the first answer to a question from any source.
-        if not self.proofs.is_first_answer(source, datagram) and self.outside.is_strange(source):
+        if not self.proofs.is_first_answer(source, datagram) and self.outside.refuses_source(source):
             return []
         return self._heard_at_discovery(datagram, source, False, now)
 
@@ -286,7 +286,7 @@ class Domain:
             is_for_data = mapping.kind is TrafficKind.USER_DATA
             if is_for_data and not (mapping.is_read and may_be_discovery(datagram)):
                 return [self._passed(mapping, datagram, True, is_user_data=True)]
-            if self.outside.is_strange(source):
+            if self.outside.refuses_source(source):
                 return []
             passed = [datagram]
             back = list[Outgoing]()
@@ -393,14 +393,16 @@ class Domain:
         return Standing.PROVEN_OUTSIDE if is_proven else Standing.OUTSIDE
 
     def has_confirmed_ports(self, participant: InsideParticipant) -> bool:
-        """Whether a participant inside has confirmed that it remembers all its ports.
+        """Whether a participant inside has confirmed all its ports to the port store.
 
-        It remembers the ports for the next process of the proxy.
+        Then the next process of the proxy can learn these ports from the participant.
         """
         return self.proxy_participants.port_store.keeps(participant.prefix, participant.ports)
 
     def expire(self, now: float) -> list[Outgoing]:
         """End participants whose lease duration is over. Return the datagrams for outside.
+
+        Inside gets no dispose messages. A call ends at most `MOST_ENDED_PER_CALL` of each side.
 
         A participant on two networks may have lost the network on which the proxy served the
         participant. After the end of its lease duration, the proxy accepts its announcement on the
@@ -436,13 +438,17 @@ class Domain:
             return []  # participants of a proxy are not announced to the other side
         if self.proofs.note(source, message.datagram, now):
             sent = self.disposal.end_former_processes(prefix, source)
-            return sent + [out for p in self.inside.prove() for out in self.disposal.end_inside(p)]
+            return sent + [
+                out for p in self.inside.over_limit() for out in self.disposal.end_inside(p)
+            ]
         if spdp is None:
             return self.proxy_participants.handle_from_inside(message, source, now)
         if spdp.ended:
             return self._end_inside(message, source, now)
         is_new = prefix not in self.inside.by_prefix
-        if is_new and (self.ports.is_restoring(now) or self.mappings.lacks_proof(prefix, source)):
+        if is_new and (
+            self.ports.is_restoring(now) or self.mappings.must_answer_first(prefix, source)
+        ):
             return self._wait(message, source, now)
         return self._serve_inside(message, source, now)
 
@@ -515,18 +521,18 @@ class Domain:
         sent = list[Outgoing]()
         if self.proofs.note(source, message.datagram, now):
             sent += self.disposal.end_former_processes(message.prefix, source)
-            told, ended = self.outside.prove(source)
+            to_announce, ended = self.outside.prove(source)
             inside = self.inside.by_prefix.values()
             sent += [
                 out for outsider in ended for out in self.disposal.end_outside(outsider, inside)
             ]
-            sent += self.to_inside.of_outside(told, inside, now)
+            sent += self.to_inside.of_outside(to_announce, inside, now)
         return sent + self.proxy_participants.handle_from_outside(message, source, received)
 
     def _handle_outside_announcement(
         self, message: DiscoveryMessage, source: str, received: int, now: float
     ) -> list[Outgoing]:
-        """Handle the announcement of a participant outside, and announce it inside.
+        """Handle the announcement of a participant outside, and announce the participant inside.
 
         Raises RtpsError.
         """
@@ -545,7 +551,8 @@ class Domain:
     ) -> tuple[OutsideParticipant | None, list[Outgoing]]:
         """The participant in an announcement, and the datagrams that end another participant.
 
-        The other participant ends to make room.
+        The other participant ends to make room. The participant is None if the proxy refuses the
+        announcement. Raises RtpsError.
         """
         end_datagrams = self._end_one_for_place(message, source)
         return self.outside.meet(message, source, now), end_datagrams
@@ -555,7 +562,7 @@ class Domain:
         spdp = message.of_participant
         if spdp is None or spdp.ended or message.prefix in self.outside.by_prefix:
             return []
-        outsider = self.outside.gives_place(source)
+        outsider = self.outside.participant_to_end(source)
         return (
             self.disposal.end_outside(outsider, self.inside.by_prefix.values()) if outsider else []
         )
@@ -566,13 +573,13 @@ class Domain:
         """Handle the announcement of a participant inside, and announce the participant outside."""
         prefix = message.prefix
         is_new = prefix not in self.inside.by_prefix
-        if is_new and self.mappings.lacks_proof(prefix, source):
+        if is_new and self.mappings.must_answer_first(prefix, source):
             # The proxy announces the participant with all ports or not at all, because Fast DDS
             # accepts no new locators of a known participant. The participant will announce itself
             # again.
             return self.proxy_participants.question_to_announced(message, source)
-        gives_place = self.inside.gives_place(prefix, source) if is_new else None
-        sent = self.disposal.end_inside(gives_place) if gives_place else []
+        ending = self.inside.participant_to_end(prefix, source) if is_new else None
+        sent = self.disposal.end_inside(ending) if ending else []
         insider = self.inside.meet(message, source, now)
         if insider is None:
             if prefix not in self.inside.by_prefix:
@@ -654,7 +661,7 @@ class Domain:
             )
         if insider.is_separated:
             return []
-        readers = [outsider.prefix for outsider, _ in _meant(users, message.datagram)]
+        readers = [outsider.prefix for outsider, _ in _addressed_users(users, message.datagram)]
         if len(users) == 1 or destinations(message.datagram):
             for reader in readers:
                 self.rediscovery.note_met(insider, reader)
@@ -664,7 +671,7 @@ class Domain:
         passed, questions = self.fragments.rewritten(port, message, reader, for_outside.rewritten)
         back = sent_to(insider.metatraffic, questions) + self._port_reminders(insider, count, now)
         return back + [
-            sent for d in passed for sent in self._to_outside(_meant(users, d), d, False)
+            sent for d in passed for sent in self._to_outside(_addressed_users(users, d), d, False)
         ]
 
     def _port_reminders(
@@ -798,7 +805,7 @@ class Domain:
         return []
 
 
-def _meant(users: Sequence[StandInUser], datagram: bytes) -> Sequence[StandInUser]:
+def _addressed_users(users: Sequence[StandInUser], datagram: bytes) -> Sequence[StandInUser]:
     """The participants outside behind a stand-in that a message is for.
 
     All of them if the message names none. A single participant gets all messages, and ignores

@@ -1,4 +1,4 @@
-"""Announcements in fragments: hold these until all fragments have come, then rewrite and pass them.
+"""Announcements in fragments: hold the fragments until all have come, then rewrite and pass on.
 
 A long announcement of a reader or writer comes in several DATA_FRAG, of one or several datagrams.
 Cyclone DDS makes fragments of 1,344 bytes. A locator may begin in one fragment and end in the next.
@@ -11,7 +11,7 @@ requests for the others. But the reader has not received the first fragment, whi
 and requests nothing. So the proxy requests the other fragments on behalf of the reader.
 
 Each participant has a store. So a participant can't displace the fragments of another one, until
-all stores together are too large. Then the largest store goes first.
+all stores together are too large. Then the proxy drops the largest store first.
 """
 
 import struct
@@ -34,17 +34,18 @@ from rosproxy.ros2.protocol.rtps import (
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 
 LONGEST_ANNOUNCEMENT_BYTES = 60_000
-"""Bytes of the longest announcement that the proxy accepts in fragments. Real ones have some
-thousand."""
+"""Bytes of the longest announcement that the proxy accepts in fragments. Real announcements
+have a few thousand."""
 SHORTEST_FRAGMENT_BYTES = 128
-"""Bytes of the shortest fragment that the proxy accepts. Real ones have some thousand."""
+"""Bytes of the shortest fragment that the proxy accepts. Real fragments have over 1,000."""
 MOST_BYTES = 1024 * 1024
-"""Bytes of a participant's announcements in a store, and bytes of its datagrams that wait. Beyond
-either bound, the oldest go."""
-MOST_OF_ALL = 16 * 1024 * 1024
-"""Bytes of all stores together."""
+"""The highest number of bytes of a participant's announcements in a store, and of its waiting
+datagrams. Beyond either bound, the store drops the oldest."""
+MOST_BYTES_OF_ALL = 16 * 1024 * 1024
+"""The highest number of bytes of all stores together."""
 MOST_FRAGMENTS = 64
-"""DATA_FRAG in a datagram. A datagram of 64 KB holds fewer than 50 of Cyclone DDS."""
+"""The highest number of DATA_FRAG in a datagram. A datagram of 64 KB holds fewer than 50 of Cyclone
+DDS."""
 OVERHEAD_BYTES = 1024
 """Bytes that are added to the length of each announcement, and of each DATA_FRAG that waits."""
 
@@ -55,6 +56,8 @@ _PAYLOAD_AT = HEADER_BYTES + 24
 """Offset of the payload of a DATA without inline QoS that is the first submessage of a message."""
 
 _Key = tuple[int, bytes, int, int]
+"""Identifies an announcement: port of the proxy, GUID prefix, entity id of the writer, sequence
+number."""
 
 
 class PassedFragments(NamedTuple):
@@ -68,6 +71,7 @@ class PassedFragments(NamedTuple):
 class _PendingSample:
     """The fragments of a sample, by their numbers.
 
+    ``total`` is the bytes of the sample, and ``size`` the bytes of each fragment but the last.
     ``whole`` is the rewritten payload when all fragments have come; empty if the announcement is
     hidden.
     """
@@ -106,7 +110,7 @@ class _WaitingDatagram(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class FragmentStores:
-    """The stores of all participants, by GUID prefix."""
+    """The stores of all participants, by GUID prefix; ``size`` is the bytes of all stores."""
 
     by_prefix: dict[bytes, "FragmentStore"] = field(default_factory=dict)
     size: int = 0
@@ -134,7 +138,7 @@ class FragmentStores:
         finally:
             # The store may have kept some fragments of a malformed message, too.
             self.size += store.size - before
-            while self.size > MOST_OF_ALL:
+            while self.size > MOST_BYTES_OF_ALL:
                 self.forget(max(self.by_prefix, key=lambda prefix: self.by_prefix[prefix].size))
         return PassedFragments(
             released, [self._question(message, reader, *pair) for pair in missing]
@@ -249,7 +253,10 @@ class FragmentStore:
         frags: Fragments,
         rewrite: Rewrite,
     ) -> bool:
-        """Gather the fragments of a DATA_FRAG. Return whether these make the sample whole."""
+        """Gather the fragments of a DATA_FRAG. Return whether these complete the sample.
+
+        Raises RtpsError.
+        """
         gathered = self._gathered(port, sample, frags)
         payloads = dict(_payloads(message.datagram, sample, frags))
         if gathered.whole is not None:

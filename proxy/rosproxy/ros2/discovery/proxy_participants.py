@@ -190,7 +190,7 @@ class ProxyParticipants:
         self.former_ports.forget_participant(prefix)
 
     def _ask(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> list[bytes]:
-        """Pass a message at a port to the discovery participant. Return the requests."""
+        """Pass a message at a port to the discovery participant. Return its requests."""
         passed, questions = self.fragments.rewritten(
             port, message, self.discovery_participant.prefix, rewrite
         )

@@ -8,10 +8,10 @@ Then B forgets A, but A does not repeat confirmed samples. B never discovers the
 of A. So the proxy *separates* the two for a moment: it sends both a dispose message for the other,
 and passes no discovery between them. Only then the proxy announces each to the other.
 
-The proxy does so in three cases: a verdict of the policy has changed, outside knows other ports or
-another address of a participant (`FormerPorts`), or the advertised host has moved. The separation
-waits for the first datagram of the LAN relay, which starts after the proxy. Before that, outside
-would not receive the dispose message.
+The proxy separates participants in three cases: a verdict of the policy has changed, outside knows
+other ports or another address of a participant (`FormerPorts`), or the advertised host has moved.
+In the second case, the separation waits for the first datagram of the LAN relay, which starts after
+the proxy. Before that, outside would not receive the dispose message.
 
 While many participants rediscover each other, datagrams are lost. So the proxy repeats the dispose
 message of a participant outside with each of its announcements. The repetition ends when the
@@ -59,13 +59,17 @@ class Rediscovery:
     to_inside: AnnouncementsToInside
     lan_relay_heard: bool = False
     _waiting: dict[str, deque[Iterator[list[Outgoing]]]] = field(default_factory=dict)
-    """Datagrams for participants inside that wait, by address."""
+    """Work for participants inside, by their address. A step of an iterator makes the datagrams of
+    a pair of participants."""
     _review: Iterator[InsideParticipant | None] = field(default_factory=lambda: iter(()))
     _has_verdicts: bool = False
     _now: float = 0.0
 
     def separate(self, insider: InsideParticipant) -> list[Outgoing]:
-        """Let a participant inside and all participants outside forget each other."""
+        """Let a participant inside and all participants outside forget each other.
+
+        Return the datagrams for outside. `next_datagrams` has the datagrams for inside.
+        """
         datagram = dispose_message(insider.prefix, insider.vendor, insider.next_number)
         insider.separation_due_from = None
         insider.separated_until = inf  # until the last dispose message
@@ -85,7 +89,7 @@ class Rediscovery:
         return self._has_verdicts or bool(self._waiting)
 
     def next_datagrams(self, now: float) -> list[Outgoing]:
-        """The datagrams of the next part of the work."""
+        """The datagrams of the next part of the work, for outside and inside."""
         self._now = now
         verdicts = list(islice(self._review, MOST_VERDICTS_PER_PART))
         self._has_verdicts = len(verdicts) == MOST_VERDICTS_PER_PART
@@ -97,9 +101,9 @@ class Rediscovery:
         return sent
 
     def move(self, insider: InsideParticipant) -> list[Outgoing]:
-        """Announce a participant at the present addresses of the advertised host.
+        """Separate a participant, and announce it later at the present addresses of the proxy.
 
-        The announcement follows a separation. Raises RtpsError.
+        Return the datagrams for outside. Raises RtpsError.
         """
         message = read_discovery(insider.announcement)
         insider.announcement = rewritten(message, self._at_present_host, lambda _: False)

@@ -4,8 +4,7 @@ In the first `EVIDENCE_PERIOD_S`, the first announcement of a participant inside
 asks the participant for its former ports (`rosproxy.ros2.ports.store` explains how the participant
 remembers these). The wait ends with the answer, or after `ANSWER_TIMEOUT_S` without an answer. The
 wait lasts at least until outside has had `SETTLING_PERIOD_S` to send to former ports
-(`LocatorPorts`).
-Later, reminders make participants remember their present ports.
+(`LocatorPorts`). Later, reminders make participants remember their present ports.
 """
 
 from collections import Counter
@@ -54,6 +53,7 @@ class FormerPorts:
     recorded: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
     displaced: dict[bytes, None] = field(default_factory=dict)
     _counts: Counter[str] = field(default_factory=Counter)
+    """The number of waiting participants, by address."""
 
     @classmethod
     def starting(
@@ -81,17 +81,20 @@ class FormerPorts:
         return prefix in self.waiting and self.waiting[prefix][0] == source
 
     def wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        """Hold an announcement until ports may be given. Return questions for the former ports."""
-        if not self._has_room(message.prefix, source):
+        """Hold an announcement until ports may be given. Return questions for the former ports.
+
+        Empty if no further participant may wait.
+        """
+        if not self._make_room(message.prefix, source):
             return []  # the participant announces itself again, and there may be room then
         self.waiting[message.prefix] = source, message, now
         self._counts[source] += 1
         return self._questions(message, source, now)
 
-    def _has_room(self, prefix: bytes, source: str) -> bool:
-        """Whether a further participant may wait at an address.
+    def _make_room(self, prefix: bytes, source: str) -> bool:
+        """Return whether a further participant may wait at an address.
 
-        If necessary, another wait ends. If only the number of all waiting participants is too
+        If necessary, end another wait. If only the number of all waiting participants is too
         great, the first participant that has not proved an address leaves. If the address is full,
         such a participant at this address leaves, and only in favour of a participant that has
         answered.
@@ -112,11 +115,11 @@ class FormerPorts:
         return leaver is not None
 
     def repeated_questions(self, now: float) -> list[Outgoing]:
-        """The questions to waiting participants that have not answered."""
+        """The questions to waiting participants whose answers are still due."""
         return [
             question
             for source, message, since in self.waiting.values()
-            if not self._has_answered(message.prefix, since, now)
+            if not self._is_question_closed(message.prefix, since, now)
             for question in self._questions(message, source, now)
         ]
 
@@ -124,7 +127,9 @@ class FormerPorts:
         """The waiting participants that may get ports now. Each waits on until `end_wait`."""
         if not self.ports.may_give_ports(now):
             return []
-        return [p for p, (*_, since) in self.waiting.items() if self._has_answered(p, since, now)]
+        return [
+            p for p, (*_, since) in self.waiting.items() if self._is_question_closed(p, since, now)
+        ]
 
     def end_wait(self, prefix: bytes) -> tuple[str, DiscoveryMessage] | None:
         """End the wait of a participant. Return the source and the announcement.
@@ -138,7 +143,7 @@ class FormerPorts:
         return source, message
 
     def forget(self, addresses: Collection[str]) -> None:
-        """Forget the waiting participants at addresses that are gone."""
+        """Forget the waiting participants at addresses that are gone, with their claims."""
         for prefix in [p for p, (source, *_) in self.waiting.items() if source in addresses]:
             self._forget_waiting(prefix)
 
@@ -161,7 +166,10 @@ class FormerPorts:
                 self.ports.note_claims(prefix, self.recorded[prefix], len(ports))
 
     def of(self, prefix: bytes) -> Sequence[int]:
-        """The ports of a participant from before the start, in the order of its locators."""
+        """The ports of a participant from before the start, in the order of its locators.
+
+        Empty if these are unknown.
+        """
         return self.recorded.get(prefix) or self.port_store.former_ports(prefix)
 
     def take_answer(self, prefix: bytes, source: str, datagram: bytes) -> bool:
@@ -238,7 +246,8 @@ class FormerPorts:
         self._counts -= Counter((self.waiting.pop(prefix)[0],))
         self.forget_participant(prefix)
 
-    def _has_answered(self, prefix: bytes, since: float, now: float) -> bool:
+    def _is_question_closed(self, prefix: bytes, since: float, now: float) -> bool:
+        """Whether a participant has answered, needs no answer, or has had `ANSWER_TIMEOUT_S`."""
         return (
             self.must_be_rediscovered(prefix)
             or self.port_store.has_answered(prefix)

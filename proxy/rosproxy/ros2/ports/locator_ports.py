@@ -15,7 +15,7 @@ The proxy gives no port in the first second, so that outside has time to name pa
 statement without a proof is void if outside names only other participants. If two participants
 claim a port with equal evidence, both get other ports: one of the two lies, and the proxy can't
 tell which. If a participant with a proof comes later, it gets its port back from a participant
-without.
+without a proof.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -70,21 +70,21 @@ class _Claim(IntEnum):
     KEPT = 2
     """The participant had the port, as a former process has signed, or the operator has
     recorded."""
-    SAID_AND_NAMED = 3
-    SAID = 4
+    STATED_AND_NAMED = 3
+    STATED = 4
     """The participant states that this was its port. No reliable source names another
     participant."""
     NAMED = 5
     """Outside names the participant. The port may belong to another locator of the participant."""
-    NOBODYS = 6
+    UNCLAIMED = 6
     """There is no evidence for any participant."""
-    ANOTHERS = 7
+    OF_ANOTHER = 7
     """Another participant has better evidence, or may still come back."""
     DISPUTED = 8
     """Several participants have claimed the port with equal evidence."""
 
 
-_SAID_BY_ITSELF = range(_Claim.KEPT_AND_NAMED, _Claim.NAMED)
+_KEPT_OR_STATED = range(_Claim.KEPT_AND_NAMED, _Claim.NAMED)
 """The claims from `LocatorPorts.note_claims`."""
 
 
@@ -135,7 +135,7 @@ class LocatorPorts:
         """The participants that claim each port, and whether each has a proof."""
         self._ports_claimed: dict[bytes, Sequence[int]] = {}
         self._lent: dict[int, tuple[bytes, _Claim]] = {}
-        """The participant that has got each port since the start, and the claim of then."""
+        """By port: the participant that got the port since the start, and its claim then."""
         self._disputed: dict[int, _Claim] = {}
         """Ports that several participants claim, and the evidence of these claims."""
 
@@ -202,9 +202,9 @@ class LocatorPorts:
             return set()
         displaced = set[bytes]()
         for port in self._ports_claimed.get(prefix, ()):
-            holder, held_by = self._lent.get(port, (prefix, _Claim.NOBODYS))
-            claim = self._said(port, prefix)
-            if holder == prefix or claim not in _SAID_BY_ITSELF:
+            holder, held_by = self._lent.get(port, (prefix, _Claim.UNCLAIMED))
+            claim = self._evidence(port, prefix)
+            if holder == prefix or claim not in _KEPT_OR_STATED:
                 continue
             if claim == held_by:
                 self._disputed[port] = claim
@@ -219,30 +219,30 @@ class LocatorPorts:
         locator: HostPort,
         kind: TrafficKind,
         now: float,
-        had: int | None = None,
+        former_port: int | None = None,
     ) -> int | None:
         """Choose a port for a locator of a participant; None if all ports are taken.
 
-        ``had`` is the port that the participant claims for this locator (`note_claims`).
+        ``former_port`` is the port that the participant claims for this locator (`note_claims`).
         """
         if not self.is_restoring(now):
             self._forget_former()
         if not self.pool.free:
             return None  # the search takes long, and a datagram may name a thousand locators
-        claims = self._seen_by((prefix, kind), locator, had)
+        claims = self._claims_of((prefix, kind), locator, former_port)
         order = partial(order_for, f"{prefix.hex()} {locator}", self.pool.range)
-        nobodys = (port for port in order() if claims.get(port) in (None, _Claim.NOBODYS))
-        others = (port for port in order() if claims.get(port) is _Claim.ANOTHERS)
+        unclaimed = (port for port in order() if claims.get(port) in (None, _Claim.UNCLAIMED))
+        others = (port for port in order() if claims.get(port) is _Claim.OF_ANOTHER)
         disputed = (port for port in order() if claims.get(port) is _Claim.DISPUTED)
         first = next(order())
         length = len(self.pool.range)
-        own = [port for port, claim in claims.items() if claim < _Claim.NOBODYS]
+        own = [port for port, claim in claims.items() if claim < _Claim.UNCLAIMED]
         own.sort(key=lambda port: (claims[port], (port - first) % length))
-        port = next(filter(self.pool.claim, chain(own, nobodys, others, disputed)), None)
+        port = next(filter(self.pool.claim, chain(own, unclaimed, others, disputed)), None)
         if port is not None:
             self._former_users.pop(port, None)
             self._forwarded.pop(port, None)
-            self._lent[port] = prefix, claims.get(port, _Claim.NOBODYS)
+            self._lent[port] = prefix, claims.get(port, _Claim.UNCLAIMED)
         return port
 
     def _forget_former(self) -> None:
@@ -254,19 +254,21 @@ class LocatorPorts:
         self._lent.clear()
         self._disputed.clear()
 
-    def _seen_by(self, user: _User, locator: HostPort, had: int | None) -> dict[int, _Claim]:
+    def _claims_of(
+        self, user: _User, locator: HostPort, former_port: int | None
+    ) -> dict[int, _Claim]:
         """The claim of a participant to each port for which there is any evidence."""
-        told_of = {*self._former_users, *self._forwarded, *self._claims, *self._disputed}
-        told_of |= {had} if had else set()
-        return {port: self._claim(port, user, locator, had) for port in told_of}
+        ports = {*self._former_users, *self._forwarded, *self._claims, *self._disputed}
+        ports |= {former_port} if former_port else set()
+        return {port: self._claim(port, user, locator, former_port) for port in ports}
 
-    def _claim(self, port: int, user: _User, locator: HostPort, had: int | None) -> _Claim:
+    def _claim(self, port: int, user: _User, locator: HostPort, former_port: int | None) -> _Claim:
         """The claim of a participant to a port, for a locator."""
         prefix, kind = user
         if (former_locator := self._forwarded.get(port)) is not None:
             is_own = former_locator == locator and kind is TrafficKind.USER_DATA
-            return _Claim.FORWARDED if is_own else _Claim.ANOTHERS
-        if port == had:
+            return _Claim.FORWARDED if is_own else _Claim.OF_ANOTHER
+        if port == former_port:
             return self._judged(port, prefix)
         if port in self._disputed:
             return _Claim.DISPUTED
@@ -274,33 +276,35 @@ class LocatorPorts:
         claims = self._claims.get(port, {})
         rivals = claims.keys() - {prefix}
         if any(claims[rival] for rival in rivals):
-            return _Claim.ANOTHERS
+            return _Claim.OF_ANOTHER
         if user in named.users:
             # Every sender may forge a source. So a name from an unproven address is worth no more
             # than the word of a rival.
             is_doubtful = rivals and named.best is NamedBy.OTHERS
-            return _Claim.ANOTHERS if is_doubtful else _Claim.NAMED
+            return _Claim.OF_ANOTHER if is_doubtful else _Claim.NAMED
         # The participant may be named for the other kind of traffic: Cyclone DDS has one locator
         # for both kinds, Fast DDS has two.
-        return _Claim.ANOTHERS if rivals or named.prefixes - {prefix} else _Claim.NOBODYS
+        return _Claim.OF_ANOTHER if rivals or named.prefixes - {prefix} else _Claim.UNCLAIMED
 
     def _judged(self, port: int, prefix: bytes) -> _Claim:
         """The claim of a participant to a port that it states or has proved, against its rivals."""
-        claim = self._said(port, prefix)
+        claim = self._evidence(port, prefix)
         rivals = self._claims.get(port, {}).keys() - {prefix}
-        best_rival = min((self._said(port, rival) for rival in rivals), default=_Claim.NOBODYS)
-        if claim is _Claim.ANOTHERS:
+        best_rival = min(
+            (self._evidence(port, rival) for rival in rivals), default=_Claim.UNCLAIMED
+        )
+        if claim is _Claim.OF_ANOTHER:
             return claim
         if claim == best_rival:
             self._disputed[port] = claim
         if claim >= self._disputed.get(port, _Claim.DISPUTED):
             return _Claim.DISPUTED
         named_prefixes = self._former_users.get(port, _NO_USERS).prefixes
-        is_void = claim is _Claim.SAID and named_prefixes and prefix not in named_prefixes
-        return _Claim.ANOTHERS if is_void or claim > best_rival else claim
+        is_void = claim is _Claim.STATED and named_prefixes and prefix not in named_prefixes
+        return _Claim.OF_ANOTHER if is_void or claim > best_rival else claim
 
-    def _said(self, port: int, prefix: bytes) -> _Claim:
-        """The worth of a participant's statement or proof for a port.
+    def _evidence(self, port: int, prefix: bytes) -> _Claim:
+        """The claim that a participant's own statement or proof gives, without regard to rivals.
 
         Names from unproven addresses count neither for nor against the participant.
         """
@@ -309,8 +313,8 @@ class LocatorPorts:
         if self._claims.get(port, {}).get(prefix):
             return _Claim.KEPT_AND_NAMED if prefix in prefixes else _Claim.KEPT
         if prefix in prefixes:
-            return _Claim.SAID_AND_NAMED
-        return _Claim.ANOTHERS if prefixes else _Claim.SAID
+            return _Claim.STATED_AND_NAMED
+        return _Claim.OF_ANOTHER if prefixes else _Claim.STATED
 
     def give_back(self, port: int) -> None:
         """Make a port available again."""

@@ -49,8 +49,8 @@ class PortMappings:
     changes: int = 0
     _by_address: dict[str, dict[int, Holder]] = field(default_factory=dict)
 
-    def lacks_proof(self, prefix: bytes, address: str) -> bool:
-        """Whether a participant gets no port because ports are scarce and no answer has come."""
+    def must_answer_first(self, prefix: bytes, address: str) -> bool:
+        """Whether a participant gets a port only after an answer, because few ports are free."""
         kept = len(self.settings.ports.listen) // PART_FOR_PROVEN
         return self.ports.pool.free <= kept and not self.proofs.has_answered(address, prefix)
 
@@ -102,9 +102,10 @@ class PortMappings:
     def make_room(
         self, participant: InsideParticipant, spdp: Announcement, datagram: bytes
     ) -> None:
-        """End mappings to locators that a participant with too many no longer announces.
+        """If a participant has too many mappings, end those that its announcement does not name.
 
-        A forged announcement may have caused these mappings.
+        A forged announcement may have caused these mappings. No mapping ends if the announcement
+        itself names more than `MOST_MAPPINGS` locators.
         """
         address = participant.address
         named = {locator for _, locator in spdp.reached_at(datagram) if locator.host == address}
@@ -143,7 +144,7 @@ class PortMappings:
             self.shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
         if former_port not in (None, port) and self.ports.is_restoring(now):
-            self._lose(participant, former_port, now)
+            self._lose_port(participant, former_port, now)
         mapping = PortMapping(port, locator, kind)
         self.add(participant, mapping)
         return mapping
@@ -158,7 +159,7 @@ class PortMappings:
             text = f"{locator} got no port: {participant.address} already has as many ports of "
             text += f"{ports} as one address may have"
             return PortShortage(ShortageKind.RANGE, text)
-        if self.lacks_proof(participant.prefix, participant.address):
+        if self.must_answer_first(participant.prefix, participant.address):
             text = (
                 f"{locator} got no port: the participant does not answer the proxy, and the last "
             )
@@ -183,7 +184,9 @@ class PortMappings:
         in_range = locator.port in self.settings.ports.listen
         return in_range and locator.host == self.settings.proxy_address_for(locator.host)
 
-    def _lose(self, participant: InsideParticipant, former_port: int | None, now: float) -> None:
+    def _lose_port(
+        self, participant: InsideParticipant, former_port: int | None, now: float
+    ) -> None:
         """Let all participants outside rediscover a participant that has lost a former port."""
         participant.separation_due_from = now
         text = f"participant {participant.guid_prefix} gets another port than {former_port}, which "

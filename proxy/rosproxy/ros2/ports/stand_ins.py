@@ -18,12 +18,12 @@ from rosproxy.ros2.registry.participants import OutsideParticipant, PortMapping,
 from rosproxy.ros2.sources.claimed_addresses import is_proxy_port
 
 STAND_INS = PortRange(20_000, 32_767)
-"""The range of stand-ins. It ends below the ephemeral ports of Linux."""
+"""The range of stand-ins, below the ephemeral ports of Linux."""
 MOST_PORTS_TRIED = 32
-"""Ports that are tried for a locator outside."""
+"""The highest number of ports that are tried for a locator outside."""
 MOST_SHARING = 3
-"""Locators outside that a stand-in may serve. For a known participant, the locators of unknown
-participants do not count."""
+"""The highest number of locators outside that a stand-in may serve. For a known participant, the
+locators of unknown participants do not count."""
 
 StandInUser = tuple[OutsideParticipant, PortMapping]
 """A participant outside that a stand-in serves, and the mapping of the participant's locator."""
@@ -82,7 +82,7 @@ class LocatorStandIns:
             self._close(outsider, mapping.target)
 
     def is_own_port(self, locator: HostPort) -> bool:
-        """Whether a locator is a port of the proxy. A stand-in for it would lead inside."""
+        """Whether a locator is a port of the proxy. Its stand-in would lead inside."""
         return is_proxy_port(locator, self.by_port, self.settings)
 
     def _users(self, for_known: bool, port: int) -> int:

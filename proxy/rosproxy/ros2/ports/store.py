@@ -46,9 +46,9 @@ store::
   confirmed the number (`keeps`).
 - *A former heartbeat does no harm.* A reader ignores a heartbeat unless the count is greater than
   that of the last heartbeat, which another process may have sent. So the count follows from the
-  time (`_told`).
-- *A longer range keeps the ports.* The first port of the range stays, and a port takes the same
-  bits up to a length of the range. So the port store stays the same.
+  time (`_heartbeat_datagrams`).
+- *A longer range keeps the ports.* The first port of the range stays. A port takes the same number
+  of bits in the longer range, up to a limit (`_WIDTHS`). So the port store stays the same.
 - *A lie is worth less than a proof.* Each participant can compute the number for the ports of
   another participant. So a proxy with a secret has a second such participant, the *port proof*. The
   number of the port proof has the count of the ports, and a keyed hash of the participant's GUID
@@ -73,7 +73,7 @@ from rosproxy.ros2.protocol.rtps import HEADER_BYTES, NO_VENDOR, PREFIX_BYTES
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 COUNTS_EACH_SECOND = 4
-"""Heartbeat counts per second of Unix time (`PortStore._told`)."""
+"""Heartbeat counts per second of Unix time (`PortStore._heartbeat_datagrams`)."""
 LEASE_DURATION_S = 24 * 3600.0
 """Seconds for which participants remember the port store without an announcement."""
 WRITERS = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
@@ -123,13 +123,14 @@ class PortStore:
     _answers: dict[bytes, dict[_Writer, int]] = field(default_factory=dict)
     """The last answers of each participant, by GUID prefix and by writer."""
     _counts: dict[bytes, int] = field(default_factory=dict)
+    """The count of the last heartbeat to each participant, by GUID prefix."""
 
     @classmethod
     def of(
         cls, host: str, ports: PortRange, domain: int, unix_offset: float, key: bytes = b""
     ) -> "PortStore":
         """Return the port store of a host, a range and a domain, the same in each process."""
-        identity = f"{host} {ports.first} {_width(ports)} {domain}"
+        identity = f"{host} {ports.first} {_bits_of_port(ports)} {domain}"
         digest = blake2b(identity.encode(), digest_size=PREFIX_BYTES - 2).digest()
         # A GUID prefix begins with the vendor's id (DDSI 2.2; so in Cyclone DDS, ddsi_init.c).
         return cls(NO_VENDOR + digest, ports, key, unix_offset)
@@ -151,13 +152,15 @@ class PortStore:
 
         ``reached_at`` is where the participant reaches the port store.
         """
-        return self._told(prefix, dict.fromkeys(self._writers, 1), reached_at, now)
+        return self._heartbeat_datagrams(prefix, dict.fromkeys(self._writers, 1), reached_at, now)
 
     def reminders(
         self, prefix: bytes, ports: Sequence[int], reached_at: HostPort, now: float
     ) -> list[bytes]:
         """The datagrams with which a participant keeps its ports; empty if nothing is missing.
 
+        If a number would have to become smaller, these are `dispose_messages`, and the answers of
+        the participant are forgotten.
         ``reached_at`` is where the participant reaches the port store.
         """
         if self.keeps(prefix, ports):
@@ -172,7 +175,7 @@ class PortStore:
             # A reader ignores smaller numbers (DDSI-RTPS 2.5, 8.4.12.1). So the participant has to
             # forget the port store first, and gets the number with the next reminders.
             return self.dispose_messages(prefix)
-        return self._told(prefix, wanted, reached_at, now)
+        return self._heartbeat_datagrams(prefix, wanted, reached_at, now)
 
     def dispose_messages(self, prefix: bytes) -> list[bytes]:
         """The datagrams with which a participant forgets the port store and the ports."""
@@ -198,8 +201,11 @@ class PortStore:
         return len(self._answers.get(prefix, ())) == len(self._writers)
 
     def former_ports(self, prefix: bytes) -> list[int]:
-        """The ports that a participant has kept, in the order of its locators."""
-        return list(self._ports(self._answer(prefix, self.prefix, self.port_bits)))
+        """The ports that a participant has kept, in the order of its locators.
+
+        Empty if the participant has not answered.
+        """
+        return list(self._ports(self._answer(prefix, self.prefix, self.lower_half_bits)))
 
     def proven_count(self, prefix: bytes) -> int:
         """How many of `former_ports` a participant has proved."""
@@ -217,7 +223,7 @@ class PortStore:
 
     def numbers(self, prefix: bytes, ports: Sequence[int]) -> dict[_Writer, int]:
         """The numbers of the port store and the port proof for a participant's ports, by writer."""
-        numbers = [*halves(self.number(ports), self.port_bits)]
+        numbers = [*halves(self.number(ports), self.lower_half_bits)]
         if self.key:
             numbers += halves(self.proof(prefix, ports), HALF_BITS)
         return dict(zip(self._writers, numbers, strict=True))
@@ -225,15 +231,15 @@ class PortStore:
     def number(self, ports: Sequence[int]) -> int:
         """The number that holds these ports, or as many as fit."""
         number = 0
-        width = _width(self.ports)
-        for index, port in enumerate(ports[: _most(self.ports)]):
+        width = _bits_of_port(self.ports)
+        for index, port in enumerate(ports[: _most_ports(self.ports)]):
             # The first port of the range is 1, because 0 means that no port follows (`_ports`).
             number |= (port - self.ports.first + 1) << index * width
         return number + 1
 
     def proof(self, prefix: bytes, ports: Sequence[int]) -> int:
         """The number that proves the ports of a participant; 1 without ports or without a key."""
-        count = min(len(ports), _most(self.ports))
+        count = min(len(ports), _most_ports(self.ports))
         if not self.key or not count:
             return 1
         # The port store's prefix stands for the proxy, its range and its domain.
@@ -253,12 +259,12 @@ class PortStore:
         return [(own, writer) for own in self._own_prefixes for writer in WRITERS]
 
     @property
-    def port_bits(self) -> int:
+    def lower_half_bits(self) -> int:
         """Bits of the lower half of a number that holds ports. Each port lies in one half."""
-        return _most(self.ports) // 2 * _width(self.ports)
+        return _most_ports(self.ports) // 2 * _bits_of_port(self.ports)
 
     def _answer(self, prefix: bytes, own: bytes, bits: int) -> int:
-        """The last number of a participant for the port store or the port proof.
+        """The last number of a participant for the port store or the port proof; 1 without answers.
 
         ``own`` is the GUID prefix of port store or port proof, and ``bits`` the length of the lower
         half.
@@ -269,18 +275,18 @@ class PortStore:
         return lower + (upper - 1 << bits)
 
     def _has_kept(self, prefix: bytes, ports: Sequence[int]) -> bool:
-        """Whether the number of a participant holds these ports, or as many as fit."""
-        fitting = list(ports[: _most(self.ports)])
+        """Whether the number of a participant begins with these ports, or with as many as fit."""
+        fitting = list(ports[: _most_ports(self.ports)])
         return self.former_ports(prefix)[: len(fitting)] == fitting
 
     def _is_proven(self, prefix: bytes, ports: Sequence[int]) -> bool:
-        """Whether a participant has proved these ports, or more."""
-        return self.proven_count(prefix) >= min(len(ports), _most(self.ports))
+        """Whether a participant has proved as many ports as these, or more."""
+        return self.proven_count(prefix) >= min(len(ports), _most_ports(self.ports))
 
     def _ports(self, number: int) -> Iterator[int]:
         """Yield the ports that a number holds, up to the first that is not in the range."""
         bits = number - 1
-        width = _width(self.ports)
+        width = _bits_of_port(self.ports)
         while bits > 0:
             port = self.ports.first + (bits & (1 << width) - 1) - 1
             if port not in self.ports:
@@ -288,7 +294,7 @@ class PortStore:
             yield port
             bits >>= width
 
-    def _told(
+    def _heartbeat_datagrams(
         self, prefix: bytes, numbers: Mapping[_Writer, int], reached_at: HostPort, now: float
     ) -> list[bytes]:
         """The datagrams that give a participant the numbers of the writers.
@@ -311,10 +317,10 @@ class PortStore:
         return sent
 
 
-def _width(ports: PortRange) -> int:
+def _bits_of_port(ports: PortRange) -> int:
     return next(width for width in _WIDTHS if len(ports) < 1 << width)
 
 
-def _most(ports: PortRange) -> int:
+def _most_ports(ports: PortRange) -> int:
     """How many ports of a range a number can hold."""
-    return 2 * (HALF_BITS // _width(ports))
+    return 2 * (HALF_BITS // _bits_of_port(ports))

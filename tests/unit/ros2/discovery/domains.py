@@ -144,7 +144,7 @@ def kept_halves(own: bytes, prefix: bytes, number: int, bits: int) -> bytes:
 def kept_answer(domain: Domain, prefix: bytes, number: int) -> bytes:
     """A participant's answer to the port store of a domain."""
     port_store = domain.proxy_participants.port_store
-    return kept_halves(port_store.prefix, prefix, number, port_store.port_bits)
+    return kept_halves(port_store.prefix, prefix, number, port_store.lower_half_bits)
 
 
 def proof_answer(domain: Domain, prefix: bytes, proof: int) -> bytes:

@@ -220,7 +220,7 @@ def test_a_datagram_waits_for_all_that_it_has_a_part_of() -> None:
 
 
 def test_nobody_pushes_out_what_others_have_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fragments, "MOST_OF_ALL", 100 * OVERHEAD_BYTES)
+    monkeypatch.setattr(fragments, "MOST_BYTES_OF_ALL", 100 * OVERHEAD_BYTES)
     stores = FragmentStores()
     sent = cut(described(100), 128)
     assert [through(stores, datagram) for datagram in sent[:-1]] == [[]] * (len(sent) - 1)

@@ -312,7 +312,7 @@ class Neighbours(RuleBasedStateMachine):
         assert domain.ports._ports_claimed.keys() <= known
         assert domain.fragments.by_prefix.keys() <= prefixes
         sizes = [store.size for store in domain.fragments.by_prefix.values()]
-        assert domain.fragments.size == sum(sizes) <= fragments.MOST_OF_ALL
+        assert domain.fragments.size == sum(sizes) <= fragments.MOST_BYTES_OF_ALL
         assert len(domain.rates._by_source) <= MOST_SOURCES
         assert all(allowance.remaining <= BURST for allowance in domain.rates._by_source.values())
 

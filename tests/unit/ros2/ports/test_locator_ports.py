@@ -198,8 +198,8 @@ def test_what_the_kernel_forwarded_leads_there_again(
     pool = ports()
     pool.note_forwarded({port: locator(1), 9: locator(1)})
     pool.note_former_user(port, other_prefix, DATA, PEER, 0.5)
-    assert pool.take(other_prefix, locator(0), DATA, SETTLING_PERIOD_S, had=port) != port
-    assert pool.take(prefix, locator(1), METATRAFFIC, SETTLING_PERIOD_S, had=port) != port
+    assert pool.take(other_prefix, locator(0), DATA, SETTLING_PERIOD_S, former_port=port) != port
+    assert pool.take(prefix, locator(1), METATRAFFIC, SETTLING_PERIOD_S, former_port=port) != port
     assert pool.take(prefix, locator(1), DATA, SETTLING_PERIOD_S) == port
     pool.give_back(port)
     order = order_for(f"{other_prefix.hex()} {locator(2)}", RANGE)

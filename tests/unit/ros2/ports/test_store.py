@@ -37,7 +37,7 @@ def make_port_store(started: float = 0.0, key: bytes = KEY, ports: PortRange = R
 def answered(port_store: PortStore, number: int, proof: int = 1, prefix: bytes = PEER) -> int:
     """Have a participant answer a port store; how many ports that proves."""
     assert port_store.take(
-        prefix, kept_halves(port_store.prefix, prefix, number, port_store.port_bits)
+        prefix, kept_halves(port_store.prefix, prefix, number, port_store.lower_half_bits)
     )
     assert port_store.has_answered(prefix) is not bool(port_store.key)
     if port_store.key:
@@ -256,7 +256,7 @@ def test_answers_to_both_in_one_message(is_first: bool) -> None:
     port_store = make_port_store()
     ports = [11405]
     answers = [
-        kept_halves(port_store.prefix, PEER, port_store.number(ports), port_store.port_bits),
+        kept_halves(port_store.prefix, PEER, port_store.number(ports), port_store.lower_half_bits),
         kept_halves(port_store.proof_prefix, PEER, port_store.proof(PEER, ports), HALF_BITS),
     ]
     first, second = answers if is_first else answers[::-1]

@@ -489,8 +489,8 @@ def test_an_address_inside_that_is_full_pushes_out_no_other() -> None:
         address = OTHER if number >= MOST_PER_ADDRESS else INSIDE
         domain.inside.meet(read_discovery(spdp(named(number), address)), address, NOW)
     assert domain.inside.count_by_address == {INSIDE: MOST_PER_ADDRESS, OTHER: MOST_PER_ADDRESS}
-    assert domain.inside.gives_place(A, OTHER) is None
-    assert domain.inside.gives_place(A, "172.30.0.9") is domain.inside.by_prefix[named(0)]
+    assert domain.inside.participant_to_end(A, OTHER) is None
+    assert domain.inside.participant_to_end(A, "172.30.0.9") is domain.inside.by_prefix[named(0)]
 
 
 def crowd_at(domain: Domain, address: str, now: float) -> None:

@@ -30,8 +30,8 @@ from rosproxy.ros2.rewriting.discovery import (
 )
 
 DISPOSE_MESSAGE_INTERVAL_S = 2.0
-"""Seconds until a participant inside gets the next dispose message for the same participant
-outside. The proxy repeats the message until the two have rediscovered each other."""
+"""Seconds from a dispose message to the next, for the same participant inside and the same
+participant outside. The proxy repeats the message until the two have rediscovered each other."""
 
 
 @dataclass(slots=True)
@@ -55,11 +55,11 @@ class ForInside:
         has_source = self.outsider.address in set(_user_data_hosts(message))
         return rewritten(
             message,
-            lambda pid, locator: self._led(pid, locator, has_source),
+            lambda pid, locator: self._inside_target(pid, locator, has_source),
             lambda announcement: self._is_hidden(announcement, datagram),
         )
 
-    def _led(self, pid: int, locator: HostPort, has_source: bool) -> HostPort | None:
+    def _inside_target(self, pid: int, locator: HostPort, has_source: bool) -> HostPort | None:
         """The address at which inside reaches a locator of the participant; None if there is none.
 
         ``has_source`` means that the message has a locator for user data at the source address of
@@ -74,9 +74,9 @@ class ForInside:
         elif not self.outside.settings.both_ways:
             return None if self._means_another(locator, has_source) else locator
         else:
-            is_led = locator.host == self.outsider.address and not stand_ins.is_own_port(locator)
+            may_open = locator.host == self.outsider.address and not stand_ins.is_own_port(locator)
             mapping = (
-                stand_ins.open(self.outsider, locator, TrafficKind.USER_DATA) if is_led else None
+                stand_ins.open(self.outsider, locator, TrafficKind.USER_DATA) if may_open else None
             )
         return HostPort(self.near, mapping.port) if mapping else None
 
@@ -130,9 +130,9 @@ class AnnouncementsToInside:
                 near = self.settings.proxy_address_for(insider.address)
                 by_near.setdefault(near, []).append(insider)
         for outsider in filter(self.outside.may_be_announced, outside):
-            for near, told in by_near.items():
+            for near, receivers in by_near.items():
                 datagram = self._announcement(outsider, near)
-                for insider in told:
+                for insider in receivers:
                     sent += self.dispose_message(outsider, insider, now)
                     sent += sent_to(insider.metatraffic, [datagram])
         return sent
@@ -140,9 +140,9 @@ class AnnouncementsToInside:
     def dispose_message(
         self, outsider: OutsideParticipant, insider: InsideParticipant, now: float
     ) -> list[Outgoing]:
-        """The dispose message for a participant outside, if a participant inside has to forget it.
+        """The dispose message with which a participant inside forgets a participant outside.
 
-        Empty outside of a rediscovery, and if the last such message is more recent than
+        Empty without a rediscovery, and if the last such message is more recent than
         `DISPOSE_MESSAGE_INTERVAL_S`.
         """
         if (
@@ -160,10 +160,10 @@ class AnnouncementsToInside:
     ) -> list[Outgoing]:
         """The unchanged announcement of a participant inside, for others on the same network.
 
-        Empty if the announcement came by multicast. These participants reach each other without the
-        proxy. The processes of a pod, which share an address, need this, too: Fast DDS sends no
-        multicast if it has peers. A participant may announce an address of the proxy as a locator.
-        Nothing goes to the ports at which the proxy itself receives announcements.
+        Empty if the announcement came by multicast: these participants reach each other without the
+        proxy. The processes of a pod share an address and need this announcement, because Fast DDS
+        sends no multicast if it has peers. A participant may announce an address of the proxy as a
+        locator. So nothing goes to the ports at which the proxy itself receives announcements.
         """
         if newcomer.is_in_group:
             return []

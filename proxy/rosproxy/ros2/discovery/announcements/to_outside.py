@@ -17,7 +17,7 @@ from rosproxy.ros2.rewriting.announced_participant import note_endpoints
 from rosproxy.ros2.rewriting.discovery import Announcement, DiscoveryMessage, rewritten
 
 REPEAT_INTERVAL_S = 0.5
-"""Seconds in which the proxy sends the same announcement outside only once."""
+"""Seconds in which the proxy sends the same announcement to outside only once."""
 
 
 @dataclass(slots=True)
@@ -45,11 +45,11 @@ class ForOutside:
         note_endpoints(self.inside.notes, self.insider, datagram, message.announcements)
         return rewritten(
             message,
-            self._led,
+            self._outside_target,
             lambda announcement: self._is_hidden(announcement, datagram),
         )
 
-    def _led(self, pid: int, locator: HostPort) -> HostPort | None:
+    def _outside_target(self, pid: int, locator: HostPort) -> HostPort | None:
         """The address and port at which outside reaches a locator; None if there is no port."""
         is_metatraffic = pid == Pid.METATRAFFIC_UNICAST_LOCATOR
         kind = TrafficKind.METATRAFFIC if is_metatraffic else TrafficKind.USER_DATA
@@ -75,9 +75,9 @@ class AnnouncementsToOutside:
     ) -> list[Outgoing]:
         """The datagrams that announce a participant inside to outside.
 
-        Empty if the same announcement has just been sent: participants repeat announcements while
-        many discover each other, and each goes to all ports of the peers. Empty during a
-        separation, too.
+        Empty if the same announcement has just been sent (`REPEAT_INTERVAL_S`). While many
+        participants discover each other, each repeats its announcement, and each repetition goes to
+        many ports of the peers. Empty during a separation, too.
         """
         if announcement == insider.announcement and now - insider.announced_at < REPEAT_INTERVAL_S:
             return []
@@ -88,9 +88,9 @@ class AnnouncementsToOutside:
             return []
         if is_first:
             return self.settings.to_outside(announcement)
-        return self._to_met(announcement)
+        return self._to_known_targets(announcement)
 
-    def _to_met(self, datagram: bytes) -> list[Outgoing]:
+    def _to_known_targets(self, datagram: bytes) -> list[Outgoing]:
         """The datagrams for an announcement of a participant inside that is not the first.
 
         For a peer without a port, the announcement goes to the locators of known participants, and
@@ -107,11 +107,12 @@ class AnnouncementsToOutside:
             elif not count:
                 targets = self.settings.well_known_of_peer(peer.host)
             else:
-                targets = self._met_at(peer.host, count)
+                targets = self._known_targets(peer.host, count)
             sent += [Outgoing(target, datagram) for target in targets]
         return sent
 
-    def _met_at(self, host: str, count: int) -> list[HostPort]:
+    def _known_targets(self, host: str, count: int) -> list[HostPort]:
+        """The next well-known ports of a host, and the locators of its known participants."""
         met = (p.metatraffic for p in self.outside.by_prefix.values() if p.address == host)
         next_ports = self.settings.well_known(host, min(count + NEXT_PORTS, MOST_TRIED))
         return list(dict.fromkeys([*next_ports, *filter(None, met)]))

@@ -71,7 +71,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         participant.traits = traits(spdp, datagram, source)
         return participant
 
-    def gives_place(self, prefix: bytes, source: str) -> InsideParticipant | None:
+    def participant_to_end(self, prefix: bytes, source: str) -> InsideParticipant | None:
         """The participant that ends in favour of a new participant; None if none has to end.
 
         Then there is room for the new participant, or the new participant gets no place.
@@ -84,7 +84,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             return fairer_place(self._answering(True), MOST_INSIDE, source, str)
         return oldest_unproven(self._answering(False), MOST_INSIDE_UNPROVEN)
 
-    def prove(self) -> list[InsideParticipant]:
+    def over_limit(self) -> list[InsideParticipant]:
         """The participants that end because more have answered than may have a place."""
         return surplus(self._answering(True), MOST_INSIDE, str)
 

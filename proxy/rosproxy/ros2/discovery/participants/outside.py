@@ -120,14 +120,15 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         for outsider in self.at(address):
             outsider.proven = True
         ended = surplus(self._proven_strangers(), MOST_OUTSIDE, subnet)
-        told = [p for p in self.at(address) if not p.is_announced and p not in ended]
-        return told, ended
+        to_announce = [p for p in self.at(address) if not p.is_announced and p not in ended]
+        return to_announce, ended
 
     def may_be_announced(self, outsider: OutsideParticipant) -> bool:
         """Whether the proxy announces a participant inside.
 
-        If many participants are at unproven addresses, the proxy announces no more of these. A
-        forger may have invented them, and each participant inside would remember all.
+        If many participants are at unproven addresses, the proxy announces no more of these: a
+        forger may have invented them, and each participant inside would remember all. A participant
+        that was announced once stays announced.
         """
         if not outsider.is_announced:
             outsider.is_announced = (
@@ -139,10 +140,10 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """Whether a participant is known at an address, or the address is that of a peer."""
         return source in self.count_by_address or self.settings.is_peer(source)
 
-    def is_strange(self, source: str) -> bool:
-        """Whether the proxy ignores an address, because no participant is known there.
+    def refuses_source(self, source: str) -> bool:
+        """Whether the proxy ignores a source, because no participant is known at this address.
 
-        If so, count a refusal.
+        If so, report a refusal.
         """
         if self.is_met(source):
             return False
@@ -185,7 +186,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         self.remove(participant)
         self.stand_ins.close(participant)
 
-    def gives_place(self, source: str) -> OutsideParticipant | None:
+    def participant_to_end(self, source: str) -> OutsideParticipant | None:
         """The participant that ends in favour of a new one; None if no participant has to end.
 
         Then there is room for the new participant, or the new participant gets no place.

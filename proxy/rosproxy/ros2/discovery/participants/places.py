@@ -30,7 +30,7 @@ def fairer_place(
 
     This is the newest participant of the largest owner, which has most participants. None if there
     is room for a further participant, up to ``most``. None also if the owner of ``source`` would
-    then have at least as many participants as the largest owner.
+    then have at least as many participants as the largest owner has now.
     """
     if len(proven) < most:
         return None

@@ -38,13 +38,13 @@ class PrefixOwners:
         return prefix in self.inside.by_prefix or prefix in self.former_ports.waiting
 
     def yields_to_inside(self, prefix: bytes) -> bool:
-        """Whether a participant inside may have a prefix, which a participant outside may use."""
+        """Whether a participant inside may have a prefix, even if a participant outside uses it."""
         outsider = self.outside.by_prefix.get(prefix)
         is_weak = outsider is None or not (outsider.trusted or outsider.proven)
         return is_weak or self.former_ports.was_inside(prefix)
 
     def yields_to_outside(self, prefix: bytes, source: str, now: float) -> bool:
-        """Whether a participant outside may have a prefix, which a participant inside uses.
+        """Whether a participant outside may have a prefix that a participant inside uses.
 
         ``source`` is the address of the participant outside.
         """
