@@ -22,12 +22,13 @@ from rosproxy.ros2.protocol.rtps import (
     walk_submessages,
 )
 
-MOST_OF_USERS = 16
-"""Submessages of a datagram that may pass unread. User data has half a dozen."""
+MOST_UNREAD_SUBMESSAGES = 16
+"""The highest number of submessages of a datagram that may pass unread. User data has half a
+dozen."""
 
-LONGEST_HEARTBEAT = 160
-"""Bytes of a message that can count as a heartbeat alone. Messages of Fast DDS have 112: header 20,
-INFO_DST 16, heartbeat 32, statistics 44."""
+LONGEST_HEARTBEAT_BYTES = 160
+"""The most bytes of a message that can count as a heartbeat alone. Messages of Fast DDS have 112:
+header 20, INFO_DST 16, heartbeat 32, statistics 44."""
 
 _WRITER_AT: dict[int, int] = {
     SubmessageId.DATA: 8,
@@ -53,8 +54,8 @@ _NAMELESS = frozenset(
 _NAMELESS_OF = {FAST_DDS: _NAMELESS | {STATISTICS}}
 """Submessages without a reader and a writer, by vendor, for vendors with submessages of their
 own."""
-LONGEST_WITHOUT_SAMPLES = 256
-"""Bytes of a message that may be without a sample. So the proxy looks into small messages alone."""
+LONGEST_WITHOUT_SAMPLES_BYTES = 256
+"""The most bytes of a message without samples. So the proxy looks only into small messages."""
 _WITHOUT_SAMPLES = _NAMELESS | frozenset(
     kind.value
     for kind in (
@@ -67,9 +68,9 @@ _WITHOUT_SAMPLES = _NAMELESS | frozenset(
 )
 _WITHOUT_SAMPLES_OF = {FAST_DDS: _WITHOUT_SAMPLES | {STATISTICS}}
 """Submessages without a sample, and the same by vendor."""
-_ENTITY_ID = 4
+_ENTITY_ID_BYTES = 4
 """Bytes of an entity id."""
-_HEARTBEAT = 28
+_HEARTBEAT_BYTES = 28
 """Bytes of the body of a heartbeat (DDSI-RTPS 2.5, 9.4.5.7)."""
 _BUILT_IN = 0xC0
 """Bits that are set in the last byte of the entity id of each builtin endpoint (9.3.1.2)."""
@@ -146,7 +147,7 @@ def heartbeat_stream(datagram: bytes) -> bytes | None:
     of the same stream replaces an earlier one (8.3.8.6). The flags say whether the writer wants an
     answer, and whether the writer is alive.
     """
-    if len(datagram) > LONGEST_HEARTBEAT:
+    if len(datagram) > LONGEST_HEARTBEAT_BYTES:
         return None
     stream = b""
     try:
@@ -155,8 +156,8 @@ def heartbeat_stream(datagram: bytes) -> bytes | None:
             if kind == INFO_DST and not stream:
                 stream = datagram[body.start : body.start + PREFIX_BYTES]
             elif kind == SubmessageId.HEARTBEAT and len(stream) <= PREFIX_BYTES:
-                require_size(body, _HEARTBEAT)
-                entities = datagram[body.start : body.start + 2 * _ENTITY_ID]
+                require_size(body, _HEARTBEAT_BYTES)
+                entities = datagram[body.start : body.start + 2 * _ENTITY_ID_BYTES]
                 stream = stream.ljust(PREFIX_BYTES, b"\0") + entities + bytes([flags])
             elif kind not in nameless or kind == SubmessageId.INFO_SRC:
                 return None
@@ -176,7 +177,7 @@ def carries_samples(datagram: bytes) -> bool:
     subscriber sends such messages to each publisher.
     """
     size = len(datagram)
-    if not HEADER_BYTES < size <= LONGEST_WITHOUT_SAMPLES:
+    if not HEADER_BYTES < size <= LONGEST_WITHOUT_SAMPLES_BYTES:
         return True
     # The proxy does this for each small datagram. `walk_submessages` takes three times as long.
     kinds = _WITHOUT_SAMPLES_OF.get(datagram[6:8], _WITHOUT_SAMPLES)
@@ -195,14 +196,14 @@ def carries_samples(datagram: bytes) -> bool:
 def may_be_discovery(datagram: bytes) -> bool:
     """Whether the proxy has to read a message: a builtin reader or writer may be named there.
 
-    The proxy also has to read a datagram that is malformed, that has more than MOST_OF_USERS
-    submessages, or that has submessages of an unknown kind. The submessages of DDS Security are of
-    an unknown kind.
+    The proxy also has to read a datagram that is malformed, that has more than
+    MOST_UNREAD_SUBMESSAGES submessages, or that has submessages of an unknown kind. The submessages
+    of DDS Security are of an unknown kind.
     """
     try:
         nameless = _NAMELESS_OF.get(source_vendor(datagram), _NAMELESS)
         for count, (kind, _, body) in enumerate(walk_submessages(datagram)):
-            if count >= MOST_OF_USERS or (
+            if count >= MOST_UNREAD_SUBMESSAGES or (
                 kind not in nameless and _names_built_in(datagram, kind, body)
             ):
                 return True

@@ -1,7 +1,7 @@
 """Announcements of the proxy's own participants, and dispose messages.
 
-Participants that discover a new participant announce themselves to it at once. Their next regular
-announcement may be seconds away.
+A participant that discovers a new participant announces itself to the new one at once, and does not
+wait for its next regular announcement. So the proxy's participants soon know all others.
 """
 
 import struct
@@ -31,8 +31,9 @@ def announcement(
 ) -> bytes:
     """The datagram in which a participant of the proxy announces itself.
 
-    ``reached_at`` are its locators. ``lease_duration`` is in whole seconds; ``endpoints`` are bits
-    of PID_BUILTIN_ENDPOINT_SET. Raises ValueError if the host of a locator is a name.
+    ``reached_at`` are its locators. ``lease_duration`` is in seconds, and is cut to whole seconds.
+    ``endpoints`` are bits of PID_BUILTIN_ENDPOINT_SET. Raises ValueError if the host of a locator
+    is a name.
     """
     locators = [pack_locator(host_port, "<") for host_port in reached_at]
     return _message(

@@ -15,7 +15,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.parameters import Parameter, ParameterList
 from rosproxy.ros2.protocol.rtps import Overwrite
 
-SIZE = 24
+LOCATOR_BYTES = 24
 """Bytes of a locator."""
 
 
@@ -52,10 +52,10 @@ def read_locator(
 ) -> Locator | None:
     """The locator in a parameter; None if the parameter is too short."""
     start = parameter.value.start
-    if parameter.value.end - start < SIZE:
+    if parameter.value.end - start < LOCATOR_BYTES:
         return None
     kind, port = struct.unpack_from(parameters.order + "iI", datagram, start)
-    return Locator(kind, port, datagram[start + 8 : start + SIZE])
+    return Locator(kind, port, datagram[start + 8 : start + LOCATOR_BYTES])
 
 
 def replaced(parameters: ParameterList, parameter: Parameter, target: HostPort) -> Overwrite:

@@ -17,8 +17,8 @@ from rosproxy.ros2.protocol.rtps import RtpsError
 
 LIST_MAGIC = b"ADDR"
 MOST_LISTED = 256
-"""Addresses in a list; the datagram then has 4 KiB."""
-_SIZE = 16
+"""The highest number of addresses in a list; the datagram then has 4 KiB."""
+_ADDRESS_BYTES = 16
 
 
 def wrapped(source: str, datagram: bytes) -> bytes:
@@ -28,9 +28,9 @@ def wrapped(source: str, datagram: bytes) -> bytes:
 
 def unwrapped(data: bytes) -> tuple[str, bytes]:
     """The source address and the datagram. Raises RtpsError if ``data`` is too short."""
-    if len(data) < _SIZE:
+    if len(data) < _ADDRESS_BYTES:
         raise RtpsError("the datagram is too short for the address of its source")
-    return _unpacked(data[:_SIZE]), data[_SIZE:]
+    return _unpacked(data[:_ADDRESS_BYTES]), data[_ADDRESS_BYTES:]
 
 
 def address_lists(addresses: Iterable[str]) -> Iterator[bytes]:
@@ -47,8 +47,8 @@ def listed_addresses(content: bytes) -> list[str] | None:
     """Return the addresses in a list; None if the content is not a list."""
     if not content.startswith(LIST_MAGIC):
         return None
-    starts = range(len(LIST_MAGIC), len(content) - _SIZE + 1, _SIZE)
-    return [_unpacked(content[start : start + _SIZE]) for start in starts]
+    starts = range(len(LIST_MAGIC), len(content) - _ADDRESS_BYTES + 1, _ADDRESS_BYTES)
+    return [_unpacked(content[start : start + _ADDRESS_BYTES]) for start in starts]
 
 
 def _packed(text: str) -> bytes:

@@ -27,8 +27,8 @@ from rosproxy.ros2.protocol.rtps import RtpsError
 MAGIC = b"RPX1"
 WINDOW_S = 30.0
 """Seconds by which the time stamp may differ from the receiver's clock."""
-LONGEST_CONTENT = 8192 + 16
-"""Bytes of a content that the receiver reads: the longest announcement, and an address."""
+LONGEST_CONTENT_BYTES = 8192 + 16
+"""The most bytes of a content that the receiver reads: the longest announcement, and an address."""
 _PROOF_SIZE = 16
 _STAMP = struct.Struct(">Q")
 _CONTENT_AT = len(MAGIC) + _STAMP.size + _PROOF_SIZE
@@ -65,8 +65,10 @@ class RelayProof:
             raise ProofError(
                 "the datagram has no proof. Use the same version for the proxy and its LAN relay"
             )
-        if len(datagram) > _CONTENT_AT + LONGEST_CONTENT:
-            raise ProofError(f"the datagram has more than {LONGEST_CONTENT} bytes after its proof")
+        if len(datagram) > _CONTENT_AT + LONGEST_CONTENT_BYTES:
+            raise ProofError(
+                f"the datagram has more than {LONGEST_CONTENT_BYTES} bytes after its proof"
+            )
         stamp = datagram[len(MAGIC) : len(MAGIC) + _STAMP.size]
         proof = datagram[len(MAGIC) + _STAMP.size : _CONTENT_AT]
         content = datagram[_CONTENT_AT:]

@@ -28,12 +28,12 @@ from rosproxy.ros2.protocol.rtps import (
 )
 
 MOST_ASKED = 256
-"""Samples that a reader may request at once: the bits of a set (9.4.2.6)."""
+"""The highest number of samples that a reader may request at once: the bits of a set (9.4.2.6)."""
 _LITTLE = 0x01
 _FINAL = 0x02
 _GAP_SIZE = 28
 """Bytes of a GAP with one number."""
-_TO_READER = 5
+_READER_ID_OFFSET = 5
 """The entity id of a builtin writer (…c2) plus this is the entity id of its reader (…c7)."""
 
 
@@ -65,7 +65,7 @@ def heartbeat(own: bytes, to: bytes, writer: int, first: int, count: int) -> byt
     ``first`` is the number of the writer's next sample. The reader answers with the number of the
     sample that the reader expects.
     """
-    body = struct.pack(">II", writer + _TO_READER, writer)
+    body = struct.pack(">II", writer + _READER_ID_OFFSET, writer)
     last = first - 1
     body += struct.pack("<iIiI", first >> 32, first & 0xFFFFFFFF, last >> 32, last & 0xFFFFFFFF)
     return _directed(own, to, SubmessageId.HEARTBEAT, _LITTLE, body + _packed_count(count))
@@ -101,7 +101,7 @@ def acknack(
     ``base`` on. Unless ``final`` is set, the writer answers with a heartbeat.
     """
     # Cyclone DDS ignores an ACKNACK without a reader (ddsi_receive.c, validate_AckNack).
-    body = struct.pack(">II", writer + _TO_READER, writer)
+    body = struct.pack(">II", writer + _READER_ID_OFFSET, writer)
     body += struct.pack("<iI", base >> 32, base & 0xFFFFFFFF)
     body += _bits([number - base for number in missing]) + _packed_count(count)
     flags = _LITTLE | (_FINAL if final else 0)
@@ -113,10 +113,10 @@ def nack_frag(
 ) -> bytes:
     """The message in which a builtin reader requests fragments of a sample (8.3.8.10).
 
-    ``missing`` are the numbers of the fragments, in ascending order and at least one. The message
-    requests only numbers less than MOST_ASKED above the first.
+    ``missing`` are the numbers of the fragments, in ascending order and at least one. Numbers that
+    are MOST_ASKED or more above the first are left out.
     """
-    body = struct.pack(">II", writer + _TO_READER, writer)
+    body = struct.pack(">II", writer + _READER_ID_OFFSET, writer)
     body += struct.pack("<iII", sequence >> 32, sequence & 0xFFFFFFFF, missing[0])
     body += _bits([number - missing[0] for number in missing]) + _packed_count(count)
     return _directed(own, to, SubmessageId.NACK_FRAG, _LITTLE, body)

@@ -14,8 +14,8 @@ _NODE_SERVICES = {
     "type_description_interfaces::srv::dds_::GetTypeDescription_Request_": "/get_type_description",
 }
 """The DDS types of requests of two services that nodes have by default, and the names of these
-services in the namespace of the node. rclcpp and rclpy start the first without
-``start_parameter_services=False``, and the second since Jazzy (parameter
+services in the namespace of the node. rclcpp and rclpy start the first unless
+``start_parameter_services`` is False, and the second since Jazzy (parameter
 ``start_type_description_service``)."""
 
 

@@ -6,7 +6,7 @@ other submessages unchanged: heartbeats, acknowledgements, and submessages of a 
 
 The proxy never encodes a received message anew. This module returns positions, and an edit
 (`Overwrite`) keeps the length of the datagram. So all bytes outside the edits stay, also those of
-unknown versions and vendors. With one exception, `by_source` splits a message of several
+unknown versions and vendors. There is one exception: `by_source` splits a message of several
 participants into a message for each.
 
 The numbers are bytes:
@@ -191,8 +191,8 @@ def has_checksum(datagram: bytes) -> bool:
 def samples(datagram: bytes) -> list[Sample]:
     """All samples in a message, in their order.
 
-    Raises RtpsError if a length leads outside the datagram, or if the inline QoS is longer than
-    MOST_INLINE_BYTES.
+    Raises RtpsError if a length leads outside the datagram, if a sequence number is not from 1 to
+    LAST_SEQUENCE_NUMBER, or if all inline QoS together is longer than MOST_INLINE_BYTES.
     """
     all_samples = list[Sample]()
     prefix = source_prefix(datagram)

@@ -7,7 +7,7 @@ import pytest
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import Outgoing
-from rosproxy.ros2.protocol.addressing import MOST_OF_USERS, may_be_discovery
+from rosproxy.ros2.protocol.addressing import MOST_UNREAD_SUBMESSAGES, may_be_discovery
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import TrafficKind
@@ -83,7 +83,7 @@ def test_user_data_takes_nothing_of_the_allowance_of_discovery() -> None:
 
 
 @pytest.mark.parametrize(
-    "in_front", [SAID, TIME + data(bytes(8), writer=USER) * (MOST_OF_USERS + 4)]
+    "in_front", [SAID, TIME + data(bytes(8), writer=USER) * (MOST_UNREAD_SUBMESSAGES + 4)]
 )
 def test_discovery_behind_user_data_is_read_and_charged(in_front: bytes) -> None:
     domain, port, stand_in = shared()
@@ -127,7 +127,7 @@ STATISTICS = submessage(0x80, 0, bytes(56))
         message(SAID),
         message(TIME, TO_A, with_reader(SAID, USER), between(0x07, USER, USER)),
         message(fragment(bytes(1200), 1, 1200, 5000, writer=USER)),
-        message(*[SAID] * MOST_OF_USERS),
+        message(*[SAID] * MOST_UNREAD_SUBMESSAGES),
         *[message(between(kind, UNKNOWN, USER)) for kind in (0x06, 0x07, 0x08, 0x12, 0x13)],
         message(submessage(0x0C, 0, bytes(20)), submessage(0x01, 0, bytes(8)), SAID),
         message(SAID, STATISTICS),  # at the end of all that Fast DDS sends
@@ -146,7 +146,7 @@ def test_what_users_send_is_known(unread: bytes) -> None:
         message(SAID, b"\x15"),
         message(submessage(0x15, 0, bytes(8))),
         message(submessage(0x80, 0, b"abc"), SAID),
-        message(*[SAID] * (MOST_OF_USERS + 1)),
+        message(*[SAID] * (MOST_UNREAD_SUBMESSAGES + 1)),
         message(SAID, data(bytes(40), writer=SEDP_WRITERS)),
         message(SAID, data(bytes(40), writer=0xFF0003C2)),
         message(with_reader(SAID, BUILT_IN)),

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.ros2.protocol.addressing import (
-    LONGEST_WITHOUT_SAMPLES,
+    LONGEST_WITHOUT_SAMPLES_BYTES,
     carries_samples,
     may_be_discovery,
 )
@@ -27,7 +27,7 @@ SAMPLE = data(b"12345678", writer=0x00001203)
         (message(ACKNACK, data(b"12345678", writer=0x1203)), True),
         (message(fragment(b"12345678", 1, 8, 8, writer=0x1203)), True),
         (message(ENCRYPTED), True),
-        (message(*[ACKNACK] * (LONGEST_WITHOUT_SAMPLES // 28)), True),
+        (message(*[ACKNACK] * (LONGEST_WITHOUT_SAMPLES_BYTES // 28)), True),
         (message(ACKNACK)[:-1], True),
         (b"", True),
     ],
@@ -38,7 +38,7 @@ def test_a_message_has_samples_unless_it_shows_that_it_has_none(
     assert carries_samples(datagram) is has_samples
 
 
-@given(st.binary(max_size=2 * LONGEST_WITHOUT_SAMPLES))
+@given(st.binary(max_size=2 * LONGEST_WITHOUT_SAMPLES_BYTES))
 def test_any_message_has_samples_or_not(rest: bytes) -> None:
     carries_samples(message() + rest)
     carries_samples(rest)

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from rosproxy.ros2.protocol.addressing import LONGEST_HEARTBEAT, heartbeat_stream
+from rosproxy.ros2.protocol.addressing import LONGEST_HEARTBEAT_BYTES, heartbeat_stream
 from tests.unit.ros2.protocol.messages import data, message, payload, submessage
 
 HERE = bytes(range(12))
@@ -60,7 +60,7 @@ def test_another_writer_reader_or_flag_is_another_stream(other: bytes):
         fast_dds(info_dst(THERE), submessage(0x06, 0, bytes(24))),
         message(submessage(0x0C, 0, bytes(20)), heartbeat()),
         message(submessage(0x07, 0, bytes(8))),
-        fast_dds(info_dst(THERE), heartbeat(), submessage(0x01, 0, bytes(LONGEST_HEARTBEAT))),
+        fast_dds(info_dst(THERE), heartbeat(), submessage(0x01, 0, bytes(LONGEST_HEARTBEAT_BYTES))),
     ],
 )
 def test_what_says_more_than_a_heartbeat_is_of_no_stream(datagram: bytes):

@@ -10,7 +10,7 @@ from rosproxy.ros2.protocol.relay_envelope import (
     unwrapped,
     wrapped,
 )
-from rosproxy.ros2.protocol.relay_proof import LONGEST_CONTENT
+from rosproxy.ros2.protocol.relay_proof import LONGEST_CONTENT_BYTES
 from rosproxy.ros2.protocol.rtps import RtpsError
 
 ADDRESSES = ["192.0.2.7", "2001:db8::9", "169.254.7.7"]
@@ -38,7 +38,7 @@ def test_many_addresses_take_several_lists() -> None:
     addresses = [f"10.0.{number // 256}.{number % 256}" for number in range(MOST_LISTED + 1)]
     lists = list(address_lists(addresses))
     assert [len(listed_addresses(listed) or ()) for listed in lists] == [MOST_LISTED, 1]
-    assert max(map(len, lists)) <= LONGEST_CONTENT
+    assert max(map(len, lists)) <= LONGEST_CONTENT_BYTES
 
 
 def test_an_announcement_is_no_list() -> None:

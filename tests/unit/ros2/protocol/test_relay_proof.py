@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from rosproxy.ros2.protocol import relay_proof
 from rosproxy.ros2.protocol.relay_proof import (
-    LONGEST_CONTENT,
+    LONGEST_CONTENT_BYTES,
     MAGIC,
     WINDOW_S,
     Direction,
@@ -84,8 +84,8 @@ def test_a_datagram_of_the_proxy_is_not_accepted_from_the_relay() -> None:
 
 def test_a_long_datagram_costs_no_hash(monkeypatch: pytest.MonkeyPatch) -> None:
     """Any process may send 64 KiB, which take 60 us each."""
-    longest = at(SENT_AT).sealed(Direction.TO_PROXY, bytes(LONGEST_CONTENT))
-    assert len(opened(longest)) == LONGEST_CONTENT
+    longest = at(SENT_AT).sealed(Direction.TO_PROXY, bytes(LONGEST_CONTENT_BYTES))
+    assert len(opened(longest)) == LONGEST_CONTENT_BYTES
     receiver = at(SENT_AT)
     monkeypatch.setattr(relay_proof, "blake2b", None)
     with pytest.raises(ProofError, match="more than 8208 bytes"):
