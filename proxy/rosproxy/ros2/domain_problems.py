@@ -77,7 +77,7 @@ _FIXES = {
 
 
 def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
-    """Yield the problems of a domain, first the problem to fix first."""
+    """Yield the problems of a domain, in the order in which to fix them."""
     yield from (problem for _, problem in _participant_problems(domain))
     yield from (problem for _, problem in mismatch_problems(domain))
     if domain.mismatches_left_out:
@@ -171,7 +171,7 @@ def _problems(
 def _security(
     participant: ParticipantStatus, label: str, is_inside: bool
 ) -> Iterator[DomainProblem]:
-    """Yield the problem of a participant with protected discovery, which the proxy can't change.
+    """Yield the problem of a participant whose discovery is protected: the proxy can't change it.
 
     Fast DDS repeats its locators in the announcement of each reader and writer. Cyclone DDS has
     locators only in the announcement of the participant, which is never protected.

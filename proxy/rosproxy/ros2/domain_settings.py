@@ -17,11 +17,11 @@ SPDP_MULTICAST = 7400
 SPDP_UNICAST = 7410
 """The first well-known port of domain 0."""
 PARTICIPANTS_TRIED = 32
-"""Well-known ports of a peer to which announcements go. Each process binds one of these ports. If
-more than 16 participants are known there, announcements go to twice as many ports, up to
-`MOST_TRIED`."""
+"""The number of well-known ports of a peer to which announcements go. Each process binds one port.
+If more than 16 participants are known there, announcements go to two ports for each participant, up
+to `MOST_TRIED`."""
 MOST_TRIED = 120
-"""Well-known ports of a domain. The next ports belong to the next domain (9.6.2.3)."""
+"""The number of well-known ports of a domain. Further ports belong to the next domain (9.6.2.3)."""
 NEXT_PORTS = 2
 """Well-known ports that are used beyond the number of known participants at an address."""
 
@@ -51,7 +51,8 @@ MOST_MAPPINGS = 16
 """Ports of the range for a participant. Fast DDS announces three locators for an address."""
 
 Judge = Callable[[RuleKind, str, str], bool]
-"""Whether a kind of rule allows a name to the participant inside at an address."""
+"""Returns whether the policy allows a name. The arguments are the kind of rule, the name, and the
+address of the participant inside."""
 Note = Callable[[str, str, str], None]
 """Called for each refusal with the reason in one word, the source, and a text."""
 Settled = Callable[[str], None]
@@ -98,8 +99,8 @@ class DomainSettings:
     ``hosts`` are the IP addresses at which outside reaches the range: a single address, or one of
     each family. A participant gets the address of its own family, if there is one. ``peers`` are
     the hosts outside that get the announcements of participants inside; the port 0 means their
-    well-known ports. ``relay`` is the LAN relay. ``proxy_address_for`` returns the proxy's address
-    for an address inside. ``is_inside`` tells whether an address is in an inside network.
+    well-known ports. ``relay`` is the LAN relay, if any. ``proxy_address_for`` returns the proxy's
+    address for an address inside. ``is_inside`` tells whether an address is in an inside network.
     ``participants_at`` returns the number of known participants at an address outside. ``gateways``
     are those of the proxy's default routes. ``settled`` is called with the address of each new
     participant. ``both_ways`` means that inside reaches the locators outside only through the

@@ -14,7 +14,7 @@ from rosproxy.telemetry.problems import Problems
 log = logging.getLogger(__name__)
 
 MOST_NOTED = 20
-"""Problems that are reported at a time, with fair shares by address."""
+"""The highest number of problems reported at a time, with fair shares by address."""
 
 
 class DomainWatch:

@@ -5,9 +5,9 @@ receives the announcements of participants to the group (SPDP). The relay sends 
 with their source addresses. The announcements of the proxy go to the group on the LAN. The relay
 passes on nothing else: neither the discovery of readers and writers nor user data.
 
-The relay needs no right but to be in the host's network. The relay keeps no state, so it may be
-killed and started at any time. Each datagram between relay and proxy has a proof
-(`rosproxy.ros2.protocol.relay_proof`), because other programs have the addresses of both.
+The relay needs no other right than to be in the host's network. The relay keeps no state, so it may
+be killed and started at any time. Each datagram between relay and proxy has a proof
+(`rosproxy.ros2.protocol.relay_proof`), because other programs may use the addresses of both.
 """
 
 import asyncio
@@ -27,7 +27,7 @@ from rosproxy.ros2.domain_settings import (
     SPDP_MULTICAST,
     Outgoing,
 )
-from rosproxy.ros2.lan_relay.sources import BURST, PER_SECOND, LanSources
+from rosproxy.ros2.lan_relay.sources import SOURCE_BURST_UNITS, SOURCE_UNITS_PER_SECOND, LanSources
 from rosproxy.ros2.protocol.relay_envelope import listed_addresses, wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source
@@ -38,7 +38,7 @@ from rosproxy.ros2.sources.rates import DiscoveryRates
 
 log = logging.getLogger(__name__)
 
-QUIET_S = 60.0
+PROOF_WARNING_INTERVAL_S = 60.0
 """Seconds until the relay logs a refused proof again."""
 
 
@@ -59,7 +59,10 @@ class LanRelaySettings:
 
 
 class LanRelay:
-    """Passes announcements on, from `start` to `close`. Needs a running event loop."""
+    """Passes announcements on, from `start` to `close`. Needs a running event loop.
+
+    ``from_lan`` and ``to_lan`` count announcements, and ``dropped`` counts datagrams.
+    """
 
     def __init__(self, settings: LanRelaySettings) -> None:
         self._settings = settings
@@ -70,24 +73,24 @@ class LanRelay:
         self._groups = GroupSockets(self._port, self._begin, self._end)
         self._sources = LanSources()
         # A machine on the LAN may forge the proxy's address, but not its proof.
-        self._proxy_rates = DiscoveryRates(PER_SECOND, BURST)
+        self._proxy_rates = DiscoveryRates(SOURCE_UNITS_PER_SECOND, SOURCE_BURST_UNITS)
         self._scheduler = DiscoveryScheduler()
-        self._warned_at = -QUIET_S
+        self._warned_at = -PROOF_WARNING_INTERVAL_S
         self.from_lan = self.to_lan = self.dropped = 0
 
     def start(self) -> None:
         """Bind all sockets. Raises OSError."""
         settings = self._settings
-        self._own = datagrams.bind(settings.bind.host, settings.bind.port)
-        self._sockets.append(self._own)
-        self._lan = datagrams.bind(settings.lan, 0)
-        self._sockets.append(self._lan)
-        send_through(self._lan, settings.lan, loop=True)  # also to participants on this host
+        self._proxy_socket = datagrams.bind(settings.bind.host, settings.bind.port)
+        self._sockets.append(self._proxy_socket)
+        self._lan_socket = datagrams.bind(settings.lan, 0)
+        self._sockets.append(self._lan_socket)
+        send_through(self._lan_socket, settings.lan, loop=True)  # also to participants on this host
         self._groups.open([family_of(settings.lan)])
         if not self._groups.join([settings.lan]):
             text = f"can't join the multicast group on the network of the address {settings.lan}"
             raise OSError(errno.EADDRNOTAVAIL, text)
-        self._loop.add_reader(self._own, self._take_in)
+        self._loop.add_reader(self._proxy_socket, self._hear_proxy)
 
     def close(self) -> None:
         """Close all sockets."""
@@ -97,25 +100,25 @@ class LanRelay:
             self._end(sock)
 
     def _begin(self, sock: socket.socket) -> None:
-        self._loop.add_reader(sock, self._hear, sock)
+        self._loop.add_reader(sock, self._hear_lan, sock)
 
     def _end(self, sock: socket.socket) -> None:
         self._loop.remove_reader(sock)
         sock.close()
 
-    def _hear(self, lan: socket.socket) -> None:
+    def _hear_lan(self, sock: socket.socket) -> None:
         """Receive announcements of the LAN, and queue these in an order fair to the sources."""
         now = self._loop.time()
         with contextlib.suppress(BlockingIOError):
             for _ in range(DATAGRAMS_PER_TURN):
-                datagram, sender = lan.recvfrom(LARGEST_DATAGRAM)
+                datagram, sender = sock.recvfrom(LARGEST_DATAGRAM)
                 source = plain_address(sender[0])
                 size = len(datagram)
-                read = partial(self._tell_proxy, datagram, source)
-                is_read = self._sources.take(source, size, now) and self._scheduler.put(
-                    source, self._sources.standing(source, now), size, read
+                tell = partial(self._tell_proxy, datagram, source)
+                is_queued = self._sources.take(source, size, now) and self._scheduler.put(
+                    source, self._sources.standing(source, now), size, tell
                 )
-                self.dropped += not is_read
+                self.dropped += not is_queued
 
     def _tell_proxy(self, datagram: bytes, source: str) -> list[Outgoing]:
         """Send the announcements of a source on the LAN to the proxy. Return the sent datagrams."""
@@ -127,15 +130,15 @@ class LanRelay:
         sent = [Outgoing(self._settings.proxy, proven) for proven in sealed]
         for out in sent:
             # The proxy accepts a proof only from the address of this socket.
-            self._send(self._own, out)
+            self._send(self._proxy_socket, out)
         return sent
 
-    def _take_in(self) -> None:
+    def _hear_proxy(self) -> None:
         """Receive the datagrams of the proxy: announcements, and lists of proven addresses."""
         with contextlib.suppress(BlockingIOError):
             for _ in range(DATAGRAMS_PER_TURN):
                 try:
-                    datagram, sender = self._own.recvfrom(LARGEST_DATAGRAM)
+                    datagram, sender = self._proxy_socket.recvfrom(LARGEST_DATAGRAM)
                 except ConnectionRefusedError:  # the proxy does not run
                     continue
                 source = plain_address(sender[0])
@@ -154,7 +157,7 @@ class LanRelay:
         for announcement in self._announcements(content):
             self.to_lan += 1
             for group in groups_of(self._settings.lan):
-                self._send(self._lan, Outgoing(HostPort(group, self._port), announcement))
+                self._send(self._lan_socket, Outgoing(HostPort(group, self._port), announcement))
 
     def _proven(self, datagram: bytes, source: str) -> bytes | None:
         """The content of a datagram of the proxy; None for a datagram of another program."""
@@ -164,7 +167,7 @@ class LanRelay:
             return self._proof.opened(Direction.TO_LAN, datagram)
         except ProofError as error:
             now = self._loop.time()
-            if now - self._warned_at >= QUIET_S:
+            if now - self._warned_at >= PROOF_WARNING_INTERVAL_S:
                 self._warned_at = now
                 log.warning("refused: from %s, the proxy's address: %s", source, error)
             return None
@@ -172,7 +175,8 @@ class LanRelay:
     def _announcements(self, datagram: bytes) -> list[bytes]:
         """The announcements of participants in a datagram.
 
-        Several participants of a process may share a datagram.
+        Several participants of a process may share a datagram. A datagram without an announcement
+        counts as dropped.
         """
         announcements = list[bytes]()
         with contextlib.suppress(RtpsError):

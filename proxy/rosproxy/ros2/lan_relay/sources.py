@@ -13,16 +13,17 @@ from rosproxy.ros2.discovery.discovery_participant import ANNOUNCE_INTERVAL_S
 from rosproxy.ros2.sources.address_proofs import MOST_ADDRESSES
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing
 
-PER_SECOND = 500.0
-"""The charge of a source in a second, in units of 256 bytes. A participant sends an announcement
-every three seconds, and the proxy sends those of all participants inside."""
-BURST = 2000.0
-"""The charge of a source at once."""
+SOURCE_UNITS_PER_SECOND = 500.0
+"""The highest charge of a source in a second, in units of 256 bytes. A participant sends an
+announcement every three seconds, and the proxy sends the announcements of all participants
+inside."""
+SOURCE_BURST_UNITS = 2000.0
+"""The highest charge of a source at once."""
 UNPROVEN_PER_SECOND = 2500.0
-"""The charge of all unproven sources together in a second: a thousand announcements. With 10,000
-forged datagrams a second, the relay then takes a fifth of a processor."""
+"""The highest charge of all unproven sources together in a second: a thousand announcements. With
+10,000 forged datagrams a second, the relay then takes a fifth of a processor."""
 UNPROVEN_BURST = 10_000.0
-"""The charge of all unproven sources together at once."""
+"""The highest charge of all unproven sources together at once."""
 REMEMBERED_S = 10 * ANNOUNCE_INTERVAL_S
 """Seconds for which an address counts as proven after the proxy has listed the address. A proxy
 that has just started knows no proven addresses."""
@@ -34,7 +35,7 @@ class LanSources:
 
     rates: DiscoveryRates = field(
         default_factory=lambda: DiscoveryRates(
-            PER_SECOND, BURST, UNPROVEN_PER_SECOND, UNPROVEN_BURST
+            SOURCE_UNITS_PER_SECOND, SOURCE_BURST_UNITS, UNPROVEN_PER_SECOND, UNPROVEN_BURST
         )
     )
     _proven_until: dict[str, float] = field(default_factory=dict)

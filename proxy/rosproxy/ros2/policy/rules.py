@@ -10,7 +10,7 @@ from rosproxy.ros2.protocol.ros_names import is_of_requests, is_of_service, ros_
 from rosproxy.ros2.registry.participants import EndpointKind
 
 GRAPH_TOPIC = "ros_discovery_info"
-"""The topic on which participants publish their nodes. Without GRAPH_TOPIC, `ros2 node list` is
+"""The topic on which participants publish their nodes. Without this topic, `ros2 node list` is
 empty."""
 
 

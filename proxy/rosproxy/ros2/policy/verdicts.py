@@ -15,16 +15,16 @@ from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import Announcement
 
 MOST_VERDICTS = 1024
-"""Remembered verdicts of a participant, which has some hundreds. A participant with more is
-rediscovered with each change of the policy."""
+"""The highest number of remembered verdicts of a participant; a participant has some hundreds. A
+participant with more verdicts is rediscovered after each change of the policy."""
 MOST_VERDICTS_PER_ADDRESS = 16_384
-"""Remembered verdicts of all participants at an address."""
+"""The highest number of remembered verdicts of all participants at an address."""
 MOST_VERDICTS_IN_ALL = 32_768
-"""Remembered verdicts of all participants."""
+"""The highest number of remembered verdicts of all participants."""
 LONGEST_NAME = 256
-"""Characters of a name whose verdict is remembered. The name must be ASCII, as names of ROS 2 are:
-a
-wide character makes all characters take four bytes. A topic of ROS 2 has at most 255."""
+"""The highest number of characters of a name whose verdict is remembered. A topic of ROS 2 has at
+most 255. The name must be ASCII, as names of ROS 2 are: one wide character makes all characters
+take four bytes."""
 
 
 @dataclass(slots=True)
@@ -55,8 +55,8 @@ class Verdicts:
         """Judge the verdicts of participants again, one in each step.
 
         Yield each participant with a changed verdict, or with more verdicts than are remembered.
-        Yield None for each unchanged verdict. A participant may have a thousand verdicts, and each
-        may take as many rules.
+        Yield None for each unchanged verdict. The steps are small, because a participant may have a
+        thousand verdicts, and a policy a thousand rules.
         """
         for insider in insiders:
             if insider.has_more_verdicts:

@@ -1,9 +1,9 @@
 """The share of each source at the LAN relay, while forged sources flood the LAN."""
 
 from rosproxy.ros2.lan_relay.sources import (
-    BURST,
-    PER_SECOND,
     REMEMBERED_S,
+    SOURCE_BURST_UNITS,
+    SOURCE_UNITS_PER_SECOND,
     UNPROVEN_BURST,
     UNPROVEN_PER_SECOND,
     LanSources,
@@ -67,8 +67,8 @@ def test_a_proven_source_has_a_separate_allowance() -> None:
     """If an attacker forges this address, no other source loses anything."""
     sources = LanSources()
     sources.note_proven([LAPTOP, "192.0.2.8"], 0.0)
-    assert sum(sources.take(LAPTOP, 0, 0.0) for _ in range(10_000)) == BURST
-    assert sum(sources.take(LAPTOP, 0, 1.0) for _ in range(10_000)) == PER_SECOND
+    assert sum(sources.take(LAPTOP, 0, 0.0) for _ in range(10_000)) == SOURCE_BURST_UNITS
+    assert sum(sources.take(LAPTOP, 0, 1.0) for _ in range(10_000)) == SOURCE_UNITS_PER_SECOND
     assert sources.take("192.0.2.8", 0, 1.0)
 
 
