@@ -297,7 +297,7 @@ class DockerController:
         return problems
 
     def _port_taken(self, name: str, port: int | None) -> None:
-        self._memory = self._memory.port_taken(name, port, time.monotonic())
+        self._memory = self._memory.with_refusal(name, port, time.monotonic())
 
     def _note_event(self, event: Json | None) -> None:
         """Note an event. None: a new connection to the engine, so earlier events may be missing."""

@@ -46,10 +46,10 @@ class ProxyUpdater:
     allowed callers. Then the updater reads the status and sends what is new (`ProxyUpdate`).
     ``has_callers`` is False for a proxy without a list of allowed callers.
 
-    ``silent_since`` is the monotonic time in seconds at which the proxy was started or began to
-    fail. A refusal of the policy counts as a failure. None: the proxy answers. ``leases`` are
-    the ports of the proxy's ROS 2 participants. The updater sends ``former_leases`` until a status
-    has leases.
+    ``silent_since`` is the monotonic time in seconds at which the updater was made, or the proxy
+    began to fail. A refusal of the policy counts as a failure. None: the proxy answers. ``leases``
+    are the ports of the proxy's ROS 2 participants. The updater sends ``former_leases`` until a
+    status has leases.
     """
 
     def __init__(
@@ -72,14 +72,14 @@ class ProxyUpdater:
         self._session = ProxySession(proxies, access.admin, access.token)
         self._update = ProxyUpdate()
         self._status = ProxyStatus()
-        self._looked = asyncio.Event()
-        self._selecting = asyncio.Event()
+        self._nodes_due = asyncio.Event()
+        self._callers_due = asyncio.Event()
 
     def update(self, network_facts: NetworkFacts) -> None:
         """Store the facts of a look, and wake both tasks."""
         self._update.record(network_facts, time.monotonic())
-        self._looked.set()
-        self._selecting.set()
+        self._nodes_due.set()
+        self._callers_due.set()
 
     async def run(self) -> None:
         """Send updates until cancelled."""
@@ -93,8 +93,8 @@ class ProxyUpdater:
         failures = 0
         logged = ""
         while True:
-            await self._selecting.wait()
-            self._selecting.clear()
+            await self._callers_due.wait()
+            self._callers_due.clear()
             addresses = tuple(self._update.facts.selected)
             try:
                 await self._session.send_policy(self._update.policy)
@@ -113,7 +113,7 @@ class ProxyUpdater:
                     logged = str(error)
                     text = "proxy not updated: %s, does not know which addresses may use it: %s"
                     log.warning(text, self._name, error, extra={"proxy": self._name})
-                self._selecting.set()
+                self._callers_due.set()
                 await asyncio.sleep(RETRY_PAUSES_S[min(failures, len(RETRY_PAUSES_S) - 1)])
                 failures += 1
 
@@ -126,17 +126,17 @@ class ProxyUpdater:
                 pause = RETRY_PAUSES_S[min(failures, len(RETRY_PAUSES_S)) - 1]
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
-                    await self._looked.wait()
+                    await self._nodes_due.wait()
             try:
                 await self._send_updates()
                 failures = 0
             except ProxyError as error:
                 failures += 1
-                # HTTP 503: the proxy answers, but can't reach the master. This is no silence.
+                # HTTP 503: the proxy is not silent, but can't reach the master.
                 self._note_answer(None if error.lacks_master else error)
 
     async def _send_updates(self) -> None:
-        self._looked.clear()
+        self._nodes_due.clear()
         refusal: ProxyError | None = await self._policy_refusal()
         try:
             self._status = await self._session.status()
@@ -241,11 +241,11 @@ class DockerProxySync:
 
     def problems(self, snapshot: DockerSnapshot) -> list[Problem]:
         """Return a problem for each proxy that has failed for `PROXY_STARTING_S` seconds."""
-        lately = time.monotonic() - PROXY_STARTING_S
+        latest = time.monotonic() - PROXY_STARTING_S
         return [
-            silence(name, updater.error, snapshot, self._settings.uplink)
+            silent_proxy_problem(name, updater.error, snapshot, self._settings.uplink)
             for name, (updater, _) in self._running.items()
-            if updater.error and updater.silent_since and updater.silent_since < lately
+            if updater.error and updater.silent_since and updater.silent_since < latest
         ]
 
 
@@ -258,13 +258,15 @@ async def ask_proxies(
         try:
             return await proxies.status(access.admin)
         except ProxyError as error:
-            return silence(name, error, snapshot, uplink)
+            return silent_proxy_problem(name, error, snapshot, uplink)
 
     answers = await asyncio.gather(*(ask(*proxy) for proxy in snapshot.access.items()))
     return dict(zip(snapshot.access, answers, strict=True))
 
 
-def silence(name: str, error: ProxyError, snapshot: DockerSnapshot, uplink: str) -> Problem:
+def silent_proxy_problem(
+    name: str, error: ProxyError, snapshot: DockerSnapshot, uplink: str
+) -> Problem:
     """Return the problem and the fix for a proxy that does not answer, or answers an error."""
     if isinstance(error, PolicyRefused):
         return Problem(f"proxy {name}", str(error))

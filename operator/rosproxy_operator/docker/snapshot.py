@@ -133,15 +133,15 @@ class Inspector:
         self._turns = asyncio.Semaphore(MOST_INSPECTIONS)
         self._event_times: dict[str, float] = {}
         self._events_missed_at = -REINSPECTED_FOR_S
-        self._updated = time.monotonic()
+        self._last_update_at = time.monotonic()
         self._looks = 0
         self._event_looks: dict[str, int] = {}
-        self._checked = time.monotonic()
+        self._last_check_at = time.monotonic()
         self._checking: set[str] = set()
 
     @property
     def waiting(self) -> bool:
-        """Whether inspections are under way whose end may call ``on_late_result``."""
+        """Whether inspections are under way, apart from checks."""
         return bool(self._inspecting.keys() - self._checking)
 
     def get(self, container: str) -> Json | None:
@@ -168,8 +168,8 @@ class Inspector:
         at least for the next look, even if this look comes after `REINSPECTED_FOR_S` seconds.
         """
         now = time.monotonic()
-        since = min(now - REINSPECTED_FOR_S, self._updated)
-        self._updated = now
+        since = min(now - REINSPECTED_FOR_S, self._last_update_at)
+        self._last_update_at = now
         self._looks += 1
         self._event_times = {key: at for key, at in self._event_times.items() if at >= since}
         with_event = (
@@ -190,12 +190,12 @@ class Inspector:
             _, pending = await asyncio.wait(tasks, timeout=patience)
             for task in pending:
                 task.add_done_callback(lambda _: self._on_late_result())
-        if self._checked < now - CHECK_INTERVAL_S:
-            self._checked = now
+        if self._last_check_at < now - CHECK_INTERVAL_S:
+            self._last_check_at = now
             self._check(key for key, role in own.items() if role != ROLE_REDIRECT)
 
     def _state_key(self, row: Json, own: Collection[str], with_event: Collection[str]) -> object:
-        """Return a value that changes when the next look has to inspect the container."""
+        """Return a value that changes when the container has to be inspected again."""
         key = row["Id"]
         signature = engine_json.signature(row)
         if key not in own:
@@ -262,7 +262,7 @@ class DockerObserver:
 
     @property
     def waiting(self) -> bool:
-        """Whether inspections are under way whose end may call ``on_late_result``."""
+        """Whether inspections are under way, apart from checks."""
         return self._inspector.waiting
 
     def note_event(self, container: str | None) -> None:
@@ -351,8 +351,8 @@ class DockerObserver:
             container = engine_json.read_container(row, inspected, networks)
             claimed = read_own(container.labels)
             if claimed and inspected is not None and row.get("Names"):
-                making = engine_json.read_making(inspected)
-                forged = forgery_reason(claimed, container.name, making, image)
+                creation = engine_json.read_making(inspected)
+                forged = forgery_reason(claimed, container.name, creation, image)
             if own is None or forged:
                 containers.append(replace(container, forged=forged))
                 own = None
@@ -411,7 +411,7 @@ def foreign_ports(
 ) -> frozenset[int]:
     """Return the listening ports of the host that may belong to other programs.
 
-    The ports of ``busy`` sandboxes, which may be starting, and of LAN relays are left out. The
+    The ports of LAN relays and of ``busy`` sandboxes, which may be starting, are left out. The
     engine opens a sandbox's ports one after the other before the engine reports the sandbox as
     running. The ports of all other sandboxes stay in the result: the planner knows these ports by
     the sandboxes.
@@ -423,7 +423,8 @@ def foreign_ports(
 def address_in(state: HostState, name: str, uplink: str) -> str:
     """Return the address of this host (`THIS_HOST`) or of a running container with a name.
 
-    Empty without such a container. For names that the name servers do not know.
+    ``name`` is in lower case. Empty without such a container. This host's address is the gateway of
+    the network ``uplink``. For names that the name servers do not know.
     """
     if name == THIS_HOST:
         return next((n.gateway for n in state.networks if n.name == uplink), "")

@@ -29,19 +29,19 @@ def by_reference(containers: Iterable[Container]) -> ByReference:
 
 
 def find_network_owner(container: Container, containers: ByReference) -> Container:
-    """Return the owner of the network namespace of ``container``. Raises NoOwner."""
+    """Return the container that owns the network namespace of ``container``. Raises NoOwner."""
     visited = {container.id}
     while (target := container.network_container) is not None:
-        sharer = containers.get(target)
-        if sharer is None or sharer.id in visited:
-            raise NoOwner(target, is_loop=sharer is not None)
-        visited.add(sharer.id)
-        container = sharer
+        other = containers.get(target)
+        if other is None or other.id in visited:
+            raise NoOwner(target, is_loop=other is not None)
+        visited.add(other.id)
+        container = other
     return container
 
 
 def network_owner(container: Container, containers: ByReference) -> Container:
-    """Return the owner of the network namespace of ``container``; itself if there is no owner."""
+    """Return the owner of the network namespace of ``container``; without one, ``container``."""
     try:
         return find_network_owner(container, containers)
     except NoOwner:

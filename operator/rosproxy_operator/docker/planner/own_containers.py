@@ -3,7 +3,7 @@
 The operator has no disk, and recognises its containers by their labels. But an image may carry such
 labels too, and variables, a command and a user. An image can't choose the name and the HostConfig
 of a container; the client that creates the container chooses both. So a container counts as own
-only if name and HostConfig are as the operator makes them. Of all other containers, the operator
+only if the operator would choose this name and HostConfig. Of all other containers, the operator
 ignores the labels for range and key.
 
 The labels have no signature, such as an HMAC. A client that chooses name and HostConfig has access
@@ -48,10 +48,11 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.zenoh_redirect import zenoh_sysctls
 
-_TEMPORARY = r"(-\d+)?(-old(-\d+)?)?"
-"""Endings of a container's name: a number if the name is taken (`duplicates.free_name`), or
-``-old`` if another container takes over (`container_steps.former_name`)."""
-_NEVER = (
+_NAME_ENDINGS = r"(-\d+)?(-old(-\d+)?)?"
+"""Pattern of the endings of a container's name: a number if the name is taken
+(`duplicates.free_name`), or ``-old`` if another container takes over
+(`container_steps.former_name`)."""
+_FIELDS_NEVER_SET = (
     *("Privileged", "Binds", "Mounts", "VolumesFrom", "Devices", "DeviceRequests", "GroupAdd"),
     *("PidMode", "UTSMode", "UsernsMode"),
 )
@@ -64,9 +65,9 @@ _COMMANDS = {
     ROLE_LAN_RELAY: LAN_RELAY_COMMAND,
     ROLE_REDIRECT: (NFT,),
 }
-_FORMER_COMMAND = ("rosproxy", FORMER_LAN_RELAY)
+_FORMER_LAN_RELAY_COMMAND = ("rosproxy", FORMER_LAN_RELAY)
 _HELPERS = (ROLE_REDIRECT, ROLE_FLUSH)
-_SYSCTLS = {"net.ipv4.ip_local_port_range", "net.ipv4.ip_forward"}
+_SANDBOX_SYSCTLS = {"net.ipv4.ip_local_port_range", "net.ipv4.ip_forward"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,37 +89,37 @@ def has_own_name(own: OwnLabels, name: str) -> bool:
     names = [_name(own)]
     if own.role == ROLE_LAN_RELAY:
         names.append(f"{proxy_name(own.key)}-{FORMER_LAN_RELAY}")
-    return any(re.fullmatch(re.escape(each) + _TEMPORARY, name) for each in names)
+    return any(re.fullmatch(re.escape(each) + _NAME_ENDINGS, name) for each in names)
 
 
-def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: str) -> str:
+def forgery_reason(own: OwnLabels, name: str, creation: CreationFacts, image_id: str) -> str:
     """Return why a container with the operator's labels is not the operator's own.
 
-    Empty if nothing speaks against the labels. ``image_id`` is the present image of the proxies. A
-    proxy of this image may have any command, since the operator leaves the command to the image.
-    All other containers must have the command of their role.
+    Empty if the container is the operator's own. ``image_id`` is the id of the present image of the
+    proxies. A proxy of this image may have any command, since the operator leaves the command to
+    the image. All other containers must have the command of their role.
     """
     if not has_own_name(own, name):
         return f"the name is not {_name(own)}"
     user = HELPER_USER if own.role in _HELPERS else USER
-    if making.user != user:
+    if creation.user != user:
         return f"the user is not {user}"
-    if own.role == ROLE_FLUSH and making.command != flush_command(own.key, own.range):
+    if own.role == ROLE_FLUSH and creation.command != flush_command(own.key, own.range):
         return "the command is not the operator's"
-    command = _COMMANDS.get(own.role, making.command)
-    of_image = own.role == ROLE_PROXY and making.image == image_id
+    command = _COMMANDS.get(own.role, creation.command)
+    of_image = own.role == ROLE_PROXY and creation.image == image_id
     # The rules are the last argument of a redirect's command. The check of the name covers the
     # rules, too: the name has the fingerprint of the rules.
-    actual = making.command[:1] if own.role == ROLE_REDIRECT else making.command
-    is_former = own.role == ROLE_LAN_RELAY and actual == _FORMER_COMMAND
+    actual = creation.command[:1] if own.role == ROLE_REDIRECT else creation.command
+    is_former = own.role == ROLE_LAN_RELAY and actual == _FORMER_LAN_RELAY_COMMAND
     if actual != command and not of_image and not is_former:
         return f"the command is not {' '.join(command)}"
     odd = {
-        ROLE_SANDBOX: _odd_sandbox(own, making.host),
-        ROLE_PROXY: _odd_proxy(making.host),
-        ROLE_LAN_RELAY: _odd_lan_relay(making.host),
-        ROLE_REDIRECT: _odd_redirect(own, making.host),
-        ROLE_FLUSH: _odd_flush(making.host),
+        ROLE_SANDBOX: _odd_sandbox(own, creation.host),
+        ROLE_PROXY: _odd_proxy(creation.host),
+        ROLE_LAN_RELAY: _odd_lan_relay(creation.host),
+        ROLE_REDIRECT: _odd_redirect(own, creation.host),
+        ROLE_FLUSH: _odd_flush(creation.host),
     }
     return next((f"HostConfig.{name} is not the operator's" for name in odd[own.role]), "")
 
@@ -131,12 +132,12 @@ def _name(own: OwnLabels) -> str:
 
 
 def _odd(host: Mapping[str, Any]) -> Iterator[str]:
-    """The fields of a HostConfig that differ from all containers of the operator."""
+    """Yield the fields of a HostConfig whose values no container of the operator has."""
     if host.get("ReadonlyRootfs") is not True:
         yield "ReadonlyRootfs"
     if host.get("CapDrop") != ["ALL"]:
         yield "CapDrop"
-    yield from (name for name in _NEVER if host.get(name))
+    yield from (name for name in _FIELDS_NEVER_SET if host.get(name))
     if host.get("IpcMode") not in _OWN_IPC:
         yield "IpcMode"
 
@@ -163,7 +164,7 @@ def _odd_sandbox(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
     if actual not in expected:
         yield "PortBindings"
     sysctls = (host.get("Sysctls") or {}).keys()
-    if "net.ipv4.ip_local_port_range" not in sysctls or not sysctls <= _SYSCTLS:
+    if "net.ipv4.ip_local_port_range" not in sysctls or not sysctls <= _SANDBOX_SYSCTLS:
         yield "Sysctls"
 
 

@@ -32,14 +32,14 @@ from rosproxy_operator.docker.planner.specs import master, proxy_name, unresolve
 from rosproxy_operator.docker.planner.state import DockerMemory, after_look, with_exited
 from rosproxy_operator.docker.settings import PlanSettings
 
-UNWANTED = "no running container needs the proxy"
+UNWANTED_REASON = "no running container needs the proxy"
 ENGINE_BUSY_RECHECK_S = 1.0
 """Seconds until the next look while the engine removes a container, or still holds a port."""
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Actions for a proxy, in order. If ``key`` is None, the actions are for the uplink.
+    """Actions for a proxy, in order. If ``key`` is None, the actions are for networks (uplink).
 
     Every group waits for the uplink's group. Groups with the same key and ``subject`` run in order.
     Redirects and flushes have a ``subject``, so other work for the proxy does not wait for these.
@@ -68,7 +68,7 @@ class DockerPlan:
     uplink network exists. These proxies get the address of the uplink's gateway as an option: at
     that address, LAN relays and zenoh routers of this host listen.
 
-    ``again_in`` are the seconds until the next look if no event comes; None if nothing is pending.
+    ``again_in`` is in seconds: the next look is then, or at an event. None: only at an event.
     """
 
     groups: tuple[Group, ...]
@@ -112,7 +112,7 @@ def plan(
     memory, port_problems = allocate(observed, settings, desired, memory, now, frozen=not creatable)
     expired = {key for key, since in memory.absent.items() if now - since >= settings.grace}
     actions_by_key: dict[Key, list[Action] | None] = {
-        key: [*removal_steps(observed, key, UNWANTED)] for key in expired
+        key: [*removal_steps(observed, key, UNWANTED_REASON)] for key in expired
     }
     for wanted in desired:
         if ports := memory.planned.get(wanted.key):  # else the reason is in port_problems
@@ -153,7 +153,7 @@ def _within_bounds(
 
 
 def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
-    """The problem that keeps the operator from creating proxies; None without such a problem."""
+    """The problem of the image or the uplink that prevents new proxies; None without a problem."""
     if not observed.image_id:
         return Problem(
             f"proxy image {settings.proxy_image}",
@@ -250,7 +250,7 @@ def _missing_lan_relays(
 
 
 def _container_problems(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
-    """Problems of containers that the engine restarts, and of masters without a known address."""
+    """Problems of own containers that the engine restarts, and of masters without an address."""
     for own in observed.own:
         name = own.container.name
         if own.key in live and own.container.state == "restarting":
@@ -266,8 +266,8 @@ def _seconds_to_changes(
 ) -> Iterator[float]:
     """The seconds until the plan may change without an event.
 
-    These are the times until a grace ends, and `ENGINE_BUSY_RECHECK_S` during a removal or after a
-    refused port.
+    These are the times until a grace ends. During a removal and after a refused port, the time is
+    `ENGINE_BUSY_RECHECK_S`. A time may be negative.
     """
     memory = docker_plan.memory
     for wanted in docker_plan.desired:

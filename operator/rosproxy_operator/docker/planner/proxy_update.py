@@ -68,8 +68,8 @@ class NetworkFacts:
     """The part of a look that concerns a single proxy.
 
     Attributes:
-        master_address: The address of the master; empty if unknown, or if the URI of the master
-            has an address already.
+        master_address: The address of the master. Empty if unknown, if the URI of the master has
+            an address already, and for ROS 2 and rmw_zenoh.
         addresses: The addresses of running containers on the proxy's networks.
         taken: The addresses of all containers and gateways.
         subnets: The subnets of the proxy's networks.
@@ -149,14 +149,17 @@ class AddressHistory:
         return min(times, default=None)
 
     def moved(self, nodes: Collection[str]) -> dict[str, str]:
-        """The new address for each old address at which the proxy still has ``nodes``."""
+        """The new address by old address, for each old address that a node of the proxy has.
+
+        ``nodes`` are the addresses of the proxy's nodes.
+        """
         return {old: new for old, (new, _) in self._moves.items() if old in nodes}
 
 
 class ProxyUpdate:
-    """The updates that the operator still has to send to a proxy.
+    """The updates that the operator still has to send to a proxy, for a single run of the proxy.
 
-    An object serves a single run of the proxy. ``policy`` is the whole policy of the proxy.
+    ``policy`` is the whole policy of the proxy, with layers of containers gone a short time ago.
     """
 
     def __init__(self) -> None:
@@ -164,7 +167,7 @@ class ProxyUpdate:
         self.policy: tuple[PolicyLayer, ...] = ()
         self._layers = RecentLayers()
         self._subnets: set[IPv4Network] = set()
-        self._places = AddressHistory()
+        self._history = AddressHistory()
         self._due: dict[ContainerArrival, list[float]] = {}
         self._moving = False
 
@@ -186,10 +189,10 @@ class ProxyUpdate:
         The body has the addresses that are ``gone``, that have ``moved``, and at which containers
         have ``arrived``. The body is empty if nothing is due.
         """
-        self._places.record(self.facts, now)
+        self._history.record(self.facts, now)
         body = {
             "gone": sorted(node for node in nodes if self._gone(node)),
-            "moved": self._places.moved(nodes),
+            "moved": self._history.moved(nodes),
             "arrived": [
                 {"address": arrival.address, "names": sorted(arrival.names)}
                 for arrival, times in sorted(self._due.items(), key=lambda item: item[0].address)
@@ -205,7 +208,7 @@ class ProxyUpdate:
         Only addresses on networks of the proxy, present or former, count: the engine knows all
         containers there.
         """
-        is_known = node in self.facts.taken or node in self._places.reserved_addresses
+        is_known = node in self.facts.taken or node in self._history.reserved_addresses
         return not is_known and is_inside(node, tuple(self._subnets))
 
     def mark_delivered(self, now: float) -> None:
@@ -215,9 +218,9 @@ class ProxyUpdate:
         }
 
     def next_due(self, now: float) -> float | None:
-        """Return the seconds until the next update is due; None if no update is due."""
+        """Return the seconds until the next update may be due; None: no time is set."""
         times = [when for due in self._due.values() for when in due[:1]]
-        times += [self._places.next_expiry] if self._places.next_expiry else []
+        times += [self._history.next_expiry] if self._history.next_expiry else []
         times += [now + MOVE_MESSAGE_INTERVAL_S] if self._moving else []
         return max(min(times) - now, 0.0) if times else None
 
@@ -230,8 +233,8 @@ def network_facts(
 ) -> NetworkFacts:
     """Return the part of a look that concerns a proxy.
 
-    ``members`` are the members of all proxies, ``policy`` are the administrator's layers. A proxy
-    for ROS 2 has no master, and gets no arrivals: the proxy discovers new participants itself.
+    ``members`` are the members of all proxies, ``policy`` are the administrator's layers. Only a
+    proxy for ROS 1 has a master, and gets arrivals: other proxies discover new nodes themselves.
     """
     host = master(proxy.key).host.lower() if proxy.key.ros == "1" else ""
     sandbox = observed.sandbox_of(proxy)
@@ -278,7 +281,7 @@ def _attachments(container: Container, networks: Collection[str]) -> list[Attach
 def _arrivals(
     member: Member, observed: HostState, containers: ByReference, joined: set[str]
 ) -> list[ContainerArrival]:
-    """The arrivals of a running container, one for each network that the proxy has joined, too."""
+    """The arrivals of a running member, one for each network of ``joined``; else none."""
     container = member.container
     host = network_owner(container, containers)
     if container.state not in STARTED or host.state not in STARTED:

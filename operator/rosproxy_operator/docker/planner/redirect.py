@@ -62,7 +62,7 @@ from rosproxy_operator.proxy_spec.fingerprint import digest
 # The priorities are the kernel's for destination and source NAT (nf_ip_hook_priorities). In the
 # hook output, nat chains see only connections that this network namespace itself opens. No other
 # connections need the redirect.
-_SET = Template("""\
+_MASTER_RULES = Template("""\
 table ip $table {
   chain output {
     type nat hook output priority -100; policy accept;
@@ -119,7 +119,7 @@ def _rules(action: CreateRedirect) -> str:
     if action.key == ZENOH:
         return text + zenoh_rules(table, action.addresses, action.proxy)
     (master,) = action.addresses
-    return text + _SET.substitute(
+    return text + _MASTER_RULES.substitute(
         table=table, address=master.host, port=master.port, proxy=action.proxy.host
     )
 
@@ -127,7 +127,10 @@ def _rules(action: CreateRedirect) -> str:
 def redirect_steps(
     observed: HostState, settings: PlanSettings, desired: Iterable[Desired]
 ) -> Iterator[RedirectSteps]:
-    """The steps after which the host has exactly the planned redirects."""
+    """The steps after which the host has exactly the planned redirects.
+
+    A redirect whose record is busy (`_is_busy`) has no steps in this look.
+    """
     wanted = _wanted(observed, settings, desired)
     records: dict[RedirectSite, list[RedirectContainer]] = {}
     for record in observed.redirects:
@@ -144,11 +147,11 @@ def redirect_steps(
             steps = _removal_steps(site[1], existing, observed, settings)
         if steps and not _is_busy(existing, observed):
             name = names.get(site[1], site[1][:12])
-            fix = _by_name(site[0])
+            fix = _redirect_fix(site[0])
             yield RedirectSteps(site[0], name, tuple(steps), fix if site in wanted else "")
 
 
-def _by_name(key: Key) -> str:
+def _redirect_fix(key: Key) -> str:
     """What users can do if the operator can't set a redirect."""
     if key == ZENOH:
         return (
@@ -163,7 +166,7 @@ def _by_name(key: Key) -> str:
 
 
 def redirect_record_name(observed: HostState, key: Key, owner: Container) -> str:
-    """The name of the record of a redirect to a proxy in a container's network; or empty.
+    """The name of the record of a container's redirect to a proxy; empty without a redirect.
 
     The redirect may still lead to a former address of the proxy.
     """
@@ -180,7 +183,7 @@ def redirect_record_name(observed: HostState, key: Key, owner: Container) -> str
 def _wanted(
     observed: HostState, settings: PlanSettings, desired: Iterable[Desired]
 ) -> dict[RedirectSite, CreateRedirect | None]:
-    """The planned redirects; None for a redirect that stays unchanged.
+    """The planned redirects; None while the container can't reach the proxy: change nothing.
 
     If several proxies claim an address in a network, the first proxy gets the address.
     """
@@ -188,12 +191,12 @@ def _wanted(
     owners: dict[tuple[str, HostPort], Key] = {}
     ports: Mapping[str, int] = {}
     for proxy in desired:
-        started = [*_started(proxy, observed)]
+        redirected = [*_redirected_members(proxy, observed)]
         if proxy.key == ZENOH:
-            targets = frozenset(owner.id for _, owner in started)
+            targets = frozenset(owner.id for _, owner in redirected)
             ports = router_ports(observed.redirects, targets)
-            started = [*with_all_routers(started)]
-        for member, owner in started:
+            redirected = [*with_all_routers(redirected)]
+        for member, owner in redirected:
             if owners.setdefault((owner.id, member.redirected[0]), proxy.key) == proxy.key:
                 site = proxy.key, owner.id
                 port = ports[owner.id] if proxy.key == ZENOH else master(proxy.key).port
@@ -204,7 +207,7 @@ def _wanted(
     return wanted
 
 
-def _started(proxy: Desired, observed: HostState) -> Iterator[tuple[Member, Container]]:
+def _redirected_members(proxy: Desired, observed: HostState) -> Iterator[tuple[Member, Container]]:
     """The members of a proxy that need a redirect now, each with the owner of the network."""
     containers = by_reference(observed.containers)
     for member in proxy.members if proxy.live else ():
@@ -216,11 +219,11 @@ def _started(proxy: Desired, observed: HostState) -> Iterator[tuple[Member, Cont
 def _redirect_to(
     member: Member, owner: Container, port: int, observed: HostState, settings: PlanSettings
 ) -> CreateRedirect | None:
-    """The redirect of a container; None while the container can't reach the proxy."""
-    meeting = _meeting(member, owner, observed)
-    if meeting is None:
+    """The redirect of a container; None while the container can't reach the proxy's port."""
+    reachable = _reachable_proxy(member, owner, observed)
+    if reachable is None:
         return None
-    proxy, ports = meeting
+    proxy, ports = reachable
     if member.key == ZENOH:
         if port not in ports:  # the sandbox is about to get more ports
             return None
@@ -237,7 +240,9 @@ def _redirect_to(
     return _with_fingerprint(action, observed, settings)
 
 
-def _meeting(member: Member, owner: Container, observed: HostState) -> tuple[str, PortRange] | None:
+def _reachable_proxy(
+    member: Member, owner: Container, observed: HostState
+) -> tuple[str, PortRange] | None:
     """The address and range of the proxy, on the first network that container and proxy share.
 
     None if the proxy or the sandbox does not run, or without a common network.
@@ -245,11 +250,15 @@ def _meeting(member: Member, owner: Container, observed: HostState) -> tuple[str
     shared = {a.network for a in owner.attachments if a.address} & member.networks
     running = [p for p in observed.proxies_of(member.key) if p.container.state == "running"]
     for proxy in running:
-        box = observed.sandbox_of(proxy)
-        places = box.container.attachments if box and box.container.state == "running" else ()
+        sandbox = observed.sandbox_of(proxy)
+        places = (
+            sandbox.container.attachments
+            if sandbox and sandbox.container.state == "running"
+            else ()
+        )
         pairs = sorted((p.network, p.address) for p in places if p.network in shared and p.address)
-        if box and pairs:
-            return pairs[0][1], box.range
+        if sandbox and pairs:
+            return pairs[0][1], sandbox.range
     return None
 
 
@@ -296,7 +305,7 @@ def _removal_steps(
     """The steps that delete the rules of a redirect, and then the records.
 
     If the container has ended, only the records are left: the kernel deletes the rules with the
-    namespace.
+    namespace. No steps if the host does not have the proxy's image, which deletes the rules.
     """
     owner = next((c for c in observed.containers if c.id == target), None)
     if owner is None or owner.state not in STARTED:

@@ -13,10 +13,10 @@ from rosproxy.telemetry.text import clean, listed, plural, shorten, wrap
 Status = Mapping[str, Any]
 """What ``rosproxy-operator docker status --json`` prints."""
 
-PROXIES = ("PROXY", "STATE", "MASTER OR DOMAIN", "OUTSIDE", "PORTS")
-CONTAINERS = ("CONTAINER", "STATE", "PROXY", "PORTS", "NODES")
+PROXY_HEADINGS = ("PROXY", "STATE", "MASTER OR DOMAIN", "OUTSIDE", "PORTS")
+CONTAINER_HEADINGS = ("CONTAINER", "STATE", "PROXY", "PORTS", "NODES")
 LEAST_NAME_COLUMNS = 20
-"""Least columns of a name, even if the line is then too long."""
+"""Least columns of the first column, the names, even if the line is then too long."""
 MOST_NODE_LINES = 3
 """Most lines for the nodes of a container, and for the topics of a participant or node."""
 INDENT = "    "
@@ -26,7 +26,7 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
     """Return the status, wrapped at ``columns`` characters.
 
     If the text has more than ``lines`` lines, the table of proxies and the details of containers
-    are left out. If the text still is too long, the end is left out.
+    are left out. If the text still is too long, the end is left out. None: any number of lines.
     """
     proxies = len(status["proxies"])
     containers = len({container["name"] for container in status["containers"]})
@@ -66,11 +66,11 @@ def _proxies(status: Status, columns: int) -> Iterator[str]:
     if not proxies:
         yield "No proxy."
         return
-    heading, *rows = _table([PROXIES, *map(_proxy_row, proxies)], columns)
+    heading, *rows = _table([PROXY_HEADINGS, *map(_proxy_row, proxies)], columns)
     yield heading
     for proxy, row in zip(proxies, rows, strict=True):
         yield row
-        yield from _wrong(proxy["problems"], columns)
+        yield from _problem_lines(proxy["problems"], columns)
 
 
 def _proxy_row(proxy: Status) -> tuple[str, ...]:
@@ -109,7 +109,9 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
         yield "No container is labelled: docker run --label rosproxy.enable=true …"
         return
     ranges = {proxy["name"]: proxy["range"] for proxy in status["proxies"]}
-    heading, *rows = _table([CONTAINERS, *(_container_row(c, ranges) for c in containers)], columns)
+    heading, *rows = _table(
+        [CONTAINER_HEADINGS, *(_container_row(c, ranges) for c in containers)], columns
+    )
     yield heading
     reported: set[str] = set()
     for container, row in zip(containers, rows, strict=True):
@@ -129,11 +131,13 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
                 yield from wrap(text, columns, INDENT, most=MOST_NODE_LINES)
             for node in container["zenoh_nodes"]:
                 yield from wrap(_topics(node["name"], node), columns, INDENT, most=MOST_NODE_LINES)
-        yield from _wrong(filter(None, (p["problem"] for p in container["participants"])), columns)
+        yield from _problem_lines(
+            filter(None, (p["problem"] for p in container["participants"])), columns
+        )
         # A container with both versions of ROS has two rows, and the report shows problems once.
         subject = f"container {container['name']}"
         if subject not in reported:
-            yield from _wrong(
+            yield from _problem_lines(
                 (p["text"] for p in status["problems"] if p["subject"] == subject), columns
             )
         reported.add(subject)
@@ -162,7 +166,7 @@ def _container_row(container: Status, ranges: Mapping[str, str]) -> tuple[str, .
     return (*cells, participants if container["ros"] == "2" else nodes)
 
 
-def _wrong(texts: Iterable[str], columns: int) -> Iterator[str]:
+def _problem_lines(texts: Iterable[str], columns: int) -> Iterator[str]:
     for text in texts:
         yield from wrap(clean(text), columns, INDENT + "  ", f"{INDENT}! ")
 

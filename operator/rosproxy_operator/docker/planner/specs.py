@@ -130,7 +130,7 @@ class OwnLabels:
 
 
 def proxy_name(key: Key) -> str:
-    """The name of a proxy's container: master's host or domain, and six hex digits of a hash."""
+    """The name of a proxy's container: master's host, domain or ``zenoh``, and six hex digits."""
     digest = hashlib.sha256(_identity(key).encode()).hexdigest()
     labels = {"2": f"domain-{key.domain}", "zenoh": "zenoh"}
     label = labels.get(key.ros) or master(key).host.lower()
@@ -303,10 +303,9 @@ def sandbox_fingerprint(action: CreateSandbox, settings: PlanSettings) -> str:
 def proxy_fingerprint(action: Create, settings: PlanSettings, image_id: str, secret: str) -> str:
     """The fingerprint of a proxy's container, 16 hex digits.
 
-    The fingerprint leaves out the container's name, the sandbox, the master's address and the
-    policy: the operator tells a running proxy a new address or policy. The fingerprint includes the
-    hash of the token and the secret of the LAN relay: with another token, the proxy would refuse
-    the operator.
+    The fingerprint leaves out the container's name and the sandbox. Also left out are the master's
+    address and the policy, which the operator sends to the running proxy. The hash of the token and
+    the secret of the LAN relay count: with another token, the proxy would refuse the operator.
     """
     body = container_config(replace(action, sandbox="", fingerprint=""), settings, secret, "")
     env = [v for v in body["Env"] if v.partition("=")[0] not in LIVE_VARIABLES]
@@ -380,8 +379,8 @@ def container_config(
     The operator makes the token from ``secret``. If ``master_address`` is empty, the proxy itself
     resolves the host name of the master.
     """
-    told = _settings_fields(action, settings, secret, master_address)
-    variables = environment("docker", told, always=("port_range", "master_port"))
+    fields = _settings_fields(action, settings, secret, master_address)
+    variables = environment("docker", fields, always=("port_range", "master_port"))
     limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}
     return {
         "Image": settings.proxy_image,

@@ -63,7 +63,7 @@ class DockerMemory:
     engine_returned: bool = False
     outdated_flushes: Mapping[str, str] = field(default_factory=dict)
 
-    def port_taken(self, name: str, port: int | None, now: float) -> "DockerMemory":
+    def with_refusal(self, name: str, port: int | None, now: float) -> "DockerMemory":
         """Return the memory after the engine could not start the sandbox ``name``.
 
         ``port`` is the taken port; None if unknown.

@@ -4,8 +4,8 @@ The caller that creates a container chooses its name and aliases; an image does 
 ``com.docker.compose.service`` is not read. An image can carry this label, and Compose gives each
 service its name as an alias anyway.
 
-A container finds the names of all its networks. So a name of another network is taken as well, if a
-container is on both networks.
+A container finds the names of all its networks. So a name on one network is also taken on a second
+network if a container is on both networks.
 """
 
 from collections import defaultdict
@@ -19,7 +19,7 @@ MOST_REMEMBERED_NAMES = 10_000
 
 A container usually has two names on a network, and each name takes about 150 bytes.
 """
-GONE = frozenset({"dead", "removing"})
+GONE_STATES = frozenset({"dead", "removing"})
 """States of a container that never answers to its names again."""
 
 NamesByNetwork = Mapping[str, Mapping[str, frozenset[str]]]
@@ -29,11 +29,11 @@ FormerNames = Mapping[tuple[str, str], str]
 
 
 def present_names(observed: HostState) -> NamesByNetwork:
-    """The names of all containers, running or not, by each network where the name is taken."""
+    """The names of all containers, running or not, by network where the name is taken."""
     own: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
     neighbours: dict[str, set[str]] = defaultdict(set)
     for container in observed.containers:
-        if container.state in GONE:
+        if container.state in GONE_STATES:
             continue
         for attachment in container.attachments:
             for name in attachment.names:

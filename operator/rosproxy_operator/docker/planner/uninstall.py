@@ -1,11 +1,14 @@
 """Plan the removal of everything that the operator has made on a Docker host.
 
-The order is the reverse of the creation:
+The executor removes the following at the same time (`Group`):
 
-1. The redirects in the networks of users' containers, and then the records of these redirects.
-2. The proxy of each key. The proxy first tells outside that the nodes have ended.
-3. The LAN relay and the sandbox of the proxy.
-4. The networks that the operator has made, after all of the operator's containers are gone.
+- Each redirect in the network of a user's container, and then the records of this redirect.
+- Each flush.
+- The proxy of each key, then the LAN relay and the sandbox. The proxy first tells outside that the
+  nodes have ended.
+
+After all proxies, LAN relays and sandboxes are gone, the operator removes the networks that it has
+made.
 
 If a new container of the operator appears during the removal, another operator is running. The
 removal then stops with a problem.
@@ -24,7 +27,7 @@ from rosproxy_operator.docker.planner.redirect import redirect_steps
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
 
-REASON = "rosproxy is uninstalled"
+UNINSTALL_REASON = "rosproxy is uninstalled"
 
 
 class Uninstall:
@@ -53,12 +56,12 @@ class Uninstall:
 
 def _other_operator(observed: HostState, first: frozenset[str]) -> Problem | None:
     """The problem that another operator creates containers; None without new containers."""
-    anew = [own.container.name for own in observed.own if own.container.id not in first]
-    if not anew:
+    new = [own.container.name for own in observed.own if own.container.id not in first]
+    if not new:
         return None
     return Problem(
         "operator",
-        f"another operator is running on this host, and has created {listed(anew)} meanwhile. Stop "
+        f"another operator is running on this host, and has created {listed(new)} meanwhile. Stop "
         "that operator (docker rm -f rosproxy-operator, or docker compose stop operator), then run "
         "uninstall again",
     )
@@ -73,7 +76,7 @@ def _groups(observed: HostState, settings: PlanSettings) -> Iterator[Group]:
     for key in sorted(observed.keys - busy):
         # With ``again``, the plan has also the containers that the engine removes already. So the
         # command does not end before these containers are gone and the networks can go.
-        if actions := tuple(removal_steps(observed, key, REASON, again=True)):
+        if actions := tuple(removal_steps(observed, key, UNINSTALL_REASON, again=True)):
             yield Group(key, actions)
     if not observed.own:
         for network in observed.networks:

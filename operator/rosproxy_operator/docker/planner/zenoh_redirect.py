@@ -29,7 +29,7 @@ FIRST_PORT = ZENOH_PORT + 1
 ROUTE_LOCALNET = "net.ipv4.conf.all.route_localnet"
 # Priority -300 is before conntrack (-200). So the guard does not drop replies to redirected
 # connections: conntrack has not restored the loopback addresses in these replies yet.
-_SET = Template("""\
+_ROUTER_RULES = Template("""\
 table ip $table {
   chain guard {
     type filter hook prerouting priority -300; policy accept;
@@ -48,7 +48,7 @@ $resets}
 """)
 # In the hook output, redirected packets already have the proxy's address and match no rule. In the
 # hook input, redirected packets have the router's address again, so `ct status dnat` comes first.
-_RESETS = Template("""\
+_RESET_CHAINS = Template("""\
   chain resets_out {
     type filter hook output priority 0; policy accept;
 $out
@@ -69,11 +69,11 @@ def zenoh_rules(table: str, routers: Iterable[HostPort], proxy: HostPort) -> str
     every = [*routers]
     outside = [router for router in every if router != LOCAL_ROUTER]
     reset = "reject with tcp reset"
-    resets = _RESETS.substitute(
+    resets = _RESET_CHAINS.substitute(
         out="\n".join(f"    ip daddr {r.host} tcp dport {r.port} {reset}" for r in outside),
         in_="\n".join(f"    ip saddr {r.host} tcp sport {r.port} {reset}" for r in outside),
     )
-    return _SET.substitute(
+    return _ROUTER_RULES.substitute(
         table=table,
         redirects="\n".join(
             f"    ip daddr {r.host} tcp dport {r.port} dnat to {proxy}" for r in every
@@ -85,7 +85,7 @@ def zenoh_rules(table: str, routers: Iterable[HostPort], proxy: HostPort) -> str
 
 
 def zenoh_sysctls(is_set: bool) -> dict[str, str]:
-    """Return the sysctls of a network namespace with or without a redirect."""
+    """Return the sysctls of a network namespace: with a redirect if ``is_set``, else without."""
     return {ROUTE_LOCALNET: str(int(is_set))}
 
 

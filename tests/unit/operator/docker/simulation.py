@@ -430,7 +430,7 @@ class Controller:
             self.engine.apply(action)
         except Refused as error:
             assert isinstance(action, Start)
-            self.memory = self.memory.port_taken(action.name, error.port, self.now)
+            self.memory = self.memory.with_refusal(action.name, error.port, self.now)
             return error
         except Failed as error:
             return error

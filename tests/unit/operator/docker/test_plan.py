@@ -576,7 +576,7 @@ def test_exhausted() -> None:
 
 
 def refused(seen: HostState, port: int | None, memory: DockerMemory, now: float) -> DockerPlan:
-    return look(seen, memory=memory.port_taken(PORTS, port, now), now=now)
+    return look(seen, memory=memory.with_refusal(PORTS, port, now), now=now)
 
 
 @pytest.mark.parametrize(
@@ -633,7 +633,7 @@ def test_ports_that_a_stranger_publishes_now_are_left() -> None:
 
 
 def test_a_start_that_went_well_is_the_end_of_it() -> None:
-    memory = DockerMemory().port_taken(PORTS, None, 0.0)
+    memory = DockerMemory().with_refusal(PORTS, None, 0.0)
     plan = look(observed(container(), **both()), memory=memory, now=30.0)
     assert (plan.actions, plan.again_in) == ((), None)
     expected = DockerMemory(served={KEY: RANGE}, planned={KEY: RANGE}, names=plan.memory.names)

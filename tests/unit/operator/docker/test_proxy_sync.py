@@ -23,7 +23,7 @@ from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, Pr
 from rosproxy_operator.docker import proxy_sync
 from rosproxy_operator.docker.planner.labels.members import LabelReading
 from rosproxy_operator.docker.planner.model import ZENOH, Attachment, Member
-from rosproxy_operator.docker.proxy_sync import DockerProxySync, silence
+from rosproxy_operator.docker.proxy_sync import DockerProxySync, silent_proxy_problem
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 from tests.unit.operator.docker.builders import KEY, RANGE, SETTINGS, both, container, observed
 
@@ -259,7 +259,7 @@ async def test_without_its_policy_nobody_new_is_let_in(
     assert proxies.told == []
     proxies.refuses = None
     assert await proxies.next() == ["172.18.0.5"]
-    problem = silence("p", PolicyRefused("knows no policies"), seen, "0-rosproxy")
+    problem = silent_proxy_problem("p", PolicyRefused("knows no policies"), seen, "0-rosproxy")
     assert (problem.subject, problem.text, problem.fatal) == ("proxy p", "knows no policies", True)
 
 
