@@ -1,8 +1,8 @@
 """The requests that the operator sends to the API server: a thin layer over `kubernetes`.
 
 The operator's service account has exactly these rights. The rights of the second group are for
-single objects, by name. The right to create leases is an exception: RBAC can't restrict it to a
-name::
+single objects, by name. The right to create leases is an exception, since RBAC can't restrict a
+creation to a name::
 
     nodes                   list watch
     pods                    get list watch create delete patch
@@ -48,26 +48,26 @@ WITHIN: Timeout = (3.0, 15.0)
 """Seconds to connect, and seconds to wait for an answer."""
 SOON: Timeout = (1.0, 2.0)
 """The same while a pod waits for the webhook, or while a Lease object runs out."""
-ONCE: Timeout = (3.0, 10.0)
+EVICTION_TIMEOUT_S: Timeout = (3.0, 10.0)
 """The same for an eviction, without a retry after HTTP 429.
 
-For an eviction, HTTP 429 means that a PodDisruptionBudget forbids the eviction now.
+The answer HTTP 429 means here that a PodDisruptionBudget forbids the eviction now.
 """
-WATCHED_FOR = 300
+WATCH_DURATION_S = 300
 """Seconds after which the API server ends a watch. The next watch continues from there."""
-SILENT: Timeout = (3.0, 90.0)
+WATCH_TIMEOUT_S: Timeout = (3.0, 90.0)
 """Seconds to connect for a watch, and seconds of silence. A bookmark comes every minute."""
-PAGE = 500
-"""Objects in an answer to a list request, if the answer has at most `LONGEST_PAGE` bytes."""
-LONGEST_PAGE = 16 * 1024 * 1024
+MOST_PAGE_ITEMS = 500
+"""Most objects in an answer to a list request; fewer if they exceed `MOST_PAGE_BYTES`."""
+MOST_PAGE_BYTES = 16 * 1024 * 1024
 """Most bytes of such an answer, unless a single object has more.
 
 500 pods usually have 5 MB. But the API server accepts a pod of 1.5 MB (etcd, --max-request-bytes).
 So without this bound, any user that creates pods could fill the operator's memory.
 """
-TRIES = 4
-"""How often the operator sends a request while the API server answers HTTP 429."""
-LONGEST_PAUSE = 10.0
+MOST_TRIES = 4
+"""Most times that the operator sends a request while the API server answers HTTP 429."""
+MOST_RETRY_PAUSE_S = 10.0
 """Most seconds to wait after such an answer, whatever Retry-After says."""
 WEBHOOKS = "mutatingwebhookconfigurations"
 POLICIES = "networkpolicies"
@@ -83,16 +83,16 @@ _ROOTS = {
     REVIEWS: "/apis/authorization.k8s.io/v1",
 }
 """The API's paths for kinds outside the core group."""
-_ACCOUNTS = "system:serviceaccounts"
+_ACCOUNTS_GROUP = "system:serviceaccounts"
 """The group of all service accounts."""
-_TERMINATING = "because it is being terminated"
+_NAMESPACE_TERMINATING = "because it is being terminated"
 """Part of the refusal when the operator creates an object in a namespace that is being deleted.
 
 The admission plug-in NamespaceLifecycle refuses. The operator needs no object there.
 """
 _TEST_FAILED = "the server rejected our request due to an error in our request"
 """The whole message of the API server when a ``test`` of a JSON patch fails."""
-_LONGEST = 500
+_MOST_MESSAGE_CHARACTERS = 500
 
 
 class ApiError(Exception):
@@ -156,7 +156,7 @@ class Event(msgspec.Struct, frozen=True):
 
 
 class Watch:
-    """An open watch. The iteration yields events as they arrive, and ends with the watch."""
+    """An open watch. The iteration yields lists of events, and ends with the watch."""
 
     def __init__(self, response: Any) -> None:
         self._response = response
@@ -182,7 +182,7 @@ class Watch:
 _EVENT = msgspec.json.Decoder(Event)
 
 
-_KINDS: Mapping[int, type[ApiError]] = {
+_ERRORS_BY_STATUS: Mapping[int, type[ApiError]] = {
     400: ApiInvalid,
     401: ApiUnavailable,  # a token that was just replaced, or that the server does not know yet
     404: ApiNotFound,
@@ -196,7 +196,10 @@ _KINDS: Mapping[int, type[ApiError]] = {
 class Api:
     """The cluster of this pod, or else of the kubeconfig file. Safe in any thread.
 
-    Each failed request raises ApiError. ``namespaces`` are the managed namespaces; none means all.
+    Each failed request raises ApiError; without a cluster, the creation raises ApiUnavailable.
+    ``namespaces`` are the managed namespaces; none means all. ``place`` is a namespace; empty means
+    all. ``within`` has the seconds to connect, and to wait for an answer.
+
     While the `Gate` is closed, each request that changes something raises NotLeading. Requests for
     Lease objects are an exception.
     """
@@ -249,19 +252,19 @@ class Api:
         items take ten times as much memory. So the iteration raises ApiUnavailable if the API
         server's answer is not valid.
         """
-        limit = PAGE
+        limit = MOST_PAGE_ITEMS
         path = _path(kind, place)
         data = None
         while data is None:
             query = {"limit": str(limit), **_watched(kind), "continue": token}
             query["fieldSelector"] = fields
-            longest = LONGEST_PAGE if limit > 1 else None
+            longest = MOST_PAGE_BYTES if limit > 1 else None
             data = self._data("GET", path, query, longest=longest)
-            limit = max(limit // 8, 1)
+            limit = max(limit // 8, 1)  # the answer was too long: ask for fewer objects
         try:
             listing = msgspec.json.decode(data, type=_Listing)
         except (msgspec.DecodeError, UnicodeDecodeError):
-            raise self._no_server(path) from None
+            raise self._not_an_api_server(path) from None
         meta = listing.metadata
         version = text_at(meta, "resourceVersion")
         next_token = text_at(meta, "continue")
@@ -282,13 +285,13 @@ class Api:
             try:
                 yield msgspec.json.decode(item, type=JsonObject)
             except (msgspec.DecodeError, UnicodeDecodeError):
-                raise self._no_server(path) from None
+                raise self._not_an_api_server(path) from None
 
     def watch(self, kind: str, place: str, version: str) -> Watch:
         """Watch the changes of a kind after ``version``. Raises ApiExpired for an old version."""
         query = {"watch": "1", "resourceVersion": version, "allowWatchBookmarks": "true"}
-        query |= _watched(kind) | {"timeoutSeconds": str(WATCHED_FOR)}
-        answer = self._send("GET", _path(kind, place), query, within=SILENT)
+        query |= _watched(kind) | {"timeoutSeconds": str(WATCH_DURATION_S)}
+        answer = self._send("GET", _path(kind, place), query, within=WATCH_TIMEOUT_S)
         if answer.status != 200:
             body = self._body(answer) or b""
             raise refusal(int(answer.status), str(answer.reason or ""), body)
@@ -316,7 +319,7 @@ class Api:
 
         Only the doctor calls this, with the rights of its user.
         """
-        groups = [_ACCOUNTS, f"{_ACCOUNTS}:{account.namespace}", "system:authenticated"]
+        groups = [_ACCOUNTS_GROUP, f"{_ACCOUNTS_GROUP}:{account.namespace}", "system:authenticated"]
         resource = {"verb": "patch", "group": GROUP, "resource": PLURAL, "subresource": "status"}
         spec = {
             "user": f"system:serviceaccount:{account.namespace}:{account.name}",
@@ -349,7 +352,12 @@ class Api:
             "metadata": {"namespace": id.namespace, "name": id.name},
             "deleteOptions": {"preconditions": {"uid": uid}},
         }
-        self._ask("POST", _path("pods/eviction", id.namespace, id.name), body=body, within=ONCE)
+        self._ask(
+            "POST",
+            _path("pods/eviction", id.namespace, id.name),
+            body=body,
+            within=EVICTION_TIMEOUT_S,
+        )
 
     def patch(self, kind: str, id: Name, operations: list[Json], within: Timeout = WITHIN) -> None:
         """Change an object, or a subresource such as ``rosproxies/status``, by a JSON patch."""
@@ -370,7 +378,7 @@ class Api:
     def _items(self, listing: JsonObject) -> list[JsonObject]:
         items = listing.get("items")
         if not isinstance(items, list):
-            raise self._no_server()
+            raise self._not_an_api_server()
         return [item for item in items if isinstance(item, dict)]
 
     def _ask(
@@ -385,9 +393,9 @@ class Api:
         try:
             return msgspec.json.decode(data, type=JsonObject)
         except (msgspec.DecodeError, UnicodeDecodeError):
-            raise self._no_server(path) from None
+            raise self._not_an_api_server(path) from None
 
-    def _no_server(self, path: str = "") -> ApiUnavailable:
+    def _not_an_api_server(self, path: str = "") -> ApiUnavailable:
         return ApiUnavailable(
             f"the program that answers at {self.server}{path} is not an API server"
         )
@@ -421,13 +429,13 @@ class Api:
         HTTP 429 means that the API server has not begun the request. A caller with another
         ``within`` than `WITHIN` gets the answer at once, and tries again itself.
         """
-        for _ in range(TRIES - 1 if within is WITHIN else 0):
+        for _ in range(MOST_TRIES - 1 if within is WITHIN else 0):
             answer = self._send(method, path, query, body, within)
             retry_after = str(answer.getheader("Retry-After", ""))
             if answer.status != 429 or not retry_after.isdecimal():
                 return answer
             self._body(answer)  # frees the connection
-            time.sleep(min(float(retry_after), LONGEST_PAUSE))
+            time.sleep(min(float(retry_after), MOST_RETRY_PAUSE_S))
         return self._send(method, path, query, body, within)
 
     def _send(
@@ -461,7 +469,7 @@ class Api:
                     raise NotLeading("this operator does not lead")
                 return self._client.call_api(*request, _request_timeout=within)
         except (HTTPError, ApiException, ConfigException, OSError) as error:
-            raise self._away(error) from error
+            raise self._unreachable(error) from error
 
     def _body(self, answer: Any, longest: int | None = None) -> bytes | None:
         """Return the body of an answer; None if the body exceeds ``longest`` bytes."""
@@ -474,15 +482,15 @@ class Api:
             answer.response.close()
             return None
         except (HTTPError, OSError) as error:
-            raise self._away(error) from error
+            raise self._unreachable(error) from error
 
-    def _away(self, error: Exception) -> ApiUnavailable:
+    def _unreachable(self, error: Exception) -> ApiUnavailable:
         text = " ".join(str(error).split())[:200] or type(error).__name__
         return ApiUnavailable(f"the API server at {self.server} can't be reached: {text}")
 
 
 def _watched(kind: str) -> dict[str, str]:
-    """Return the query of a watch: of NetworkPolicies, only the operator's own."""
+    """Return the selector of a list or watch: of NetworkPolicies, only the operator's own."""
     return {"labelSelector": OWN_SELECTOR} if kind == POLICIES else {}
 
 
@@ -506,18 +514,18 @@ def crd_missing(kind: str) -> str:
 def refusal(status: int, reason: str, body: bytes) -> ApiError:
     """Return the error for an answer of the API server: HTTP status, reason phrase, body."""
     message = _message(body) or reason
-    kind = _KINDS.get(status, ApiUnavailable if status >= 500 else ApiError)
+    error_type = _ERRORS_BY_STATUS.get(status, ApiUnavailable if status >= 500 else ApiError)
     if status == 403:  # from RBAC, or from an admission plug-in that refuses the object
         if rule := missing_rule(message):
             return ApiError(f"{rule} ({message})")
-        return ApiNotFound(message) if _TERMINATING in message else ApiInvalid(message)
+        return ApiNotFound(message) if _NAMESPACE_TERMINATING in message else ApiInvalid(message)
     if status == 422 and message == _TEST_FAILED:
         return ApiConflict("the object has changed meanwhile")
     if status == 401:
         message = f"the API server does not accept the operator's token or certificate ({message})"
-    elif kind is ApiUnavailable:
+    elif error_type is ApiUnavailable:
         message = f"the API server answers HTTP {status}: {message}"
-    return kind(message)
+    return error_type(message)
 
 
 def _message(body: bytes) -> str:
@@ -525,4 +533,4 @@ def _message(body: bytes) -> str:
     text = body.decode(errors="replace")
     with contextlib.suppress(ValueError, KeyError, TypeError):  # not a Status object
         text = str(json.loads(text)["message"])
-    return " ".join(text.split())[:_LONGEST]
+    return " ".join(text.split())[:_MOST_MESSAGE_CHARACTERS]

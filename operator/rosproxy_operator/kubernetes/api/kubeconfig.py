@@ -6,7 +6,7 @@ from typing import Any
 from kubernetes.client import Configuration
 from kubernetes.config import ConfigException, load_incluster_config, load_kube_config
 
-CONNECTIONS = 16
+MOST_OPEN_CONNECTIONS = 16
 """Connections to the API server that the client keeps open."""
 
 
@@ -32,5 +32,5 @@ def configuration() -> Any:
         ) from error
     # Without urllib3's own retries, an error reaches the caller at once. The caller tries again.
     settings.retries = False
-    settings.connection_pool_maxsize = CONNECTIONS
+    settings.connection_pool_maxsize = MOST_OPEN_CONNECTIONS
     return settings

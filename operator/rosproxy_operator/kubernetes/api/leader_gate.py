@@ -33,7 +33,7 @@ class Gate:
                 self._changed.notify_all()
 
     def close(self, seconds: float) -> bool:
-        """Let no more requests pass, and wait for the requests under way.
+        """Let no more requests pass from now on, and wait for the requests under way.
 
         Return whether all requests have ended within ``seconds``.
         """

@@ -9,7 +9,7 @@ _RBAC = re.compile(
 
 
 def missing_rule(message: str) -> str:
-    """Return which rule the operator's role lacks; empty if ``message`` is about anything else."""
+    """Return the rule that the operator's role lacks; empty if RBAC did not refuse."""
     match = _RBAC.search(message)
     if match is None:
         return ""
@@ -22,7 +22,7 @@ def missing_rule(message: str) -> str:
 
 
 def missing_right(message: str) -> str:
-    """Return the missing right as arguments of ``kubectl auth can-i``; empty if none is missing."""
+    """Return the missing right for ``kubectl auth can-i``; empty if RBAC did not refuse."""
     match = _RBAC.search(message)
     if match is None:
         return ""

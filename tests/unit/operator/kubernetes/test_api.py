@@ -54,7 +54,7 @@ async def test_lists_with_selectors(server: ApiServer, api: Api) -> None:
 async def test_a_list_comes_in_pages(
     server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy_operator.kubernetes.api.api_client.PAGE", 2)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.api.api_client.MOST_PAGE_ITEMS", 2)
     for name in "abc":
         server.put("pods", pod(name))
     first = await in_thread(api.page, "pods", "")
@@ -171,7 +171,7 @@ async def test_a_page_of_large_objects_is_asked_for_in_parts(
     server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Reading 500 pods of a megabyte each at once would end the operator, at each start."""
-    monkeypatch.setattr("rosproxy_operator.kubernetes.api.api_client.LONGEST_PAGE", 30_000)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.api.api_client.MOST_PAGE_BYTES", 30_000)
     large = {f"a{number}": "x" * 60 for number in range(100)}
     for number in range(9):
         server.put("pods", pod(f"p{number}", **large))

@@ -72,7 +72,7 @@ class Seen:
 @pytest.fixture
 async def seen(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Seen]:
     monkeypatch.setattr(reflector, "RETRY_PAUSES_S", (0.02,))
-    monkeypatch.setattr(api_module, "PAGE", 2)
+    monkeypatch.setattr(api_module, "MOST_PAGE_ITEMS", 2)
     reflected_store = Seen(api)
     yield reflected_store
     for collection_reflector in reflected_store.all:
