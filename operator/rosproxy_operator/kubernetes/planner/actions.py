@@ -32,9 +32,9 @@ class Creation(ClusterAction, frozen=True):
 
 
 class Deletion(ObjectAction, frozen=True):
-    """Delete an object of ``kind`` that is wrong or no longer needed.
+    """Delete an object that is wrong or no longer needed.
 
-    ``why`` gives the reason for the log and the Event.
+    ``kind`` is the kind of the object. ``why`` gives the reason for the log and the Event.
     """
 
     kind: ClassVar[str] = "Pod"

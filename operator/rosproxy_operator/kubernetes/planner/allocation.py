@@ -74,7 +74,11 @@ def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> Clus
 
 
 class _Node(msgspec.Struct):
-    """Chooses the ranges on a node, and stores the result in ``ranges``."""
+    """Chooses the ranges on a node, and stores the result in ``ranges``.
+
+    ``kernel`` has the ranges that the node itself uses, by the words of messages. ``refused`` has
+    the ports that the node refused a short time ago.
+    """
 
     view: View
     state: ClusterState
@@ -235,7 +239,8 @@ class _Node(msgspec.Struct):
 def _avoided_stand_ins(spec: RosProxySpec) -> list[PortRange]:
     """Return the ports of stand-ins that a new range avoids, if possible.
 
-    If all ranges of the window have such ports, no range is better, and the list is empty.
+    The list is empty for a proxy without stand-ins. If all ranges of the window have such ports, no
+    range is better, and the list is empty, too.
     """
     others = gaps(spec.window, (), [proxy_ports.STAND_INS])
     has_choice = any(len(ports) >= spec.ports for ports in others)

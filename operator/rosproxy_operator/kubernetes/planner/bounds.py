@@ -38,9 +38,9 @@ Consents = Mapping[Name, frozenset[str]]
 """The other namespaces whose RosProxies may name a master's Service, by that Service."""
 MOST_PATTERNS = 5
 """Most allowed patterns that a refusal names."""
-_EVERYBODY = "*"
-_NUMERIC = re.compile(r"http://([0-9.*?]*[0-9][0-9.*?]*|\[.*\])(:[0-9*?]*)?")
-"""A pattern for addresses: the host has digits and no letters, or is in brackets (IPv6)."""
+_ANY_NAMESPACE = "*"
+_ADDRESS_PATTERN = re.compile(r"http://([0-9.*?]*[0-9][0-9.*?]*|\[.*\])(:[0-9*?]*)?")
+"""Matches a pattern for addresses: the host has digits, but no letters, or is in brackets."""
 
 
 def within_bounds(observed: ClusterSnapshot, settings: ClusterSettings) -> ClusterSnapshot:
@@ -84,7 +84,7 @@ def is_allowed_master(master: str, allowed: tuple[str, ...]) -> bool:
         return False
     bare = slave_uri(host_port).rstrip("/")
     matching = (p for p in allowed if _fits(bare, p.rstrip("/")))
-    return any(is_address(host_port.host) or not _NUMERIC.fullmatch(p) for p in matching)
+    return any(is_address(host_port.host) or not _ADDRESS_PATTERN.fullmatch(p) for p in matching)
 
 
 def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
@@ -126,14 +126,14 @@ def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
 def _port_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
     """Yield the violations in the hostPorts."""
     if spec.ports > bounds.max_ports:
-        fewer = f"Ask for {bounds.max_ports} at most"
-        yield _refusal("spec.ports", spec.ports, fewer, "allow.maxPorts")
+        fix = f"Ask for {bounds.max_ports} at most"
+        yield _refusal("spec.ports", spec.ports, fix, "allow.maxPorts")
     if not within(spec.window, bounds.window):
-        inside = f"Choose a window within {bounds.window}"
-        yield _refusal("spec.portWindow", str(spec.window), inside, "allow.portWindow")
+        fix = f"Choose a window within {bounds.window}"
+        yield _refusal("spec.portWindow", str(spec.window), fix, "allow.portWindow")
     if spec.master.publish and spec.master.publish not in bounds.window:
-        inside = f"Choose a port in {bounds.window}"
-        yield _refusal("spec.master.publish", spec.master.publish, inside, "allow.portWindow")
+        fix = f"Choose a port in {bounds.window}"
+        yield _refusal("spec.master.publish", spec.master.publish, fix, "allow.portWindow")
 
 
 def _any_of(patterns: Iterable[str]) -> str:
@@ -151,7 +151,7 @@ def _masters(spec: RosProxySpec) -> Iterator[str]:
     """Yield the URIs at which the proxy really looks for the master.
 
     If the RosProxy itself gives addresses for the master's host name, yield these instead of the
-    name.
+    host name.
     """
     master = spec.master
     if master.service is not None:
@@ -182,7 +182,7 @@ def _missing_consent(rosproxy: RosProxy, consents: Consents) -> str:
     if service is None or service.namespace == namespace:
         return ""
     allowed = consents.get(service, frozenset())
-    if allowed & {namespace, _EVERYBODY}:
+    if allowed & {namespace, _ANY_NAMESPACE}:
         return ""
     value = ",".join(sorted({*allowed, namespace}))
     return (

@@ -51,7 +51,7 @@ def briefings(
     rosproxies = {r.uid: r for r in observed.rosproxies if not r.deleting}
     live_pods = (pod for pod in observed.pods if not (pod.ended or pod.host_network))
     pods = group_by_key(((pod.id.namespace, pod.node), pod) for pod in live_pods)
-    told: dict[str, Briefing] = {}
+    by_uid: dict[str, Briefing] = {}
     for proxy in observed.proxies:
         uid = proxy.pod.uid
         policy = callers = None
@@ -61,5 +61,5 @@ def briefings(
             ips = {ip for p in nearby if selects(rosproxy, p) for ip in (p.ip, *p.ips) if ip}
             callers = tuple(sorted(ips))
         former = former_ports.get(uid, {})
-        told[uid] = Briefing(policy, callers, peers.get(uid), former, gone.get(uid, ()))
-    return told
+        by_uid[uid] = Briefing(policy, callers, peers.get(uid), former, gone.get(uid, ()))
+    return by_uid

@@ -35,8 +35,8 @@ class View(msgspec.Struct, frozen=True):
     """A `ClusterSnapshot`, sorted by RosProxy and by node.
 
     - ``rosproxies``: the RosProxies that are not being deleted.
-    - ``proxies``: the proxies of these RosProxies.
-    - ``current``: the proxy that has the right name for its place and is not being deleted.
+    - ``proxies``: the proxies of these RosProxies, by place.
+    - ``current``: by place, the proxy with the right name that is not being deleted.
     - ``orphans``: the proxies of RosProxies that are gone or being deleted. The proxies of an
       unusable RosProxy are no orphans.
     - ``proxies_by_node``: by intended node, all proxies whose pods have not ended.
@@ -45,7 +45,7 @@ class View(msgspec.Struct, frozen=True):
     - ``selected_pods``: by RosProxy, the pods that the RosProxy takes, on any node.
     - ``other_pods_by_node``: the pods that hold ports and do not belong to the operator.
     - ``other_pod_names``: the names of all pods that do not belong to the operator.
-    - ``names``: the names of all proxies.
+    - ``names``: the names of all proxies' pods.
     - ``findings``: the findings about pods.
     """
 
@@ -81,7 +81,7 @@ def serves(proxy: ProxyPod) -> bool:
 def has_ports(proxy: ProxyPod) -> bool:
     """Whether a proxy's pod holds its hostPorts.
 
-    The scheduler reserves the ports when it binds the pod to a node. The kubelet may refuse them.
+    The scheduler reserves the ports when it binds the pod to a node. The kubelet may still refuse.
     """
     return bool(proxy.pod.node) and not proxy.pod.ended and proxy.stuck is not PodFailure.PORTS
 
@@ -150,7 +150,10 @@ def _wanted(
     rosproxies: Mapping[Name, RosProxy],
     taken: Mapping[Name, Iterable[Pod]],
 ) -> tuple[dict[ProxyPlace, tuple[Pod, ...]], list[ClusterFinding]]:
-    """Return the places where pods want a proxy, and findings about pods that get no proxy."""
+    """Return the places where pods want a proxy, and findings about pods that get no proxy.
+
+    Places on an unknown node, or on a node that is being deleted, are left out without a finding.
+    """
     places = group_by_key(
         (ProxyPlace(n, pod.node), pod) for n, pods in taken.items() for pod in pods
     )

@@ -42,9 +42,9 @@ from rosproxy_operator.proxy_spec.environment import environment, variable
 from rosproxy_operator.proxy_spec.fingerprint import LIVE_VARIABLES, digest
 from rosproxy_operator.proxy_spec.spec import WISHES
 
-STOPS_WITHIN = 5
-"""Seconds from the deletion of a proxy until the kubelet kills the proxy, `_LINGERS` included."""
-_LINGERS = 2
+TERMINATION_GRACE_S = 5
+"""Seconds from the deletion of a proxy until the kubelet kills the proxy, `_LINGER_S` included."""
+_LINGER_S = 2
 """Seconds that a proxy goes on after its deletion.
 
 The garbage collector deletes the proxies of a deleted RosProxy before the operator knows of the
@@ -175,7 +175,10 @@ def proxy_fingerprint(site: ProxySite, settings: ClusterSettings) -> str:
 
 
 def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
-    """The Service of a RosProxy. The same address leads each pod to the proxy on its own node."""
+    """The Service of a RosProxy. The same address leads each pod to the proxy on its own node.
+
+    If ``cluster_ip`` is empty, the API server chooses the address.
+    """
     annotations: dict[str, str] = {}
     meta = metadata(rosproxy, service_id(rosproxy.id), annotations)
     spec: dict[str, Any] = {
@@ -307,7 +310,7 @@ def _spec(site: ProxySite, settings: ClusterSettings, local_ports: PortRange) ->
     sysctls = [{"name": "net.ipv4.ip_local_port_range", "value": value}]
     return {
         **bound_to(site.node.name, spec, settings),
-        "terminationGracePeriodSeconds": STOPS_WITHIN,
+        "terminationGracePeriodSeconds": TERMINATION_GRACE_S,
         "securityContext": {**pod_security_context(settings), "sysctls": sysctls},
         **({"hostAliases": aliases} if aliases else {}),
     }
@@ -376,7 +379,7 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
     spec = site.rosproxy.spec
     policy = spec.image_pull_policy or settings.image_pull_policy
     always = ("port_range", "master_port", "cleanup_after", "slave_control")
-    variables = environment("kubernetes", _told(site, settings), always)
+    variables = environment("kubernetes", _settings_fields(site, settings), always)
     forwards = spec.proxy.data_plane == "kernel"
     return {
         "name": CONTAINER,
@@ -387,7 +390,7 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
         "resources": dict(spec.resources or {}),
         "livenessProbe": _probe("/healthz", 10),
         "readinessProbe": _probe("/readyz", 2),
-        "lifecycle": {"preStop": {"exec": {"command": ["sleep", str(_LINGERS)]}}},
+        "lifecycle": {"preStop": {"exec": {"command": ["sleep", str(_LINGER_S)]}}},
         # The container's status then has the last log lines, which `pod_failures.py` quotes.
         "terminationMessagePolicy": "FallbackToLogsOnError",
         "securityContext": {
@@ -411,8 +414,8 @@ def _container_ports(site: ProxySite, tcp_ports: PortRange) -> list[Json]:
     ]
 
 
-def _told(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:
-    """The values for the fields of a proxy's settings, in the order of the variables."""
+def _settings_fields(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:
+    """The settings of a proxy, by field of `Settings`, in the order of the variables."""
     spec = site.rosproxy.spec
     policy = policy_of(site.rosproxy, settings)
     return {

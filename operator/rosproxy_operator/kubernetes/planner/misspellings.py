@@ -20,13 +20,13 @@ from rosproxy_operator.kubernetes.status.findings import finding
 
 MOST_PODS = 10
 """Most pods that are reported in a namespace: all pods of a Deployment have the same labels."""
-REASON = "UnknownName"
+UNKNOWN_NAME_REASON = "UnknownName"
 
 
 def misspellings(view: View, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
     """Yield the findings about names at a RosProxy, at its nodes and at the master's Service."""
     observed = view.observed
-    yield from (finding(rosproxy, REASON, text) for text in rosproxy.misspelt)
+    yield from (finding(rosproxy, UNKNOWN_NAME_REASON, text) for text in rosproxy.misspelt)
     for place in view.places.get(rosproxy.id, ()):
         node = observed.nodes.get(place.node)
         yield from _others(rosproxy, f"node {place.node}", node.misspelt if node else ())
@@ -37,7 +37,7 @@ def misspellings(view: View, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
 
 
 def _others(rosproxy: RosProxy, subject: str, texts: Iterable[str]) -> Iterator[ClusterFinding]:
-    return (finding(rosproxy, REASON, text, subject=subject) for text in texts)
+    return (finding(rosproxy, UNKNOWN_NAME_REASON, text, subject=subject) for text in texts)
 
 
 def misspelt_pod_findings(view: View) -> Iterator[ClusterFinding]:
@@ -55,7 +55,7 @@ def misspelt_pod_findings(view: View) -> Iterator[ClusterFinding]:
                     f"pod {pod.id}",
                     f"{text}{joint}{fix}",
                     fatal=False,
-                    reason=REASON,
+                    reason=UNKNOWN_NAME_REASON,
                     of=of,
                     about=about,
                 )

@@ -109,7 +109,7 @@ def plan(
     """Return the next plan. A plan has no actions if everything is as the RosProxies ask.
 
     ``state`` is the state of the last plan, or an empty state. ``now`` is in seconds of a monotonic
-    clock, the same clock as in ``state``. ``stamp`` is the time of day in RFC 3339.
+    clock, the same clock as in ``state``. ``stamp`` is the present time in RFC 3339.
     """
     full_snapshot = observed  # with the RosProxies that `within_bounds` makes unusable
     observed = with_pod_defaults(within_bounds(observed, settings), settings.pod)
@@ -256,8 +256,8 @@ def _patch(
 ) -> Iterator[Action]:
     """Yield the action that writes a status, if the status has changed.
 
-    If the API server does not keep a status, `Retries` delays the next write. For this comparison
-    the times in the conditions don't count.
+    If the API server does not keep a status, `Retries` delays the next write of the same status. A
+    status that differs only in the times of conditions counts as the same.
     """
     if status != rosproxy.status:
         conditions = [{**c, "lastTransitionTime": ""} for c in status.get("conditions", ())]

@@ -55,7 +55,7 @@ def misspelt_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> lis
 
 
 def unreached(pods: Iterable[Pod], rosproxies: Sequence[RosProxy], ready_since: str) -> list[str]:
-    """Return the pods that are not wired, although an operator was ready at their creation.
+    """Return the unwired pods that were created while an operator was ready, as NAMESPACE/NAME.
 
     ``ready_since`` is the RFC 3339 time at which an operator became ready; empty without an
     operator.

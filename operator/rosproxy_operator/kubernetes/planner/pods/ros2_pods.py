@@ -38,7 +38,10 @@ _RANGES_WITHOUT_PEERS = ("OFF", "SYSTEM_DEFAULT")
 def ros2_findings(
     pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState = UNKNOWN_WEBHOOK
 ) -> Iterator[ClusterFinding]:
-    """Yield findings about a pod. ``address`` is the address of the RosProxy's Service."""
+    """Yield findings about a pod; none if the RosProxy has no ROS 2.
+
+    ``address`` is the address of the RosProxy's Service.
+    """
     if rosproxy.spec.ros2 is None:
         return
     problems = dict.fromkeys(

@@ -39,9 +39,9 @@ def own_values(name: str) -> tuple[str, str]:
 def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFinding | None:
     """Return the RosProxy that takes a pod, or the reason why a selected pod gets no proxy.
 
-    Of several RosProxies that select the pod, the pod's label names one. Otherwise the result is a
-    finding with the reason Ambiguous. For a pod in the host's network the result is a finding with
-    the reason HostNetwork. If no RosProxy selects the pod, the result is None.
+    If several RosProxies select the pod, the pod's label has to name one of them: otherwise the
+    result is a finding with the reason Ambiguous. For a pod in the host's network, the result is a
+    finding with the reason HostNetwork. If no RosProxy selects the pod, the result is None.
     """
     taking = sorted((r for r in rosproxies if selects(r, pod)), key=lambda r: r.id)
     named = [r for r in taking if r.id.name == pod.labels.get(INJECT)]

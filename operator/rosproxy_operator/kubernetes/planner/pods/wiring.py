@@ -58,10 +58,11 @@ class Wiring(msgspec.Struct, frozen=True):
 
 
 class PodVariables(msgspec.Struct, frozen=True):
-    """The variables that the webhook sets in a pod. An empty value sets no variable.
+    """The variables that the webhook sets in a pod. An empty value or None sets no variable.
 
-    ``masters`` has the hosts and ports of the real master. The webhook replaces a ROS_MASTER_URI of
-    the template that names this master.
+    ``uri`` is for ROS_MASTER_URI, ``static_peers`` for ROS_STATIC_PEERS, ``domain`` for
+    ROS_DOMAIN_ID. ``masters`` has the hosts and ports of the real master. The webhook replaces a
+    ROS_MASTER_URI of the template that names this master.
     """
 
     uri: str = ""
@@ -132,8 +133,8 @@ def wiring_finding(
 ) -> ClusterFinding | None:
     """Return a finding (reason NotWired) if the ROS 1 nodes of a selected pod do not use its proxy.
 
-    Also if the pod has to be recreated so that the nodes use the proxy. ``cluster_ip`` is the
-    address of the RosProxy's Service.
+    Also if the pod has to be recreated: the ROS nodes may not be registered any more. Else None.
+    ``cluster_ip`` is the address of the RosProxy's Service.
     """
     text = _why_not_wired(pod, rosproxy, cluster_ip, webhook)
     return pod_finding(pod, rosproxy, "NotWired", text, fatal=False) if text else None
@@ -201,9 +202,9 @@ def _is_older(pod: Pod, rosproxy: RosProxy) -> bool:
 
 
 def should_be_wired(pod: Pod, rosproxy: RosProxy, ready_since: str) -> bool:
-    """Whether the webhook was sure to wire pods when a pod was created.
+    """Whether the webhook should have wired a pod when the pod was created.
 
-    That is `WEBHOOK_READY_AFTER` after the creation of the pod's RosProxy, and after the time
+    The pod must be at least `WEBHOOK_READY_AFTER` younger than the RosProxy, and than the time
     ``ready_since`` at which the webhook became ready (RFC 3339). False if a time is not known.
     """
     if not (pod.created and rosproxy.created and ready_since):
@@ -214,7 +215,7 @@ def should_be_wired(pod: Pod, rosproxy: RosProxy, ready_since: str) -> bool:
 
 
 def _why_not_wired(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState) -> str:
-    """Return why the ROS 1 nodes of a pod do not use the proxy, and the fix; empty if they do."""
+    """Return why the ROS 1 nodes of a pod do not use the proxy, and the fix; else empty."""
     masters = _masters_of(rosproxy)
     bypassing = [
         uri for uri in pod.own_masters if not _leads_to_proxy(uri, rosproxy.id, cluster_ip)
@@ -327,7 +328,7 @@ def _address_variables(wanted: PodVariables) -> list[tuple[str, str, str]]:
 
 
 def _wired(container: Json, wanted: PodVariables, annotations: Mapping[str, str]) -> Json:
-    """Return a container with the wanted variables. ``annotations`` are those of the pod."""
+    """Return a container with the wanted variables. ``annotations`` belong to the pod."""
     variables = list(submaps(container, "env"))
     names = {text_at(v, "name") for v in variables}
     added: list[Json] = []

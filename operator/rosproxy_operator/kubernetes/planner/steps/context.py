@@ -6,7 +6,7 @@ from msgspec.structs import replace
 from rosproxy.setting_kinds import hash_token
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
 from rosproxy_operator.kubernetes.planner.cluster_view import View
-from rosproxy_operator.kubernetes.planner.manifests import STOPS_WITHIN, ProxySite
+from rosproxy_operator.kubernetes.planner.manifests import TERMINATION_GRACE_S, ProxySite
 from rosproxy_operator.kubernetes.planner.retries import Retries
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources.checks import host_problem
@@ -30,7 +30,7 @@ from rosproxy_operator.kubernetes.status.refusal_fixes import NOT_OURS
 
 NODE_GONE_AFTER_S = 10.0
 """Seconds that a node must be missing before the operator deletes the node's proxies."""
-TORN_DOWN_WITHIN_S = STOPS_WITHIN + 3.0
+TORN_DOWN_WITHIN_S = TERMINATION_GRACE_S + 3.0
 """Seconds in which a kubelet ends a pod that was deleted by force, and removes its hostPort rules.
 
 If a new pod gets the same ports earlier, the rules of the former pod still come first. A steady
