@@ -49,11 +49,11 @@ from rosproxy_operator.kubernetes.status.refusal_fixes import NOT_OURS
 
 log = logging.getLogger(__name__)
 
-AT_ONCE = 8
+MOST_PARALLEL_CALLS = 8
 """Most calls to the API server at the same time."""
-RETIRING = 10.0
+RETIREMENT_TIMEOUT_S = 10.0
 """Seconds that a proxy has to unregister its nodes before the operator deletes the proxy."""
-RELEASED = (0.2, 0.5, 1.0)
+ADDRESS_RETRY_PAUSES_S = (0.2, 0.5, 1.0)
 """Seconds between tries to create a Service again under the former address.
 
 Pods know only this address. The API server reports a Service as deleted before the address is free.
@@ -67,8 +67,8 @@ Count = Callable[[Action, str], None]
 class ClusterApplier:
     """Carries out actions: RosProxies in parallel, the actions of each RosProxy in order.
 
-    Calls ``counted`` with each action and the outcome (ok, failed). Calls ``doubted`` when the
-    watched state differs from a fresh read twice in a row: then a watch has missed a change.
+    Calls ``counted`` with each action and the outcome (ok, failed). Calls ``doubted`` when an
+    object differs from the watched state in two tries in a row: a watch has missed a change.
     ``busy`` is the number of actions that are under way or wait for a turn.
     """
 
@@ -86,7 +86,7 @@ class ClusterApplier:
         self._counted = counted
         self._doubted = doubted
         self._stale = set[str]()
-        self._room = asyncio.Semaphore(AT_ONCE)
+        self._room = asyncio.Semaphore(MOST_PARALLEL_CALLS)
         self._retiring: set[str] = set()
         self._retired: set[str] = set()
         self.failures: Mapping[Name, Mapping[Name, str]] = {}
@@ -138,7 +138,10 @@ class ClusterApplier:
         await asyncio.gather(*(self._perform(emit, observed) for emit in wanted))
 
     async def _perform(self, action: Action, observed: ClusterSnapshot) -> str | None:
-        """Carry out an action. Return the error; None if the action succeeded or was postponed."""
+        """Carry out an action. Return the error.
+
+        None if the action succeeded, was postponed, or had nothing left to do.
+        """
         quiet = isinstance(action, PatchStatus | Emit)
         self.busy += 1
         try:
@@ -188,9 +191,10 @@ class ClusterApplier:
             self._stale.add(uid)
 
     async def _is_retired(self, action: Action, observed: ClusterSnapshot) -> bool:
-        """Whether a proxy has unregistered its nodes.
+        """Whether a proxy has unregistered its nodes, or has failed to do so.
 
-        If not, start a task for that, unless `confirm` raises StateChanged or ApiError.
+        If not, and if this operator leads, start a task that retires and deletes the proxy. No task
+        starts if `confirm` raises StateChanged or ApiError.
         """
         assert isinstance(action, DeleteProxy)  # noqa: S101 - only a proxy retires
         if action.uid in self._retired:
@@ -236,17 +240,17 @@ class ClusterApplier:
                 _emit(api, action)
 
     async def _retire(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
-        """Let a proxy unregister its nodes, within `RETIRING` seconds. Then delete the proxy."""
+        """Let a proxy unregister its nodes, for `RETIREMENT_TIMEOUT_S` at most. Then delete it."""
         fields = _log_fields(action)
         try:
             proxy = next((p for p in observed.proxies if p.pod.uid == action.uid), None)
             if proxy is not None and proxy.pod.ip:
-                async with asyncio.timeout(RETIRING):
+                async with asyncio.timeout(RETIREMENT_TIMEOUT_S):
                     token = token_for(proxy, observed.key)
                     answer = await self._proxies.retire(address_of(proxy), token)
                 log.info("nodes unregistered: proxy %s, %s", action.id, answer, extra=fields)
         except (ProxyError, TimeoutError) as error:
-            reason = str(error) or f"no answer in {RETIRING:g} s"
+            reason = str(error) or f"no answer in {RETIREMENT_TIMEOUT_S:g} s"
             text = "nodes not unregistered at the master: proxy %s: %s"
             log.info(text, action.id, reason, extra=fields)
         finally:
@@ -322,7 +326,9 @@ def _nothing_left(action: Action) -> tuple[type[ApiError], ...]:
     return (ApiNotFound,)
 
 
-def _create(api: Api, kind: str, body: Json, pauses: Sequence[float] = RELEASED) -> None:
+def _create(
+    api: Api, kind: str, body: Json, pauses: Sequence[float] = ADDRESS_RETRY_PAUSES_S
+) -> None:
     """Create an object, unless the object exists.
 
     If the API server refuses the former address of a Service, try again after each of ``pauses``.

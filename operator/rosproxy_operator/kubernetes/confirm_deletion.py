@@ -6,8 +6,8 @@ pod. If any of these objects differs from the snapshot, the operator deletes not
 deliver the change, and the next look decides. Then the operator deletes the pod only in the
 version just read (uid, resourceVersion).
 
-If the RosProxy is gone, the operator checks nothing else: the garbage collector already deletes the
-pods, so the pods keep changing.
+If the RosProxy is gone, the operator does not check the node and the pods there: the garbage
+collector already deletes pods, so the pods keep changing.
 """
 
 from collections.abc import Iterable
@@ -63,7 +63,7 @@ def confirm(api: Api, action: Deletion | EvictPod, observed: ClusterSnapshot) ->
 
 
 def _check_rosproxy(api: Api, name: Name, observed: ClusterSnapshot) -> bool:
-    """Whether the RosProxy is gone. Raises StateChanged."""
+    """Return whether the RosProxy is gone. Raises StateChanged if it differs from the snapshot."""
     objs = api.list_fresh(PLURAL, name.namespace, f"metadata.name={name.name}")
     current = {_requested(rosproxy_record(obj)) for obj in objs}
     expected = {_requested(rosproxy) for rosproxy in observed.rosproxies if rosproxy.id == name}

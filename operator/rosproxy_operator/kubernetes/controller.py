@@ -9,7 +9,7 @@ decisions, and no decision depends on a single event.
 
 Of several operators, only the leader acts, for a term (`leader_election`). The other operators
 follow the cluster and the proxies' reports, so the next leader begins at once. At the end of a term
-the operator forgets the state of the term.
+the operator forgets the state of the term, except the former ports of participants.
 """
 
 import asyncio
@@ -56,15 +56,15 @@ from rosproxy_operator.kubernetes.watch.store import ClusterStore
 
 log = logging.getLogger(__name__)
 
-DEBOUNCE = 0.1
+LEAST_LOOK_INTERVAL_S = 0.1
 """Least seconds between two looks: a roll-out makes dozens of events."""
-SETTLED = 1.0
+RECHECK_AFTER_ACTION_S = 1.0
 """Seconds from an action to another look, in case no watch reports the effect."""
-LONGEST_LOOK = 90.0
+LOOK_TIMEOUT_S = 90.0
 """Seconds after which the loop gives up a look."""
-STANDING_BY = 5.0
+STANDBY_INTERVAL_S = 5.0
 """Seconds between two looks of an operator that does not lead."""
-KEY_EVERY = 30.0
+KEY_CHECK_INTERVAL_S = 30.0
 """Seconds between two checks whether the key of the proxies' tokens has changed."""
 
 
@@ -90,7 +90,7 @@ class KubernetesController:
         self._term = term
         self._webhook_since = webhook_since
         self._acting = 0
-        pace = Pace("API server", settings.resync, DEBOUNCE, LONGEST_LOOK)
+        pace = Pace("API server", settings.resync, LEAST_LOOK_INTERVAL_S, LOOK_TIMEOUT_S)
         self._loop = loop = ControlLoop(pace, metrics)
         self.wake = loop.wake_threadsafe
         self.dead = loop.dead
@@ -113,7 +113,7 @@ class KubernetesController:
         self._proxy_sync = ClusterProxySync(self._tasks, self._proxies, self._wake_for, leads)
         self._state = ClusterState()
         self._due = PlanSchedule()
-        self._stood_by = -STANDING_BY
+        self._last_standby_at = -STANDBY_INTERVAL_S
         self._reflectors: list[Reflector] = []
         self._secret = b""
         self._problems: dict[str, list[ClusterFinding]] = {}
@@ -130,7 +130,9 @@ class KubernetesController:
         for reflector in reflectors:
             reflector.start()
         checks = Tasks()  # not in self._tasks, whose tasks end with each term
-        checks.repeat(self._check_key, KEY_EVERY, "checking the key of the proxies' tokens")
+        checks.repeat(
+            self._check_key, KEY_CHECK_INTERVAL_S, "checking the key of the proxies' tokens"
+        )
         try:
             await self._loop.run(self.look)
         finally:
@@ -162,7 +164,10 @@ class KubernetesController:
         return self._store.pod_names()
 
     async def look(self) -> float | None:
-        """Look and act. Return in how many seconds to look again, or None. Raises LookFailed."""
+        """Look and act. Return the seconds until the next look. Raises LookFailed.
+
+        None: the next look is at an event, or after ``--resync`` seconds.
+        """
         try:
             return await self._look()
         except ApiError as error:
@@ -182,7 +187,10 @@ class KubernetesController:
         return self._term() != 0
 
     async def _change_term(self) -> None:
-        """End the present term, if any, and forget its state. Then begin the next term, if any."""
+        """End the present term, if any, and forget its state. Then begin the next term, if any.
+
+        The former ports of participants stay: the next term needs them.
+        """
         if self._acting:
             await self._tasks.cancel()
             await self._proxy_sync.forget()
@@ -193,12 +201,12 @@ class KubernetesController:
             self._state = ClusterState(former=self._state.former)
             self._report(ClusterSnapshot())
         self._acting = self._term()
-        self._stood_by = -STANDING_BY
+        self._last_standby_at = -STANDBY_INTERVAL_S
         self._due.mark_all_due()
 
     async def _stand_by(self) -> float:
-        """Remember what the next term needs. Return in how many seconds to do so again."""
-        remaining = self._stood_by + STANDING_BY - time.monotonic()
+        """Remember what the next term needs. Return the seconds until the next call."""
+        remaining = self._last_standby_at + STANDBY_INTERVAL_S - time.monotonic()
         if remaining > 0:
             return remaining
         self._secret = await in_thread(self._key.read)
@@ -206,9 +214,9 @@ class KubernetesController:
         observed = self._store.snapshot(self._secret)
         self._proxy_sync.follow(observed.proxies, observed.key)
         observed = replace(observed, reports=self._proxy_sync.reports)
-        self._stood_by = time.monotonic()
-        self._state = stand_by(observed, self._settings.plan, self._state, self._stood_by)
-        return STANDING_BY
+        self._last_standby_at = time.monotonic()
+        self._state = stand_by(observed, self._settings.plan, self._state, self._last_standby_at)
+        return STANDBY_INTERVAL_S
 
     async def _act(self) -> float | None:
         started = time.monotonic()
@@ -267,7 +275,7 @@ class KubernetesController:
         if self._applier.failures != observed.failures:
             self._wake_for(concerned)  # the statuses have to show the failures
         else:
-            self._due.due_at(concerned, time.monotonic() + SETTLED)
+            self._due.due_at(concerned, time.monotonic() + RECHECK_AFTER_ACTION_S)
 
     def _wake_for(self, namespaces: Iterable[str]) -> None:
         """Plan these namespaces soon, after a change that no watch reports."""

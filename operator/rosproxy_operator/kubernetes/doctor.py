@@ -3,8 +3,9 @@
 The doctor checks in this order: the operators, the statuses of the RosProxies, the labelled pods,
 the webhook, and the last Events (`doctor_facts`). Then the doctor runs ``rosproxy doctor`` in the
 pod of each proxy, as ``kubectl exec`` does: this command tests from the place of the proxy. All
-requests use the rights of the user that calls the doctor. A missing right becomes a finding, and
-the doctor checks the rest.
+requests use the rights of the user that calls the doctor. The doctor can't work without the right
+to list RosProxies and the operator's pods. Any other missing right becomes a finding, and the
+doctor checks the rest.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -41,14 +42,14 @@ from rosproxy_operator.kubernetes.status.webhook_findings import webhook_finding
 MOST_DOCTORS = 4
 """Proxies checked at the same time: each doctor is a separate Python process in the pod."""
 DOCTOR_TIMEOUT_S = 60
-"""Seconds for the doctor of a proxy: this doctor waits for nodes that may not answer."""
+"""Most seconds for the doctor of a proxy, which waits for nodes that may not answer."""
 
 
 def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFinding]:
     """Return all findings.
 
     If ``names`` are given, the proxies report only on these nodes, topics and services. Raises
-    ApiError.
+    ApiError if the doctor can't list RosProxies or the operator's pods.
     """
     api = Api(namespaces)
     try:
@@ -56,7 +57,7 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
         own_pods = api.own_pods()
         facts = DoctorFacts(api, namespaces)
         operators = facts.operators(rosproxies)
-        pods = facts.meant_pods()
+        pods = facts.labelled_pods()
         usable, _ = read_rosproxies(rosproxies)
         cut_off = unreached(pods, [*usable.values()], operators.ready_since)
         with_rosproxy = namespaces_of(rosproxies)
@@ -110,7 +111,7 @@ def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
 
 
 def _run(namespace: str, pod: str, arguments: Sequence[str]) -> bytes:
-    """Return all output of a command in a pod, after at most `DOCTOR_TIMEOUT_S` seconds."""
+    """Return the standard output of a command in a pod, up to its end or `DOCTOR_TIMEOUT_S`."""
     with ApiClient(configuration()) as client:  # `stream` changes the client during the call
         channel = stream(
             CoreV1Api(client).connect_get_namespaced_pod_exec,

@@ -40,8 +40,8 @@ from rosproxy_operator.kubernetes.status.webhook_findings import (
 )
 
 T = TypeVar("T")
-MOST_LOOKED_FOR = 3 * MOST_EVENTS
-"""Most Events whose pod the doctor looks up: Events of deleted users' pods do not matter."""
+MOST_CHECKED_EVENTS = 3 * MOST_EVENTS
+"""Most Events for which the doctor checks whether the pod still exists."""
 
 
 class DoctorFacts:
@@ -53,7 +53,7 @@ class DoctorFacts:
         self.refused: list[DoctorFinding] = []
 
     def operators(self, rosproxies: Iterable[Json]) -> Operators:
-        """Return the operators' pods, and the namespaces where these may not write a status.
+        """Return the operators' pods, and the namespaces where no operator may write a status.
 
         The doctor checks only namespaces with a RosProxy that no operator has looked at.
         """
@@ -76,21 +76,24 @@ class DoctorFacts:
             if group and not any(may_write(account, name) for account in group)
         )
 
-    def meant_pods(self) -> list[Pod]:
+    def labelled_pods(self) -> list[Pod]:
         """Return the live pods with the label rosproxy.io/inject, or with a misspelt name."""
         found: list[Pod] = []
         for place in self._places:
-            found += self._ask("pods", partial(self._meant, place)) or []
+            found += self._ask("pods", partial(self._labelled, place)) or []
         return found
 
-    def _meant(self, place: str) -> list[Pod]:
+    def _labelled(self, place: str) -> list[Pod]:
         # No label selector finds a misspelt label.
         pods = map(objects.pod, self._api.each("pods", place, ""))
-        meant = (pod for pod in pods if INJECT in pod.labels or pod.misspelt)
-        return [pod for pod in meant if not (pod.ended or pod.deleting)]
+        labelled = (pod for pod in pods if INJECT in pod.labels or pod.misspelt)
+        return [pod for pod in labelled if not (pod.ended or pod.deleting)]
 
     def webhook(self, operators: Operators, unreached: Sequence[str]) -> WebhookFacts:
-        """Return the webhook's configurations, and how many endpoints of each Service are ready."""
+        """Return the webhook's configurations, and how many endpoints of each Service are ready.
+
+        ``unreached`` has the pods that no webhook wired (`labelled.unreached`).
+        """
         api = self._api
         listed = self._ask("webhook", lambda: api.list_fresh(WEBHOOKS, ""))
         if listed is None:
@@ -110,12 +113,12 @@ class DoctorFacts:
             events += self._ask("events", partial(self._warnings, place)) or []
         recent = recent_events(events, rosproxies, own_pods, time.time())
         ours = {text_at(submap(obj, "metadata"), "uid") for obj in (*rosproxies, *own_pods)}
-        return [e for e in recent[:MOST_LOOKED_FOR] if e.uid in ours or self._is_there(e)]
+        return [e for e in recent[:MOST_CHECKED_EVENTS] if e.uid in ours or self._pod_exists(e)]
 
     def _warnings(self, place: str) -> list[Json]:
         return [*self._api.list_fresh("events", place, fields="type=Warning")]
 
-    def _is_there(self, event: RecentEvent) -> bool:
+    def _pod_exists(self, event: RecentEvent) -> bool:
         """Whether the pod of an Event exists. After a failed request, the answer is yes."""
         try:
             pod = self._api.get("pods", event.id)

@@ -14,9 +14,9 @@ class PlanSchedule:
     """The times at which namespaces are due. All times are seconds of a monotonic clock."""
 
     def __init__(self) -> None:
-        self._at: dict[str, float] = {}
+        self._due_times: dict[str, float] = {}
         self._all_due = True
-        self._all_at = 0.0
+        self._last_full_plan_at = 0.0
 
     def mark_all_due(self) -> None:
         """Make everything due."""
@@ -29,11 +29,11 @@ class PlanSchedule:
     def due_at(self, namespaces: Iterable[str], at: float) -> None:
         """Make these namespaces due at a time, unless an earlier time is set."""
         for namespace in namespaces:
-            self._at[namespace] = min(self._at.get(namespace, at), at)
+            self._due_times[namespace] = min(self._due_times.get(namespace, at), at)
 
     def is_all(self, now: float, resync: float) -> bool:
         """Whether everything is due: by `mark_all_due`, or after ``resync`` seconds."""
-        self._all_due = self._all_due or now - self._all_at >= resync
+        self._all_due = self._all_due or now - self._last_full_plan_at >= resync
         return self._all_due
 
     def due_partition(
@@ -46,7 +46,7 @@ class PlanSchedule:
         """Return the part that is due, with the given namespaces and nodes; None: all is due."""
         if self._all_due:
             return None
-        due = {namespace for namespace, at in self._at.items() if at <= now}
+        due = {namespace for namespace, at in self._due_times.items() if at <= now}
         return partition_of(observed, {*namespaces, *due}, nodes)
 
     def planned(
@@ -58,19 +58,19 @@ class PlanSchedule:
         """
         if scope is None:
             self._all_due = False
-            self._all_at = now
-            self._at = {}
+            self._last_full_plan_at = now
+            self._due_times = {}
             planned = {rosproxy.id.namespace for rosproxy in observed.rosproxies}
             planned |= {proxy.of.namespace for proxy in observed.proxies}
             planned |= {pod.id.namespace for pod in observed.unselected_pods}
         else:
             planned = {*scope.namespaces}
             for namespace in planned:
-                self._at.pop(namespace, None)
+                self._due_times.pop(namespace, None)
         if again_in is not None:
             self.due_at(planned, now + again_in)
 
     def again_in(self, now: float, delay: float | None) -> float | None:
         """Return the seconds until a namespace is due, at most ``delay``; None: no time is set."""
-        delays = [max(at - now, 0.0) for at in self._at.values()]
+        delays = [max(at - now, 0.0) for at in self._due_times.values()]
         return min([*delays, *([] if delay is None else [delay])], default=None)

@@ -61,9 +61,9 @@ class Running:
 
 @pytest.fixture
 async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Running]:
-    monkeypatch.setattr(module, "DEBOUNCE", 0.01)
-    monkeypatch.setattr(module, "SETTLED", 0.05)
-    monkeypatch.setattr(module, "KEY_EVERY", 0.05)
+    monkeypatch.setattr(module, "LEAST_LOOK_INTERVAL_S", 0.01)
+    monkeypatch.setattr(module, "RECHECK_AFTER_ACTION_S", 0.05)
+    monkeypatch.setattr(module, "KEY_CHECK_INTERVAL_S", 0.05)
     monkeypatch.setattr(control_loop, "RETRY_PAUSES_S", (0.02,))
     monkeypatch.setattr(reflector, "RETRY_PAUSES_S", (0.02,))
     monkeypatch.setattr(proxy_sync, "POLL_INTERVAL_S", 0.05)
@@ -206,7 +206,7 @@ async def test_an_operator_without_the_lead_only_looks(server: ApiServer, runnin
     put_all(server)
     looks = running.looks()
     running.controller.wake()
-    await until(lambda: running.looks() > looks + 1 or running.controller._stood_by > 0)
+    await until(lambda: running.looks() > looks + 1 or running.controller._last_standby_at > 0)
     assert written() == []
     assert running.controller.unready() is None
     running.term = 1

@@ -139,7 +139,7 @@ async def test_labelled_pods_in_a_namespace_without_a_rosproxy(server: ApiServer
     for name in ("talker", "listener"):
         server.put("pods", pod_obj(name, {"rosproxy.io/inject": "true"}), NAMESPACE)
     server.put("pods", pod_obj("off", {"rosproxy.io/inject": "false"}), NAMESPACE)
-    pods = await in_thread(DoctorFacts(api, ()).meant_pods)
+    pods = await in_thread(DoctorFacts(api, ()).labelled_pods)
     (finding,) = missing_rosproxy_findings(pods, frozenset({"other"}))
     assert (finding.severity, finding.subject) == (Severity.ERROR, f"namespace {NAMESPACE}")
     assert "2 pods with the label rosproxy.io/inject (listener, talker)" in finding.text
@@ -158,7 +158,7 @@ async def test_misspelt_labels_in_a_namespace_without_a_rosproxy(
             "pods", {**obj, "metadata": {**obj["metadata"], "ownerReferences": [owner]}}, NAMESPACE
         )
     server.put("pods", pod_obj("other", {"app": "x"}), NAMESPACE)
-    pods = await in_thread(DoctorFacts(api, ()).meant_pods)
+    pods = await in_thread(DoctorFacts(api, ()).labelled_pods)
     (finding,) = misspelt_findings(pods, frozenset())
     assert (finding.severity, finding.subject) == (Severity.ERROR, f"pod {NAMESPACE}/listener")
     assert "Did you mean the label rosproxy.io/inject of pods?" in finding.text
