@@ -86,7 +86,7 @@ class CreationFacts:
 
 def has_own_name(own: OwnLabels, name: str) -> bool:
     """Whether the operator gives this name to a container with these labels."""
-    names = [_name(own)]
+    names = [_expected_name(own)]
     if own.role == ROLE_LAN_RELAY:
         names.append(f"{proxy_name(own.key)}-{FORMER_LAN_RELAY}")
     return any(re.fullmatch(re.escape(each) + _NAME_ENDINGS, name) for each in names)
@@ -100,7 +100,7 @@ def forgery_reason(own: OwnLabels, name: str, creation: CreationFacts, image_id:
     the image. All other containers must have the command of their role.
     """
     if not has_own_name(own, name):
-        return f"the name is not {_name(own)}"
+        return f"the name is not {_expected_name(own)}"
     user = HELPER_USER if own.role in _HELPERS else USER
     if creation.user != user:
         return f"the user is not {user}"
@@ -114,24 +114,24 @@ def forgery_reason(own: OwnLabels, name: str, creation: CreationFacts, image_id:
     is_former = own.role == ROLE_LAN_RELAY and actual == _FORMER_LAN_RELAY_COMMAND
     if actual != command and not of_image and not is_former:
         return f"the command is not {' '.join(command)}"
-    odd = {
-        ROLE_SANDBOX: _odd_sandbox(own, creation.host),
-        ROLE_PROXY: _odd_proxy(creation.host),
-        ROLE_LAN_RELAY: _odd_lan_relay(creation.host),
-        ROLE_REDIRECT: _odd_redirect(own, creation.host),
-        ROLE_FLUSH: _odd_flush(creation.host),
+    wrong_fields = {
+        ROLE_SANDBOX: _wrong_sandbox_fields(own, creation.host),
+        ROLE_PROXY: _wrong_proxy_fields(creation.host),
+        ROLE_LAN_RELAY: _wrong_lan_relay_fields(creation.host),
+        ROLE_REDIRECT: _wrong_redirect_fields(own, creation.host),
+        ROLE_FLUSH: _wrong_flush_fields(creation.host),
     }
-    return next((f"HostConfig.{name} is not the operator's" for name in odd[own.role]), "")
+    return next((f"HostConfig.{name} is not the operator's" for name in wrong_fields[own.role]), "")
 
 
-def _name(own: OwnLabels) -> str:
+def _expected_name(own: OwnLabels) -> str:
     if own.role == ROLE_REDIRECT:
         return redirect_name(own.key, own.fingerprint)
     names = {ROLE_SANDBOX: sandbox_name, ROLE_LAN_RELAY: lan_relay_name, ROLE_FLUSH: flush_name}
     return names.get(own.role, proxy_name)(own.key)
 
 
-def _odd(host: Mapping[str, Any]) -> Iterator[str]:
+def _wrong_fields(host: Mapping[str, Any]) -> Iterator[str]:
     """Yield the fields of a HostConfig whose values no container of the operator has."""
     if host.get("ReadonlyRootfs") is not True:
         yield "ReadonlyRootfs"
@@ -142,8 +142,8 @@ def _odd(host: Mapping[str, Any]) -> Iterator[str]:
         yield "IpcMode"
 
 
-def _odd_sandbox(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
-    yield from _odd(host)
+def _wrong_sandbox_fields(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
+    yield from _wrong_fields(host)
     if host.get("CapAdd"):
         yield "CapAdd"
     if host.get("SecurityOpt") != ["no-new-privileges:true"]:
@@ -168,9 +168,9 @@ def _odd_sandbox(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
         yield "Sysctls"
 
 
-def _odd_lan_relay(host: Mapping[str, Any]) -> Iterator[str]:
-    """A LAN relay is in the host's network, and has no other privilege."""
-    yield from _odd(host)
+def _wrong_lan_relay_fields(host: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the wrong fields of a LAN relay: it is in the host's network, without privileges."""
+    yield from _wrong_fields(host)
     if host.get("CapAdd"):
         yield "CapAdd"
     if host.get("SecurityOpt") != ["no-new-privileges:true"]:
@@ -180,23 +180,28 @@ def _odd_lan_relay(host: Mapping[str, Any]) -> Iterator[str]:
     yield from (name for name in ("PortBindings", "Sysctls") if host.get(name))
 
 
-def _odd_redirect(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
-    """A redirect has NET_ADMIN in another container's network; for rmw_zenoh also a sysctl."""
+def _wrong_redirect_fields(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the wrong fields of a redirect.
+
+    A redirect has NET_ADMIN in another container's network; for rmw_zenoh also a sysctl.
+    """
     sysctls = frozenset(zenoh_sysctls(True)) if own.key == ZENOH else frozenset()
-    yield from _odd_helper(host, sysctls)
+    yield from _wrong_helper_fields(host, sysctls)
     if not str(host.get("NetworkMode")).startswith("container:"):
         yield "NetworkMode"
 
 
-def _odd_flush(host: Mapping[str, Any]) -> Iterator[str]:
-    """A flush has NET_ADMIN in the host's network, and no other privilege."""
-    yield from _odd_helper(host)
+def _wrong_flush_fields(host: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the wrong fields of a flush: it has NET_ADMIN in the host's network, and no more."""
+    yield from _wrong_helper_fields(host)
     if host.get("NetworkMode") != "host":
         yield "NetworkMode"
 
 
-def _odd_helper(host: Mapping[str, Any], sysctls: frozenset[str] = frozenset()) -> Iterator[str]:
-    yield from _odd(host)
+def _wrong_helper_fields(
+    host: Mapping[str, Any], sysctls: frozenset[str] = frozenset()
+) -> Iterator[str]:
+    yield from _wrong_fields(host)
     if [str(name).removeprefix("CAP_") for name in host.get("CapAdd") or ()] != ["NET_ADMIN"]:
         yield "CapAdd"
     if host.get("SecurityOpt") != ["no-new-privileges:true"]:
@@ -207,8 +212,8 @@ def _odd_helper(host: Mapping[str, Any], sysctls: frozenset[str] = frozenset()) 
         yield "Sysctls"
 
 
-def _odd_proxy(host: Mapping[str, Any]) -> Iterator[str]:
-    yield from _odd(host)
+def _wrong_proxy_fields(host: Mapping[str, Any]) -> Iterator[str]:
+    yield from _wrong_fields(host)
     if not is_kernel_host(host):
         if host.get("CapAdd"):
             yield "CapAdd"

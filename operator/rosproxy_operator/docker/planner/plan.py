@@ -125,7 +125,7 @@ def plan(
     if obstacle:  # fatal only if a proxy lacks a container, and the operator can't create it
         problems.append(replace(obstacle, fatal=None in actions_by_key.values()))
     groups = [*_possible_groups(observed, settings, desired, actions_by_key, naming, memory)]
-    deferred = tuple(group for group in groups if _waits(group, observed, settings.uplink))
+    deferred = tuple(group for group in groups if _is_deferred(group, observed, settings.uplink))
     docker_plan = DockerPlan(
         groups=tuple(group for group in groups if group not in deferred),
         deferred=deferred,
@@ -227,7 +227,7 @@ def _groups(
             yield Group(wanted.key, tuple(actions))
 
 
-def _waits(group: Group, observed: HostState, uplink: str) -> bool:
+def _is_deferred(group: Group, observed: HostState, uplink: str) -> bool:
     """Whether a group creates a proxy without a known address of the master, or of the uplink."""
     return any(
         isinstance(action, Create) and _lacks_address(action.key, observed, uplink)

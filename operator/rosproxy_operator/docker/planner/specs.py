@@ -60,7 +60,7 @@ FORMER_TOKEN = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
 """The variable with the token of former proxies. Present proxies have only the token's hash."""
 ADMIN_PORT = 11312
 DEFAULT_MASTER_PORT = 11311
-COMMON: Mapping[str, Any] = {
+COMMON_HOST_CONFIG: Mapping[str, Any] = {
     "ReadonlyRootfs": True,
     "CapDrop": ["ALL"],
     "SecurityOpt": ["no-new-privileges:true"],
@@ -72,7 +72,7 @@ The restart policy is ``always``. After a crash of the engine, the new engine st
 and counts these as stopped by a user. So the engine starts containers with ``always`` again, but
 not containers with ``unless-stopped``.
 """
-_KERNEL = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:false"]}
+_KERNEL_CONFIG = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:false"]}
 """The further ``HostConfig`` of a proxy with the kernel plane: see the proxy's Dockerfile.
 
 no-new-privileges is set to false explicitly, because an engine may have true as the default.
@@ -93,7 +93,7 @@ SANDBOX_COMMAND = ("sleep", "infinity")
 PROXY_COMMAND = ("rosproxy", "run")
 """The default command of the proxy's image (Dockerfile). The operator gives proxies no command."""
 NFT = "/usr/sbin/nft"
-FLUSH = r"""
+FLUSH_SCRIPT = r"""
 /usr/sbin/conntrack -L -p udp --orig-port-dst "$1" >/dev/null
 /usr/sbin/conntrack -L -p udp |
   sed -n 's/^udp *17 [0-9]* src=[^ ]* dst=[^ ]* sport=[0-9]* dport=\([0-9]*\) .*/\1/p' |
@@ -275,7 +275,7 @@ Creation = CreateSandbox | Create | CreateLanRelay | CreateRedirect | CreateFlus
 def flush_command(key: Key, ports: PortRange) -> tuple[str, ...]:
     """The command that deletes the conntrack entries for the UDP ports of a key's sandbox."""
     published = own_range(key, ports)
-    return ("/bin/sh", "-ec", FLUSH, "flush", str(published.first), str(published.last))
+    return ("/bin/sh", "-ec", FLUSH_SCRIPT, "flush", str(published.first), str(published.last))
 
 
 def own_labels(action: Creation) -> dict[str, str]:
@@ -338,7 +338,7 @@ def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, A
         "Labels": own_labels(action),
         "ExposedPorts": {port: {} for port in bindings},
         "HostConfig": {
-            **COMMON,
+            **COMMON_HOST_CONFIG,
             # As process 1, sleep would ignore SIGTERM (pid_namespaces(7)), so that the engine would
             # have to kill sleep after a time-out.
             "Init": True,
@@ -360,7 +360,7 @@ def helper_config(settings: PlanSettings, network_mode: str) -> dict[str, Any]:
         "User": HELPER_USER,
         "Healthcheck": {"Test": ["NONE"]},
         "HostConfig": {
-            **COMMON,
+            **COMMON_HOST_CONFIG,
             "RestartPolicy": {"Name": "no"},
             "CapAdd": ["NET_ADMIN"],
             "Init": False,
@@ -388,8 +388,8 @@ def container_config(
         "Env": [f"{name}={value}" for name, value in variables.items()],
         "Labels": own_labels(action),
         "HostConfig": {
-            **COMMON,
-            **(_KERNEL if action.spec.data_plane == "kernel" else {}),
+            **COMMON_HOST_CONFIG,
+            **(_KERNEL_CONFIG if action.spec.data_plane == "kernel" else {}),
             "Init": False,
             **{name: limit for name, limit in limits.items() if limit},
             "NetworkMode": f"container:{action.sandbox}",
@@ -459,7 +459,7 @@ def lan_relay_config(action: CreateLanRelay, settings: PlanSettings, secret: str
         "Env": [f"{name}={value}" for name, value in variables.items()],
         "Labels": own_labels(action),
         "HostConfig": {
-            **COMMON,
+            **COMMON_HOST_CONFIG,
             "Init": False,
             "Memory": LAN_RELAY_MEMORY_BYTES,
             "PidsLimit": LAN_RELAY_PIDS,
@@ -482,4 +482,7 @@ def is_kernel_host(host: Mapping[str, Any]) -> bool:
     Some engines write capabilities with the prefix ``CAP_``.
     """
     added = [str(name).removeprefix("CAP_") for name in host.get("CapAdd") or ()]
-    return added == _KERNEL["CapAdd"] and host.get("SecurityOpt") == _KERNEL["SecurityOpt"]
+    return (
+        added == _KERNEL_CONFIG["CapAdd"]
+        and host.get("SecurityOpt") == _KERNEL_CONFIG["SecurityOpt"]
+    )

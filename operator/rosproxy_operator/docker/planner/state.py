@@ -18,7 +18,7 @@ from rosproxy_operator.docker.planner.taken_names import (
 )
 
 # A container in the state created has published no port yet: the range may still be taken.
-_HAS_SERVED = SERVING | {"exited", "dead", "removing"}
+_SERVED_STATES = SERVING | {"exited", "dead", "removing"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ def _served(memory: DockerMemory, observed: HostState) -> dict[Key, PortRange]:
     served = dict(memory.served)
     for own in (*observed.sandboxes, *observed.proxies):
         previous = served.get(own.key)
-        if own.container.state in _HAS_SERVED and (not previous or within(previous, own.range)):
+        if own.container.state in _SERVED_STATES and (not previous or within(previous, own.range)):
             served[own.key] = own.range
     for sandbox in reversed(observed.sandboxes):
         if sandbox.container.state in SERVING:

@@ -3,7 +3,7 @@
 The executor removes the following at the same time (`Group`):
 
 - Each redirect in the network of a user's container, and then the records of this redirect.
-- Each flush.
+- Each flush whose sandbox is gone.
 - The proxy of each key, then the LAN relay and the sandbox. The proxy first tells outside that the
   nodes have ended.
 
