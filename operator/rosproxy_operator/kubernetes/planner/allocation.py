@@ -167,7 +167,7 @@ class _Node(msgspec.Struct):
         """
         served = place in self.state.served
         is_waiting = served or self.view.current.get(place) is not None
-        pods = [pod for pod in self._strangers(place) if not (served and pod.deleting)]
+        pods = [pod for pod in self._non_proxy_pods(place) if not (served and pod.deleting)]
         for proxy in self.proxies:
             counts = has_ports(proxy) or place_of(proxy) not in self.view.wanted
             if counts and place_of(proxy) != place and not (is_waiting and proxy.pod.deleting):
@@ -226,9 +226,9 @@ class _Node(msgspec.Struct):
     def _other_pods(self, place: ProxyPlace) -> list[Pod]:
         """Return all other pods that hold ports on the node."""
         proxy_pods = (p.pod for p in self.proxies if place_of(p) != place)
-        return [*self._strangers(place), *proxy_pods]
+        return [*self._non_proxy_pods(place), *proxy_pods]
 
-    def _strangers(self, place: ProxyPlace) -> list[Pod]:
+    def _non_proxy_pods(self, place: ProxyPlace) -> list[Pod]:
         """Return the node's pods that are not proxies, with the LAN relays of other RosProxies."""
         lan_relays = (r for r in self.view.observed.lan_relays if r.node == self.node)
         # The LAN relay of the same RosProxy holds the last port of the range (`steps.lan_relay`).

@@ -94,8 +94,8 @@ def view(observed: ClusterSnapshot) -> View:
     orphans = (p for p in observed.proxies if not _owned(p, rosproxies))
     own_uids = {own_pod.pod.uid for own_pod in observed.own_pods}
     other_pods = {pod.uid: pod for pod in observed.pods if pod.uid not in own_uids}.values()
-    taken, findings = _taken(observed, rosproxies)
-    wanted, left_out = _wanted(observed, rosproxies, taken)
+    selected_pods, findings = _selected_pods(observed, rosproxies)
+    wanted, left_out = _wanted(observed, rosproxies, selected_pods)
     return View(
         observed=observed,
         rosproxies=rosproxies,
@@ -110,7 +110,7 @@ def view(observed: ClusterSnapshot) -> View:
         proxies_by_node=group_by_key((p.node, p) for p in observed.proxies if not p.pod.ended),
         wanted=wanted,
         places=group_by_key((place.of, place) for place in sorted({*wanted, *proxies})),
-        selected_pods=taken,
+        selected_pods=selected_pods,
         other_pods_by_node=group_by_key(
             (pod.node, pod) for pod in other_pods if pod.node and pod.every_port and not pod.ended
         ),
@@ -124,13 +124,13 @@ def _owned(proxy: ProxyPod, rosproxies: Mapping[Name, RosProxy]) -> bool:
     return proxy.of in rosproxies and rosproxies[proxy.of].uid == proxy.owner
 
 
-def _taken(
+def _selected_pods(
     observed: ClusterSnapshot, rosproxies: Mapping[Name, RosProxy]
 ) -> tuple[dict[Name, tuple[Pod, ...]], list[ClusterFinding]]:
     """Return the pods that each RosProxy takes, and findings about selected pods left out."""
     pods = [pod for pod in observed.pods if not (pod.ended or pod.deleting or is_own(pod.labels))]
     choices = [(select_rosproxy(pod, rosproxies.values()), pod) for pod in pods]
-    taken = group_by_key(
+    selected_pods = group_by_key(
         (choice.id, pod) for choice, pod in choices if isinstance(choice, RosProxy)
     )
     refused = [(choice, pod) for choice, pod in choices if isinstance(choice, ClusterFinding)]
@@ -142,20 +142,20 @@ def _taken(
         for r in rosproxies.values()
         if selects(r, pod)
     ]
-    return taken, findings
+    return selected_pods, findings
 
 
 def _wanted(
     observed: ClusterSnapshot,
     rosproxies: Mapping[Name, RosProxy],
-    taken: Mapping[Name, Iterable[Pod]],
+    selected_pods: Mapping[Name, Iterable[Pod]],
 ) -> tuple[dict[ProxyPlace, tuple[Pod, ...]], list[ClusterFinding]]:
     """Return the places where pods want a proxy, and findings about pods that get no proxy.
 
     Places on an unknown node, or on a node that is being deleted, are left out without a finding.
     """
     places = group_by_key(
-        (ProxyPlace(n, pod.node), pod) for n, pods in taken.items() for pod in pods
+        (ProxyPlace(n, pod.node), pod) for n, pods in selected_pods.items() for pod in pods
     )
     wanted: dict[ProxyPlace, tuple[Pod, ...]] = {}
     findings: list[ClusterFinding] = []

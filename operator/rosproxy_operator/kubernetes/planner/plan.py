@@ -120,9 +120,9 @@ def plan(
     retries = Retries(decided.attempts, observed.failures, now)
     context = ClusterContext(cluster_view, settings, decided, ranges, retries, now)
     actions = [*reconcile_orphans(context), *reconcile_orphaned_policies(context)]
-    of_pods = _pod_findings(cluster_view, decided, now)
-    problems = [*of_pods]
-    shared = (*of_pods, *moves(cluster_view, decided, ranges.given))
+    pod_findings = _pod_findings(cluster_view, decided, now)
+    problems = [*pod_findings]
+    shared = (*pod_findings, *moves(cluster_view, decided, ranges.given))
     for _, rosproxy in sorted(cluster_view.rosproxies.items()):
         own = [action for step in _STEPS for action in step(context, rosproxy)]
         states = tuple(_states(context, rosproxy))

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
-    MIRROR,
+    MIRROR_ANNOTATION,
     PodVariables,
     Wiring,
     needs_recreation,
@@ -229,7 +229,7 @@ def test_a_copy_of_a_wired_pod_is_wired_anew():
 
 def test_a_static_pods_picture_is_not_changed():
     obj = admitted(container())
-    obj["metadata"]["annotations"] = {MIRROR: "hash"}
+    obj["metadata"]["annotations"] = {MIRROR_ANNOTATION: "hash"}
 
     wiring = wire(obj, TO)
 

@@ -38,7 +38,7 @@ from rosproxy_operator.kubernetes.resources.names import (
 from rosproxy_operator.kubernetes.resources.objects import MASTER_VARIABLE
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 
-MIRROR = "kubernetes.io/config.mirror"
+MIRROR_ANNOTATION = "kubernetes.io/config.mirror"
 """Annotation of the mirror pod of a static pod. A change of a mirror pod changes no container."""
 WEBHOOK_READY_AFTER = timedelta(minutes=1)
 """Time after which the webhook is sure to wire the pods of a new RosProxy.
@@ -46,7 +46,7 @@ WEBHOOK_READY_AFTER = timedelta(minutes=1)
 The time starts when the RosProxy exists and the webhook is ready.
 """
 UNKNOWN_WEBHOOK = WebhookState()
-_KINDS = ("initContainers", "containers")
+_CONTAINER_FIELDS = ("initContainers", "containers")
 
 
 class Wiring(msgspec.Struct, frozen=True):
@@ -99,7 +99,7 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
     The caller must not pass a pod in the host's network: see `selection.select_rosproxy`.
     """
     annotations = texts_at(pod, "metadata", "annotations")
-    if MIRROR in annotations:
+    if MIRROR_ANNOTATION in annotations:
         warning = (
             "rosproxy: this pod was not wired to a proxy: the pod is a static pod, made from a "
             "file on its node. Set "
@@ -110,7 +110,7 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
     spec = submap(pod, "spec")
     wired: dict[str, Any] = {
         kind: [_wired(container, wanted, annotations) for container in submaps(spec, kind)]
-        for kind in _KINDS
+        for kind in _CONTAINER_FIELDS
         if spec.get(kind)
     }
     aliases = _merged(submaps(spec, "hostAliases"), host_aliases)
@@ -121,7 +121,11 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
     new_annotations = {
         annotation: value
         for annotation, variable, value in _address_variables(wanted)
-        if any(_value(c, variable) == value for kind in _KINDS for c in wired.get(kind, ()))
+        if any(
+            _value(c, variable) == value
+            for kind in _CONTAINER_FIELDS
+            for c in wired.get(kind, ())
+        )
     }
     if replaced and MASTER_URI in new_annotations:
         new_annotations[REPLACED_URI] = replaced
@@ -150,7 +154,7 @@ def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
     masters = _masters_of(rosproxy)
     lacks_master = (
         rosproxy.spec.ros1
-        and all(_names_one(uri, masters) for uri in pod.own_masters)
+        and all(_names_master(uri, masters) for uri in pod.own_masters)
         and (pod.wired_master_uri != master_uri(cluster_ip) or _is_of_former(pod, rosproxy))
     )
     peers = {c.variables["ROS_STATIC_PEERS"] for c in pod.containers if has_peers(c)}
@@ -220,7 +224,7 @@ def _why_not_wired(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: Webho
     bypassing = [
         uri for uri in pod.own_masters if not _leads_to_proxy(uri, rosproxy.id, cluster_ip)
     ]
-    foreign = [uri for uri in bypassing if not _names_one(uri, masters)]
+    foreign = [uri for uri in bypassing if not _names_master(uri, masters)]
     if foreign:
         return (
             f"variable ROS_MASTER_URI={clean(foreign[0])[:200]} of the template does not lead to "
@@ -301,7 +305,7 @@ def _masters_of(rosproxy: RosProxy) -> frozenset[HostPort]:
     return frozenset(HostPort(host, master.service_port) for host in hosts)
 
 
-def _names_one(uri: str, masters: Collection[HostPort]) -> bool:
+def _names_master(uri: str, masters: Collection[HostPort]) -> bool:
     """Whether a ROS_MASTER_URI names one of these masters, in upper or lower case."""
     plain = uri.strip().lower()
     named = parse_slave_uri(plain)
@@ -312,10 +316,10 @@ def _names_one(uri: str, masters: Collection[HostPort]) -> bool:
 
 def _replaced_uri(spec: Json, wanted: PodVariables) -> str:
     """The first ROS_MASTER_URI of a template that the webhook replaces; empty without one."""
-    containers = (container for kind in _KINDS for container in submaps(spec, kind))
+    containers = (container for kind in _CONTAINER_FIELDS for container in submaps(spec, kind))
     own = (v for c in containers for v in submaps(c, "env") if v.get("name") == MASTER_VARIABLE)
     values = (text_at(variable, "value") for variable in own)
-    return next((value for value in values if _names_one(value, wanted.masters)), "")
+    return next((value for value in values if _names_master(value, wanted.masters)), "")
 
 
 def _address_variables(wanted: PodVariables) -> list[tuple[str, str, str]]:
@@ -338,7 +342,7 @@ def _wired(container: Json, wanted: PodVariables, annotations: Mapping[str, str]
         for index, variable in enumerate(variables):
             own = text_at(variable, "value")
             is_ours = bool(former) and own == former
-            if variable.get("name") == name and (is_ours or _names_one(own, masters)):
+            if variable.get("name") == name and (is_ours or _names_master(own, masters)):
                 variables[index] = {**variable, "value": value}
         if name not in names:
             added.append({"name": name, "value": value})
