@@ -39,7 +39,7 @@ from rosproxy_operator.docker.planner.specs import (
     OwnLabels,
     flush_command,
     flush_name,
-    is_kernel_host,
+    has_kernel_privileges,
     lan_relay_name,
     proxy_name,
     published_ports,
@@ -214,7 +214,7 @@ def _wrong_helper_fields(
 
 def _wrong_proxy_fields(host: Mapping[str, Any]) -> Iterator[str]:
     yield from _wrong_fields(host)
-    if not is_kernel_host(host):
+    if not has_kernel_privileges(host):
         if host.get("CapAdd"):
             yield "CapAdd"
         if host.get("SecurityOpt") != ["no-new-privileges:true"]:

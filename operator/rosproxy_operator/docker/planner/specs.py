@@ -476,8 +476,8 @@ def lan_relay_fingerprint(
     return digest({**body, "Image": image_id})
 
 
-def is_kernel_host(host: Mapping[str, Any]) -> bool:
-    """Whether a proxy's HostConfig has the privileges for the kernel plane.
+def has_kernel_privileges(host: Mapping[str, Any]) -> bool:
+    """Whether ``host``, the HostConfig of a proxy, has the privileges for the kernel plane.
 
     Some engines write capabilities with the prefix ``CAP_``.
     """
