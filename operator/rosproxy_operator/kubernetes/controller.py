@@ -220,9 +220,9 @@ class KubernetesController:
 
     async def _act(self) -> float | None:
         started = time.monotonic()
-        if self._due.is_all(started, self._settings.resync):
+        if self._due.is_all_due(started, self._settings.resync):
             self._secret = await in_thread(self._key.read)
-        self._due.at_once(await self._sandbox.read(self._store.snapshot()))
+        self._due.mark_due_now(await self._sandbox.read(self._store.snapshot()))
         # No await from here until the plan is made. So the snapshot has exactly these changes.
         touched = self._store.take_changes()
         observed = self._store.snapshot(self._secret)
@@ -263,7 +263,7 @@ class KubernetesController:
                 self._problems.pop(namespace, None)
         for problem in planned.problems:
             self._problems.setdefault(problem.of.namespace, []).append(problem)
-        self._due.planned(scope, observed, planned.next_look_in, now)
+        self._due.note_plan(scope, observed, planned.next_look_in, now)
         return planned
 
     async def _carry_out(
@@ -275,11 +275,11 @@ class KubernetesController:
         if self._applier.failures != observed.failures:
             self._wake_for(concerned)  # the statuses have to show the failures
         else:
-            self._due.due_at(concerned, time.monotonic() + RECHECK_AFTER_ACTION_S)
+            self._due.mark_due_at(concerned, time.monotonic() + RECHECK_AFTER_ACTION_S)
 
     def _wake_for(self, namespaces: Iterable[str]) -> None:
         """Plan these namespaces soon, after a change that no watch reports."""
-        self._due.at_once(namespaces)
+        self._due.mark_due_now(namespaces)
         self._loop.wake()
 
     def _relist(self) -> None:

@@ -22,16 +22,16 @@ class PlanSchedule:
         """Make everything due."""
         self._all_due = True
 
-    def at_once(self, namespaces: Iterable[str]) -> None:
+    def mark_due_now(self, namespaces: Iterable[str]) -> None:
         """Make these namespaces due now."""
-        self.due_at(namespaces, 0.0)
+        self.mark_due_at(namespaces, 0.0)
 
-    def due_at(self, namespaces: Iterable[str], at: float) -> None:
+    def mark_due_at(self, namespaces: Iterable[str], at: float) -> None:
         """Make these namespaces due at a time, unless an earlier time is set."""
         for namespace in namespaces:
             self._due_times[namespace] = min(self._due_times.get(namespace, at), at)
 
-    def is_all(self, now: float, resync: float) -> bool:
+    def is_all_due(self, now: float, resync: float) -> bool:
         """Whether everything is due: by `mark_all_due`, or after ``resync`` seconds."""
         self._all_due = self._all_due or now - self._last_full_plan_at >= resync
         return self._all_due
@@ -49,10 +49,10 @@ class PlanSchedule:
         due = {namespace for namespace, at in self._due_times.items() if at <= now}
         return partition_of(observed, {*namespaces, *due}, nodes)
 
-    def planned(
+    def note_plan(
         self, scope: Partition | None, observed: ClusterSnapshot, again_in: float | None, now: float
     ) -> None:
-        """Note that ``scope`` was planned at ``now``. None: everything was planned.
+        """Note that ``scope`` was planned at ``now``; None: everything.
 
         The planned namespaces are due again in ``again_in`` seconds; None: after a change.
         """
@@ -68,7 +68,7 @@ class PlanSchedule:
             for namespace in planned:
                 self._due_times.pop(namespace, None)
         if again_in is not None:
-            self.due_at(planned, now + again_in)
+            self.mark_due_at(planned, now + again_in)
 
     def again_in(self, now: float, delay: float | None) -> float | None:
         """Return the seconds until a namespace is due, at most ``delay``; None: no time is set."""

@@ -116,6 +116,7 @@ class _Node(msgspec.Struct):
             self.ranges.exhausted[place] = self._exhaustion(place, error)
 
     def _rank(self, place: ProxyPlace) -> tuple[int, ProxyPlace]:
+        """Return the key by which `allocate` sorts places."""
         proxy = self.view.current.get(place)
         has_had_ports = self.node in self.view.rosproxies[place.of].former_ranges
         present = (serves(proxy), has_ports(proxy)) if proxy else (False, False)

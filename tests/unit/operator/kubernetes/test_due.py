@@ -20,9 +20,9 @@ LEGS = Partition(frozenset({"legs"}), frozenset({"node2"}))
 def begun(now: float = 100.0, again_in: float | None = None) -> PlanSchedule:
     """After a first look at all."""
     due = PlanSchedule()
-    assert due.is_all(now, 30.0)
+    assert due.is_all_due(now, 30.0)
     assert due.due_partition(APART, (), (), now) is None
-    due.planned(None, APART, again_in, now)
+    due.note_plan(None, APART, again_in, now)
     return due
 
 
@@ -35,11 +35,11 @@ def test_what_has_changed_is_planned() -> None:
 
 def test_all_is_planned_now_and_then_and_when_asked_for() -> None:
     due = begun()
-    assert not due.is_all(129.0, 30.0)
-    assert due.is_all(130.0, 30.0)
+    assert not due.is_all_due(129.0, 30.0)
+    assert due.is_all_due(130.0, 30.0)
     due = begun()
     due.mark_all_due()
-    assert due.is_all(100.0, 30.0)
+    assert due.is_all_due(100.0, 30.0)
 
 
 def test_what_wants_to_be_planned_again_is_then() -> None:
@@ -49,18 +49,18 @@ def test_what_wants_to_be_planned_again_is_then() -> None:
     assert due.due_partition(APART, (), (), 105.0) == Partition(
         ROBOTS.namespaces | LEGS.namespaces, ROBOTS.nodes | LEGS.nodes
     )
-    due.planned(ROBOTS, APART, None, 105.0)
+    due.note_plan(ROBOTS, APART, None, 105.0)
     assert due.due_partition(APART, (), (), 105.0) == LEGS
-    due.planned(LEGS, APART, None, 105.0)
+    due.note_plan(LEGS, APART, None, 105.0)
     assert due.again_in(105.0, None) is None
     assert due.again_in(105.0, 3.0) == 3.0
 
 
 def test_the_earlier_of_two_times_counts() -> None:
     due = begun()
-    due.due_at(["robots"], 110.0)
-    due.due_at(["robots"], 105.0)
-    due.due_at(["robots"], 120.0)
+    due.mark_due_at(["robots"], 110.0)
+    due.mark_due_at(["robots"], 105.0)
+    due.mark_due_at(["robots"], 120.0)
     assert due.again_in(100.0, 30.0) == 5.0
-    due.at_once(["robots"])
+    due.mark_due_now(["robots"])
     assert due.again_in(100.0, None) == 0.0
