@@ -43,7 +43,8 @@ class Caller(msgspec.Struct, frozen=True):
 class Addressing:
     """The rules that export and import addresses.
 
-    Nodes within one of ``networks`` reach each other without the proxy.
+    ``host`` is the advertised host. Nodes within one of ``networks`` reach each other without the
+    proxy.
     """
 
     registry: Registry
@@ -69,7 +70,7 @@ class Addressing:
         return uri
 
     def uris_at_master(self, endpoint: Endpoint) -> list[str]:
-        """The slave URIs that the master may have for an endpoint, also of a former version."""
+        """The slave URIs that the master may have for an endpoint, from former versions as well."""
         former = [uri for uri in endpoint.former_uris if self.lease_of(uri) == endpoint.port]
         return list(dict.fromkeys([self.advertised_uri(endpoint), *former]))
 
@@ -78,7 +79,7 @@ class Addressing:
         return service_uri(self.outside(endpoint.port))
 
     def export_slave(self, uri: str, caller: Caller) -> str:
-        """The outside form of a slave URI that an inside node gave."""
+        """The outside form of a slave URI that an inside node gave; others stay the same."""
         uri = with_caller_address(uri, caller.address)
         if (original := self.stand_ins.export_uri(uri)) is not None:
             return original
@@ -86,7 +87,7 @@ class Addressing:
         endpoint = self._meant_by(slave, caller) if slave else None
         if endpoint:
             return self.advertised_uri(endpoint)
-        if slave and self._is_relayed(slave, caller):
+        if slave and self._is_inside_form(slave, caller):
             return uri.replace(str(slave), str(self.outside(slave.port)), 1)
         return uri
 
@@ -98,7 +99,7 @@ class Addressing:
         host_port = parse_service_uri(uri)
         if host_port is None:
             return uri
-        if self._is_relayed(host_port, caller):
+        if self._is_inside_form(host_port, caller):
             return service_uri(self.outside(host_port.port))
         provider = self.registry.services.get(service)
         if provider and (host_port.host == provider[0].node.host or uri == provider[1].service_api):
@@ -132,14 +133,14 @@ class Addressing:
         slave = parse_slave_uri(uri)
         if slave is None:
             return False
-        return self._is_relayed(slave, caller) or self.endpoint_of(uri) is not None
+        return self._is_inside_form(slave, caller) or self.endpoint_of(uri) is not None
 
     def advertises(self, host_port: HostPort) -> bool:
         """Whether outside reaches a port of this proxy at a host and port."""
         return self._listening(host_port) is not None
 
     def lease_of(self, uri: str) -> int | None:
-        """The listening port of an advertised slave URI of this proxy."""
+        """The listening port of an advertised slave URI of this proxy; None for any other URI."""
         return self._listening(parse_slave_uri(uri))
 
     def _import_foreign(self, uri: str, caller: Caller) -> str:
@@ -182,7 +183,8 @@ class Addressing:
             return None
         return self.ports.listening(host_port.port)
 
-    def _is_relayed(self, host_port: HostPort, caller: Caller) -> bool:
+    def _is_inside_form(self, host_port: HostPort, caller: Caller) -> bool:
+        """Whether a host and port are a port of the range, at the address that the caller uses."""
         return host_port.host == caller.proxy and host_port.port in self.ports.listen
 
     def _meant_by(self, node: HostPort, caller: Caller) -> Endpoint | None:

@@ -38,7 +38,9 @@ from rosproxy.ros1.rewriting.master_calls import (
 from rosproxy.ros1.rewriting.slave_api import replace_value
 
 ResultFilter = Callable[[CallResult, Caller], Sequence[Edit]]
-"""The edits of a result that hide or add parts for a caller; empty if there are none."""
+"""The edits of a result that hide or add parts for a caller; empty if there are none.
+
+The texts of these edits have imported URIs, so a filtered result is not imported again."""
 
 
 def export_request(
@@ -98,7 +100,10 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
 def unregistering_endpoint(
     call: Call, caller: Caller, addressing: Addressing
 ) -> Endpoint | Passing:
-    """The endpoint of the registration that a call ends, if the call has the endpoint's URI."""
+    """The endpoint of the registration that a call ends.
+
+    FOREIGN_URI if the call does not have the URI of this endpoint.
+    """
     spec = method_spec(call.method)
     endpoint = addressing.registry.by_caller.get(caller_id_of(call))
     if endpoint is None:

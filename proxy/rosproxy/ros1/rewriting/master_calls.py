@@ -1,4 +1,4 @@
-"""Read a request to the master and the reply: which calls they contain, and what follows.
+"""Read requests to the master and the replies: calls, URIs, and changes of the registry.
 
 A request is a single call, or a ``system.multicall`` of several calls. Each call follows its row in
 ``rosproxy.ros1.protocol.master_methods``. This module says what a call registers, which URIs a
@@ -51,15 +51,15 @@ class Passing(Enum):
     """Why a call passes to the master without an endpoint. Its URIs are exported nevertheless."""
 
     NO_REGISTRATION = "the call neither registers nor unregisters"
-    FOREIGN_URI = "the URI is not that of the caller's own endpoint: a node outside, or another"
+    FOREIGN_URI = "the URI is not that of the caller's own endpoint, but of another node"
 
 
 def refusal(reason: str) -> LocalAnswer:
-    """The answer to a call that fails: ROS status -1, and the reason."""
+    """The answer to a refused call: ROS status -1, and the reason."""
     return LocalAnswer(-1, reason)
 
 
-_URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
+_URI_REPLIES = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
 CallOutcome = Endpoint | LocalAnswer | Passing
 """The outcome of a call: the endpoint that the call registers or unregisters, the proxy's own
 answer, or the reason why the call passes without an endpoint."""
@@ -190,7 +190,7 @@ class MasterReply(msgspec.Struct, frozen=True):
         """The URIs in the reply for a node inside, in the form that the master has."""
         for result in self.results:
             value = result.value
-            if value and result.accepted and method_spec(result.call.method).reply in _URIS:
+            if value and result.accepted and method_spec(result.call.method).reply in _URI_REPLIES:
                 texts = (item.string() for item in (value.items or [value]))
                 yield from (text for text in texts if text)
 
@@ -245,7 +245,7 @@ def registration_of(call: Call, now: float, source: str) -> Registration | None:
 
 
 def second_parameter_name(call: Call) -> str:
-    """The topic, service or node in the second parameter of a call."""
+    """The topic, service or node in the second parameter of a call, as a global name."""
     return resolve_name(call.string(1) or "", caller_id_of(call))
 
 

@@ -93,7 +93,7 @@ def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -
         return reply
     edits: list[Edit] = []
     if call.method == "requestTopic" and _is_tcpros(triple):
-        edits = send_to(triple, reached)
+        edits = replace_topic_address(triple, reached)
     elif call.method == "requestTopic" and _is_udpros(triple):
         # A relay or NAT sends the datagrams from there; some libraries drop all other datagrams.
         edits = [triple.items[2].items[1].with_text(reached.host)]
@@ -105,21 +105,23 @@ def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -
 
 
 def with_address_in_reply(call: Call, reply: bytes, host: str, address: str) -> bytes:
-    """A node's reply, with ``address`` in place of the host name ``host`` for a topic.
+    """A node's reply, with ``address`` in place of the host name ``host`` (in lower case).
 
-    So topics flow without the proxy. The rest of the reply stays the same. Raises XmlRpcError.
+    Only the TCPROS address in a reply to ``requestTopic`` changes. So topics flow without the
+    proxy. Raises XmlRpcError.
     """
     triple = ros_triple(xmlrpc.parse_reply(reply)) if call.method == "requestTopic" else None
     server = tcpros_address(triple) if triple else None
     if triple is None or server is None or server.host.lower() != host:
         return reply
-    return xmlrpc.apply(reply, send_to(triple, HostPort(address, server.port)))
+    return xmlrpc.apply(reply, replace_topic_address(triple, HostPort(address, server.port)))
 
 
 def with_address(body: bytes, call: Call, host: str, address: str) -> bytes:
-    """A ``requestTopic`` from outside, with ``address`` in place of the host name in UDPROS offers.
+    """A ``requestTopic`` from outside, with ``address`` in place of ``host`` in UDPROS offers.
 
-    The subscriber receives datagrams at this host. No stand-in is possible for such an address.
+    The subscriber receives datagrams at ``host``, a name in lower case. No stand-in is possible for
+    such an address. Other calls stay the same.
     """
     if call.method != "requestTopic" or len(call.params) < 3:
         return body
@@ -162,7 +164,7 @@ def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
 
 
 def topic_port(call: Call, reply: bytes) -> int | None:
-    """The TCPROS port in a reply to ``requestTopic``; None if there is none."""
+    """The TCPROS port in a reply to ``requestTopic``; None if the reply or the call names none."""
     triple = ros_triple(xmlrpc.parse_reply(reply))
     server = tcpros_address(triple) if triple else None
     return server.port if server and call.string(1) else None
@@ -182,7 +184,7 @@ def tcpros_address(triple: Value) -> HostPort | None:
     return HostPort(host.text, number) if number and 0 < number < 65536 else None
 
 
-def send_to(triple: Value, target: HostPort) -> list[Edit]:
+def replace_topic_address(triple: Value, target: HostPort) -> list[Edit]:
     """Edits that change the address in a reply to ``requestTopic`` to ``target``."""
     _, host, port = triple.items[2].items
     edits = [host.with_text(target.host), port.with_text(str(target.port))]
@@ -198,7 +200,7 @@ def replace_value(triple: Value, text: str) -> list[Edit]:
 
 
 def _in_message(triple: Value, before: str, after: str) -> list[Edit]:
-    """The edit of a status message that quotes a text; empty if the message does not."""
+    """The edit that replaces a text in the status message; empty if the text is not there."""
     text = triple.items[1].string() or ""
     return [triple.items[1].with_text(text.replace(before, after))] if before in text else []
 
