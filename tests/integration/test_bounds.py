@@ -81,7 +81,7 @@ async def test_what_holds_no_address_passes_however_short_it_is(make_proxy, mast
     def call(method: str, *names: str) -> bytes:
         return xml(method, *names, "MANY").replace(b"<string>MANY</string>", many.encode())
 
-    assert len(call("setParam", "/n", "/p")) < passing.SHORT
+    assert len(call("setParam", "/n", "/p")) < passing.SHORT_BYTES
     assert len(MANY) > master_call(1).elements
     reply = await exchange(proxy.master, post(call("setParam", "/n", "/p")), NODE)
     assert reply.value[0] == 1
@@ -155,7 +155,7 @@ async def test_a_long_multicall_with_a_registration_is_read_or_refused(proxy, ma
     register = ["/talker", "/chatter", "x/Y", node.uri]
     calls = [*parameters(500, "x" * 500), {"methodName": "registerPublisher", "params": register}]
     body = xml("system.multicall", calls)
-    assert passing.SHORT < len(body) < master_call(4).size
+    assert passing.SHORT_BYTES < len(body) < master_call(4).size
     assert (await exchange(proxy.master, post(body), NODE)).value[-1][0][0] == 1
     assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
     longer = xml("system.multicall", [*parameters(3000, "x" * 2000), calls[-1]])
@@ -202,7 +202,7 @@ async def test_too_many_elements_are_a_fault(proxy, node):
         params = b"<param><value/></param>" * (limits.elements // 2)
         method = "registerService" if address == proxy.master else "requestTopic"
         body = xml(method).replace(b"<params>", b"<params>" + params)
-        assert passing.SHORT < len(body) < limits.size
+        assert passing.SHORT_BYTES < len(body) < limits.size
         assert (await exchange(address, post(body), NODE)).fault == PARSE_ERROR
 
 

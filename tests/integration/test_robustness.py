@@ -82,7 +82,7 @@ async def test_requests_in_tiny_slices(door):
 
 
 async def test_a_header_that_never_ends_costs_a_time_out(door, monkeypatch):
-    monkeypatch.setattr("rosproxy.ros1.servers.xmlrpc_server.HEADER_TIMEOUT", 0.1)
+    monkeypatch.setattr("rosproxy.ros1.servers.xmlrpc_server.HEADER_TIMEOUT_S", 0.1)
     async with connect(door.address) as mute, connect(door.address) as kept:
         await mute.send(b"POST / HTTP/1.1\r\nX: ")
         await kept.send(post(CALL))

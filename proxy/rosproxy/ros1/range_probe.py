@@ -26,6 +26,7 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 log = logging.getLogger(__name__)
 
 PROBE_TIMEOUT_S = 3.0
+"""Seconds for a connection to the port under test, and again for the exchange there."""
 MASTER_TIMEOUT_S = 4.0
 """Seconds within which the master must call back. rosmaster calls back from three threads."""
 MOST_REQUEST_BYTES = 65536
@@ -68,6 +69,8 @@ async def probe_range(
 ) -> tuple[PortProbe, ...]:
     """Try the lowest and the highest free port of the range; without a free port, one fast port.
 
+    The result is empty if no port was tried.
+
     After the probe, the proxy relays the topics of the fast port's node for a while. So without
     ``or_fast`` nothing is tried if no port is free.
 
@@ -96,7 +99,7 @@ async def probe_range(
 
 
 async def _dial(context: Context, trial: _PortTrial, target: HostPort) -> str:
-    """Connect to the advertised address, and check the answer."""
+    """Connect to the advertised address, and check the answer; return a word for `PortProbe`."""
     addresses = await resolve(context.upstream.reach(target).host)
     if not addresses:
         return "unresolvable"
@@ -133,7 +136,10 @@ async def _await_greeting(
 
 
 async def _ask_master(context: Context, trial: _PortTrial, target: HostPort) -> str:
-    """Make the master call the port, as if the port were a node with a changed parameter."""
+    """Make the master call the port, as if a parameter of a node there had changed.
+
+    Returns a word for `PortProbe`: "ok", "missed", or "unknown" if the master could not be asked.
+    """
     try:
         async with _subscribed(context, trial, target), asyncio.timeout(MASTER_TIMEOUT_S):
             await trial.reached.wait()

@@ -38,7 +38,7 @@ from rosproxy.ros1.protocol.master_methods import KNOWN_METHODS
 from rosproxy.ros1.range_probe import probe_range
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
-from rosproxy.ros1.servers.tcpros_server import RATE_INTERVAL, TcprosServer
+from rosproxy.ros1.servers.tcpros_server import RATE_INTERVAL_S, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer
 from rosproxy.ros1.stand_ins.stand_in_ports import TIDY_INTERVAL_S, StandInPorts
 from rosproxy.ros1.status import Ros1State
@@ -60,7 +60,7 @@ log = logging.getLogger(__name__)
 
 SPARE_FILES = 64
 """Open files that the proxy needs besides its ports and connections."""
-RETRY_BLOCKED = 30.0
+RETRY_BLOCKED_S = 30.0
 """Seconds between two attempts to reserve ports that other programs held."""
 
 
@@ -152,11 +152,11 @@ class Ros1:
         repeat = context.tasks.repeat
         repeat(self.master_monitor.look, settings.master_interval, "watching the master")
         repeat(self.prober.look, PROBE_CHECK_INTERVAL_S, "probing nodes")
-        repeat(self.leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
+        repeat(self.leases.retry_blocked, RETRY_BLOCKED_S, "retrying blocked ports")
         repeat(self._resubscriber.look, RESUBSCRIBE_INTERVAL_S, "checking subscribers")
         repeat(self.stand_ins.tidy, TIDY_INTERVAL_S, "checking stand-ins for nodes outside")
         repeat(self._messages.ask_due_nodes, COUNT_INTERVAL_S, "counting messages")
-        repeat(self.tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
+        repeat(self.tcpros.sample_rates, RATE_INTERVAL_S, "sampling rates")
         repeat(self._enforcer.enforce_if_changed, ENFORCE_INTERVAL_S, "enforcing the policy")
 
     @property
@@ -202,7 +202,7 @@ class Ros1:
         await self.master_monitor.answered.wait()
 
     async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
-        """Try whether outside reaches some ports of the range."""
+        """Try whether outside reaches some ports of the range; see `probe_range`."""
         return await probe_range(self.context, self.leases, or_fast)
 
     async def try_ports(self) -> tuple[PortProbe, ...]:

@@ -287,7 +287,7 @@ def _watch(method: str, size: int, limits: Limits) -> passing.CallWatch | None:
 
 async def _is_long_and_passes(body: bytes) -> bool:
     """Whether a body is a long multicall that the proxy need not read."""
-    if len(body) <= passing.SHORT or passing.method_of(body) != MULTICALL:
+    if len(body) <= passing.SHORT_BYTES or passing.method_of(body) != MULTICALL:
         return False
     watch = passing.MulticallWatch(_passes)
     if watch.passes(body):

@@ -6,18 +6,19 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.ros1.protocol.master_methods import resolve_name
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 
-_EVERYTHING = "/"
-_READS = {"getParam": 1, "hasParam": 1, "searchParam": 1, "subscribeParam": 2}
-_WRITES = {"setParam": 1, "deleteParam": 1}
-_WHOLE = frozenset({"getParam", "subscribeParam", "setParam", "deleteParam"})
+_ROOT_NAMESPACE = "/"
+_NAME_INDEX_OF_READS = {"getParam": 1, "hasParam": 1, "searchParam": 1, "subscribeParam": 2}
+_NAME_INDEX_OF_WRITES = {"setParam": 1, "deleteParam": 1}
+"""The position of the parameter's name in the calls that read, and in the calls that write."""
+_NAMESPACE_METHODS = frozenset({"getParam", "subscribeParam", "setParam", "deleteParam"})
 """The methods that apply to a whole namespace if the name is a namespace."""
 
 
 class ParamUse(msgspec.Struct, frozen=True):
     """How a call uses parameters.
 
-    ``kind``: the rules for the call. ``names``: the names that the call may mean. ``below``:
-    whether the call also means all names below ``names``.
+    ``kind``: the kind of the rules for the call. ``names``: the names that the call may mean.
+    ``below``: whether the call also means all names below ``names``.
     """
 
     kind: RuleKind
@@ -26,25 +27,28 @@ class ParamUse(msgspec.Struct, frozen=True):
 
 
 def param_use(method: str, caller_id: str, name: str | None) -> ParamUse | None:
-    """How a call uses parameters; None without parameters. ``name``: None if unknown."""
-    if method not in _READS and method not in _WRITES:
+    """How a call uses parameters; None for a method that names no parameter.
+
+    ``name`` is the name as sent; None if unknown, which stands for all parameters.
+    """
+    if method not in _NAME_INDEX_OF_READS and method not in _NAME_INDEX_OF_WRITES:
         return None
-    kind = RuleKind.SET_PARAM if method in _WRITES else RuleKind.GET_PARAM
+    kind = RuleKind.SET_PARAM if method in _NAME_INDEX_OF_WRITES else RuleKind.GET_PARAM
     if name is None:
-        return ParamUse(kind, (_EVERYTHING,), True)
+        return ParamUse(kind, (_ROOT_NAMESPACE,), True)
     if method == "searchParam":
         return ParamUse(kind, _searched_names(caller_id, name), False)
-    return ParamUse(kind, (resolve_name(name, caller_id),), method in _WHOLE)
+    return ParamUse(kind, (resolve_name(name, caller_id),), method in _NAMESPACE_METHODS)
 
 
 def param_use_of(call: Call) -> ParamUse | None:
-    """How a parsed call uses parameters; None without parameters."""
-    place = _READS.get(call.method) or _WRITES.get(call.method)
+    """How a parsed call uses parameters; None for a method that names no parameter."""
+    place = _NAME_INDEX_OF_READS.get(call.method) or _NAME_INDEX_OF_WRITES.get(call.method)
     return param_use(call.method, call.string(0) or "", call.string(place)) if place else None
 
 
 def sets_namespace(call: Call) -> bool:
-    """Whether a call sets a whole namespace, or may do so."""
+    """Whether a call sets a whole namespace by a struct. True also for a call without a value."""
     return call.method == "setParam" and (len(call.params) < 3 or call.params[2].kind == "struct")
 
 

@@ -20,10 +20,10 @@ from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.registry import Registry
 
 ASK_AGAIN_S = 5.0
-"""Seconds without a second question for the same service. roscpp looks up an awaited service fifty
+"""Seconds between two questions for the same service. roscpp looks up an awaited service fifty
 times a second."""
-MOST_REMEMBERED = 1000
-"""Services for which the proxy remembers the time of the question."""
+MOST_REMEMBERED_SERVICES = 1000
+"""The highest number of services for which the proxy remembers the time of the last question."""
 
 
 @dataclass(slots=True, eq=False)
@@ -45,7 +45,7 @@ class ServiceFinder:
         if not endpoints or now - self._asked_at.get(name, -ASK_AGAIN_S) < ASK_AGAIN_S:
             return
         self._asked_at.pop(name, None)
-        if len(self._asked_at) >= MOST_REMEMBERED:
+        if len(self._asked_at) >= MOST_REMEMBERED_SERVICES:
             del self._asked_at[next(iter(self._asked_at))]
         self._asked_at[name] = now
         await asyncio.gather(*(self._ask(endpoint, name) for endpoint in endpoints))

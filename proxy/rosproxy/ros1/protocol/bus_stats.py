@@ -18,8 +18,8 @@ IN = "i"
 """Directions, as in ``getBusInfo``: of a publisher's connections, and of a subscriber's."""
 MOST_CONNECTIONS = 256
 """The highest number of connections to read for a topic; `/rosout` of a large system has 200."""
-LEAST = -(2**31)
-GREATEST = 2**31 - 1
+LEAST_INTEGER = -(2**31)
+GREATEST_INTEGER = 2**31 - 1
 """The bounds of an integer of XML-RPC."""
 Count = tuple[int, int]
 """Bytes and messages."""
@@ -52,7 +52,7 @@ def _add(counts: dict[int, Count], row: Any, direction: str) -> None:
             pass
         case _:
             return
-    if all(LEAST <= value <= GREATEST for value in (number, size, messages)):
+    if all(LEAST_INTEGER <= value <= GREATEST_INTEGER for value in (number, size, messages)):
         former_size, former_messages = counts.get(number, (0, 0))
         counts[number] = former_size + size, former_messages + messages
 

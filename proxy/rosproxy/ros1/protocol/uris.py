@@ -68,7 +68,7 @@ def service_uri(host_port: HostPort) -> str:
 
 
 def path_of(uri: str) -> str:
-    """The path of a slave URI, as in a request."""
+    """The path of a slave URI, as a request names it; "/" if the URI has none."""
     try:
         return urlsplit(uri).path or "/"
     except ValueError:
@@ -76,7 +76,10 @@ def path_of(uri: str) -> str:
 
 
 def inside_path(inside: InsidePath) -> str:
-    """The location of a node in the form of a path; see the text of the module."""
+    """The location of a node in the form of a path; the module docstring shows the form.
+
+    A path of the node with more than LONGEST_PATH characters is left out.
+    """
     own_path = inside.path if len(inside.path) <= LONGEST_PATH else "/"
     segments = [_quoted(str(inside.node))]
     if inside.address is not None or own_path != "/":
@@ -88,7 +91,7 @@ def inside_path(inside: InsidePath) -> str:
 
 @cached
 def parse_inside_path(uri: str) -> InsidePath | None:
-    """The location of the node of an advertised URI with a path; None if the path has none.
+    """Read the location of a node from the path of an advertised URI; None without a location.
 
     An address segment must be an IP address; a name there is refused.
     """

@@ -13,8 +13,8 @@ former proxies keep a port from a live node.
 Log messages begin with the source address. So a source that makes up names is a single subject, and
 the log bounds the lines of a subject (`rosproxy.telemetry.logs`).
 
-The proxy probes a new node at once, to report at once if the node is unreachable. A node that
-registers again counts as alive, whatever the state of its endpoint.
+The proxy probes a new node at once, to report at once if the node is unreachable. If a node
+registers again, its port listens again, even if the node counted as dead.
 """
 
 import asyncio
@@ -45,10 +45,11 @@ from rosproxy.ros1.rewriting.master_calls import (
 
 log = logging.getLogger(__name__)
 
-PATIENCE = 15.0
+FIRST_ANSWER_TIMEOUT_S = 15.0
 """Seconds for a first answer if many nodes of the source have not answered yet: all nodes of a
 machine that has just started may be slow."""
-PATIENCE_STEP = 0.2
+FIRST_ANSWER_RETRY_S = 0.2
+"""Seconds between two questions to such a node."""
 MOST_ADDRESSES = 4
 """The highest number of addresses that the proxy tries for a host name."""
 RETIRED = "rosproxy: this proxy is retired and accepts no registrations"
@@ -65,7 +66,7 @@ class Verification(Protocol):
     """Verifies nodes that only the master mentions; see `rosproxy.ros1.upkeep.recovery`."""
 
     async def wait_for_dead_claim(self) -> None:
-        """Wait a moment until such a node turns out dead."""
+        """Wait until a node under verification turns out dead, or the time for this is over."""
 
 
 class NodeAdmission:
@@ -188,13 +189,16 @@ class NodeAdmission:
             problems.add(PORTS, f"another program has taken port {endpoint.port}")
 
     def _open(self, endpoint: Endpoint, answers: bool) -> OSError | None:
-        """Open the port of an endpoint whose node ``answers`` or not; the error if that fails."""
+        """Open the port of an endpoint; return the error if that fails.
+
+        ``answers``: the node has just answered, so the method records this first.
+        """
         if answers:
             endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
         return self._leases.open(endpoint)
 
     async def _make_room(self, answers: bool) -> bool:
-        """Free a port for a new node, if possible.
+        """Free a port for a new node; return whether that was possible.
 
         Only a node that ``answers`` displaces other nodes. Raises Unreachable.
         """
@@ -212,9 +216,9 @@ class NodeAdmission:
         return self._context.registry.pool.free > 0 or await self._give_up_dead()
 
     async def _give_up_dead(self) -> bool:
-        """Unregister a dead node and end its lease; whether there was one.
+        """Unregister a dead node and end its lease; return whether there was a dead node.
 
-        If the node comes back during the call to the master, it keeps its port.
+        If the node comes back during the call to the master, the node keeps its port.
         """
         registry = self._context.registry
         endpoint = registry.dead_endpoint()
@@ -231,9 +235,9 @@ class NodeAdmission:
         return True
 
     def _is_crowded(self, source: str) -> bool:
-        """Whether a source has the highest number of nodes that have never answered.
+        """Whether a source has `most_unproven` nodes that have never answered.
 
-        Such nodes without a registration give their ports to new nodes.
+        The method first ends the leases of such nodes that are without a registration.
         """
         registry = self._context.registry
         while len(unproven := registry.unproven(source)) >= registry.most_unproven:
@@ -244,11 +248,11 @@ class NodeAdmission:
         return False
 
     async def _comes_to_answer(self, slave: HostPort, source: str) -> bool:
-        """Whether a node answers within the time that a starting machine may need.
+        """Whether a node answers within FIRST_ANSWER_TIMEOUT_S.
 
         The wait ends as soon as the node refuses connections, or the source is no longer crowded.
         """
-        end = self._context.now() + PATIENCE
+        end = self._context.now() + FIRST_ANSWER_TIMEOUT_S
         while True:
             answer = await self._context.nodes.probe(slave)
             if answer.probe is ProbeResult.ANSWERED:
@@ -256,7 +260,7 @@ class NodeAdmission:
             is_over = self._context.now() >= end
             if answer.probe is ProbeResult.REFUSED or is_over or not self._is_crowded(source):
                 return False
-            await asyncio.sleep(PATIENCE_STEP)
+            await asyncio.sleep(FIRST_ANSWER_RETRY_S)
 
     async def _answers(self, slave: HostPort) -> bool:
         return (await self._context.nodes.probe(slave)).probe is ProbeResult.ANSWERED
@@ -268,7 +272,10 @@ class NodeAdmission:
         return refusal(text)
 
     def _welcome_back(self, endpoint: Endpoint, caller: Caller) -> None:
-        """Record that a node that registers is alive, whatever the state of its endpoint."""
+        """Serve a node that registers again, whatever the state of its endpoint.
+
+        The prober checks the node soon if the node counted as dead, or if its name is new.
+        """
         if not endpoint.location.confirmed and endpoint.location.address == caller.address:
             endpoint.confirm()
             self._context.problems.solved_at(endpoint.port)
@@ -281,11 +288,11 @@ class NodeAdmission:
     async def _locate(self, node: HostPort, call: Call, caller: Caller) -> NodeLocation | None:
         """The location of a node that gives ``node`` as its address; None if this is outside.
 
-        The address may lead elsewhere than to the source of the call, while no node answers at the
-        source, because the way to the proxy hides the source. Then the node at the address has to
-        confirm the name that the call registers. A node outside only has to answer: a gateway
-        registers nodes of another machine under different names, and the proxy opens no port for
-        such a node.
+        The node usually is at the source of the call. But NAT on the way to the proxy may hide the
+        node's address. Then no node answers at the source, and ``node`` resolves to other
+        addresses. A node there has to confirm the name that the call registers. A node outside only
+        has to answer: a gateway registers nodes of another machine under different names, and the
+        proxy opens no port for such a node.
         """
         source = caller.address
         caller_id = call.string(0) or ""
@@ -300,12 +307,12 @@ class NodeAdmission:
             slave = HostPort(address, node.port)
             client_kind = self._context.client_kind(address)
             if client_kind is ClientKind.OUTSIDE:
-                bears_out = await self._answers(slave)  # a gateway gives the node another name
+                is_confirmed = await self._answers(slave)  # a gateway gives the node another name
             else:
-                bears_out = await self._context.nodes.name(slave, service) == caller_id
-            if bears_out and client_kind is ClientKind.ADMITTED:
+                is_confirmed = await self._context.nodes.name(slave, service) == caller_id
+            if is_confirmed and client_kind is ClientKind.ADMITTED:
                 return NodeLocation(address, named=True, confirmed=False)
-            if bears_out:
+            if is_confirmed:
                 log.info(
                     "%s at %s is outside: the proxy does not rewrite its URI", caller_id, slave
                 )
@@ -320,7 +327,7 @@ class NodeAdmission:
         return NodeLocation(source, named=False)
 
     async def _probe_first(self, endpoint: Endpoint, caller_id: str) -> None:
-        """Probe a new node at once, and report if it is unreachable."""
+        """Probe a new node at once. Report an unreachable node, and a loopback address."""
         answer = await self._context.nodes.probe(endpoint.slave)
         endpoint.health.note(answer.probe, self._context.now())
         endpoint.health.pid = answer.pid

@@ -7,7 +7,7 @@ An operator reports a container some tenths of a second after the start of the c
 first call of the container may come earlier. So a call from an address that is not selected waits
 for an update, up to UPDATE_TIMEOUT. Right after a start of the proxy, no address is selected yet.
 If an operator manages the proxy, all calls wait for the first update, up to UPDATE_TIMEOUT. If no
-update comes, the proxy lets these calls in, so that nodes work without the operator
+update comes, the proxy serves all inside networks, so that nodes work without the operator
 (`Callers.await_operator`).
 
 A refused call gets HTTP 403 with the reason, not an XML-RPC fault. roscpp takes a fault for the
@@ -36,9 +36,10 @@ MOST_WAITING = 512
 call at a time, so this is the number of nodes that may start within the same seconds."""
 MOST_WAITING_EACH = 64
 """The highest number of waiting calls of one source, so that no source takes all places."""
-LOG_INTERVAL = 10.0
+LOG_INTERVAL_S = 10.0
 """Seconds between two log lines about refused callers."""
 SUBJECT = "master port"
+"""The subject of the log lines and the problems about refused callers."""
 
 
 class Callers:
@@ -81,7 +82,10 @@ class Callers:
         await self._begun.wait()
 
     async def refusal(self, source: str) -> str | None:
-        """Why a caller is refused, in one line; None if the caller may use the port."""
+        """Why a caller is refused, in one line; None if the caller may use the port.
+
+        The answer may take up to twice UPDATE_TIMEOUT.
+        """
         if not self._begun.is_set() and not is_own(source):
             await self.wait_until_begun()
         if self._client_kind(source) is ClientKind.ADMITTED:
@@ -104,7 +108,8 @@ class Callers:
     async def _wait_for_update(self, source: str) -> None:
         """Wait until an operator has selected a source, up to UPDATE_TIMEOUT.
 
-        If the admin endpoint is on loopback and no update has come yet, there is no operator.
+        The method returns at once if too many callers wait. It also does so if the admin endpoint
+        is on loopback and no update has come yet, because then there is no operator.
         """
         no_update = self._context.selected is None and is_loopback(
             self._context.settings.admin.host
@@ -130,6 +135,6 @@ class Callers:
         context.metrics.strangers.labels(kind.value).inc()
         context.problems.solved(SUBJECT)  # only the last refusal stays: there may be any number
         context.problems.add(SUBJECT, text)
-        if self._logged is None or now - self._logged >= LOG_INTERVAL:
+        if self._logged is None or now - self._logged >= LOG_INTERVAL_S:
             self._logged = now
             log.warning("%s: refused: %s", SUBJECT, text)

@@ -1,4 +1,4 @@
-"""Long calls, with too many bytes or elements to read, which the proxy need not read."""
+"""Calls that pass unread, because they have too many bytes or elements to read."""
 
 import asyncio
 from collections.abc import AsyncIterator

@@ -31,7 +31,8 @@ from rosproxy.telemetry.metrics import Traffic
 
 log = logging.getLogger(__name__)
 
-RATE_INTERVAL = 2.0
+RATE_INTERVAL_S = 2.0
+"""Seconds between two calls of `TcprosServer.sample_rates`."""
 UNREGISTERED = "unregistered"
 """The name of a relay whose topic or service is not registered."""
 NO_PORT = 0
@@ -59,7 +60,10 @@ class TcprosTarget(Protocol):
         """Connect to the node's TCPROS server; None if there is none. Raises NotOffered."""
 
     def label(self, kind: str, name: str) -> str:
-        """The name of a topic or service in status and metrics. Clients may send any name."""
+        """The name of a topic or service in status and metrics.
+
+        Only known names count, because clients may send any name.
+        """
 
     def note_connection(self) -> None:
         """Record that a relay for the node has started."""
@@ -100,7 +104,10 @@ class TcprosServer:
             relay.sample(now)
 
     async def serve(self, target: TcprosTarget, peer: str, conn: socket.socket) -> None:
-        """Relay a connection whose first bytes are a TCPROS header. Close it on failure."""
+        """Relay a connection whose first bytes are a TCPROS header. Close it on failure.
+
+        Raises EOFError, TimeoutError, OSError; the caller then closes the connection.
+        """
         try:
             header = await read_header(self._context, peer, conn)
             kind, name, caller_id = _requested(decode_header(header[4:]))
@@ -199,7 +206,10 @@ class InsideNodes:
         return InsideNode(self._context, endpoint, self._learn_port)
 
     async def _learn_port(self, endpoint: Endpoint, kind: str, name: str) -> int | None:
-        """Ask the node for the TCPROS port of a topic or service, once for all waiting callers."""
+        """Ask the node for the TCPROS port of a topic or service, once for all waiting callers.
+
+        Returns NO_PORT if the node does not have the topic or service, None without an answer.
+        """
         key = endpoint, kind, name
         task = self._port_tasks.get(key)
         if task is None:
@@ -350,13 +360,16 @@ async def _dial(address: str, port: int | None) -> socket.socket | None:
         return None
 
 
-async def hand_on(header: bytes, inside: socket.socket) -> bool:
-    """Send a node the header of a client; close the connection to the node if that fails."""
+async def hand_on(header: bytes, node: socket.socket) -> bool:
+    """Send a node the header of a client; return whether that worked.
+
+    If that fails, the connection to the node is closed.
+    """
     try:
         async with asyncio.timeout(sockets.CONNECT_TIMEOUT_S):
-            await asyncio.get_running_loop().sock_sendall(inside, header)
+            await asyncio.get_running_loop().sock_sendall(node, header)
     except BaseException as error:
-        inside.close()
+        node.close()
         if not isinstance(error, OSError):  # a TimeoutError is an OSError
             raise
         log.debug("the TCPROS header could not be sent to the node: %s", error)

@@ -45,13 +45,13 @@ from rosproxy.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)
 
-BODY_TIMEOUT = 60.0
+BODY_TIMEOUT_S = 60.0
 """Seconds within which the body of a request must arrive."""
-HEADER_TIMEOUT = 30.0
+HEADER_TIMEOUT_S = 30.0
 """Seconds within which the header of the first request of a connection must arrive."""
-STOP_TIMEOUT = 0.5
+STOP_TIMEOUT_S = 0.5
 """Seconds that calls under way have to end when the server stops."""
-VALUE = 400
+VALUE_BYTES = 400
 """Bytes of memory for each value of a document while the call is being answered."""
 
 _Answer = TypeVar("_Answer")
@@ -64,9 +64,9 @@ class IncomingCall:
     Raises OverBudget.
     """
 
-    def __init__(self, request: HttpRequest, hold: Callable[[int], None]) -> None:
+    def __init__(self, request: HttpRequest, charge: Callable[[int], None]) -> None:
         self.body = b""
-        self.charge = hold
+        self.charge = charge
         self._request = request
         self.source = request.connection.source.host
         self.local = request.connection.local
@@ -153,6 +153,7 @@ class XmlRpcServer(HttpServer):
         self._time_limits = TimeLimits()
         self._by_port: defaultdict[int, set[HttpConnection]] = defaultdict(set)
         self._mute: dict[HttpConnection, Callable[[], None]] = {}
+        """Connections without a first request, each with the function that ends the gate's wait."""
 
     async def dispatch(
         self,
@@ -164,7 +165,8 @@ class XmlRpcServer(HttpServer):
 
         In both protocols the client sends first, and the first four bytes decide: letters are an
         HTTP method, other bytes the length of a connection header. The server only peeks at these
-        bytes. A connection that ends before any byte is closed. Raises TimeoutError, OSError.
+        bytes. A connection that ends before the fourth byte is closed; without ``relay``, one that
+        ends before the first byte. Raises TimeoutError, OSError.
         """
         with self._context.gate.waiting(peer, partial(hang_up, conn)):
             first = await peek(conn, 4)
@@ -190,7 +192,7 @@ class XmlRpcServer(HttpServer):
 
     async def close(self) -> None:
         """Close all connections."""
-        await self.shutdown(STOP_TIMEOUT)
+        await self.shutdown(STOP_TIMEOUT_S)
 
     def connection_made(self, connection: HttpConnection) -> None:
         """Record a connection by the port where it arrived, and wait for the first request."""
@@ -200,7 +202,7 @@ class XmlRpcServer(HttpServer):
         self._by_port[port].add(connection)
         self._context.gate.enter(source, port)  # the acceptor counts until `dispatch` has ended
         self._mute[connection] = self._context.gate.note_waiting(source, connection.force_close)
-        asyncio.get_running_loop().call_later(HEADER_TIMEOUT, self._close_mute, connection)
+        asyncio.get_running_loop().call_later(HEADER_TIMEOUT_S, self._close_mute, connection)
 
     def connection_lost(self, connection: HttpConnection) -> None:
         """Forget a connection."""
@@ -224,7 +226,7 @@ class XmlRpcServer(HttpServer):
             await request.send(reply)
 
     async def _reply(self, request: HttpRequest) -> HttpReply | None:
-        """The reply to a request; None if it was sent, or if the connection was reset."""
+        """The reply to a request; None if the reply was sent, or if the connection was reset."""
         if request.method in ("GET", "HEAD"):  # never forwarded: roscpp's server hangs on a GET
             return text_reply(self._greeting)
         if request.method != "POST":
@@ -248,7 +250,10 @@ class XmlRpcServer(HttpServer):
         return text_reply(f"rosproxy: {text}\n", status)
 
     async def _answer(self, request: HttpRequest, call: IncomingCall) -> HttpReply | None:
-        """Read a call, and answer it. Raises HttpRefusal, OverBudget, ConnectionError."""
+        """Read a call, and send the answer; return a reply only for a malformed HTTP body.
+
+        Raises HttpRefusal, OverBudget, ConnectionError.
+        """
         try:
             answer = await self._read(request, call)
             reply = await (answer or self._service(call))
@@ -270,7 +275,7 @@ class XmlRpcServer(HttpServer):
         if isinstance(reply, LongReply):
             await self._send_long(request, call, reply)
             return None
-        if len(reply) > passing.SHORT:
+        if len(reply) > passing.SHORT_BYTES:
             call.charge(len(reply))
         await request.send(HttpReply(reply))  # here, because the charge ends with this method
         return None
@@ -290,12 +295,12 @@ class XmlRpcServer(HttpServer):
             raise HttpRefusal(415, "compressed", text)
         try:
             size = request.content_length or 0
-            if size <= passing.SHORT and request.content.is_eof():  # arrived with the header
+            if size <= passing.SHORT_BYTES and request.content.is_eof():  # arrived with the header
                 await self._take_in(call, request.content.read_nowait())
                 return self._pass_unread(request, call)
-            with TimeLimit(self._time_limits, BODY_TIMEOUT):
+            with TimeLimit(self._time_limits, BODY_TIMEOUT_S):
                 request.send_continue()
-                if size > passing.SHORT and self._long_calls is not None:
+                if size > passing.SHORT_BYTES and self._long_calls is not None:
                     long_call = await self._read_head(request, call, size, self._long_calls)
                     if long_call is not None:
                         return self._pass_on(self._long_calls, call, long_call)
@@ -303,7 +308,7 @@ class XmlRpcServer(HttpServer):
                     raise TooLong(self._limits.size)
                 await self._read_rest(request, call)
         except TimeoutError:
-            text = f"the body took over {BODY_TIMEOUT:g} s"
+            text = f"the body took over {BODY_TIMEOUT_S:g} s"
             raise HttpRefusal(408, "slow_body", text) from None
         except TooLong as error:
             raise HttpRefusal(413, "long_body", str(error)) from None
@@ -331,7 +336,7 @@ class XmlRpcServer(HttpServer):
 
         Raises TooLong, OverBudget.
         """
-        while len(call.body) < passing.HEAD and not request.content.at_eof():
+        while len(call.body) < passing.HEAD_BYTES and not request.content.at_eof():
             chunk = await request.content.readany()
             call.charge(len(chunk))
             call.body += chunk
@@ -349,12 +354,15 @@ class XmlRpcServer(HttpServer):
         await self._take_in(call, call.body + rest, len(call.body) + len(rest))
 
     async def _take_in(self, call: IncomingCall, body: bytes, charged: int = 0) -> None:
-        """Store a whole body, of which ``charged`` bytes are charged already. Raises TooLong."""
+        """Store a whole body, of which ``charged`` bytes are charged already.
+
+        Raises TooLong, OverBudget.
+        """
         if len(body) > self._limits.size:
             raise TooLong(self._limits.size)
         call.body = body
         values = body.count(b"<value")
-        call.charge(len(body) - charged + VALUE * values)
+        call.charge(len(body) - charged + VALUE_BYTES * values)
         if values > MANY_VALUES:
             await self._context.yield_to_others()
 

@@ -26,7 +26,7 @@ port opens or refuses connections.
                                                nodes outside                      nodes removed
     COUNT_INTERVAL_S, if    message_counter    the nodes' counts  topic_growth    sums in the
     the metrics are read                                                          metrics
-    RETRY_BLOCKED           leases             ports that other                   ports open
+    RETRY_BLOCKED_S         leases             ports that other                   ports open
                                                programs held
     POST /containers        containers         the nodes there    liveness        nodes
                                                                                   unregistered,

@@ -41,7 +41,10 @@ def element(method: str, *params: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("dialect", [py_call, cpp_call])
 def test_the_method_is_told_by_the_head(dialect: Any) -> None:
-    assert method_of(dialect("setParam", "/n", "/key", "x" * 100_000)[: passing.HEAD]) == "setParam"
+    assert (
+        method_of(dialect("setParam", "/n", "/key", "x" * 100_000)[: passing.HEAD_BYTES])
+        == "setParam"
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,7 +74,7 @@ def test_heads_that_are_known(head: str) -> None:
         "<methodCall><methodName a='b'>getParam</methodName>",
         "<methodCall><params/><methodName>getParam</methodName>",
         "<methodCall><x:methodName>getParam</x:methodName>",
-        "<methodCall>" + " " * passing.HEAD + "<methodName>getParam</methodName>",
+        "<methodCall>" + " " * passing.HEAD_BYTES + "<methodName>getParam</methodName>",
         "<methodCall><methodName>getParam",
         "",
     ],
@@ -118,9 +121,9 @@ def test_nesting_is_bounded(size: int) -> None:
         value = b"<value><array><data>" * depth + b"</data></array></value>" * depth
         return py_call("setParam", "/n", "/key", "x").replace(b"<string>x</string>", value * times)
 
-    see(CallWatch(), nested(passing.NESTED, times=3), size)
+    see(CallWatch(), nested(passing.MOST_NESTED, times=3), size)
     with pytest.raises(XmlRpcError, match="nested deeper than 20 levels"):
-        see(CallWatch(), nested(passing.NESTED + 1), size)
+        see(CallWatch(), nested(passing.MOST_NESTED + 1), size)
 
 
 @pytest.mark.parametrize("size", [1, 13, 1000])
@@ -259,7 +262,7 @@ def test_what_passes_python_reads_as_it_was_judged(soup: str, place: str) -> Non
 @pytest.mark.parametrize("status", [1, 0, -1])
 def test_the_status_of_a_reply_is_told_by_its_head(dialect: Any, status: int) -> None:
     body = dialect([status, "text", "x" * 100_000])
-    assert passing.status_of(body[: passing.HEAD]) == status
+    assert passing.status_of(body[: passing.HEAD_BYTES]) == status
 
 
 @pytest.mark.parametrize(

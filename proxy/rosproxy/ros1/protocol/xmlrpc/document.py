@@ -22,9 +22,10 @@ from rosproxy.ros1.protocol.xmlrpc.values import KINDS, SCALARS, Edit, text_of
 
 Value = values.Value
 PARSE_ERROR = -32700
-"""Fault code: not well formed (http://xmlrpc-epi.sourceforge.net/specs/rfc.fault_codes.php)."""
+"""Fault code: not well formed, or beyond a limit
+(http://xmlrpc-epi.sourceforge.net/specs/rfc.fault_codes.php)."""
 INVALID_REQUEST = -32600
-"""Fault code: well-formed XML that is not an XML-RPC call."""
+"""Fault code: well-formed XML that is not an XML-RPC call or response."""
 INVALID_PARAMS = -32602
 """Fault code: the parameters do not fit the method."""
 SYSTEM_ERROR = -32400
@@ -36,12 +37,13 @@ LONGEST_TAG = 4096
 # plain quantifier keeps a state of 100 bytes for each byte of a long tag.
 _TAG = re.compile(rb"<(?:[^<>\"']++|\"[^<\"]*+\"|'[^<']*+')*+>")
 _LONG_TAG = re.compile(rb"(?=<[^!?][^<]{%d})%b" % (LONGEST_TAG - 1, _TAG.pattern))
-"""A tag with the text up to the next tag, longer than LONGEST_TAG together."""
+"""A tag that is longer than LONGEST_TAG together with the text up to the next tag."""
 _ENCODINGS = frozenset({"utf-8", "us-ascii", "ascii", "iso-8859-1"})
-_MEANING = frozenset(
+_NEVER_PREFIXED = frozenset(
     {"methodName", "params", "fault", "value", "string", "array", "struct", "member", "name"}
 )
-"""Elements that Python's Unmarshaller recognizes with any prefix, as ``<x:value>``."""
+"""Elements that must not have a prefix, because Python's Unmarshaller ignores the prefix, as in
+``<x:value>``."""
 
 
 class XmlRpcError(ValueError):
@@ -158,7 +160,8 @@ def dump_value(value: Any) -> bytes:
 def python_value(value: Value) -> Any:
     """Convert a value to Python, for lists of strings and numbers such as ROS status triples.
 
-    Kinds other than string, int, array and struct become their text.
+    Kinds other than string, int, array and struct become their text. An int that is no number
+    becomes None.
     """
     if value.kind == "array":
         return [python_value(item) for item in value.items]
@@ -193,7 +196,7 @@ class _Parser:
         self._path: list[str] = []
         self._open: list[Value] = []
         self._count = 0
-        self._inner = 0
+        self._name_start = 0
         if len(body) > limits.size:
             raise XmlRpcError(PARSE_ERROR, f"the document is longer than {limits.size} bytes")
         if exceeds_elements(body, limits):  # before any element takes memory
@@ -238,7 +241,7 @@ class _Parser:
         elif name in KINDS:
             self._start_kind(name)
         elif name in ("methodName", "name"):
-            self._inner = self._tag_end()
+            self._name_start = self._tag_end()
         elif name == "fault":
             self.fault = True
         elif self._path[-2:-1] == ["value"]:
@@ -252,7 +255,7 @@ class _Parser:
         if self._count > self._limits.elements:
             text = f"the document has more than {self._limits.elements} elements and attributes"
             raise XmlRpcError(PARSE_ERROR, text)
-        if ":" in name and name.rpartition(":")[2] in _MEANING:
+        if ":" in name and name.rpartition(":")[2] in _NEVER_PREFIXED:
             raise XmlRpcError(
                 INVALID_REQUEST, "an XML-RPC element must not have a namespace prefix"
             )
@@ -296,7 +299,7 @@ class _Parser:
 
     def _text(self) -> str:
         """The text of the name element that ends here."""
-        raw = self.body[self._inner : max(self._inner, self._expat.CurrentByteIndex)]
+        raw = self.body[self._name_start : max(self._name_start, self._expat.CurrentByteIndex)]
         return text_of(raw, self._encoding)
 
     def _tag_end(self) -> int:

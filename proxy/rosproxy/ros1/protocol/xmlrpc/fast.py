@@ -81,12 +81,12 @@ _LIST_TOKEN = re.compile(
 _STRING, _INTEGER, _LIST, _LIST_END = range(1, 5)
 _FIRST_PARAM = re.compile(rb"\s*<param>")
 _LAST_PARAM = re.compile(rb"\s*</param>" + _RESPONSE_END.pattern)
-_AROUND = "methodResponse", "params", "param", "value", "string"
+_OUTER_ELEMENTS = "methodResponse", "params", "param", "value", "string"
 """The elements around a text outside of lists. Each list adds three."""
 _VALUE, _TYPE, _TYPED, _TEXT, _ARRAY, _STRUCT = range(1, 7)
 _ARRAY_END, _NAME, _MEMBER_END, _STRUCT_END, _PARAM, _PARAM_END, _NONE = range(7, 14)
 """The groups of a token. The last group of a match tells the kind of the token."""
-_END_OF_VALUE = len(b"</value>")
+_VALUE_END_LENGTH = len(b"</value>")
 _KINDS = {name.encode(): kind for name, kind in KINDS.items()}
 
 _Tokens = Iterator[re.Match[bytes]]
@@ -97,7 +97,10 @@ class _NotPlain(Exception):
 
 
 def call(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, list[Value]] | None:
-    """The method and parameters of a ``methodCall``; None without the plain form."""
+    """The method and parameters of a ``methodCall``.
+
+    None without the plain form, or beyond ``limits``.
+    """
     head = _CALL.match(body)
     if head is None or not _is_plain(body, limits):
         return None
@@ -122,7 +125,10 @@ def methods_of_multicall(body: bytes) -> set[str] | None:
 
 
 def response(body: bytes, limits: Limits = OWN_REPLY) -> Value | None:
-    """The value of a ``methodResponse``; None for a fault or without the plain form."""
+    """The value of a ``methodResponse``.
+
+    None for a fault, without the plain form, or beyond ``limits``.
+    """
     head = _RESPONSE.match(body)
     if head is None or not _is_plain(body, limits):
         return None
@@ -131,7 +137,7 @@ def response(body: bytes, limits: Limits = OWN_REPLY) -> Value | None:
 
 
 def lists(body: bytes, limits: Limits = OWN_REPLY) -> list[Any] | None:
-    """The value of a ``methodResponse`` with only strings, numbers and lists; otherwise None.
+    """The value of a ``methodResponse`` that is a list of strings, numbers and lists; else None.
 
     The master sends such replies, and replies with all topics are long. The function takes a fifth
     of the time of `response`, which also finds the position of each value.
@@ -142,13 +148,16 @@ def lists(body: bytes, limits: Limits = OWN_REPLY) -> list[Any] | None:
     if param is None or b"\r" in body or not _is_plain(body, limits):
         return None
     top = list[Any]()
-    end = _read_lists(body, param.end(), top, (limits.depth - len(_AROUND)) // 3)
+    end = _read_lists(body, param.end(), top, (limits.depth - len(_OUTER_ELEMENTS)) // 3)
     value = top[0] if end is not None and _LAST_PARAM.match(body, end) else None
     return value if isinstance(value, list) else None
 
 
 def _read_lists(body: bytes, start: int, top: list[Any], depth: int) -> int | None:
-    """Read a value into ``top``, with at most ``depth`` nested lists; return where it ends."""
+    """Read a value into ``top``; return the position after the value.
+
+    None if the value has another form, or more than ``depth`` nested lists.
+    """
     # `scanner` is not documented. Each match has to begin where the last match has ended.
     stack = [top]
     match = _LIST_TOKEN.scanner(body, start).match  # type: ignore[attr-defined]
@@ -196,7 +205,10 @@ def _params(body: bytes, start: int, end: re.Pattern[bytes], depth: int) -> list
 
 
 def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> Value:
-    """The value that a token begins; ``depth`` is how many elements may be around its text."""
+    """The value that a token begins. Raises _NotPlain.
+
+    ``depth``: how many levels of elements may follow here. The value itself is the first level.
+    """
     group = token.lastindex
     start, inside = token.span(_VALUE)
     if group == _TYPED and depth > 1:
@@ -216,12 +228,12 @@ def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> 
         end = _struct(body, tokens, depth - 3, items, members)
     else:
         raise _NotPlain
-    inner = inside, end - _END_OF_VALUE
+    inner = inside, end - _VALUE_END_LENGTH
     return Value(body, "utf-8", kind, (start, end), inner, items, members)
 
 
 def _array(body: bytes, tokens: _Tokens, depth: int, items: list[Value]) -> int:
-    """Read items up to the end of the array; return its position."""
+    """Read items up to the end of the array; return the position after the array."""
     for token in tokens:
         if token.lastindex == _ARRAY_END:
             return token.end()
@@ -232,7 +244,7 @@ def _array(body: bytes, tokens: _Tokens, depth: int, items: list[Value]) -> int:
 def _struct(
     body: bytes, tokens: _Tokens, depth: int, items: list[Value], members: list[str]
 ) -> int:
-    """Read members up to the end of the struct; return its position."""
+    """Read members up to the end of the struct; return the position after the struct."""
     for token in tokens:
         if token.lastindex == _STRUCT_END:
             return token.end()

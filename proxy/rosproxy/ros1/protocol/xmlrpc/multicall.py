@@ -22,11 +22,11 @@ MULTICALL = "system.multicall"
 MOST_CALLS = 1000
 """The highest number of calls in a multicall. The proxy admits these calls in order, or sends the
 calls to a node in order. Only roslaunch and the proxy itself (a hundred at once) send multicalls.
-The multicalls of roslaunch set parameters; from 64 KiB on they pass without a count (`passing`)."""
+The multicalls of roslaunch set parameters; above 64 KiB their calls are not counted (`passing`)."""
 
 
 def inner_items(call: Call) -> list[Value]:
-    """The elements of a multicall's parameter."""
+    """The elements of a multicall's parameter; empty if the parameter is not a single array."""
     if len(call.params) != 1 or call.params[0].kind != "array":
         return []
     return call.params[0].items
@@ -35,8 +35,9 @@ def inner_items(call: Call) -> list[Value]:
 def inner_calls(call: Call) -> list[Call | None]:
     """The calls of a multicall, in order; None for an element that is no call.
 
-    Raises XmlRpcError for too many calls, and for a multicall inside the multicall. rosmaster would
-    execute the inner multicall, and XmlRpc++ would recurse without end.
+    Raises XmlRpcError for too many calls, for a call with a repeated member, and for a multicall
+    inside the multicall. rosmaster would execute the inner multicall, and XmlRpc++ would recurse
+    without end.
     """
     items = inner_items(call)
     if len(items) > MOST_CALLS:

@@ -1,11 +1,11 @@
-"""Calls that pass unread, because they are long and have no addresses, such as parameters.
+"""Long calls without addresses, such as calls that set parameters: these calls pass unread.
 
-The proxy reads the method from the head of the document, in the form of ROS's clients. The proxy
-reads a document with another head as a whole, within `limits`. While the rest of the document
-passes, the proxy only watches for a second method name. The master or a node must not find a method
-that the proxy has not judged. The proxy holds the last piece back until the whole document has been
-watched. So no program acts on a refused document, because rosmaster and nodes parse a body only
-after the whole body has arrived.
+The proxy reads the method from the head of the document, if the head has the form of ROS's clients.
+The proxy reads a document with another head as a whole, within `limits`. While the rest of the
+document passes, the proxy only watches for a second method name. The master or a node must not find
+a method that the proxy has not judged. The proxy holds the last piece back until the whole document
+has been watched. So no program acts on a refused document, because rosmaster and nodes parse a body
+only after the whole body has arrived.
 
 roslaunch sets parameters by ``system.multicall``. expat parses such a call piece by piece, and the
 call passes if each inner call may pass. The document has to follow the grammar strictly. Python's
@@ -27,11 +27,11 @@ from rosproxy.ros1.protocol.xmlrpc.document import (
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.protocol.xmlrpc.values import text_of
 
-SHORT = 64 * 1024
+SHORT_BYTES = 64 * 1024
 """Bytes up to which the proxy reads any document as a whole, in some milliseconds."""
-HEAD = 4096
+HEAD_BYTES = 4096
 """The bytes of a document in which the proxy looks for the method."""
-DEPTH = 64
+MOST_DEPTH = 64
 """The highest number of nested elements in a multicall, as in `Limits`."""
 LONGEST_MARKUP = 64 * 1024
 """Bytes of a tag, comment or processing instruction in a multicall. expat buffers such markup until
@@ -66,9 +66,9 @@ _FORBIDDEN = re.compile(rb"[<:]methodName[\s/>]|<!DOCTYPE|<!ENTITY|\0")
 _HINTS = (b"methodName", b"<!DOCTYPE", b"<!ENTITY", b"\0")
 """Each forbidden text contains a hint. A search for hints first takes a hundredth of the time."""
 _NESTING = re.compile(rb"<(/?)(?:array|struct)>")
-_LONGEST = len(b"<methodName>")
-"""Bytes of the longest text in the search."""
-NESTED = 20
+_LONGEST_FORBIDDEN = len(b"<methodName>")
+"""Bytes of the longest text in the search for forbidden texts."""
+MOST_NESTED = 20
 """The highest number of nested arrays and structs. XmlRpc++ recurses for each level."""
 
 _LEVELS = (
@@ -95,7 +95,7 @@ _PARAMS = ["name:params", "value", "array"]
 
 def method_of(head: bytes) -> str | None:
     """The method of a call, from the head of the document; None if the head has no method."""
-    match = _HEAD.match(head, 0, HEAD)
+    match = _HEAD.match(head, 0, HEAD_BYTES)
     return match[2].decode() if match else None
 
 
@@ -104,7 +104,7 @@ def first_strings(head: bytes, count: int) -> list[str | None]:
 
     From the first parameter on that is no plain string, or not in the head, all elements are None.
     """
-    match = _HEAD.match(head, 0, HEAD)
+    match = _HEAD.match(head, 0, HEAD_BYTES)
     position = match.end() if match else 0
     strings = list[str | None]()
     opening = _PARAMS_BEGIN.match(head, position) if match else None
@@ -120,19 +120,22 @@ def first_strings(head: bytes, count: int) -> list[str | None]:
 
 def status_of(head: bytes) -> int | None:
     """The ROS status of a reply, from the head; None if the head has no status."""
-    match = _STATUS.match(head, 0, HEAD)
+    match = _STATUS.match(head, 0, HEAD_BYTES)
     return int(match[2]) if match else None
 
 
 class CallWatch:
-    """Watches a passing document, from the head on."""
+    """Watches a passing document, from the head on: no second method, no deep nesting."""
 
     def __init__(self) -> None:
         self._tail: bytes | None = None
         self._nested = 0
 
     def see(self, piece: bytes) -> None:
-        """Watch the next piece; the first piece has the method. Raises XmlRpcError."""
+        """Watch the next piece; the first piece has the method.
+
+        Raises XmlRpcError for a forbidden text or too many nested levels.
+        """
         if self._tail is None:
             head = _HEAD.match(piece)
             piece = piece[head.end() :] if head else piece
@@ -147,15 +150,15 @@ class CallWatch:
             # Tags count everywhere, also in a comment or CDATA. A closing tag without an opening
             # tag must not make room for further levels.
             self._nested = max(self._nested - 1, 0) if tag[1] else self._nested + 1
-            if self._nested > NESTED:
+            if self._nested > MOST_NESTED:
                 raise XmlRpcError(
-                    PARSE_ERROR, f"arrays and structs are nested deeper than {NESTED} levels"
+                    PARSE_ERROR, f"arrays and structs are nested deeper than {MOST_NESTED} levels"
                 )
         # A forbidden text may begin here and end in the next piece.
-        self._tail = text[1 - _LONGEST :]
+        self._tail = text[1 - _LONGEST_FORBIDDEN :]
 
     def end(self) -> None:
-        """End the watch after the last piece. Raises XmlRpcError if the document is incomplete."""
+        """End the watch after the last piece. Only `MulticallWatch` checks something here."""
 
     def passes(self, _body: bytes) -> bool:
         """Whether a whole document may pass without a watch."""
@@ -190,11 +193,14 @@ class MulticallWatch(CallWatch):
         self._parse(b"", last=True)
 
     def passes(self, body: bytes) -> bool:
-        """Whether a whole document passes at a glance; expat takes twenty times as long."""
-        methods = fast.methods_of_multicall(body)
-        return methods is not None and all(map(self._passes, methods))
+        """Whether a regular expression shows that a whole document may pass.
 
-    def _passes(self, method: str) -> bool:
+        False says nothing: expat then watches the document, which takes twenty times as long.
+        """
+        methods = fast.methods_of_multicall(body)
+        return methods is not None and all(map(self._is_permitted, methods))
+
+    def _is_permitted(self, method: str) -> bool:
         return method != MULTICALL and self._may_pass(method)
 
     def _parse(self, piece: bytes, last: bool = False) -> None:
@@ -211,8 +217,10 @@ class MulticallWatch(CallWatch):
     def _start(self, name: str, attributes: Collection[str]) -> None:
         self._note_names((name, *attributes))
         self._depth += 1
-        if self._depth > DEPTH:
-            raise XmlRpcError(PARSE_ERROR, f"the document is nested deeper than {DEPTH} elements")
+        if self._depth > MOST_DEPTH:
+            raise XmlRpcError(
+                PARSE_ERROR, f"the document is nested deeper than {MOST_DEPTH} elements"
+            )
         if self._depth > _CONTENT_DEPTH:
             return
         if name not in _LEVELS[self._depth - 1]:
@@ -260,7 +268,7 @@ class MulticallWatch(CallWatch):
             self._members.append("params")
         elif self._elements in (_METHOD, [*_METHOD, "string"]):
             self._members.append("methodName")
-            if not self._passes(self._text):
+            if not self._is_permitted(self._text):
                 raise XmlRpcError(
                     INVALID_REQUEST, f"{self._text} is not allowed in a long {MULTICALL}"
                 )
@@ -272,11 +280,11 @@ class MulticallWatch(CallWatch):
 
     def _add_text(self, text: str) -> None:
         self._text += text
-        if len(self._text) > HEAD:
-            text = f"a long {MULTICALL} has a name of more than {HEAD} characters"
+        if len(self._text) > HEAD_BYTES:
+            text = f"a long {MULTICALL} has a name of more than {HEAD_BYTES} characters"
             raise XmlRpcError(INVALID_REQUEST, text)
 
 
 def cut(body: bytes) -> Iterator[bytes]:
-    """A body in pieces; to watch a piece takes some milliseconds."""
-    return (body[start : start + SHORT] for start in range(0, len(body), SHORT))
+    """A body in pieces of at most SHORT_BYTES. To watch a piece takes some milliseconds."""
+    return (body[start : start + SHORT_BYTES] for start in range(0, len(body), SHORT_BYTES))

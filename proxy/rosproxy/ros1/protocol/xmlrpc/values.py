@@ -18,7 +18,8 @@ KINDS: dict[str, Kind] = {
     **dict.fromkeys(("int", "i4", "i8"), "int"),
     **dict.fromkeys(("boolean", "double", "dateTime.iso8601", "base64", "nil"), "other"),
 }
-"""The elements inside a value (http://xmlrpc.com/spec.md, and nil, which is an extension)."""
+"""The kind of each element that may be inside a value (http://xmlrpc.com/spec.md). ``nil`` is an
+extension."""
 SCALARS = KINDS.keys() - {"array", "struct"}
 """The elements that hold text."""
 
@@ -67,7 +68,7 @@ class Value:
         return self.text if self.kind == "string" else None
 
     def integer(self) -> int | None:
-        """The number if this is an int, else None."""
+        """The number if this is an int with a valid text, else None."""
         if self.kind != "int":
             return None
         try:
