@@ -22,10 +22,11 @@ MOST_SERVICE_PORTS = 16
 topics and services. After a restart the proxy does not try ports beyond this number."""
 MOST_FORMER_CALLERS = 64
 """Remembered names that are no longer registered at an endpoint."""
-MOST_NAMED = 3
+MOST_SHOWN_NAMES = 3
 """Most node names of an endpoint in a message. Most endpoints have a single name. An endpoint has
 several names if another node has used the same port again."""
 STATES = ("ok", "new", "failing", "refused", "silent", "cleaned", "ended", "unverified")
+"""The values of `Endpoint.state`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +34,8 @@ class NodeLocation:
     """The location of a node's slave API.
 
     - ``address``: the IP address to which the proxy connects.
-    - ``named``: the host name that the node gives leads to this address, so neighbours can use it.
+    - ``named``: the host name that the node gives leads to this address, so neighbours can use
+      the name.
     - ``confirmed``: the registration came from this address. If not, the proxy takes the TCPROS
       port only from the node itself.
     - ``stale``: the host that the node gives is an address that the node no longer has.
@@ -50,8 +52,10 @@ class Registration:
     """A registration at the master, on behalf of an endpoint.
 
     ``type`` is the message type of the topic, ``service_api`` the service URI as the node gave it.
-    The URI is None after a recovery, because only the node knows the URI. ``hidden``: the policy
-    denies the registration, and the master does not have it; see `rosproxy.ros1.policy.hidden`.
+    The URI is None after a recovery, because only the node knows the URI. ``since`` is the time of
+    the registration in seconds of the proxy's clock; 0 if only the master mentions it.
+    ``hidden``: the policy denies the registration, and the master does not have it; see
+    `rosproxy.ros1.policy.hidden`.
     """
 
     kind: Kind
@@ -116,12 +120,14 @@ class Endpoint:
     pending: int = 0
     """Calls under way that register something here. The lease does not end meanwhile."""
     idle_since: float | None = None
-    """When the lease was last found unused; None if the lease is in use, as far as known."""
+    """When the lease was first found unused after its last use; None while the lease is in use, as
+    far as known."""
     trusted: bool = True
     source: str = ""
     health: Health = field(default_factory=Health)
     admissions: dict[tuple[HostPort, str], None] = field(default_factory=dict)
-    """Hosts and ports of this endpoint with the source of each, oldest first; by `Registry`."""
+    """Hosts and ports of this endpoint with the source of each, oldest first. `Registry` adds
+    entries."""
     former_uris: set[str] = field(default_factory=set)
     unsettled: bool = False
     settles_at: float = 0.0
@@ -129,7 +135,8 @@ class Endpoint:
     fast_peers: Mapping[str, int] = field(default_factory=dict)
     inside: bool = True
     restored: bool = False
-    """Whether a former process of the proxy had the endpoint, and perhaps further data."""
+    """Whether a former process of the proxy had the endpoint, perhaps with registrations that are
+    unknown now."""
 
     def mark_alive(self, pid: int | None, topic_ports: Mapping[str, int], now: float) -> None:
         """Record an answer of the node. The proxy serves the node, and the registrations hold."""
@@ -140,7 +147,7 @@ class Endpoint:
         self.health.cleaned = False
 
     def note_unused(self, now: float) -> float:
-        """Record that the lease is unused now; return the seconds since the lease is unused."""
+        """Record that the lease is unused now; return the seconds since `idle_since`."""
         if self.idle_since is None:
             self.idle_since = now
         return now - self.idle_since
@@ -218,7 +225,7 @@ class Endpoint:
 
     @property
     def never_found(self) -> bool:
-        """Whether the node has registered, but never answered here, and may be elsewhere."""
+        """Whether all probes of the node have failed here, so that the node may be elsewhere."""
         health = self.health
         return self.trusted and health.answered_at is None and health.failures > 0
 
@@ -226,8 +233,8 @@ class Endpoint:
     def expendable(self) -> bool:
         """Whether the port may go to a live node, because this endpoint's node does not answer.
 
-        A node that has never answered gets a single probe. If only the master mentions a node, the
-        first answer of the node must confirm the registrations.
+        A port in use is never expendable. A node that has never answered gets a single probe. If
+        only the master mentions a node, its first answer must confirm the registrations.
         """
         if self.pending or self.connected:
             return False
@@ -264,12 +271,12 @@ class Endpoint:
     @property
     def label(self) -> str:
         """The endpoint in messages: node names and own URI."""
-        return f"{listed(self.caller_ids, MOST_NAMED) or 'unnamed node'} ({self.uri})"
+        return f"{listed(self.caller_ids, MOST_SHOWN_NAMES) or 'unnamed node'} ({self.uri})"
 
     @property
     def log_fields(self) -> dict[str, str | int]:
         """The fields of a log entry about the endpoint, for ``extra``."""
-        return {"node": listed(self.caller_ids, MOST_NAMED), "port": self.port}
+        return {"node": listed(self.caller_ids, MOST_SHOWN_NAMES), "port": self.port}
 
     def names(self, kind: Kind) -> list[str]:
         """The topics, services or parameters registered as ``kind``."""
@@ -329,7 +336,10 @@ class Endpoint:
 
     @property
     def unused(self) -> bool:
-        """Whether the lease has no registration, no connection and no call under way."""
+        """Whether the lease has no registration, no connection and no call under way.
+
+        Registrations that the proxy has taken back at the master do not count.
+        """
         is_registered = self.registrations and not self.health.cleaned
         return not (is_registered or self.connected or self.pending)
 

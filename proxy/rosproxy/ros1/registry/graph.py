@@ -63,7 +63,10 @@ class NodeInfo(msgspec.Struct, frozen=True):
         return False if len(tables) == len(TOPIC_KINDS) else None
 
     def holds(self, registration: Registration) -> bool | None:
-        """Whether the node has what is registered; None if it does not tell, as of services."""
+        """Whether the node has what is registered; None if the node does not tell.
+
+        No node tells its services and parameters.
+        """
         topics = self.by_kind.get(registration.kind)
         return None if topics is None else registration.name in topics
 

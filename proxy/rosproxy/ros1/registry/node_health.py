@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 from enum import Enum
 
-UNKNOWN_PID = (None, -1)
-"""Values for a pid that is unknown or not trusted."""
+UNKNOWN_PIDS = (None, -1)
+"""The values of a pid that is unknown (None) or not trusted any more (-1)."""
 
 FAILURES_TO_CLOSE = 2
 """Failed probes in a row after which the port of a node refuses connections."""
-
-
-RETRY = 1.0
+RETRY_INTERVAL_S = 1.0
 """Seconds between probes of a node that is down."""
 
 
@@ -31,6 +29,7 @@ class Health:
     - ``cleaned``: the registrations were taken back at the master, at ``cleaned_at``. The registry
       keeps them for the case that the node answers again.
     - ``has_ended``: the node has ended for good, even if its address is only silent.
+    - ``checked_at``: the time of the last probe; None if a probe is due at once.
     - ``hung_up_pid``: the process that ended the last kept connection.
     """
 
@@ -78,7 +77,7 @@ class Health:
         is_well = self.answered_at is not None and not (
             self.failures or self.cleaned or self.has_ended
         )
-        return is_well and self.checked_at is not None and self.pid not in UNKNOWN_PID
+        return is_well and self.checked_at is not None and self.pid not in UNKNOWN_PIDS
 
     @property
     def hangs_up(self) -> bool:
@@ -86,7 +85,7 @@ class Health:
         return self.hung_up_pid is not None and self.hung_up_pid == self.pid
 
     def note_cleaned(self, at: float) -> None:
-        """Record that the registrations of a time were taken back at the master."""
+        """Record that the registrations were taken back at the master; this began at ``at``."""
         self.cleaned = True
         self.cleaned_at = at
 
@@ -118,20 +117,24 @@ class Health:
     def end(self, now: float) -> None:
         """Record that the node has ended, regardless of answers at its address."""
         self.failures = max(self.failures, FAILURES_TO_CLOSE)
-        # An infinitely old failure: `clean_up` then does not wait.
+        # An infinitely old failure: `cleanup_due` then does not wait.
         self.checked_at = now
         self.failing_since = float("-inf")
         self.has_ended = True
 
-    def due(self, now: float, interval: float) -> bool:
-        """Whether to probe: idle for ``interval`` seconds, or under suspicion."""
+    def probe_due(self, now: float, interval: float) -> bool:
+        """Whether to probe the node now: ``interval`` seconds after the last probe, or at once.
+
+        At once means under suspicion, or after a first failure. A node that is down gets a probe at
+        least every RETRY_INTERVAL_S.
+        """
         if self.checked_at is None or 0 < self.failures < FAILURES_TO_CLOSE:
             return True
         if self.down:
-            return now - self.checked_at >= min(RETRY, interval)
+            return now - self.checked_at >= min(RETRY_INTERVAL_S, interval)
         return now - self.checked_at >= interval
 
-    def clean_up(self, now: float, after: float) -> bool:
+    def cleanup_due(self, now: float, after: float) -> bool:
         """Whether to unregister the node at the master: down for ``after`` seconds (0: never)."""
         if not after or self.cleaned or self.failing_since is None or not self.down:
             return False

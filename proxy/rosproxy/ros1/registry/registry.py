@@ -55,7 +55,9 @@ class Registry:
         self._by_node: dict[HostPort, dict[int, Endpoint]] = {}
         self._admitted: dict[tuple[HostPort, str], Endpoint] = {}
         self._last_port: dict[HostPort, int] = {}
+        """The last port of each slave address, also after the endpoint was removed."""
         self._former: dict[int, Endpoint] = {}
+        """The last endpoint of each port that is free again."""
         self._unproven: dict[str, dict[Endpoint, None]] = {}
         """The endpoints of each source that had not answered at the last check."""
 
@@ -303,7 +305,10 @@ class Registry:
             moved = kept
 
     def _take_admissions(self, endpoint: Endpoint) -> list[HostPort]:
-        """End the admissions from an endpoint's own address; return their hosts and ports."""
+        """End the admissions from an endpoint's own address.
+
+        Returns the hosts and ports of these admissions, and of the endpoint's URI.
+        """
         address = endpoint.location.address
         nodes = [node for node, source in endpoint.admissions if source == address]
         for node in nodes:

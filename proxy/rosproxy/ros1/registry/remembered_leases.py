@@ -25,7 +25,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import InsidePath, inside_path, parse_inside_path
 from rosproxy.ros1.registry.endpoint import MOST_SERVICE_PORTS, Endpoint
 
-_NO_NAME = re.compile(r"[^A-Za-z0-9]")
+_NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9]")
 _LINE = re.compile(r"(\d{1,5}) (/\S{1,4096}/)((?: \d{1,5})*)")
 
 
@@ -46,7 +46,7 @@ def parameter_of(host: str, ports: PortMap) -> str:
 
 
 def leases_text(endpoints: Iterable[Endpoint], ports: PortMap) -> str:
-    """The value of the parameter; empty if there is nothing to remember."""
+    """The value of the parameter; "" if there is nothing to remember."""
     return "".join(f"{_line(endpoint, ports)}\n" for endpoint in endpoints)
 
 
@@ -57,7 +57,10 @@ def read_leases(value: object, ports: PortMap) -> Mapping[int, RememberedLease]:
 
 
 def lease_at(parameters: object, advertised: HostPort) -> RememberedLease | None:
-    """The lease at an advertised host and port, of any proxy, from the parameters in NAMESPACE."""
+    """The lease at an advertised host and port, of any proxy; None if no parameter has this lease.
+
+    ``parameters`` is the value of NAMESPACE at the master.
+    """
     name = _name_of(advertised.host)
     items = parameters.items() if isinstance(parameters, dict) else ()
     values = [v for key, v in items if str(key).startswith(name)]
@@ -65,7 +68,7 @@ def lease_at(parameters: object, advertised: HostPort) -> RememberedLease | None
 
 
 def _name_of(host: str) -> str:
-    return f"leases_{_NO_NAME.sub('_', host)}_"
+    return f"leases_{_NOT_IN_NAMES.sub('_', host)}_"
 
 
 def _read(value: object) -> Iterator[tuple[int, RememberedLease]]:

@@ -12,9 +12,9 @@ a node outside, or to the server of a service outside. There are two cases:
     numbers, and the URIs stay as they are.
 
 The port of a URI follows from the text of the URI. So after a restart the proxy gives the URI the
-same port again, and subscribers connect to this port again by themselves. The order counts only if
-two texts lead to the same port. Then subscribers find the new port in the list of publishers, which
-the proxy sends after a restart.
+same port again, and subscribers connect to this port again by themselves. The order in which URIs
+come counts only if two texts lead to the same port. Then subscribers find the new port in the list
+of publishers, which the proxy sends after a restart.
 
 A slave URI also gets a second port, the *fast port*, for topics that the kernel forwards
 (`rosproxy.forwarding.kernel`).
@@ -36,11 +36,11 @@ from rosproxy.settings import Settings
 
 MOST_STAND_INS = 1024
 """The highest number of stand-ins."""
-PORTS = range(20_000, 32_768)
+STAND_IN_PORTS = range(20_000, 32_768)
 """The ports of stand-ins, below the ports that Linux gives to outgoing connections. The first half
 is for the stand-ins, the second for their fast ports."""
-_HALF = len(PORTS) // 2
-TRIES = 16
+_HALF = len(STAND_IN_PORTS) // 2
+MOST_TRIES = 16
 """The highest number of ports that the proxy tries for a URI."""
 MOST_TOPICS = 512
 """The highest number of remembered topics with their ports, for a node."""
@@ -110,7 +110,7 @@ class StandIn:
         if self.is_uri_kept or parse_service_uri(self.uri):
             return None
         number = _number(f"{self.local.host} {self.uri}") + self.fast_attempts**2
-        return HostPort(self.local.host, PORTS[_HALF + number % _HALF])
+        return HostPort(self.local.host, STAND_IN_PORTS[_HALF + number % _HALF])
 
     def note_topic_port(self, topic: str, port: int) -> None:
         """Record the TCPROS port that the node has named for a topic. Only the latest topics stay.
@@ -136,7 +136,7 @@ class StandIn:
 class StandIns:
     """The stand-ins by local address and by URI.
 
-    ``aliased`` is the master's host name in lower case, if this name may lead to the proxy.
+    ``aliased`` is the master's host name in lower case if this name may lead to the proxy, else "".
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -167,20 +167,20 @@ class StandIns:
             yield StandIn(HostPort(address, target.port), uri, target, is_uri_kept=True)
             return
         seed = _number(uri)
-        for number in range(TRIES):
-            port = PORTS[(seed + number * number) % _HALF]
+        for number in range(MOST_TRIES):
+            port = STAND_IN_PORTS[(seed + number * number) % _HALF]
             yield StandIn(HostPort(address, port), uri, target, is_uri_kept=False)
 
     def address(self, proxy: str) -> str:
         """The address where stand-ins listen for a node inside that sees the proxy at ``proxy``.
 
-        This is ``proxy`` alone. If URIs are kept, it is ``--bind``, because the host name in a URI
-        may lead to any address of the proxy.
+        With ``--direction both`` this is ``proxy``. Otherwise URIs are kept, and this is
+        ``--bind``, because the host name in a URI may lead to any address of the proxy.
         """
         return proxy if self.is_bidirectional else self._settings.bind
 
     def at(self, local: HostPort) -> StandIn | None:
-        """The stand-in at which a connection arrived."""
+        """The stand-in at which a connection arrived; None if the stand-in was removed."""
         return self.by_local.get(HostPort(self.address(local.host), local.port))
 
     def find(self, address: str, uri: str) -> StandIn | None:
@@ -196,7 +196,7 @@ class StandIns:
         if stand_in.fast_port is not None or stand_in.fast_candidate is None:
             return None
         # `port` and `fast_candidate` follow from `fast_attempts`, the loop variable.
-        for stand_in.fast_attempts in range(TRIES):
+        for stand_in.fast_attempts in range(MOST_TRIES):
             if stand_in.port not in self.by_port:
                 return stand_in.fast_candidate
         return None
@@ -232,7 +232,7 @@ class StandIns:
             del self.by_port[stand_in.port]
 
     def note_used(self, stand_in: StandIn) -> None:
-        """Record that a stand-in is used."""
+        """Record that a stand-in is used: the stand-in becomes the last of `by_local`."""
         if self.by_local.get(stand_in.local) is stand_in:
             self.by_local[stand_in.local] = self.by_local.pop(stand_in.local)
 
@@ -277,7 +277,10 @@ def aliased_host(master_uri: str) -> str | None:
 
 
 def obstacle(port: int, settings: Settings) -> str | None:
-    """The use of a port by the proxy itself, which excludes a stand-in; None if there is none."""
+    """The use of a port by the proxy itself, which excludes a stand-in; None if there is none.
+
+    The text continues a sentence about the port: "lies in …" or "is taken by …".
+    """
     if port in settings.ports.listen:
         return f"lies in the range {settings.ports.listen} of the proxy"
     use_by_port = {

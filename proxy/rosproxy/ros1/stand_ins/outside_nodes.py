@@ -1,9 +1,9 @@
 """How nodes inside reach nodes outside through a stand-in: by slave API calls and by TCPROS.
 
-No connection may lead to the proxy itself or to inside, because any program can write addresses to
-the master. Nodes of outside may run on the proxy's own machine. So at an address of this machine
-only the proxy's own ports are refused. Loopback is always refused, because the node that gave a
-loopback address meant another machine.
+No connection may lead to the proxy itself, because any program can write addresses to the master.
+With ``--direction both`` no connection may lead to inside either. Nodes of outside may run on the
+proxy's own machine. So at an address of this machine only the proxy's own ports are refused.
+Loopback is always refused, because the node that gave a loopback address meant another machine.
 """
 
 import logging
@@ -97,12 +97,15 @@ class Outside:
                 self._note_refused(stand_in)
             return None
 
-    async def _dial(self, target: HostPort, within: float) -> socket.socket:
+    async def _dial(self, target: HostPort, timeout_s: float) -> socket.socket:
         """Connect to a port outside; refuse targets inside or of the proxy. Raises OSError."""
-        return await sockets.dial(await self.reach(target), within)
+        return await sockets.dial(await self.reach(target), timeout_s)
 
     async def reach(self, target: HostPort) -> HostPort:
-        """The address and port of a host outside. Raises OSError, also for a host inside."""
+        """The address and port of a host outside. Raises OSError, also for a host inside.
+
+        A host is not outside if `_leads_back` refuses all its addresses.
+        """
         mapped = self._context.upstream.reach(target)
         resolved = await resolve(mapped.host, NODES)
         if not resolved:
@@ -113,7 +116,10 @@ class Outside:
         return HostPort(outside[0], target.port)
 
     def _leads_back(self, target: HostPort) -> bool:
-        """Whether an address and port are inside, on loopback, or the proxy's own."""
+        """Whether an address and port are on loopback, the proxy's own, or inside.
+
+        Inside counts only with ``--direction both``.
+        """
         stand_ins = self._context.stand_ins
         address = target.host
         inside = stand_ins.is_bidirectional and is_inside(
@@ -143,7 +149,11 @@ class OutsideNode:
         return self._context.policy.check_inside(kind, name, peer, caller_id)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
-        """Connect to the node; ask for its port again if the known port refuses."""
+        """Connect to the node; ask for its port again if the known port refuses.
+
+        None if that fails. Also None if a client asks a service for a topic, or a node for a
+        service.
+        """
         outside = self._outside
         stand_in = self._stand_in
         is_service = parse_service_uri(stand_in.uri) is not None

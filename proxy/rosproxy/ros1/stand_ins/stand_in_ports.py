@@ -123,7 +123,10 @@ class StandInPorts:
         await self.listen_for((uri for uri in targets if uri in known_uris), caller)
 
     def with_address(self, body: bytes, call: xmlrpc.Call) -> bytes:
-        """A call from outside, parsed as ``call``, in a form for nodes inside."""
+        """A call from outside, parsed as ``call``, with UDPROS offers that nodes inside can reach.
+
+        The master's address replaces the master's host name, if this name leads to the proxy.
+        """
         address = self._context.upstream.master_address
         if not address or not self._stand_ins.aliased:
             return body
@@ -131,6 +134,8 @@ class StandInPorts:
 
     async def tidy(self) -> None:
         """Remove problems of nodes that have ended, and of services that have not failed lately.
+
+        Also end UDPROS relays whose node inside is no longer registered.
 
         The proxy does not try the port of a service: rospy logs a warning for a connection without
         a header.
@@ -173,7 +178,10 @@ class StandInPorts:
         return ports
 
     def close_fast_ports(self) -> int:
-        """Close all fast ports, where no header is checked; the number of cut connections."""
+        """Close all fast ports, where no header is checked.
+
+        Returns the number of cut connections.
+        """
         count = 0
         for stand_in in self._stand_ins.by_local.values():
             if stand_in.fast_port is not None:
@@ -238,22 +246,25 @@ class StandInPorts:
             self._stand_ins.note_used(stand_in)
             self._open_fast_port(stand_in)
             return
-        why = self._make_room()
-        if why is None:
+        reason = self._make_room()
+        if reason is None:
             for candidate in self._stand_ins.candidates(uri, target, address):
-                why = self._open(candidate)
-                if why is None:
+                reason = self._open(candidate)
+                if reason is None:
                     problems.solved(uri)
                     return
         text = self._stand_ins.advice(
-            target, why or "", self._context.upstream.master_address or ""
+            target, reason or "", self._context.upstream.master_address or ""
         )
         if (uri, text) not in ((p.subject, p.text) for p in problems.all()):
             log.warning("%s: %s", uri, text)
         problems.add(uri, text)
 
     def _make_room(self) -> str | None:
-        """Close the port unused for longest if there are too many; the reason if all are in use."""
+        """Close the port unused for longest if there are too many.
+
+        Returns None if there is room now, otherwise the reason.
+        """
         if len(self._stand_ins.by_local) < stand_ins.MOST_STAND_INS:
             return None
         counts = self._connections()
@@ -268,8 +279,8 @@ class StandInPorts:
     def _open(self, stand_in: StandIn) -> str | None:
         """Open a port; return the reason if that fails."""
         local = stand_in.local
-        if why := stand_ins.obstacle(local.port, self._context.settings):
-            return why
+        if reason := stand_ins.obstacle(local.port, self._context.settings):
+            return reason
         if local in self._stand_ins.by_local:
             return "already stands in for another node"
         try:
@@ -336,7 +347,10 @@ class StandInPorts:
             self.server.close_port(stand_in.local.port)
 
     def _note_refused(self, stand_in: StandIn) -> None:
-        """Close the port of a node that refuses, which has ended, until the node is found again."""
+        """Close the port of a node that refuses connections, because such a node has ended.
+
+        `listen_for` opens the port again if the node no longer refuses.
+        """
         log.debug(
             "%s refuses connections: the proxy closes the stand-in %s", stand_in.uri, stand_in.local
         )

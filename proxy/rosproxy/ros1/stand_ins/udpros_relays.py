@@ -21,8 +21,8 @@ chooses TCPROS if that was offered, too. The proxy also removes an offer whose c
 names another topic than the call. The reason: roscpp serves the topic of the header
 (topic_manager.cpp), but the policy has checked the topic of the call.
 
-A relay ends when an ICMP error shows that the subscriber has closed its port, when the end inside
-is no longer registered (`sweep`), or when the policy denies the topic (`cut_denied`).
+A relay ends when an ICMP error shows that the subscriber has closed its port, when the node inside
+is no longer registered for the topic (`sweep`), or when the policy denies the topic (`cut_denied`).
 """
 
 import logging
@@ -43,7 +43,7 @@ from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.values import Edit
 from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.stand_ins import PORTS, StandIn
+from rosproxy.ros1.registry.stand_ins import STAND_IN_PORTS, StandIn
 from rosproxy.ros1.rewriting.udpros_offers import read_offers, redirect_offer
 from rosproxy.ros1.stand_ins.outside_nodes import Outside
 
@@ -77,7 +77,7 @@ class UdprosSubscription(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class _RelayCondition:
-    """What a relay needs: the end inside is registered, and the policy allows the topic.
+    """What a relay needs: the node inside is registered, and the policy allows the topic.
 
     Each call evaluates the present state.
     """
@@ -136,7 +136,7 @@ class UdprosRelays:
             sources = [endpoint.location.address]
             subscription = UdprosSubscription(port, topic, caller_id, source, target, False)
             relay_port = self._open_relay(
-                subscription, condition, proxy, _candidates(subscription, PORTS), sources
+                subscription, condition, proxy, _candidates(subscription, STAND_IN_PORTS), sources
             )
             return HostPort(proxy, relay_port) if relay_port else None
 
@@ -177,7 +177,7 @@ class UdprosRelays:
         return await _rewritten(call, body, condition, redirect)
 
     def sweep(self) -> None:
-        """End relays whose end inside is no longer registered."""
+        """End relays whose node inside is no longer registered for the topic."""
         for subscription in [s for s, (_, c) in self._open.items() if not c.is_registered()]:
             self._end(subscription)
 

@@ -37,7 +37,9 @@ log = logging.getLogger(__name__)
 
 SHUTDOWN_LOOKUP_TIMEOUT_S = 2.0
 """Seconds within which the master must tell the URI of a node for a ``shutdown``."""
-NO_PORT = "registered directly at the master, and can't be adopted: no port of the range is left"
+NO_PORT_TEXT = (
+    "registered directly at the master, and can't be adopted: no port of the range is left"
+)
 
 
 @dataclass(slots=True, eq=False)
@@ -141,12 +143,12 @@ class Adopter:
         """The names that are confirmed, each with the slave address of the node."""
         judge = Verifier(self._context.nodes).judge
         tried = [(node, slave) for node in nodes for slave in node.slaves if slave in infos]
-        borne_out = await asyncio.gather(
+        confirmations = await asyncio.gather(
             *(judge(slave, node.registrations, infos[slave]) for node, slave in tried)
         )
         return {
             (node.caller_id, slave)
-            for (node, slave), is_verified in zip(tried, borne_out, strict=True)
+            for (node, slave), is_verified in zip(tried, confirmations, strict=True)
             if is_verified
         }
 
@@ -162,7 +164,7 @@ class Adopter:
                 if endpoint is None:
                     for node in nodes:
                         fix = how_to_in_a_sentence("larger range")
-                        self._report(node.caller_id, f"{NO_PORT}. {fix}")
+                        self._report(node.caller_id, f"{NO_PORT_TEXT}. {fix}")
                     continue
                 endpoints[endpoint] = infos[slave]
                 former |= {node.caller_id: (endpoint, node.uri) for node in nodes}
@@ -183,8 +185,9 @@ class Adopter:
     ) -> Endpoint | None:
         """Make the endpoint of nodes at a slave address, with their registrations.
 
-        The caller has to decrement ``pending``. The registry has the registrations from the start,
-        so the proxy repeats the calls to the master if these fail at first.
+        None if no port of the range is left. The caller has to decrement ``pending``. The registry
+        has the registrations from the start, so the proxy repeats the calls to the master if these
+        fail at first.
         """
         uri = nodes[0].uri
         own_slave = parse_slave_uri(uri) or slave

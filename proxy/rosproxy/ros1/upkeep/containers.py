@@ -165,9 +165,9 @@ class ContainerEvents:
         registrations = list(endpoint.registrations.values())
         slave = HostPort(address, endpoint.node.port)
         ports = list(endpoint.service_ports)
-        info, borne_out = await Verifier(self.context.nodes).ask(slave, registrations, ports)
+        info, is_confirmed = await Verifier(self.context.nodes).ask(slave, registrations, ports)
         known_pid = endpoint.health.pid
-        if info is None or not liveness.is_same_process(known_pid, info.pid, borne_out):
+        if info is None or not liveness.is_same_process(known_pid, info.pid, is_confirmed):
             return None
         return info
 

@@ -83,7 +83,7 @@ class Prober:
 
     def _ask(self, endpoint: Endpoint, now: float) -> None:
         """Ask for the pid of a node over a kept connection if possible, otherwise by a call."""
-        pid = endpoint.health.pid if liveness.may_be_kept(endpoint) else None
+        pid = endpoint.health.pid if liveness.may_use_kept_connection(endpoint) else None
         if pid is None or not self.kept_connections.ask(endpoint, endpoint.slave, pid, now):
             self._begin_probe(endpoint)
 
@@ -91,7 +91,7 @@ class Prober:
         """Record the result of a kept connection; None: the node has ended the connection."""
         if result is None:
             endpoint.health.note_hung_up()
-        elif endpoint in self._probing or not liveness.may_be_kept(endpoint):
+        elif endpoint in self._probing or not liveness.may_use_kept_connection(endpoint):
             return  # meanwhile the node needs a probe by a call, or such a probe runs
         elif result is ProbeResult.ANSWERED:
             endpoint.health.note(result, now)
@@ -160,7 +160,7 @@ class Prober:
         if not endpoint.unused:
             endpoint.idle_since = None
             return
-        lease_time = liveness.lease_lasts(endpoint, self._context.settings.linger)
+        lease_time = liveness.unused_lease_lifetime(endpoint, self._context.settings.linger)
         if endpoint.note_unused(now) >= lease_time:
             log.info(
                 "port %d is free again: the lease of %s has ended",

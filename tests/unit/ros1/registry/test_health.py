@@ -73,23 +73,23 @@ def test_when_to_probe_with_an_interval_of_five_seconds(
     health = Health()
     for moment, probe in enumerate(probes):
         health.note(probe, float(moment))
-    assert health.due(now, 5.0) is due
+    assert health.probe_due(now, 5.0) is due
 
 
 def test_a_short_interval_holds_for_nodes_that_are_down_too() -> None:
     health = Health()
     health.note(R, 0.0)
     health.note(R, 0.0)
-    assert not health.due(0.1, 0.2)
-    assert health.due(0.2, 0.2)
+    assert not health.probe_due(0.1, 0.2)
+    assert health.probe_due(0.2, 0.2)
 
 
 def test_a_suspect_is_probed_at_once_and_its_process_id_forgotten() -> None:
     health = Health(pid=42)
     health.note(A, 0.0)
-    assert not health.due(1.0, 5.0)
+    assert not health.probe_due(1.0, 5.0)
     health.suspect()
-    assert health.due(1.0, 5.0)
+    assert health.probe_due(1.0, 5.0)
     assert health.pid != 42
 
 
@@ -106,15 +106,15 @@ def test_a_suspect_is_probed_at_once_and_its_process_id_forgotten() -> None:
     ],
 )
 def test_when_to_clean_up(health: Health, now: float, after: float, due: bool) -> None:
-    assert health.clean_up(now, after) is due
+    assert health.cleanup_due(now, after) is due
 
 
 def test_the_grace_period_counts_from_the_first_failure_and_starts_anew() -> None:
     health = Health()
     for moment, probe in [(0.0, S), (10.0, S), (20.0, A), (30.0, S), (40.0, S)]:
         health.note(probe, moment)
-    assert not health.clean_up(59.0, 30.0)
-    assert health.clean_up(60.0, 30.0)
+    assert not health.cleanup_due(59.0, 30.0)
+    assert health.cleanup_due(60.0, 30.0)
 
 
 def test_a_node_that_is_known_to_have_ended_is_down_at_once() -> None:
@@ -122,11 +122,11 @@ def test_a_node_that_is_known_to_have_ended_is_down_at_once() -> None:
     health.note(A, 1.0)
     health.end(2.0)
     assert (health.down, health.has_ended) == (True, True)
-    assert health.clean_up(2.0, after=30.0)  # at the next look, if not at once
-    assert not health.clean_up(2.0, after=0.0)
+    assert health.cleanup_due(2.0, after=30.0)  # at the next look, if not at once
+    assert not health.cleanup_due(2.0, after=0.0)
     health.note(S, 3.0)  # the address is silent, but the node won't come back
     assert (health.down, health.has_ended) == (True, True)
     assert not health.note(A, 4.0)
     assert not health.down
     assert (health.down, health.has_ended) == (False, False)
-    assert not health.clean_up(99.0, after=30.0)
+    assert not health.cleanup_due(99.0, after=30.0)

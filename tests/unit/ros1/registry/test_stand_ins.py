@@ -3,7 +3,7 @@
 from itertools import count
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.registry.stand_ins import TRIES, StandIn, StandIns
+from rosproxy.ros1.registry.stand_ins import MOST_TRIES, StandIn, StandIns
 from tests.unit.builders import make_stand_ins
 
 NEAR = "172.30.1.2"
@@ -42,7 +42,7 @@ def test_stand_ins_with_the_same_computed_port_get_a_port_each() -> None:
 def test_who_finds_all_taken_has_none() -> None:
     stand_ins = make_stand_ins(direction="both")
     stand_in = make_stand_in(1)
-    for stand_in.fast_attempts in range(TRIES):
+    for stand_in.fast_attempts in range(MOST_TRIES):
         stand_ins.by_port[stand_in.port] = make_stand_in(2)
     assert stand_ins.choose_fast_candidate(stand_in) is None
 

@@ -90,11 +90,11 @@ SAME = [
 ]
 
 
-@pytest.mark.parametrize(("former_pid", "pid", "borne_out", "same"), SAME)
+@pytest.mark.parametrize(("former_pid", "pid", "is_confirmed", "same"), SAME)
 def test_whether_it_is_the_same_process(
-    former_pid: int | None, pid: int | None, borne_out: bool | None, same: bool
+    former_pid: int | None, pid: int | None, is_confirmed: bool | None, same: bool
 ) -> None:
-    assert liveness.is_same_process(former_pid, pid, borne_out) is same
+    assert liveness.is_same_process(former_pid, pid, is_confirmed) is same
 
 
 TIMES = st.none() | st.integers(0, 12).map(float)
@@ -132,7 +132,7 @@ def test_nobody_who_is_due_or_unused_is_passed_over(
         assert not liveness.is_due(endpoint, 12.0, 5.0)
         assert not endpoint.unused
         assert endpoint.idle_since is None
-    if liveness.may_be_kept(endpoint):
+    if liveness.may_use_kept_connection(endpoint):
         assert health.pid == 7
         assert not any((health.failures, health.cleaned, direct))
 
@@ -149,18 +149,18 @@ def test_a_thousand_that_are_well_are_passed_over() -> None:
 def test_a_process_that_hangs_up_is_called_from_then_on_and_another_is_not() -> None:
     endpoint = add_node(make_addressing())
     health = endpoint.health
-    assert not liveness.may_be_kept(endpoint)  # no answer yet
+    assert not liveness.may_use_kept_connection(endpoint)  # no answer yet
     health.note(ProbeResult.ANSWERED, 1.0)
     health.pid = 7
-    assert liveness.may_be_kept(endpoint)
+    assert liveness.may_use_kept_connection(endpoint)
     health.note_hung_up()
-    assert health.due(1.0, 5.0)
+    assert health.probe_due(1.0, 5.0)
     health.note(ProbeResult.ANSWERED, 1.1)
-    assert not liveness.may_be_kept(endpoint)
+    assert not liveness.may_use_kept_connection(endpoint)
     health.pid = 8
-    assert liveness.may_be_kept(endpoint)
+    assert liveness.may_use_kept_connection(endpoint)
     health.suspect()
-    assert not liveness.may_be_kept(endpoint)
+    assert not liveness.may_use_kept_connection(endpoint)
 
 
 @pytest.mark.parametrize(

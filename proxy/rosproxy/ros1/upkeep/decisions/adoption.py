@@ -28,7 +28,8 @@ Container = tuple[str, Collection[str]]
 """The IP address of a container on an inside network, and the host names in lower case."""
 
 _NEW_URI = re.compile(r"\[(/[^\]\s]*)\] Reason: new node registered")
-"""rosmaster/registrations.py, shutdown_node_task."""
+"""The reason in a ``shutdown`` for a name with a new URI (rosmaster/registrations.py,
+shutdown_node_task)."""
 
 
 class DirectNode(msgspec.Struct, frozen=True):
@@ -104,7 +105,7 @@ def has_name_still(endpoint: Endpoint, uri: str | None, advertised: str) -> bool
 
     ``uri`` is the URI that the master has for the name now. The master calls ``shutdown`` at the
     URI that the name had before. The new URI may be a former URI of the same node, which registered
-    at the real master directly, or the advertised URI again.
+    at the real master directly, or the advertised URI again. None: the master has no URI.
     """
     if uri is None:  # the proxy is registering the node anew: the master has no URI meanwhile
         return endpoint.has_registered_directly

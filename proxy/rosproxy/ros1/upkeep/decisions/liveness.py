@@ -10,7 +10,7 @@ from enum import Enum
 
 from rosproxy.net.addresses import Network, is_address, is_inside, is_loopback
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
-from rosproxy.ros1.registry.node_health import UNKNOWN_PID, ProbeResult
+from rosproxy.ros1.registry.node_health import UNKNOWN_PIDS, ProbeResult
 
 LONGEST_DIRECT_INTERVAL_S = 2.0
 """The longest time between probes, in seconds, of a node that registered directly."""
@@ -61,8 +61,8 @@ def to_look_at(endpoints: Iterable[Endpoint], now: float, interval: float) -> li
     ]
 
 
-def may_be_kept(endpoint: Endpoint) -> bool:
-    """Whether a kept connection may ask the node: an answer then has no consequences."""
+def may_use_kept_connection(endpoint: Endpoint) -> bool:
+    """Whether to probe the node over a kept connection: an answer then has no consequences."""
     health = endpoint.health
     return (
         health.steady
@@ -73,7 +73,7 @@ def may_be_kept(endpoint: Endpoint) -> bool:
 
 def is_due(endpoint: Endpoint, now: float, interval: float) -> bool:
     """Whether to probe a node now; ``interval`` is that of idle nodes in seconds."""
-    return endpoint.health.due(
+    return endpoint.health.probe_due(
         now,
         min(interval, LONGEST_DIRECT_INTERVAL_S) if endpoint.has_registered_directly else interval,
     )
@@ -87,11 +87,15 @@ def is_to_be_unregistered(endpoint: Endpoint, now: float, after: float) -> bool:
     """
     if endpoint.has_registered_directly and endpoint.health.refused:
         after = min(after, NO_PATIENCE_S)
-    return endpoint.health.clean_up(now, after)
+    return endpoint.health.cleanup_due(now, after)
 
 
-def lease_lasts(endpoint: Endpoint, linger: float) -> float:
-    """Seconds for which an unused lease lasts; an hour for a silent node, which may come back."""
+def unused_lease_lifetime(endpoint: Endpoint, linger: float) -> float:
+    """Seconds for which an unused lease lasts.
+
+    These are ``linger`` seconds, but an hour for a node that was unregistered while silent, because
+    this node may come back.
+    """
     health = endpoint.health
     return FORGET_AFTER_S if health.cleaned and not (health.refused or health.has_ended) else linger
 
@@ -137,12 +141,13 @@ def moved_location(endpoint: Endpoint, address: str) -> NodeLocation:
     return NodeLocation(address, named=False, confirmed=previous.confirmed, stale=stale)
 
 
-def is_same_process(known_pid: int | None, pid: int | None, borne_out: bool | None) -> bool:
+def is_same_process(known_pid: int | None, pid: int | None, is_confirmed: bool | None) -> bool:
     """Whether the node that answers elsewhere with a pid is the node with a known pid.
 
     Each node that is alone in a container has the same pid. So the node also has to confirm its
-    registrations. ``borne_out`` says whether it does; if that is unknown (None), the pid decides.
+    registrations. ``is_confirmed`` says whether it does. If that is unknown (None), the pid
+    decides.
     """
-    if pid is not None and known_pid not in UNKNOWN_PID and known_pid != pid:
+    if pid is not None and known_pid not in UNKNOWN_PIDS and known_pid != pid:
         return False
-    return known_pid == pid and pid is not None if borne_out is None else borne_out
+    return known_pid == pid and pid is not None if is_confirmed is None else is_confirmed

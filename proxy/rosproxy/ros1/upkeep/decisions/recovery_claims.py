@@ -113,7 +113,8 @@ def confirmed_by(registrations: Iterable[Registration], info: NodeInfo) -> bool 
     """Whether the topics that a node names confirm the registrations.
 
     A forged URI may lead to a program that is not the node of that name. Then there is no answer
-    here, or the topics of another node. None: no topic is registered, or the node names no topics.
+    here, or the topics of another node. None: no topic is registered, or the node tells only a part
+    of its topics.
     """
     topics = {r.name for r in registrations if r.kind in TOPIC_KINDS}
     answers = [info.has(topic) for topic in (topics - {ROSOUT} or topics)]
@@ -151,7 +152,7 @@ def unconfirmed_registrations(
 def topics_and_services_to_ask(
     registrations: Iterable[Registration],
 ) -> tuple[list[str], list[Registration]]:
-    """The topics and services by which a node can confirm the registrations.
+    """The published topics and the services by which a node can confirm the registrations.
 
     At most `MOST_ASKED` of each, with /rosout as the last topic.
     """

@@ -7,7 +7,7 @@ has a name by a former URI of the same node, the proxy first takes back all regi
 name, and then registers the name again.
 
 The other functions compare three views of a node: the registry, the master, and what the node
-itself says (`NodeInfo`). A node names topics, but no services and parameters.
+itself says (`NodeInfo`). A node names its topics, but not its services and parameters.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -92,9 +92,11 @@ def restore_calls(
 
 
 def release_calls(uris: Mapping[str, str], caller: str) -> list[MethodCall]:
-    """The calls that end the parameter subscription of every node, and ask which names are left.
+    """The calls that end each node's subscription to COMMON_PARAMETER.
 
-    The master does not list such a subscription, but keeps the name of the node as known.
+    The master does not list such a subscription, but knows the name of the node as long as the
+    subscription lasts. So lookupNode asks for each name before and after. ``caller`` makes these
+    calls.
     """
     ask: list[MethodCall] = [("lookupNode", [caller, name]) for name in uris]
     params = [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in uris]
@@ -104,7 +106,11 @@ def release_calls(uris: Mapping[str, str], caller: str) -> list[MethodCall]:
 def read_release(
     uris: Mapping[str, str], values: Sequence[Any]
 ) -> tuple[list[Registration], dict[str, str]]:
-    """Read the results of `release_calls`: ended subscriptions; URIs of names that are left."""
+    """Read the results of `release_calls`.
+
+    Returns:
+        The subscriptions that have ended, and the URIs of the names that the master still knows.
+    """
     # The results: first where each name was, then the unsubscriptions, then where each name is.
     before = zip(uris, values, strict=False)
     after = zip(uris, values[2 * len(uris) :], strict=True)
@@ -142,7 +148,7 @@ def left_over_registrations(
 
 
 def vanished_topics(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
-    """The topics registered before a time that the node says not to have.
+    """The topics, registered before the time ``before``, that the node says it does not have.
 
     A node that registers at the real master directly also unregisters there. The master ignores
     such a call, because the master has another URI for the node.
@@ -168,7 +174,7 @@ def valid_registrations(
 
 
 def unregistered_topics(endpoint: Endpoint, info: NodeInfo) -> list[Registration]:
-    """The topics that a node has and the master does not know, with their types.
+    """The topics that a node has and that are not registered through the proxy, with their types.
 
     rospy gives up a registration without a master. If several node names share the slave API, the
     list is empty.
@@ -185,18 +191,22 @@ def unregistered_topics(endpoint: Endpoint, info: NodeInfo) -> list[Registration
 
 
 def lost_registrations(
-    ours: Sequence[Registration], state: Mapping[str, list[Registration]], before: float
+    recorded: Sequence[Registration], state: Mapping[str, list[Registration]], before: float
 ) -> list[Registration]:
-    """The registrations of the registry (``ours``) that the master no longer has.
+    """The registrations of the registry (``recorded``) that the master no longer has.
 
     ``before`` is the time at which the master was asked: later registrations do not count. The
     state of the master has no parameter subscriptions. These count as lost if the master has lost
     the whole node.
     """
-    ours = [r for r in ours if not r.hidden]
+    recorded = [r for r in recorded if not r.hidden]
     keys = {r.key for of_node in state.values() for r in of_node}
-    params = [r for r in ours if r.kind is Kind.PARAM]
-    gone = [r for r in ours if r.since < before and r.key not in keys and r.kind is not Kind.PARAM]
+    params = [r for r in recorded if r.kind is Kind.PARAM]
+    gone = [
+        r
+        for r in recorded
+        if r.since < before and r.key not in keys and r.kind is not Kind.PARAM
+    ]
     lost_nodes = {r.caller_id for r in gone} - set(state)
     return gone + [r for r in params if r.caller_id in lost_nodes]
 

@@ -122,7 +122,7 @@ def _networks_of(address: str, addressing: Addressing) -> frozenset[int]:
 def _not_forwarded(
     endpoint: Endpoint, group: list[TopicSubscription], rows: Sequence[BusRow], addresses: Addresses
 ) -> list[TopicSubscription]:
-    """The subscriptions to an endpoint that its connections in the kernel do not explain.
+    """The subscriptions to an endpoint that its connections in the kernel do not serve.
 
     If no connection comes from the host of a subscriber, NAT or Docker's port proxy hides the
     addresses. The function then counts all connections together.
@@ -144,11 +144,12 @@ def _not_forwarded(
 def _unserved(
     connections: int, group: list[TopicSubscription], rows: Sequence[BusRow]
 ) -> list[TopicSubscription]:
-    """The subscriptions of a group that none of its ``connections`` serves.
+    """The subscriptions of a group that no connection in the kernel serves.
 
-    The publisher's rows contain all open connections. If the rows do not tell enough subscriptions
-    apart, the whole group counts as unserved. A subscriber that was told in vain makes a new
-    connection, and the next look counts this connection.
+    ``connections`` is the number of the group's connections there. The publisher's rows contain all
+    open connections. If the rows do not tell enough subscriptions apart, the whole group counts as
+    unserved. A subscriber that was told in vain makes a new connection, and the next look counts
+    this connection.
     """
     if connections >= len(group):
         return []
