@@ -124,7 +124,7 @@ class MasterApi:
         """The reply to a parsed request. A request without changes passes as the original bytes."""
         policy = self._context.policy
         upstream = self._context.upstream
-        if not request.plain:
+        if not request.is_address_free:
             # Without the recovery, a node of a former process of the proxy would get another port.
             # rosmaster would shut the node down for the new URI (registrations.py,
             # _register_node_api).
@@ -133,7 +133,7 @@ class MasterApi:
             return await upstream.pass_to_master(request.body)
         version = policy.rules.version
         answers = await policy.check_request(request)
-        if request.plain and not any(answers) and not policy.reads_reply(request):
+        if request.is_address_free and not any(answers) and not policy.reads_reply(request):
             return await upstream.pass_to_master(request.body)
         async with self._admitted(request, answers, incoming) as outcomes:
             exported = master_api.export_request(request, outcomes, self._context.addressing)
@@ -261,7 +261,7 @@ class PublishedMaster:
             return await upstream.pass_to_master(call.body)
         caller = Caller(call.source, call.local.host, master=self._address)
         request = master_calls.read_request(call.body, caller, self._context.master_call)
-        if request.plain:
+        if request.is_address_free:
             return await upstream.pass_to_master(call.body)
         reply = await upstream.post_to_master(call.body)
         return master_api.rename_master(request, reply, self._address)

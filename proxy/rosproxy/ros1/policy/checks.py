@@ -84,7 +84,7 @@ class Ros1Policy:
     @property
     def idle(self) -> bool:
         """Whether there is nothing to check: no rule, and no hidden registration."""
-        return self.rules.empty and not self._registry.hides
+        return self.rules.empty and not self._registry.has_hidden
 
     # Calls at the master port
 
@@ -94,7 +94,7 @@ class Ros1Policy:
 
     def reads_reply(self, request: Request) -> bool:
         """Whether the proxy may have to change the master's reply to a request."""
-        if request.tells_graph and self._registry.hides:
+        if request.tells_graph and self._registry.has_hidden:
             return True
         lists_params = any(call and call.method == "getParamNames" for call in request.calls)
         return lists_params and self._filters_params(request.caller)
@@ -179,7 +179,7 @@ class Ros1Policy:
         call = result.call
         if call.method == "getParamNames":
             return self._without_denied_params(value, caller)
-        if call.method in GRAPH_METHODS and self._registry.hides:
+        if call.method in GRAPH_METHODS and self._registry.has_hidden:
             graph = self._hidden.complete_graph(call, xmlrpc.python_value(value))
             return [value.replaced_by(xmlrpc.dump_value(graph))]
         if method_spec(call.method).registers is Kind.SUBSCRIBER and result.endpoint:
@@ -194,7 +194,7 @@ class Ros1Policy:
 
         ``at_master`` are the publishers that the master tells this node.
         """
-        if not self._registry.hides:
+        if not self._registry.has_hidden:
             return [*dict.fromkeys(at_master)]
         return self._hidden.publishers_for(endpoint, topic, at_master)
 

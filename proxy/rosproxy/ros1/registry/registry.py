@@ -24,7 +24,7 @@ from rosproxy.ros1.registry.endpoint import (
 MOST_ADMISSIONS = 16
 """Remembered pairs of host:port and source for an endpoint. A node gives one host, from a single
 address, or from a few on a machine with several networks."""
-UNPROVEN_SHARE = 4
+UNPROVEN_DIVISOR = 4
 """Nodes of one source that have never answered may hold the range divided by this number. A healthy
 node answers within milliseconds after its first registration."""
 
@@ -190,7 +190,7 @@ class Registry:
     @property
     def most_unproven(self) -> int:
         """The highest number of endpoints of one source that have never answered."""
-        return max(1, len(self.pool.range) // UNPROVEN_SHARE)
+        return max(1, len(self.pool.range) // UNPROVEN_DIVISOR)
 
     def register(self, endpoint: Endpoint, registration: Registration) -> None:
         """Record what the master has accepted.
@@ -273,7 +273,7 @@ class Registry:
         ]
 
     @property
-    def hides(self) -> bool:
+    def has_hidden(self) -> bool:
         """Whether there is a hidden registration, which the master does not have."""
         return bool(self._hidden)
 

@@ -103,8 +103,11 @@ class Request(msgspec.Struct, frozen=True):
         return method_spec(self.method).reply is Reply.OTHER
 
     @property
-    def plain(self) -> bool:
-        """Whether request and reply pass unchanged."""
+    def is_address_free(self) -> bool:
+        """Whether neither the request nor the reply has an address or a registration.
+
+        A policy may refuse such a request all the same, or filter the reply.
+        """
         return all(call is None or method_spec(call.method) == NO_SPEC for call in self.calls)
 
 

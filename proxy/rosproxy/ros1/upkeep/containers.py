@@ -140,7 +140,7 @@ class ContainerEvents:
         """Move endpoints to the new addresses of their containers; return the number of nodes."""
         registry = self.context.registry
         addressing = self.context.addressing
-        candidates = liveness.movable(registry, moved, addressing.networks)
+        candidates = liveness.new_addresses(registry, moved, addressing.networks)
         answers = await asyncio.gather(*(self._inspect(e, new) for e, new in candidates.items()))
         infos = {e: info for e, info in zip(candidates, answers, strict=True) if info}
         former_uris = {endpoint: addressing.advertised_uri(endpoint) for endpoint in infos}

@@ -73,7 +73,7 @@ class Prober:
         for endpoint, result in self.kept_connections.collect(now).items():
             self._note_result(endpoint, result, now)
         busy = self._probing | self._recovery.verifying
-        for endpoint in liveness.to_look_at(context.registry, now, interval):
+        for endpoint in liveness.endpoints_to_check(context.registry, now, interval):
             if endpoint not in busy and liveness.is_due(endpoint, now, interval):
                 self._ask(endpoint, now)
             self._end_if_unused(endpoint)

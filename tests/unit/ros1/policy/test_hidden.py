@@ -118,7 +118,7 @@ def test_what_is_hidden_is_known_by_kind_and_name() -> None:
     assert hidden.publishers_for(c, "/t", []) == []
     registry.register(b, replace(b.registrations[Kind.SERVICE, "/s", "/b"], hidden=False))
     registry.remove(a)
-    assert not registry.hides
+    assert not registry.has_hidden
     assert c.names_at_master(Kind.SERVICE) == ["/shown"]
 
 

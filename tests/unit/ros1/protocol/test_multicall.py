@@ -200,7 +200,7 @@ def test_what_holds_no_call_goes_to_the_master_as_it_is(params: tuple[Any, ...])
     done = exchange(world(), NODE, body, reply)
     assert done.sent == body
     assert done.received == reply
-    assert master_calls.read_request(body, NODE).plain
+    assert master_calls.read_request(body, NODE).is_address_free
 
 
 def test_a_multicall_in_a_multicall_is_refused() -> None:
@@ -238,5 +238,5 @@ def test_empty_and_self_closing_results_keep_their_places() -> None:
 @pytest.mark.parametrize("calls", [[], [element("getParam", "/n", "/a")], [element("x"), 5]])
 def test_a_multicall_without_addresses_is_plain(calls: list[Any]) -> None:
     request = master_calls.read_request(py_call("system.multicall", calls), NODE)
-    assert request.plain
+    assert request.is_address_free
     assert request.method == MULTICALL

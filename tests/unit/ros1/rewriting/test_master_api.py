@@ -202,13 +202,13 @@ OTHER_METHODS = ["getParam", "setParam", "getSystemState", "system.listMethods",
 @pytest.mark.parametrize("method", OTHER_METHODS)
 def test_other_methods_are_plain(method: str) -> None:
     request = master_calls.read_request(py_call(method, ID, OWN, OUT), NODE)
-    assert request.plain
+    assert request.is_address_free
     assert request.method == method
 
 
 @pytest.mark.parametrize("method", ["registerPublisher", "lookupNode", "getUri"])
 def test_methods_of_the_table_are_not_plain(method: str) -> None:
-    assert not master_calls.read_request(py_call(method), NODE).plain
+    assert not master_calls.read_request(py_call(method), NODE).is_address_free
 
 
 def test_the_caller_is_known_by_its_name() -> None:

@@ -51,7 +51,7 @@ def test_who_may_have_moved() -> None:
         same.location.address: same.location.address,
         "10.0.0.99": "10.0.0.100",
     }
-    moves = liveness.movable(addressing.registry, update, addressing.networks)
+    moves = liveness.new_addresses(addressing.registry, update, addressing.networks)
     assert moves == {moved: "10.0.0.9"}
 
 
@@ -127,7 +127,7 @@ def test_nobody_who_is_due_or_unused_is_passed_over(
     endpoint.health = health
     endpoint.connections = connections
     endpoint.idle_since = idle_since
-    passed_over = not liveness.to_look_at([endpoint], 12.0, 5.0)
+    passed_over = not liveness.endpoints_to_check([endpoint], 12.0, 5.0)
     if passed_over:
         assert not liveness.is_due(endpoint, 12.0, 5.0)
         assert not endpoint.unused
@@ -142,8 +142,8 @@ def test_a_thousand_that_are_well_are_passed_over() -> None:
     endpoint = add_node(addressing)
     add_registration(addressing, endpoint, Kind.PUBLISHER, "/chatter")
     endpoint.health.note(ProbeResult.ANSWERED, 10.0)
-    assert liveness.to_look_at([endpoint] * 1000, 14.9, 5.0) == []
-    assert liveness.to_look_at([endpoint], 15.0, 5.0) == [endpoint]
+    assert liveness.endpoints_to_check([endpoint] * 1000, 14.9, 5.0) == []
+    assert liveness.endpoints_to_check([endpoint], 15.0, 5.0) == [endpoint]
 
 
 def test_a_process_that_hangs_up_is_called_from_then_on_and_another_is_not() -> None:

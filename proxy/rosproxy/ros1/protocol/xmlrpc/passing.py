@@ -34,10 +34,10 @@ HEAD_BYTES = 4096
 MOST_DEPTH = 64
 """The highest number of nested elements in a multicall, as in `Limits`."""
 LONGEST_MARKUP = 64 * 1024
-"""Bytes of a tag, comment or processing instruction in a multicall. expat buffers such markup until
-the markup is complete. Before version 2.6, expat starts again at the beginning with each new
-piece."""
-LONGEST_NAMES = 4096
+"""The highest number of bytes of a tag, comment or processing instruction in a multicall. expat
+buffers such markup until the markup is complete. Before version 2.6, expat starts again at the
+beginning with each new piece."""
+MOST_NAME_CHARACTERS = 4096
 """Characters of all names of elements and attributes in a multicall, each name counted once. The
 parser keeps the names until the end of the document. XML-RPC has 20 names."""
 
@@ -91,6 +91,7 @@ _CONTENT_DEPTH = 11
 """The depth of the content of a member's value."""
 _METHOD = ["name:methodName", "value"]
 _PARAMS = ["name:params", "value", "array"]
+"""The two members of a call, as `MulticallWatch` collects their elements and names."""
 
 
 def method_of(head: bytes) -> str | None:
@@ -244,9 +245,9 @@ class MulticallWatch(CallWatch):
             if name not in self._names:
                 self._names.add(name)
                 self._names_length += len(name)
-        if self._names_length > LONGEST_NAMES:
+        if self._names_length > MOST_NAME_CHARACTERS:
             text = f"the names of elements and attributes in a long {MULTICALL} have more than"
-            raise XmlRpcError(PARSE_ERROR, f"{text} {LONGEST_NAMES} characters together")
+            raise XmlRpcError(PARSE_ERROR, f"{text} {MOST_NAME_CHARACTERS} characters together")
 
     def _end(self, name: str) -> None:
         if self._depth == _FIELD_DEPTH and name == "name":

@@ -42,7 +42,9 @@ def after_answer(endpoint: Endpoint, pid: int | None) -> AfterAnswer:
     return AfterAnswer.RECONCILE if endpoint.has_registered_directly else AfterAnswer.NOTHING
 
 
-def to_look_at(endpoints: Iterable[Endpoint], now: float, interval: float) -> list[Endpoint]:
+def endpoints_to_check(
+    endpoints: Iterable[Endpoint], now: float, interval: float
+) -> list[Endpoint]:
     """The endpoints that may be due for a probe, or whose lease may end.
 
     The proxy goes through all endpoints several times a second. So the test is a single expression
@@ -119,10 +121,13 @@ def dead_endpoints(answers: Mapping[Endpoint, ProbeResult], since: float) -> lis
     ]
 
 
-def movable(
+def new_addresses(
     endpoints: Iterable[Endpoint], moved: Mapping[str, str], networks: Sequence[Network]
 ) -> dict[Endpoint, str]:
-    """The endpoints with a changed address, each with the new address, if inside."""
+    """The new addresses of endpoints that have moved to an address inside.
+
+    ``moved`` maps old addresses to new addresses. Endpoints without a new address are left out.
+    """
     moves = {e: moved.get(e.location.address, "") for e in endpoints}
     return {
         e: new for e, new in moves.items() if new != e.location.address and is_inside(new, networks)
