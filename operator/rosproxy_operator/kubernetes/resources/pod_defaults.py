@@ -86,9 +86,7 @@ def with_pod_defaults(observed: ClusterSnapshot, defaults: PodDefaults) -> Clust
 def _completed(rosproxy: RosProxy, defaults: PodDefaults) -> RosProxy:
     spec = rosproxy.spec
     given = {
-        name: getattr(defaults, name)
-        for name in _REPLACEABLE_FIELDS
-        if getattr(spec, name) is None
+        name: getattr(defaults, name) for name in _REPLACEABLE_FIELDS if getattr(spec, name) is None
     }
     if not given:
         return rosproxy

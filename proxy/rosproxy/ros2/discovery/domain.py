@@ -189,7 +189,9 @@ class Domain:
             return self._heard_by_relay(relay, datagram, now)
         # Forged participants may fill the table, so that no participant is known at this address.
         # So the proxy accepts the first answer to a question from any source.
-        if not self.proofs.is_first_answer(source, datagram) and self.outside.refuses_source(source):
+        if not self.proofs.is_first_answer(source, datagram) and self.outside.refuses_source(
+            source
+        ):
             return []
         return self._heard_at_discovery(datagram, source, False, now)
 

@@ -122,9 +122,7 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
         annotation: value
         for annotation, variable, value in _address_variables(wanted)
         if any(
-            _value(c, variable) == value
-            for kind in _CONTAINER_FIELDS
-            for c in wired.get(kind, ())
+            _value(c, variable) == value for kind in _CONTAINER_FIELDS for c in wired.get(kind, ())
         )
     }
     if replaced and MASTER_URI in new_annotations:

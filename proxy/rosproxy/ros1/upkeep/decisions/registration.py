@@ -203,9 +203,7 @@ def lost_registrations(
     keys = {r.key for of_node in state.values() for r in of_node}
     params = [r for r in recorded if r.kind is Kind.PARAM]
     gone = [
-        r
-        for r in recorded
-        if r.since < before and r.key not in keys and r.kind is not Kind.PARAM
+        r for r in recorded if r.since < before and r.key not in keys and r.kind is not Kind.PARAM
     ]
     lost_nodes = {r.caller_id for r in gone} - set(state)
     return gone + [r for r in params if r.caller_id in lost_nodes]
