@@ -43,7 +43,7 @@ from rosproxy_operator.kubernetes.settings import (
 
 
 def _read_bind(example: HostPort, optional: bool, text: str) -> HostPort | None:
-    """Parse ``host:port``; if ``optional``, ``none`` is None. Raises ValueError."""
+    """Parse ``host:port``. With ``optional``, the text ``none`` gives None. Raises ValueError."""
     listener = parse_host_port(text)
     if listener is None and not (optional and text == "none"):
         raise ValueError(f"{text!r} is not of the form {example}")
@@ -53,7 +53,10 @@ def _read_bind(example: HostPort, optional: bool, text: str) -> HostPort | None:
 def _bind_option(
     name: str, example: HostPort, text: str, optional: bool = False
 ) -> Callable[[Command], Command]:
-    """An option for an address and port. The default is the example; if ``optional``, none."""
+    """An option for an address and port.
+
+    The default is ``example``; with ``optional``, the text ``none``.
+    """
     kind = Parsed("address:port", partial(_read_bind, example, optional))
     return click.option(name, type=kind, default="none" if optional else str(example), help=text)
 
@@ -230,7 +233,7 @@ def health() -> None:
     """Exit with 0 if the operator is alive, with 1 if not; for container health checks."""
     from rosproxy.admin.admin_client import AdminClient, AdminError, default_url
 
-    # Without the variable, default_url() returns the port of a proxy, 11312, not 11313.
+    # Without the variable, default_url() has the port of a proxy, 11312. The operator has 11313.
     url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else f"http://{DEFAULT_ADMIN}"
     try:
         AdminClient(url).get("/healthz", within=3.0)

@@ -14,7 +14,7 @@ from rosproxy_operator.common.problem import Problem
 
 @contextlib.contextmanager
 def exit_on_error(*expected: type[Exception]) -> Iterator[None]:
-    """Print a LookFailed or ``expected`` error of the context in a line, and exit with 1."""
+    """On a LookFailed or ``expected`` error in the ``with`` block, print a line and exit with 1."""
     errors: tuple[type[Exception], ...] = (LookFailed, *expected)
     try:
         yield

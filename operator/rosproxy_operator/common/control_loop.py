@@ -25,12 +25,12 @@ log = logging.getLogger(__name__)
 RETRY_PAUSES_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Seconds from a failed look to the next look; the last value repeats."""
 BEAT_INTERVAL_S = 1.0
-"""Seconds between two times at which the event loop notes that it runs."""
+"""Seconds between two beats. A beat notes that the event loop runs."""
 HANGING_AFTER_S = 20.0
-"""Seconds without such a note after which the event loop counts as hanging."""
+"""Seconds without a beat after which the event loop counts as hanging."""
 
 UNSETTLED_RECHECK_S = 1.0
-"""Seconds until the next look of `ControlLoop.run_until` without an event."""
+"""Seconds from a successful look of `ControlLoop.run_until` to the next look without an event."""
 
 Look = Callable[[], Awaitable[float | None]]
 """Looks and acts. Returns the longest time in seconds to the next look; None: the resync interval.
@@ -52,17 +52,17 @@ class LookImpossible(LookFailed):
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """The times of a loop, in seconds.
+    """The times of a loop, in seconds, and the name of the engine.
 
-    ``resync`` is the longest and ``debounce`` the shortest time from the end of a look to the next
-    look. ``longest`` is the time-out of a look: the loop cancels the look then. Messages name the
-    ``engine``.
+    After a successful look, ``resync`` is the longest time to the next look. ``debounce`` is the
+    shortest time between two looks. After ``timeout`` the loop cancels a look. ``engine`` is the
+    word for the engine in messages.
     """
 
     engine: str
     resync: float
     debounce: float
-    longest: float
+    timeout: float
 
 
 class ControlLoop:
@@ -100,7 +100,7 @@ class ControlLoop:
                 await self._pause(self._pace.resync)
 
     async def run_until(self, look: Look, settled: Callable[[], bool], seconds: float) -> None:
-        """Look until a look succeeds and ``settled()`` is true, for so many seconds at most.
+        """Look until a look succeeds and ``settled()`` is true, for at most ``seconds``.
 
         Raises LookFailed if a look reports that the engine is away, and LookImpossible.
         """
@@ -120,7 +120,7 @@ class ControlLoop:
         self._woken.set()
 
     def wake_threadsafe(self) -> None:
-        """Look again soon. Any thread may call this at any time."""
+        """Look again soon. Any thread may call this; before `run`, it has no effect."""
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the event loop has ended
                 self._loop.call_soon_threadsafe(self._woken.set)
@@ -159,7 +159,7 @@ class ControlLoop:
         since = self._looking_since
         if now - self._beat_at > HANGING_AFTER_S:
             return f"the event loop has not run for {now - self._beat_at:.0f} s"
-        if since is not None and now - since > self._pace.longest:
+        if since is not None and now - since > self._pace.timeout:
             return f"a look at the {self._pace.engine} has lasted for {now - since:.0f} s"
         return None
 
@@ -179,10 +179,10 @@ class ControlLoop:
         self._awaiting_look = []
         self._looking_since = asyncio.get_running_loop().time()
         try:
-            async with asyncio.timeout(self._pace.longest):
+            async with asyncio.timeout(self._pace.timeout):
                 self._again_in = await look()
         except TimeoutError:
-            reason = f"a look at the {self._pace.engine} took more than {self._pace.longest:.0f} s"
+            reason = f"a look at the {self._pace.engine} took more than {self._pace.timeout:.0f} s"
             self._failed(LookFailed(reason, away=True))
         except LookFailed as error:
             is_final = isinstance(error, LookImpossible)

@@ -14,7 +14,7 @@ UNRESOLVED_RETRY_S = 3.0
 
 
 class MasterResolver:
-    """The addresses of the masters' hosts. While a name server fails, the last address stays.
+    """The addresses of the masters' hosts. If a name no longer resolves, its last address stays.
 
     `refresh` calls ``changed`` after a change of an address. In all methods, a host is a name or
     an address, in lower case.
@@ -28,7 +28,7 @@ class MasterResolver:
         self._excluded: frozenset[str] = frozenset()
 
     def address(self, host: str) -> str:
-        """Return the address of a host; empty if the resolver has no address yet."""
+        """Return the address of a host: resolved, else the fallback of `learn`, else empty."""
         if is_address(host):
             return plain_address(host)
         return self._resolved.get(host) or self._fallback.get(host, "")
@@ -46,19 +46,19 @@ class MasterResolver:
         wanted = {host for host in hosts if not is_address(host)}
         self._asked_at = {host: self._asked_at.get(host, 0.0) for host in wanted}
         self._resolved = {host: self._resolved[host] for host in wanted if host in self._resolved}
-        await self._ask([host for host, when in self._asked_at.items() if not when])
+        await self._ask([host for host, at in self._asked_at.items() if not at])
 
     async def refresh(self) -> None:
         """Resolve the names that are due, and call ``changed`` if an address changes."""
         now = time.monotonic()
         previous = dict(self._resolved)
         await self._ask(
-            [host for host, when in self._asked_at.items() if now >= when + self._age(host)]
+            [host for host, at in self._asked_at.items() if now >= at + self._interval(host)]
         )
         if self._resolved != previous:
             self._changed()
 
-    def _age(self, host: str) -> float:
+    def _interval(self, host: str) -> float:
         return RESOLVE_INTERVAL_S if host in self._resolved else UNRESOLVED_RETRY_S
 
     async def _ask(self, hosts: list[str]) -> None:

@@ -3,8 +3,8 @@
 Each proxy has its own nodes inside. All proxies of a master have the same nodes outside, so the
 merged page shows each node and each link once. A node outside one proxy may be inside another. A
 master on loopback is a different master on each host. A participant of ROS 2 has the same key at
-all proxies: the domain and the GUID prefix, which is unique. If a proxy does not answer, its node
-on the page says why.
+all proxies: the domain and the unique GUID prefix. If a proxy does not answer, the page shows the
+proxy as a node with the reason.
 
 An attacker may control a proxy. So each proxy gets a fair share of the nodes, links and findings,
 and the operator shortens all texts as a proxy of this release does. A proxy can't forge the key of
@@ -91,18 +91,18 @@ def merged(
             nodes[name] = PageNode(HOST, PROXY, name, BROKEN, text, logs(name))
             continue
         others = documents.keys() - {name}
-        names = {
+        page_keys = {
             key: _key(name, document, key, node, others) for key, node in document.nodes.items()
         }
         for key, node in document.nodes.items():
-            if node.lane != CONTAINER and names[key] in inside:
-                names[key] = inside[names[key]]  # the proxy with the node inside knows more
+            if node.lane != CONTAINER and page_keys[key] in inside:
+                page_keys[key] = inside[page_keys[key]]  # the proxy with the node inside knows more
                 continue
-            known = nodes.get(names[key])
+            known = nodes.get(page_keys[key])
             if known and _RANKS.get(known.state, 0) > _RANKS.get(node.state, 0):
                 continue  # an earlier proxy reports a worse state
-            nodes[names[key]] = _placed(name, key, node, places)
-        for link in _own_links(name, document, names):
+            nodes[page_keys[key]] = _placed(name, key, node, places)
+        for link in _own_links(name, document, page_keys):
             links[link.key] = max(links.get(link.key, link), link, key=_report_rank)
         findings += ((name, replace(f, subject=f"{name}: {f.subject}")) for f in document.findings)
         left_out += document.left_out
@@ -120,8 +120,8 @@ def merged(
 def _placed(name: str, key: str, node: PageNode, places: Mapping[str, str]) -> PageNode:
     """Return a node of the proxy ``name`` with the label, the proxy and the place on the page.
 
-    A participant without known nodes gets the name of its container or pod as its label. The
-    operator ignores places that a proxy reports.
+    A participant without known nodes gets the name of its container or pod as its label. A node
+    outside has no proxy and no place. The operator ignores places that a proxy reports.
     """
     label = name if node.kind == PROXY else node.label or key
     if node.lane != CONTAINER:
@@ -178,15 +178,15 @@ def _size(document: Document | str) -> int:
 
 
 def _report_rank(link: PageLink) -> tuple[int, bool, bool]:
-    """Return the rank of a proxy's report of a link. The page shows the report with the highest.
+    """Return the rank of a proxy's report of a link. The page shows the report of highest rank.
 
-    A worse state ranks higher. Otherwise OK ranks above unknown, and then a report with a port.
+    A worse state ranks higher. OK ranks above unknown. Then a report with a port ranks higher.
     """
     return _RANKS.get(link.state, 0), link.state == OK, link.port is not None
 
 
 def _inside(documents: Mapping[str, Document | str]) -> dict[str, str]:
-    """Return the keys of all nodes inside, by the keys that other proxies give these nodes."""
+    """Return the page keys of all nodes inside, by the page keys of the same nodes as outside."""
     return {
         _outside_key(name, document, key, node, documents.keys() - {name}): f"{name} {key}"
         for name, document in documents.items()
@@ -204,10 +204,10 @@ def _key(name: str, document: Document, key: str, node: PageNode, others: Set[st
 
 
 def _outside_key(name: str, document: Document, key: str, node: PageNode, others: Set[str]) -> str:
-    """Return the key of a node as a node outside.
+    """Return the key that a node has on the page as a node outside.
 
-    If the first word is in ``others``, ``name`` comes first. Otherwise a proxy could forge a key
-    of another proxy.
+    ``others`` are the names of the other proxies. If the key would begin with one of them, ``name``
+    is put in front. So a proxy can't forge a key of another proxy.
     """
     outside_key = key
     if node.kind != PARTICIPANT:
@@ -218,17 +218,18 @@ def _outside_key(name: str, document: Document, key: str, node: PageNode, others
     return f"{name} {outside_key}" if _first_word(outside_key) in others else outside_key
 
 
-def _own_links(name: str, document: Document, names: Mapping[str, str]) -> Iterator[PageLink]:
-    """Yield the links with an end inside a proxy. ``names`` has the keys of the ends on the page.
+def _own_links(name: str, document: Document, page_keys: Mapping[str, str]) -> Iterator[PageLink]:
+    """Yield the links of a document with an end inside the proxy ``name``.
 
-    A proxy shows no other links (`rosproxy.page.graph_document`). Each link with a port gets the
-    key of this proxy's node, if the document has such a node.
+    ``page_keys`` has the key on the page for each key in the document. A proxy of this release
+    shows no other links (`rosproxy.page.graph_document`). Each link with a port gets the key of the
+    proxy's own node, if the document has this node.
     """
-    carriers = (names[key] for key, node in document.nodes.items() if node.kind == PROXY)
+    carriers = (page_keys[key] for key, node in document.nodes.items() if node.kind == PROXY)
     carrier = next(carriers, "")
     for link in document.links.values():
-        source = names.get(link.source)
-        target = names.get(link.target) if link.target else ""
+        source = page_keys.get(link.source)
+        target = page_keys.get(link.target) if link.target else ""
         if source is None or target is None:
             continue
         if name in (_first_word(source), _first_word(target)):

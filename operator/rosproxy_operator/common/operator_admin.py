@@ -45,7 +45,7 @@ class OperatorAdminServer:
     """The HTTP server of the admin endpoint.
 
     ``alive`` and ``ready`` are the checks at ``/healthz`` and ``/readyz``. ``status`` and the
-    ``page`` answer only callers on loopback.
+    ``page`` answer only callers on loopback. Without ``status`` there is no ``/status``.
     """
 
     def __init__(

@@ -17,8 +17,8 @@ from prometheus_client import (
 
 from rosproxy import __version__
 
-# prometheus_client adds a second series for each counter, with its start time: no alert and no
-# dashboard uses these series.
+# prometheus_client adds a series with the start time of each counter. No alert and no dashboard
+# uses these series.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 OUTCOMES = ("ok", "unavailable", "failed")
@@ -35,9 +35,9 @@ _BEFORE_CAPITAL = re.compile(r"(?<!^)(?=[A-Z])")
 class CommonMetrics:
     """The metrics of both operators, in a separate registry.
 
-    ``source`` names the API that the operator reads; the gauge ``up`` says whether this API
-    answers. ``site`` names what the operator changes. ``states`` are the possible states of a
-    proxy.
+    ``source`` names the API that the operator reads. ``up`` is the name of the gauge that says
+    whether this API answers. ``site`` is the word for the host or cluster that the operator
+    changes. ``states`` are the possible states of a proxy.
     """
 
     def __init__(self, source: str, site: str, states: Sequence[str], up: str) -> None:
@@ -66,7 +66,7 @@ class CommonMetrics:
         self._jobs = self._gauge("jobs", text, ["state"])
 
     def show_proxies(self, states: Iterable[str]) -> None:
-        """Set the number of proxies in each state."""
+        """Set the number of proxies in each state. ``states`` has the state of every proxy."""
         tally = Tally(states)
         for state in self._states:
             self.proxies.labels(state).set(tally[state])

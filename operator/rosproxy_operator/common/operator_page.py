@@ -32,14 +32,15 @@ def operator_page(
 ) -> Page:
     """Return the page. ``documents`` requests the documents of all proxies.
 
-    ``logs`` and ``places``: `merged`.
+    ``logs`` returns the command that shows the logs of a proxy. ``places`` returns the names of
+    containers or pods inside, by address.
     """
 
     async def make() -> AsyncGenerator[dict[str, Any]]:
         while True:
             proxy_documents = await documents()
-            named = places()
-            yield await asyncio.to_thread(merged, proxy_documents, __version__, logs, named)
+            names = places()
+            yield await asyncio.to_thread(merged, proxy_documents, __version__, logs, names)
             await asyncio.sleep(ROUND_PAUSE_S)
 
     return Page(Feed(Tasks(), make), Visitors(None, time.monotonic, local=True))

@@ -3,7 +3,7 @@
 A proxy should keep its range: ROS nodes are registered at the master under the ports of the range.
 So `kept_ranges` gives each proxy its present range, or a former range that is free. Then
 `assign_ranges` gives ranges to the other proxies, and more ports to proxies with too few. The
-operator of each engine finds out which ports are not free.
+caller, the operator of an engine, passes the ports that are not free.
 """
 
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping
@@ -16,7 +16,7 @@ LAST_PORT = 65535
 REFUSED_RANGE_KEPT_S = 20.0
 """Seconds for which a proxy that has served keeps a range whose ports the engine refuses.
 
-Then the proxy gets another range.
+After that time the proxy gets another range.
 """
 REFUSED_PORT_AVOIDED_S = 300.0
 """Seconds for which the operator avoids a port that the engine has refused."""
@@ -93,7 +93,7 @@ def advice_after_move(ros1: bool, ros2: bool) -> str:
 class PortsExhausted(Exception):
     """A window does not have ``count`` consecutive free ports.
 
-    ``free`` are the lengths of the free stretches in the window.
+    ``free`` has the lengths of the free stretches in the window.
     """
 
     def __init__(self, count: int, window: PortRange, free: Collection[int]) -> None:
@@ -215,10 +215,10 @@ def local_ports(
 ) -> PortRange:
     """Return the ports for outgoing connections of a proxy that listens on the ``listening`` ports.
 
-    These ports are apart from ``listening``. Else a connection might take a port of the proxy's
-    range before a node needs the port. The result is the first range of `LOCAL_PORTS` without ports
-    of ``listening``; this range may have ports of ``stand_ins``. If there is none, the result is
-    the longest range without ports of ``listening`` and of ``stand_ins``.
+    The result is the first range of `LOCAL_PORTS` without ports of ``listening``; this range may
+    have ports of ``stand_ins``. If there is none, the result is the longest range without ports of
+    ``listening`` and of ``stand_ins``. If ``listening`` had ports of the result, a connection might
+    take a port of the proxy's range before a node needs the port.
     """
     free = gaps(_UNPRIVILEGED_PORTS, (), [*listening, *stand_ins])
     longest = max(free, key=len, default=LOCAL_PORTS[0])

@@ -27,7 +27,7 @@ class Problem:
 
 
 def bounded(text: str, most: int) -> str:
-    """Return the text, with at most so many characters. A cut text ends in an ellipsis."""
+    """Return the text, cut to ``most`` characters at most. A cut text ends in an ellipsis."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
@@ -38,7 +38,10 @@ class ProblemLog:
         self._logged: dict[Problem, None] = {}
 
     def update(self, problems: Iterable[Problem]) -> None:
-        """Log new problems and solved subjects. ``problems`` are all current problems."""
+        """Log new problems, and subjects whose problems are solved.
+
+        ``problems`` are all current problems.
+        """
         current = dict.fromkeys(problems)
         for problem in current:
             if problem not in self._logged:

@@ -8,8 +8,8 @@ import msgspec
 from rosproxy.setting_kinds import declared
 from rosproxy.settings import Settings
 
-PREFIX = "proxy-"
-"""The prefix of the operator's options."""
+OPTION_PREFIX = "proxy-"
+"""The prefix of the operator's options for the bounds of proxies."""
 _OWN = {setting.field: setting.default for setting in declared(Settings)}
 
 
@@ -23,8 +23,9 @@ class ProxyBounds(msgspec.Struct, frozen=True):
 
 
 OWN_BOUNDS = ProxyBounds()
+"""The bounds of a proxy without options."""
 
 
 def make_proxy_bounds(options: Mapping[str, Any]) -> ProxyBounds:
-    """Return the bounds from the values of the operator's options. Keys are parameter names."""
+    """Return the bounds from options, by parameter name such as ``proxy_max_body``."""
     return ProxyBounds(*(options[f"proxy_{name}"] for name in ProxyBounds.__struct_fields__))

@@ -45,11 +45,13 @@ class ProxyError(Exception):
     """A proxy did not carry out a request.
 
     ``is_unreachable``: no answer in time, or an error of the operating system, such as no route. A
-    refused connection does not count. ``status`` is the HTTP status; 0 without an HTTP answer.
-    ``lacks_master``: HTTP 503. The proxy answers, but its master does not, or all places for
-    callers are taken. ``is_unreadable``: the answer has more bytes than the operator reads. After
-    other errors the proxy may have restarted, so the operator for Kubernetes sends everything
-    again. An answer with too many bytes is no sign of a restart.
+    refused connection does not count as unreachable. ``status`` is the HTTP status; 0 without an
+    HTTP answer. ``lacks_master``: HTTP 503. The proxy answers, but its master does not, or all
+    places for callers are taken.
+
+    ``is_unreadable``: the answer has more bytes than the operator reads. This is no sign of a
+    restart. After all other errors the proxy may have restarted, so the operator for Kubernetes
+    sends everything again.
     """
 
     def __init__(
@@ -87,10 +89,10 @@ class ProxyClient:
     async def changes(
         self, admin: HostPort, token: str, since: str, within: float
     ) -> tuple[str, ProxyStatus]:
-        """Wait until the version of the status differs from ``since``. Return version and status.
+        """Wait until the status has another version than ``since``. Return version and status.
 
-        The proxy answers after ``within`` seconds, even without a change. If a proxy can't report
-        changes, the error has the HTTP status 403, 404, 405 or 503.
+        The proxy answers after ``within`` seconds at the latest, even without a change. If a proxy
+        can't report changes, the error has the HTTP status 403, 404, 405 or 503.
         """
         path = f"/status/changes?since={quote(since)}&within={within:g}"
         within += ANSWER_TIMEOUT_S
@@ -126,7 +128,7 @@ class ProxyClient:
     async def documents(
         self, proxies: Mapping[str, tuple[HostPort, str]]
     ) -> dict[str, Document | str]:
-        """Request many page documents, by name of the proxy. Instead of an error, return a text."""
+        """Request the page document of each proxy, by name. A failed request gives a text."""
         room = asyncio.Semaphore(MOST_PAGE_REQUESTS)
 
         async def ask(admin: HostPort, token: str) -> Document | str:
@@ -187,8 +189,8 @@ class ProxyClient:
     ) -> None:
         """Send the addresses that may use the proxy as their master.
 
-        ``peers`` are the peers of ROS 2; None: unchanged. ``former`` are the ports that
-        participants had at the previous proxy, by GUID prefix.
+        ``peers`` are the peers of ROS 2; None: the proxy keeps its peers. ``former`` has the ports
+        of participants at the previous proxy, by GUID prefix.
         """
         body: dict[str, Any] = {"selected": sorted(addresses)}
         if peers is not None:

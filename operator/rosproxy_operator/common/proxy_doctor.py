@@ -40,9 +40,9 @@ def read_findings(proxy: str, output: bytes) -> list[DoctorFinding]:
 def without_names_of_others(
     findings_by_proxy: Sequence[Sequence[DoctorFinding]], names: Sequence[str]
 ) -> list[DoctorFinding]:
-    """Return the findings of all proxies, without "unknown name" if any proxy knows the name.
+    """Return the findings of all proxies, without "unknown name" for names that any proxy knows.
 
-    Each proxy has a graph of its own, and a topic of ROS 1 is in no domain of ROS 2.
+    Each proxy knows only its own graph: a topic of ROS 1 is in no domain of ROS 2.
     """
     known = {name for findings in findings_by_proxy for name in _known(findings, names)}
     return [
@@ -55,8 +55,8 @@ def without_names_of_others(
 
 def _known(findings: Sequence[DoctorFinding], names: Sequence[str]) -> set[str]:
     """Return the ``names`` that are subjects of a proxy's findings, except unknown names."""
-    told = {word for f in findings if f.check != UNKNOWN_NAME for word in _words(f)}
-    return told & {*names}
+    reported = {word for f in findings if f.check != UNKNOWN_NAME for word in _words(f)}
+    return reported & {*names}
 
 
 def _words(finding: DoctorFinding) -> set[str]:

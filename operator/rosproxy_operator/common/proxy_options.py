@@ -8,7 +8,7 @@ import click
 from rosproxy.cli.options import Command, click_option, click_type, with_options
 from rosproxy.setting_kinds import POLICY_RULES, declared
 from rosproxy.settings import Settings
-from rosproxy_operator.common.proxy_bounds import PREFIX, ProxyBounds
+from rosproxy_operator.common.proxy_bounds import OPTION_PREFIX, ProxyBounds
 
 _POLICY = (
     click.option(
@@ -28,7 +28,7 @@ _POLICY = (
     ),
 )
 _BOUNDS = [
-    click_option(setting, PREFIX)
+    click_option(setting, OPTION_PREFIX)
     for setting in declared(Settings)
     if setting.field in ProxyBounds.__struct_fields__
 ]

@@ -1,8 +1,8 @@
 """The operator's session with a proxy: the admin endpoint, and the facts that the proxy confirmed.
 
 A proxy stores nothing on disk. After a restart, the proxy lacks the current policy and the selected
-addresses. So the session notes what the running process has confirmed (`ProxySession.forget`). The
-operator of each engine decides when to send the rest.
+addresses. So the session notes the facts that the running process has confirmed, and
+`ProxySession.forget` drops these notes. The operator of each engine decides when to send facts.
 """
 
 import asyncio
@@ -21,8 +21,9 @@ from rosproxy_operator.common.proxy_status import Leases
 class AllowedCallers:
     """The addresses that may use a proxy, and what the operator sends in the same call.
 
-    ``peers`` are the peers of ROS 2. None: not sent, for ROS 1 and on Docker; there, an option of
-    the proxy has the peers. ``former_leases`` are the ports of participants at the previous proxy.
+    ``peers`` are the peers of ROS 2; None: do not send peers. ROS 1 has no peers. On Docker, an
+    option of the proxy has the peers. ``former_leases`` are the ports of participants at the
+    previous proxy.
     """
 
     addresses: tuple[str, ...]
@@ -31,7 +32,7 @@ class AllowedCallers:
 
 
 class ProxySession:
-    """Sends facts to a proxy, and notes what the proxy confirms. All calls raise ProxyError."""
+    """Sends facts to a proxy, and notes the confirmed facts. All requests raise ProxyError."""
 
     def __init__(self, client: ProxyClient, admin: HostPort, token: str) -> None:
         self.admin = admin
@@ -43,7 +44,7 @@ class ProxySession:
         self._runs = 0
 
     def forget(self) -> None:
-        """Note that a new process of the proxy may answer, which has confirmed nothing."""
+        """Drop all notes: a new process of the proxy may answer, which has confirmed nothing."""
         self._policy = self._callers = None
         self._runs += 1
 
@@ -71,7 +72,7 @@ class ProxySession:
                 return
             run = self._runs
             await self._client.send_policy(self.admin, self.token, layers)
-            if run == self._runs:  # else maybe the former process has confirmed
+            if run == self._runs:  # otherwise the former process may have confirmed
                 self._policy = layers
 
     async def send_callers(self, callers: AllowedCallers) -> None:

@@ -11,13 +11,13 @@ from rosproxy.settings import LEAST_PORTS_PER_DOMAIN
 LAST_DOMAIN = 232
 """The last domain whose well-known ports are below 65536 (DDSI-RTPS 2.5, 9.6.2.3)."""
 MOST_PEERS = 32
-"""Hosts in a label or field at most. Each announcement goes to at least 32 ports of each host."""
+"""The most hosts in a label or field. Each announcement goes to at least 32 ports of each host."""
 LEAST_PORTS = LEAST_PORTS_PER_DOMAIN + 1
-"""Ports of a ROS 2 proxy with a LAN relay at least: the proxy's ports, and a port of the relay."""
+"""The fewest ports of a ROS 2 proxy with a LAN relay: the proxy's ports, and one for the relay."""
 ROS1_DISTROS = frozenset(
     {"fuerte", "groovy", "hydro", "indigo", "jade", "kinetic", "lunar", "melodic", "noetic"}
 )
-"""All distributions of ROS 1. There will be no more, so any other distribution is ROS 2."""
+"""The distributions of ROS 1 since Fuerte. No more will come, so all others count as ROS 2."""
 LAN_RELAY_COMMAND = ("rosproxy", "lan-relay")
 """The command of a LAN relay, in the proxy's image."""
 
@@ -28,7 +28,7 @@ def discovery_port(domain: int) -> int:
 
 
 def well_known_ports(domain: int) -> frozenset[int]:
-    """Return the ports besides the range on which the proxy of a domain listens."""
+    """Return the ports on which the proxy of a domain listens in addition to its range."""
     return frozenset({SPDP_MULTICAST + PORTS_PER_DOMAIN * domain, discovery_port(domain)})
 
 
@@ -39,7 +39,10 @@ def read_peer_name(text: str) -> str:
 
 
 def is_dds(rmw: str) -> bool:
-    """Whether an RMW_IMPLEMENTATION is not rmw_zenoh. An empty value is the default, a DDS."""
+    """Whether a value of RMW_IMPLEMENTATION means DDS: any value without ``zenoh``.
+
+    An empty value means the default, which is a DDS.
+    """
     return "zenoh" not in rmw
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from rosproxy.telemetry.text import brief
 
 MOST_VALUE_CHARACTERS = 80
-"""Characters of a variable's value in a report at most."""
+"""The most characters of a variable's value in a report."""
 
 _PROFILE = (
     "The DDS profile may name other interfaces, other addresses or a discovery server. Unset the "
@@ -22,15 +22,15 @@ def _always(_: str) -> bool:
     return True
 
 
-def _is_without_udp(value: str) -> bool:
-    """Whether FASTDDS_BUILTIN_TRANSPORTS names transports that a proxy can't carry.
+def _has_unsupported_transports(value: str) -> bool:
+    """Whether FASTDDS_BUILTIN_TRANSPORTS names transports that a proxy can't forward.
 
     LARGE_DATA sends data by TCP, after discovery by UDP (Fast DDS, rtps/builtin_transports).
     """
     return value.upper().partition("?")[0] not in ("", "DEFAULT", "DEFAULTV6", "UDPV4", "UDPV6")
 
 
-_KEEP_APART: dict[str, tuple[Callable[[str], bool], str]] = {
+_DISCOVERY_OBSTACLES: dict[str, tuple[Callable[[str], bool], str]] = {
     "ROS_DISCOVERY_SERVER": (
         _always,
         "The nodes announce themselves only to a discovery server. Unset the variable",
@@ -41,24 +41,29 @@ _KEEP_APART: dict[str, tuple[Callable[[str], bool], str]] = {
         f"{_LOCAL}, or set SUBNET",
     ),
     "FASTDDS_BUILTIN_TRANSPORTS": (
-        _is_without_udp,
+        _has_unsupported_transports,
         "A proxy forwards UDP only. Unset the variable, or set UDPv4",
     ),
     "CYCLONEDDS_URI": (_always, _PROFILE),
     "FASTDDS_DEFAULT_PROFILES_FILE": (_always, _PROFILE),
     "FASTRTPS_DEFAULT_PROFILES_FILE": (_always, _PROFILE),
 }
-"""Variables that may prevent discovery, the surest cause first. Each has the test of the value, and
-the cause with the fix."""
+"""Variables that may prevent discovery, the surest cause first.
 
-OF_ROS2 = frozenset({*_KEEP_APART, "ROS_DOMAIN_ID", "ROS_STATIC_PEERS", "RMW_IMPLEMENTATION"})
+Each variable has a test, which is true for values that prevent discovery, and a text with the cause
+and the fix.
+"""
+
+ROS2_VARIABLES = frozenset(
+    {*_DISCOVERY_OBSTACLES, "ROS_DOMAIN_ID", "ROS_STATIC_PEERS", "RMW_IMPLEMENTATION"}
+)
 """Variables that ROS 1 does not have."""
 
 
-def why_unheard(variables: Mapping[str, str]) -> str:
-    """Return why discovery may fail for a container, and the fix; empty without such a variable."""
-    for name, (keeps_apart, text) in _KEEP_APART.items():
+def discovery_obstacle(variables: Mapping[str, str]) -> str:
+    """Return which variable may prevent discovery, and the fix; empty without such a variable."""
+    for name, (prevents_discovery, text) in _DISCOVERY_OBSTACLES.items():
         value = variables.get(name, "")
-        if value and keeps_apart(value):
+        if value and prevents_discovery(value):
             return f"variable {name}={brief(value, MOST_VALUE_CHARACTERS)}. {text}"
     return ""

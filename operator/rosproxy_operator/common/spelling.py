@@ -4,7 +4,7 @@ import difflib
 from functools import lru_cache
 
 LEAST_SIMILARITY = 0.9
-"""Least similarity (0 to 1) of any name: a less similar name may belong to another program."""
+"""Least similarity (0 to 1) of a misspelt name. Below, a name may belong to another program."""
 LEAST_SIMILARITY_WITH_PREFIX = 0.75
 """Least similarity of a name that begins like the operator's names."""
 

@@ -14,7 +14,7 @@ from rosproxy.setting_kinds import ZENOH_PORT
 OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
 SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"
 MOST_ENDPOINTS = 32
-"""Endpoints that the operator reads from a variable at most."""
+"""The most endpoints that the operator reads from a variable."""
 _ENDPOINT = re.compile(r"[\"']([a-z]+)/([^\"'/?#;]{1,300})[^\"']*[\"']")
 _ROUTER = re.compile(r"(^|[\s/;&])(rmw_)?zenohd($|[\s;&])")
 
@@ -27,12 +27,12 @@ class Endpoint(NamedTuple):
 
 
 def connect_endpoints(override: str) -> list[Endpoint]:
-    """Return the endpoints to which the sessions of a container connect."""
+    """Return the endpoints to which ZENOH_CONFIG_OVERRIDE connects the sessions of a container."""
     return _endpoints("connect", override)
 
 
 def router_port(override: str) -> int:
-    """Return the TCP port on which the router of a container listens."""
+    """Return the first TCP port on which a container's router listens; ZENOH_PORT without one."""
     ports = [e.address.port for e in _endpoints("listen", override) if e.protocol == "tcp"]
     return ports[0] if ports else ZENOH_PORT
 

@@ -12,7 +12,7 @@ from typing import Any, TypedDict
 import msgspec
 
 from rosproxy_operator.common.problem import bounded
-from rosproxy_operator.common.ros2_variables import OF_ROS2
+from rosproxy_operator.common.ros2_variables import ROS2_VARIABLES
 from rosproxy_operator.common.zenoh import OVERRIDE, SESSION_FILE, runs_router
 from rosproxy_operator.docker.engine_client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
@@ -21,7 +21,7 @@ from rosproxy_operator.docker.planner.specs import FORMER_TOKEN, MANAGED, SECRET
 
 # Go's zero time, 0001-01-01T00:00:00Z.
 _NEVER_STARTED = "0001-"
-_VARIABLES = OF_ROS2 | {
+_VARIABLES = ROS2_VARIABLES | {
     *("ROS_VERSION", "ROS_DISTRO", "ROS_IP", "ROS_HOSTNAME"),
     *(OVERRIDE, SESSION_FILE),
 }

@@ -16,7 +16,7 @@ from rosproxy.telemetry.text import brief, listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json
 from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
-from rosproxy_operator.common.ros2_variables import MOST_VALUE_CHARACTERS, why_unheard
+from rosproxy_operator.common.ros2_variables import MOST_VALUE_CHARACTERS, discovery_obstacle
 from rosproxy_operator.common.zenoh import SESSION_FILE
 from rosproxy_operator.docker.planner.model import (
     ZENOH,
@@ -228,7 +228,7 @@ def _unheard(
             continue
         settled = _is_settled(container, status, now)
         addresses = _addresses(container, observed).values()
-        reason = why_unheard(container.variables)
+        reason = discovery_obstacle(container.variables)
         if reason and settled and not participants_by_address(status).keys() & {*addresses}:
             text = "the proxy has discovered no participant of this container. Possible cause: "
             yield Problem(f"container {container.name}", f"{text}{reason}")

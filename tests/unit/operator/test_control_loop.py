@@ -16,7 +16,7 @@ import pytest
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, LookImpossible, Pace
 from rosproxy_operator.common.operator_metrics import DockerMetrics
 
-PACE = Pace("engine", resync=30.0, debounce=0.1, longest=60.0)
+PACE = Pace("engine", resync=30.0, debounce=0.1, timeout=60.0)
 AWAY = LookFailed("no engine", away=True)
 
 

@@ -15,7 +15,7 @@ from rosproxy.access.rules import parse_rules
 from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import SettingError
 from rosproxy_operator.common.policy import (
-    LONGEST_POLICY,
+    LONGEST_POLICY_BYTES,
     MOST_AUTHORS_RULES,
     administrators_policy,
     as_variable,
@@ -40,8 +40,8 @@ def test_the_options_make_one_layer_or_none() -> None:
     [
         (MOST_AUTHORS_RULES, "/a", ""),
         (MOST_AUTHORS_RULES + 1, "/a", "501 rules, at most 500 are accepted"),
-        (200, "/" + "a" * 255, f"at most {LONGEST_POLICY} are accepted"),
-        (400, "/" + "a" * 255, f"at most {LONGEST_POLICY} are accepted"),  # over LONGEST_VARIABLE
+        (200, "/" + "a" * 255, f"at most {LONGEST_POLICY_BYTES} are accepted"),
+        (400, "/" + "a" * 255, f"at most {LONGEST_POLICY_BYTES} are accepted"),  # over the variable
     ],
 )
 def test_a_policy_is_bounded(count: int, glob: str, told: str) -> None:

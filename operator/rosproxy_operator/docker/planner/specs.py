@@ -14,7 +14,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.setting_kinds import SettingError, hash_token, parse_range
 from rosproxy.settings import MOST_ZENOH_PORTS
-from rosproxy_operator.common.policy import AWAITED, as_variable
+from rosproxy_operator.common.policy import POLICY_WAIT_S, as_variable
 from rosproxy_operator.common.port_ranges import local_ports
 from rosproxy_operator.common.ros2 import (
     LAN_RELAY_COMMAND,
@@ -412,7 +412,7 @@ def _settings_fields(
             "ros": (key.ros,),
             "zenoh_ports": action.range,
             "zenoh_peer": action.peers,
-            "await_policy": AWAITED,
+            "await_policy": POLICY_WAIT_S,
             "policy_layers": as_variable((*settings.policy, *action.policy)),
         }
     return {
@@ -425,7 +425,7 @@ def _settings_fields(
         "admin_token_hash": hash_token(proxy_token(key, secret)),
         "master_address": master_address,
         **({} if key.is_ros2 else asdict(settings.proxy_bounds)),
-        "await_policy": AWAITED,
+        "await_policy": POLICY_WAIT_S,
         "policy_layers": as_variable((*settings.policy, *action.policy)),
         "ros": (key.ros,),
         "ros2_domain": key.domain,

@@ -9,7 +9,7 @@ import msgspec
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address
-from rosproxy_operator.common.policy import AWAITED, as_variable
+from rosproxy_operator.common.policy import POLICY_WAIT_S, as_variable
 from rosproxy_operator.common.port_ranges import LOCAL_PORTS, first_fitting, local_ports
 from rosproxy_operator.common.ros2 import discovery_port
 from rosproxy_operator.kubernetes.planner.proxy_ports import STAND_INS, fixed_ports
@@ -444,7 +444,7 @@ def _settings_fields(site: ProxySite, settings: ClusterSettings) -> Mapping[str,
         "ros2_lan_relay_secret": site.relay_secret if site.lan_relay else None,
         **msgspec.structs.asdict(settings.proxy_bounds),
         # Without a policy the proxy does not wait, because a wait costs a second at each restart.
-        "await_policy": AWAITED if policy else None,
+        "await_policy": POLICY_WAIT_S if policy else None,
         "policy_layers": as_variable(policy),
     }
 

@@ -17,7 +17,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.settings import LEAST_PORTS_PER_DOMAIN
-from rosproxy_operator.common.policy import too_much
+from rosproxy_operator.common.policy import excess_reason
 from rosproxy_operator.common.ros2 import LAST_DOMAIN, LEAST_PORTS, MOST_PEERS, read_peer_name
 from rosproxy_operator.kubernetes.resources.checks import (
     int_at,
@@ -243,7 +243,7 @@ def _policy(field: Field, of: Name) -> tuple[PolicyLayer, ...]:
     mode = field["mode"].one_of(_POLICY_MODE, "Enforce")
     rules = tuple(rule for r in field["rules"].items() for rule in _rules(r))
     layers = (PolicyLayer(f"RosProxy {of}", rules, mode),) if rules else ()
-    if problem := too_much(layers):
+    if problem := excess_reason(layers):
         raise InvalidField(f"{field['rules'].path}: {problem}. Join names or nodes by globs")
     return layers
 

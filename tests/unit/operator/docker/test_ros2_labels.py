@@ -8,7 +8,7 @@ import pytest
 
 from rosproxy.access.rules import parse_rules
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.ros2_variables import OF_ROS2
+from rosproxy_operator.common.ros2_variables import ROS2_VARIABLES
 from rosproxy_operator.docker.option_values import read_host_pattern
 from rosproxy_operator.docker.planner.labels.members import master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import Container, Key, Member, Network
@@ -114,7 +114,7 @@ def test_an_unusable_variable_states_no_version(variables: Mapping[str, str]) ->
     assert ["assumes ROS 1" in text for text in told] == [True]
 
 
-@pytest.mark.parametrize("name", sorted(OF_ROS2))
+@pytest.mark.parametrize("name", sorted(ROS2_VARIABLES))
 def test_a_variable_of_ros_2_alone_says_it(name: str) -> None:
     variables = {name: "localhost"} if name == STATIC_PEERS else {name: "7"}
     assert keys(labelled_container(variables=variables))[0].is_ros2

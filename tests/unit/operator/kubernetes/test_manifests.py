@@ -9,7 +9,7 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import parse_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy.setting_kinds import hash_token
-from rosproxy_operator.common.policy import AWAITED, administrators_policy
+from rosproxy_operator.common.policy import POLICY_WAIT_S, administrators_policy
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.resources import names, objects
@@ -66,7 +66,7 @@ def test_its_policy_is_there_from_the_start_and_makes_no_pod_anew() -> None:
     assert settings_of(env_of(made)).policy_layers == (*settings.policy, own)
     assert manifests.fingerprint_of(made) == manifests.fingerprint_of(body())
     assert "ROSPROXY_POLICY_LAYERS" not in env()
-    assert settings_of(env_of(made)).await_policy == AWAITED
+    assert settings_of(env_of(made)).await_policy == POLICY_WAIT_S
     assert settings_of(env()).await_policy == 0.0
 
 

@@ -21,7 +21,7 @@ from rosproxy_operator.common.ros2 import (
     ROS1_DISTROS,
     is_dds,
 )
-from rosproxy_operator.common.ros2_variables import OF_ROS2
+from rosproxy_operator.common.ros2_variables import ROS2_VARIABLES
 from rosproxy_operator.docker.planner.labels.readers import (
     ADVERTISE_HOST,
     ALIAS,
@@ -95,7 +95,7 @@ def _is_marked_ros2(container: Container) -> bool:
     if MASTER_URI in container.labels or container.master_uri:
         return False
     return any(name in container.labels for name in _OF_ROS2) or bool(
-        OF_ROS2 & container.variables.keys()
+        ROS2_VARIABLES & container.variables.keys()
     )
 
 
