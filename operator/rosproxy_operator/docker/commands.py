@@ -19,20 +19,20 @@ from rosproxy_operator.docker.settings import PlanSettings
 class CommandContext:
     """The options before a command.
 
-    ``admin`` is the admin endpoint of a running operator. A command asks that operator for the
-    status. But if the command line has options (``given``), or no operator answers, the command
-    uses ``settings``. ``resync`` is in seconds.
+    A command asks the operator whose admin endpoint is ``admin`` for the status. If that operator
+    does not answer, or the command line ``has_options``, the command looks at the host itself, with
+    ``settings``. ``resync`` is in seconds.
     """
 
     settings: PlanSettings
     admin: HostPort
-    given: bool
+    has_options: bool
     resync: float
 
     @property
     def operator(self) -> HostPort | None:
         """The admin endpoint of the operator to ask; None: ask no operator."""
-        return None if self.given else self.admin
+        return None if self.has_options else self.admin
 
 
 _json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
@@ -56,9 +56,11 @@ def status(context: CommandContext, as_json: bool, watch: bool, wait: float, ope
     """Show the proxies, the labelled containers, their nodes, and the problems.
 
     The running operator reports the status. If no operator answers at --admin-bind, or if options
-    stand before this command, the status is what an operator with those options would see. Exits
-    with 0 if nothing is wrong, no step is left, every proxy answers, and no proxy reports that its
-    master or outside can't be reached; else with 1.
+    stand before this command, the status is what an operator with those options would see.
+
+    Exits with 0 if nothing is wrong, no step is left, and every proxy works; else with 1. A proxy
+    works if it answers, reaches its master and routers, and outside reaches its ports. A check
+    without a result counts as passed.
     """
     if as_json + watch + opens > 1:
         raise click.UsageError("--json, --watch and --open exclude each other. Give one option")

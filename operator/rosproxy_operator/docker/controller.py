@@ -52,7 +52,7 @@ from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 log = logging.getLogger(__name__)
 
 LEAST_LOOK_INTERVAL_S = 0.05
-"""Least seconds between two looks: ``compose up`` causes dozens of events."""
+"""Least seconds from a look to the next: ``compose up`` causes dozens of events."""
 EVENT_RECHECK_S = 0.25
 """Seconds from an event to a further look: some events come before the engine's lists change."""
 LOOK_TIMEOUT_S = 60.0
@@ -67,16 +67,20 @@ Decide = Callable[[HostState, LabelReading, PlanSettings, DockerMemory, float], 
 
 
 def run_once(settings: PlanSettings, resync: float, mistakes: Sequence[Problem]) -> list[Problem]:
-    """Look and act until no step is left. Return the problems. Raises LookFailed.
+    """Look and act until no step is left or a step fails, for `COMMAND_TIMEOUT_S` at most.
 
-    ``mistakes`` as in `run`.
+    Return the fatal problems. Raises LookFailed if the operator can't reach the engine. ``resync``
+    and ``mistakes`` are as in `run`.
     """
     controller = DockerController(settings, resync, DockerMetrics(), mistakes=mistakes)
     return asyncio.run(controller.run_once(COMMAND_TIMEOUT_S))
 
 
 def uninstall(settings: PlanSettings, resync: float) -> list[Problem]:
-    """Remove everything that operators created on this host. Return problems. Raises LookFailed."""
+    """Remove everything that operators created on this host. Return the fatal problems.
+
+    Raises LookFailed if the operator can't reach the engine. ``resync`` is as in `run`.
+    """
     controller = DockerController(settings, resync, DockerMetrics(), decide=Uninstall())
     return asyncio.run(controller.run_once(COMMAND_TIMEOUT_S))
 
@@ -116,7 +120,7 @@ async def _run(
 
 
 class DockerController:
-    """Reconciles the host of an engine with the plans of ``decide``. `run` needs an event loop."""
+    """Reconciles the host of an engine with the plans of ``decide``."""
 
     def __init__(
         self,
@@ -159,9 +163,10 @@ class DockerController:
             await self._close()
 
     async def run_once(self, seconds: float) -> list[Problem]:
-        """Look and act until no step is left, for so many seconds at most. Return the problems.
+        """Look and act until no step is left or a step fails, for at most ``seconds``.
 
-        Raises LookFailed if the operator can't reach the engine.
+        Return the fatal problems, with a problem for each proxy that does not answer, or for steps
+        that are left. Raises LookFailed if the operator can't reach the engine.
         """
         listen(self._engine, self._note_event)
         try:
@@ -171,7 +176,7 @@ class DockerController:
             await self._close()
 
     async def documents(self) -> dict[str, Document | str]:
-        """Return the page document of each proxy by name, or a text why there is no document.
+        """Return the page document of each proxy by name, or why there is no document.
 
         A proxy that has just started is missing until it answers.
         """
@@ -190,7 +195,7 @@ class DockerController:
         return stopped | {name: answers[name] for name in answers if name not in starting}
 
     def places(self) -> dict[str, str]:
-        """Return the names of the containers at each address, as of the last look."""
+        """Return the names of the containers at each address, from the last look."""
         return container_names(self._last[0].state) if self._last else {}
 
     async def status(self) -> Json:
@@ -242,7 +247,7 @@ class DockerController:
         return min((t for t in times if t is not None), default=None)
 
     def _current(self, snapshot: DockerSnapshot, planned: DockerPlan) -> list[Problem]:
-        """Return all problems. While an action on an object runs, it keeps its earlier problems.
+        """Return all problems. While an action on an object runs, its earlier problems stay.
 
         A look during the action would report problems that are outdated a moment later.
         """
@@ -260,7 +265,7 @@ class DockerController:
         return self._shown
 
     def _settled(self) -> bool:
-        """Whether no step is left, and the operator waits for nothing."""
+        """Whether no required step is left and all wanted proxies answer, or a step has failed."""
         if self._last is None or self._executor.busy or self._loop.woken:
             return False
         snapshot, planned = self._last

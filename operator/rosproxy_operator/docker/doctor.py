@@ -21,9 +21,9 @@ from rosproxy_operator.docker.host_status import HostStatus
 
 MOST_DOCTORS = 4
 """The highest number of doctors that run at the same time: each is a Python process."""
-_CAUSES = ("engine", "proxy image", "network", "master", "container", "proxy")
+_SUBJECT_KINDS = ("engine", "proxy image", "network", "master", "container", "proxy")
 """The kinds of subjects, causes before consequences."""
-_BEING_MADE = ("absent", "created")
+_UNFINISHED_STATES = ("absent", "created")
 """States of a proxy's container while an operator makes the proxy."""
 
 
@@ -49,10 +49,10 @@ async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding
                 return [warning("proxy", f"proxy {name}", text, f"read docker logs {name}")]
         return read_findings(f"proxy {name}", output)
 
-    told = {problem["subject"] for problem in status["problems"]}
+    subjects = {problem["subject"] for problem in status["problems"]}
     running = [proxy for proxy in status["proxies"] if proxy["state"] == "running"]
     # A silent proxy without a problem has just been started.
-    asked = [p["name"] for p in running if p["reachable"] or f"proxy {p['name']}" in told]
+    asked = [p["name"] for p in running if p["reachable"] or f"proxy {p['name']}" in subjects]
     findings_by_proxy = await asyncio.gather(*map(ask, asked))
     served = served_participants(status)
     return [
@@ -84,7 +84,8 @@ def _is_of_another_proxy(finding: DoctorFinding, served: frozenset[str]) -> bool
 def host_findings(status: Json) -> Iterator[DoctorFinding]:
     """Yield the findings in the status of a host.
 
-    Fatal problems come first. Among these, and among the warnings, causes come before consequences.
+    First come the fatal problems, then the warnings, both with causes before consequences. Then
+    come proxies that do not run, steps that are left, and the number of containers with a proxy.
     """
     problems = sorted(status["problems"], key=_order)
     for problem in problems:
@@ -94,7 +95,7 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
     runs = bool(status["operator"])
     for proxy in status["proxies"]:
         if proxy["state"] != "running":
-            report = note if runs and proxy["state"] in _BEING_MADE else error
+            report = note if runs and proxy["state"] in _UNFINISHED_STATES else error
             text = f"the proxy's container is {proxy['state']}"
             fix = f"check that the operator runs; read docker logs {proxy['name']}"
             yield report("proxy", f"proxy {proxy['name']}", text, fix)
@@ -113,6 +114,6 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
 
 
 def _order(problem: Json) -> tuple[bool, int]:
-    kinds = [kind for kind in _CAUSES if problem["subject"].startswith(kind)]
+    kinds = [kind for kind in _SUBJECT_KINDS if problem["subject"].startswith(kind)]
     # The first kind: "proxy image" also begins with "proxy", and stands before "proxy".
-    return not problem["fatal"], _CAUSES.index(kinds[0]) if kinds else len(_CAUSES)
+    return not problem["fatal"], _SUBJECT_KINDS.index(kinds[0]) if kinds else len(_SUBJECT_KINDS)

@@ -34,7 +34,7 @@ WRITE_TIMEOUT_S = 300
 """Seconds for a call that changes something: 1000 ports to publish or free take a minute."""
 RUN_TIMEOUT_S = 60
 """Seconds for a command in a container: the doctor waits for nodes that do not answer."""
-FILTERS = {
+EVENT_FILTERS = {
     "type": ["container", "network", "image"],
     "event": [
         *("create", "start", "die", "destroy", "pause", "unpause", "rename"),
@@ -42,7 +42,7 @@ FILTERS = {
         *("tag", "untag", "pull", "load", "import", "delete"),
     ],
 }
-"""Events that may change a plan, without the many of health checks and ``docker exec``."""
+"""The events that may change a plan. Health checks and ``docker exec`` cause many other events."""
 LISTEN_RETRY_PAUSES_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Seconds before each new attempt to listen to events; the last value repeats."""
 
@@ -96,7 +96,7 @@ class DockerClient:
         return output
 
     def events(self) -> Iterator[Json]:
-        """Connect, and return the events of FILTERS from now on.
+        """Connect, and return the events of EVENT_FILTERS from now on.
 
         The iterator ends with the connection. When this method returns, the connection is open. So
         a later list shows all earlier changes, and each later change causes an event.
@@ -104,7 +104,7 @@ class DockerClient:
         with self._translated():
             # The stream has a client of its own, because reading the stream does not end. The SDK
             # sets no time-out for the stream, so an engine without events is no failure.
-            stream = self._connect().events(filters=FILTERS, decode=True)
+            stream = self._connect().events(filters=EVENT_FILTERS, decode=True)
         return self._read_events(stream)
 
     def do(self, method: str, *arguments: Any, **keywords: Any) -> None:
@@ -112,7 +112,10 @@ class DockerClient:
         self._call(WRITE_TIMEOUT_S, method, *arguments, **keywords)
 
     def _call(self, within: int, method: str, *arguments: Any, **keywords: Any) -> Any:
-        """Call a method of an SDK client that is idle: threads must not share a client."""
+        """Call a method of an idle SDK client: threads must not share a client.
+
+        ``within`` is the time-out in seconds.
+        """
         with self._translated():
             try:
                 client = self._idle.pop()
@@ -162,8 +165,8 @@ class DockerClient:
 def listen(engine: DockerClient, tell: Callable[[Json | None], None]) -> None:
     """Start a thread that listens to the engine's events. Needs a running event loop.
 
-    The event loop calls ``tell`` with each event of FILTERS. After each connect, it first calls
-    ``tell(None)``: the engine answers, and events before the connect may be missing.
+    The event loop calls ``tell`` with each event of EVENT_FILTERS. After each connect, the event
+    loop first calls ``tell(None)``: the engine answers, and earlier events may be missing.
     """
     loop = asyncio.get_running_loop()
 

@@ -25,7 +25,7 @@ _VARIABLES = ROS2_VARIABLES | {
     *("ROS_VERSION", "ROS_DISTRO", "ROS_IP", "ROS_HOSTNAME"),
     *(OVERRIDE, SESSION_FILE),
 }
-"""Variables that show the version of ROS in a container, and how the nodes find each other."""
+"""Variables that show the ROS version of a container, and how its nodes find each other."""
 _KEPT_VARIABLES = _VARIABLES | {"ROS_MASTER_URI", FORMER_TOKEN}
 MOST_TEXT_CHARACTERS = 4096
 """Characters of a variable or an argument that the operator keeps; longer texts get an ellipsis.
@@ -95,7 +95,10 @@ class _Inspection(TypedDict, total=False):
 
 
 def check_inspection(inspection: object) -> Json:
-    """Return the used fields of an inspection, bounded. Raises msgspec.ValidationError."""
+    """Return the fields of an inspection that the operator uses, with bounded texts.
+
+    Raises msgspec.ValidationError.
+    """
     document = dict(msgspec.convert(inspection, _Inspection))
     config = dict(dig(document, "Config") or {})
     variables = (text for text in config.get("Env") or () if _name(text) in _KEPT_VARIABLES)
@@ -150,7 +153,7 @@ def signature(row: Json) -> tuple[tuple[str, str], ...]:
 
 
 def read_making(inspected: Json | None) -> CreationFacts:
-    """Return how a container was created, from an inspection."""
+    """Return the facts of a container's creation, from an inspection."""
     argvs = (dig(inspected, "Config", key) or () for key in ("Entrypoint", "Cmd"))
     return CreationFacts(
         image=dig(inspected, "Image") or "",

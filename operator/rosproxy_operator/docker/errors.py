@@ -15,7 +15,7 @@ _ENGINES_OWN = re.compile(r"endpoint|network|container")
 
 
 class EngineError(Exception):
-    """The engine did not carry out a call. The message is a line."""
+    """The engine did not carry out a call."""
 
 
 class Unavailable(EngineError):
@@ -27,7 +27,7 @@ class FormerSocket(Unavailable):
 
 
 class Conflict(EngineError):
-    """HTTP 409: the name is in use, or another call changes the same object."""
+    """HTTP 409: the name is in use, or another call is changing the same object."""
 
 
 class NoSuchObject(EngineError):
@@ -43,7 +43,10 @@ class PortTaken(EngineError):
 
 
 def refusal(status: int, text: str, request: str) -> EngineError:
-    """Return the error for a failed ``request`` to the engine or a proxy in front of the engine."""
+    """Return the error for an HTTP ``status`` that refuses a ``request`` (method and path).
+
+    The status and the ``text`` come from the engine, or from a proxy in front of its socket.
+    """
     message = _IDS.sub(lambda match: match[0][:12], " ".join(text.split()))
     # "page not found" is no missing object: the engine does not know the path of the request
     # (moby: daemon/server/server.go, CreateMux).
@@ -96,7 +99,7 @@ def unreachable(url: str, error: BaseException) -> Unavailable:
 
 
 def _is_removed(path: str) -> bool:
-    """Whether a file is removed on the host. A mount of the file keeps the old file."""
+    """Whether the host has removed a file. The mount in this container keeps the old file."""
     try:
         return os.stat(path).st_nlink == 0
     except OSError:

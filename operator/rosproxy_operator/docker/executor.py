@@ -105,11 +105,12 @@ CarryOut = Callable[[Action], Awaitable[None]]
 Job = tuple[Key | None, str]
 """Identifies a job: the key and the subject of its groups. Different jobs run at the same time."""
 UPLINK: Job = (None, "")
+"""The job of the uplink network, which has neither key nor subject."""
 
 
 @dataclass(slots=True)
 class _Failure:
-    """All actions of a job that has failed, and the problem to report.
+    """The actions of the last run of a job, which has failed, and the problem to report.
 
     ``count`` is the number of failures in succession. ``retry_at`` is in monotonic seconds.
     """
@@ -385,7 +386,7 @@ class DockerActions:
                 log.debug("container not stopped, so it is killed: %s: %s", name, error)
         # When a sandbox ends, the engine publishes the ports anew over each network that the
         # sandbox still has, which takes 2 s per network. So disconnect the networks while the
-        # sandbox runs. The code above stops only proxies' containers, which use the sandbox's.
+        # sandbox runs. No sandbox is stopped above: ``action.stop`` is for containers of proxies.
         networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
         for network in networks:
             # The engine disconnects no container from the network host.
@@ -401,8 +402,8 @@ class DockerActions:
             # look compares the container with the plan.
             container = self._engine.container(name)
             own = read_own(container["Config"].get("Labels") or {})
-            making = engine_json.read_making(container)
-            if own is None or forgery_reason(own, name, making, image_id):
+            facts = engine_json.read_making(container)
+            if own is None or forgery_reason(own, name, facts, image_id):
                 raise EngineError(
                     f"a container {name} exists already that this operator did not create. Rename "
                     f"that container (docker rename {name} …) or remove it"

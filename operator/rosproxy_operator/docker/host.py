@@ -7,10 +7,10 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import is_loopback
 from rosproxy.net.interfaces import address_towards
 
-_USUAL_EPHEMERAL = "32768 60999"
+_DEFAULT_EPHEMERAL_PORTS = "32768 60999"
 # TCP_LISTEN of the kernel's include/net/tcp_states.h, as hexadecimal digits.
 _LISTEN = "0A"
-_ELSEWHERE = "192.0.2.1"
+_FAR_ADDRESS = "192.0.2.1"
 """An address of no network (RFC 5737). The route to this address is the route to far hosts."""
 
 
@@ -19,7 +19,7 @@ def ephemeral_ports() -> PortRange:
 
     If the setting of the kernel can't be read, return the kernel's default.
     """
-    text = _read_text("/proc/sys/net/ipv4/ip_local_port_range") or _USUAL_EPHEMERAL
+    text = _read_text("/proc/sys/net/ipv4/ip_local_port_range") or _DEFAULT_EPHEMERAL_PORTS
     return PortRange(*map(int, text.split()))
 
 
@@ -51,20 +51,19 @@ def _port(row: Sequence[str]) -> int:
     return int(row[1].rpartition(":")[2], 16)
 
 
-def has(address: str) -> bool:
-    """Return whether an IPv4 address belongs to this network namespace.
-
-    Only for an own address, a connection has the same address as source and as target.
-    """
+def is_own_address(address: str) -> bool:
+    """Return whether an IPv4 address belongs to this network namespace."""
+    # Only a connection to an own address has the same address as source and as target.
     return address_towards(address) == address
 
 
 def own_address_towards(master: str, gateways: Collection[str]) -> str:
     """Return the address at which a master reaches this host; empty without a route.
 
-    ``master`` is an address. If the route starts at loopback or at one of the engine's
-    ``gateways``, no other host can reach that address. Then the result is `default_route_address`.
-    If there is no default route either, the result is the gateway, and empty for loopback.
+    ``master`` is an address. The result is the source address of the route to the master. If this
+    source is on loopback or one of the engine's ``gateways``, no other host can reach the source.
+    Then the result is `default_route_address`; without a default route, the gateway, or empty for
+    loopback.
     """
     own = address_towards(master)
     if own in gateways or is_loopback(own):
@@ -74,7 +73,7 @@ def own_address_towards(master: str, gateways: Collection[str]) -> str:
 
 def default_route_address() -> str:
     """Return the address at which far hosts reach this host; empty without a default route."""
-    far = address_towards(_ELSEWHERE)
+    far = address_towards(_FAR_ADDRESS)
     return "" if is_loopback(far) else far
 
 

@@ -37,7 +37,7 @@ ProxyStatuses = Mapping[str, ProxyStatus]
 PROXY_STARTING_S = 8.0
 """Seconds after the start of a proxy in which a missing answer is no problem."""
 NODES_STARTING_S = 15.0
-"""Seconds after the start of container and proxy in which missing nodes are no problem."""
+"""Seconds after the start of a container and of its proxy in which missing nodes are no problem."""
 
 
 def host_document(
@@ -50,8 +50,8 @@ def host_document(
 ) -> Json:
     """Return the document.
 
-    ``answers`` has, by name, the status of each running proxy or the reason for a missing answer.
-    ``now`` is Unix time.
+    ``answers`` has, by name, the status of each running proxy or the problem of a proxy that does
+    not answer. ``now`` is Unix time.
 
     The document lists the members of proxies and the containers with a problem. A container with
     nodes of ROS 1 and ROS 2 is listed twice. No actions are listed for a proxy that has a busy
@@ -62,7 +62,7 @@ def host_document(
     subjects = {problem.subject for problem in problems}
     silent = _silent(answers, observed, now)
     problems += [problem for problem in silent if problem.subject not in subjects]
-    problems += _unheard(planned.members, observed, statuses, now)
+    problems += _undiscovered(planned.members, observed, statuses, now)
     problems += _unconnected(planned.members, observed, statuses, now)
     subjects = {problem.subject for problem in problems}
     redirects = _redirects(planned.members, observed)
@@ -184,7 +184,7 @@ def _redirects(
 
 
 def container_names(observed: HostState) -> dict[str, str]:
-    """Return the names of the running containers by address. Several may share an address."""
+    """Return the names of the living containers by address: a list as text if several share one."""
     by_id = {container.id: container for container in observed.containers}
     names: defaultdict[str, dict[str, None]] = defaultdict(dict)
     for container in observed.containers:
@@ -214,7 +214,7 @@ def _silent(
     ]
 
 
-def _unheard(
+def _undiscovered(
     members: Iterable[Member], observed: HostState, statuses: ProxyStatuses, now: float
 ) -> Iterator[Problem]:
     """Yield problems for ROS 2 containers without participants, if variables may be the cause.

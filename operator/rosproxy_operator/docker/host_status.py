@@ -43,8 +43,8 @@ STATUS_INSPECTION_WAIT_S = 3.0
 class HostStatus:
     """The status of a host, from the operator that listens at ``operator``.
 
-    If ``operator`` is None or does not answer, the status is what an operator with ``settings``
-    would see and plan.
+    If ``operator`` is None, has another version, or does not answer, the status is what an operator
+    with ``settings`` would see and plan.
     """
 
     def __init__(self, settings: PlanSettings, operator: HostPort | None) -> None:
@@ -117,7 +117,10 @@ def show_status(host: HostStatus, as_json: bool, wait: float) -> int:
 
 
 def _await(host: HostStatus, seconds: float, good: Callable[[Json], bool]) -> Json:
-    """Return the first good status, or the status after so many seconds. Raises EngineError."""
+    """Return the first status that is ``good``, or the status after ``seconds``.
+
+    Raises EngineError.
+    """
     end = time.monotonic() + seconds
     while not good(status := asyncio.run(host.now())) and time.monotonic() < end:
         time.sleep(WAIT_INTERVAL_S)
@@ -161,7 +164,7 @@ async def survey(settings: PlanSettings) -> Json:
     Unlike a running operator, the survey has no memory of earlier looks. Raises EngineError.
     """
     proxies = ProxyClient()
-    # The callbacks wake a control loop. Here is none: there is no second look.
+    # The callbacks would wake a control loop. Here is no loop, because there is no second look.
     observer = DockerObserver(DockerClient(), settings, MasterResolver(lambda: None), lambda: None)
     try:
         snapshot = await observer.look(STATUS_INSPECTION_WAIT_S)

@@ -1,7 +1,8 @@
-"""Find the Docker operators on this machine. Each operator publishes a sign (`rosproxy.net.signs`).
+"""Finds the Docker operators of this machine by the signs that they publish (`rosproxy.net.signs`).
 
-So a command finds an operator that has another ``--admin-bind``. Any program can publish a sign, so
-a command follows signs to loopback alone, where only programs of this machine listen.
+So a command also finds an operator that listens at another address than --admin-bind. Any program
+can publish a sign, so a command connects to loopback alone, where only programs of this machine
+listen.
 """
 
 import hashlib
@@ -34,5 +35,5 @@ def operators(first: HostPort, engine: str) -> list[HostPort]:
 
 
 def _begin(engine: str) -> str:
-    """Return the beginning of all signs for this engine: a machine may have several engines."""
+    """Return the beginning of the signs for an engine: a machine may have several engines."""
     return f"rosproxy-operator/docker/{hashlib.sha256(engine.encode()).hexdigest()[:16]}"

@@ -9,7 +9,7 @@ from rosproxy.setting_kinds import Number, Text, read_address, read_master_uri
 from rosproxy_operator.common.ros2 import read_peer_name
 
 MOST_PORTS = 1000
-"""Most ports of a proxy. Each port costs the engine rules and, by default, a process."""
+"""Most ports of a proxy. For each port, the engine needs rules and, by default, a process."""
 NOWHERE = "none"
 """The value of ``--ros2-lan`` for no LAN."""
 LEAST_MEMORY_BYTES = 64 * 1024**2
@@ -18,6 +18,7 @@ MOST_MEMORY_BYTES = 1024**4
 LEAST_PIDS = 256
 """Threads and processes that a proxy needs for a hundred connections."""
 LEAST_SECRET_CHARACTERS = 32
+"""Least characters of a secret in a file."""
 _MEMORY = re.compile(r"([0-9]{1,15})([bkmg]?)b?")
 _UNITS = {"": 1, "b": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
 _NETWORK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -50,7 +51,10 @@ def read_name_pattern(text: str) -> str:
 
 
 def read_shared_master_uri(text: str) -> str:
-    """Return the URI of a master that is not on loopback; empty for no text. Raises ValueError."""
+    """Check and return the URI of a master that is not on loopback; empty for an empty text.
+
+    Raises ValueError.
+    """
     master = parse_slave_uri(read_master_uri(text)) if text else None
     if master and is_loopback(master.host):
         raise ValueError(
@@ -74,7 +78,7 @@ def read_lan(text: str) -> str:
 
 
 def read_memory(text: str) -> int:
-    """Return bytes of a size such as 512m or 1g; 0 for no bound. Raises ValueError."""
+    """Return the bytes of a size such as 512m or 1g; 0 stands for no bound. Raises ValueError."""
     match = _MEMORY.fullmatch(text.strip().lower())
     size = int(match[1]) * _UNITS[match[2]] if match else -1
     if size and not LEAST_MEMORY_BYTES <= size <= MOST_MEMORY_BYTES:
@@ -85,7 +89,7 @@ def read_memory(text: str) -> int:
 
 
 def read_pids(text: str) -> int:
-    """Return a number of threads and processes; 0 for no bound. Raises ValueError."""
+    """Return a number of threads and processes; 0 stands for no bound. Raises ValueError."""
     digits = text.strip()
     count = int(digits) if re.fullmatch(r"[0-9]{1,7}", digits, re.ASCII) else -1
     if count and count < LEAST_PIDS:
@@ -96,7 +100,7 @@ def read_pids(text: str) -> int:
 
 
 def read_secret(path: str) -> str:
-    """Return the stripped secret of a file; empty for no path.
+    """Return the secret in the file at ``path``, stripped; empty for an empty path.
 
     Raises ValueError for an unreadable file, and for fewer than LEAST_SECRET_CHARACTERS characters.
     """

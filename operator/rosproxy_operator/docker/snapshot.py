@@ -292,7 +292,7 @@ class DockerObserver:
         bridges = [n.gateway for n in networks if n.driver == "bridge" and n.gateway]
         # The gateway of a bridge is an address in the host's network namespace. In any other
         # namespace, the ports that listen here are not the ports of the host.
-        at_host = any(map(host.has, bridges))
+        at_host = any(map(host.is_own_address, bridges))
         state = self._read(rows, networks, image)
         if at_host:
             busy = [sandbox for sandbox in state.sandboxes if sandbox.container.name in state.busy]

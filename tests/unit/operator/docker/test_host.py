@@ -44,8 +44,8 @@ def test_a_socket_that_listens_is_seen() -> None:
 
 
 def test_own_addresses() -> None:
-    assert host.has("127.0.0.1")
-    assert not host.has("192.0.2.77")
+    assert host.is_own_address("127.0.0.1")
+    assert not host.is_own_address("192.0.2.77")
 
 
 @pytest.fixture
