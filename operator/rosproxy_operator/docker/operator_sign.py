@@ -1,8 +1,8 @@
 """Finds the Docker operators of this machine by the signs that they publish (`rosproxy.net.signs`).
 
 So a command also finds an operator that listens at another address than --admin-bind. Any program
-can publish a sign, so a command connects to loopback alone, where only programs of this machine
-listen.
+can publish a sign, so a command follows signs to loopback alone, where only programs of this
+machine listen.
 """
 
 import hashlib

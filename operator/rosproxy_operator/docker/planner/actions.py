@@ -17,7 +17,7 @@ from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec
 
 
 class Action(msgspec.Struct, frozen=True):
-    """An action on the container or network ``name``. ``does`` is the beginning of the text."""
+    """An action on the container or network ``name``. The action's text begins with ``does``."""
 
     does: ClassVar[str]
     name: str
@@ -51,7 +51,11 @@ class RemoveNetwork(Action, frozen=True):
 
 
 class _CreateContainer(Action, frozen=True):
-    """Create a container for the proxy of ``key``, and do not start the container."""
+    """Create a container for the proxy of ``key``, and do not start the container.
+
+    ``range`` are the ports of the proxy. In subclasses, ``fingerprint`` is a hash of the creation
+    request.
+    """
 
     does = "create container"
     key: Key
@@ -59,7 +63,7 @@ class _CreateContainer(Action, frozen=True):
 
 
 class CreateSandbox(_CreateContainer, frozen=True):
-    """Create the sandbox of a proxy with the options ``spec``, on the uplink network."""
+    """Create the sandbox of a proxy on the uplink network. ``spec`` has the proxy's options."""
 
     spec: ProxySpec = OWN_SPEC
     fingerprint: str = ""
@@ -116,9 +120,9 @@ class CreateLanRelay(_CreateContainer, frozen=True):
 class CreateRedirect(_CreateContainer, frozen=True):
     """Create a helper container that sets the rules of a redirect for a container.
 
-    The rules are in the container's network namespace, and lead ``addresses`` to ``proxy``.
-    ``target`` is the id of that container, ``started`` the time of its start. Without ``proxy``,
-    the helper removes the rules.
+    The rules are in the network namespace of the container with the id ``target``, and lead
+    ``addresses`` to ``proxy``. ``started`` is the time of that container's start. If ``proxy`` is
+    None, the helper removes the rules.
     """
 
     target: str
@@ -206,17 +210,18 @@ class Disconnect(Action, frozen=True):
 class Remove(Action, frozen=True):
     """Kill and remove a container.
 
-    ``retire`` is for a proxy without a successor: the proxy first unregisters the nodes at the
-    master (ROS 1), or sends dispose messages for the participants (ROS 2). ``stop`` is for a proxy
-    whose network namespace goes, too: the proxy first closes the connections that the kernel
-    forwards. Otherwise these connections would never be closed.
+    ``reason`` is the text for log and plan. ``retire`` is for a proxy without a successor: the
+    proxy first unregisters the nodes at the master (ROS 1), or sends dispose messages for the
+    participants (ROS 2). ``stop`` is for a proxy whose network namespace is removed, too: the proxy
+    first closes the connections that the kernel forwards. Otherwise these connections would never
+    be closed.
     """
 
     does = "remove container"
-    why: str
+    reason: str
     retire: bool = False
     stop: bool = False
 
     def _details(self) -> str:
         text = "after the proxy has told outside that its nodes have ended"
-        return f" ({self.why})" + (f", {text}" if self.retire else "")
+        return f" ({self.reason})" + (f", {text}" if self.retire else "")

@@ -1,8 +1,8 @@
 """The names under which the nodes of containers find the proxies, by network.
 
 If several containers on a network have the same name, the engine resolves this name to all of
-these containers, in any order. So a proxy gets no name that a container has, and loses such a name:
-nodes would reach the proxy or the container by chance.
+these containers, in any order: nodes would reach the proxy or the container by chance. So a proxy
+gets no name that a container has. A proxy loses its name if a container gets the same name.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -32,7 +32,7 @@ Aliases = Mapping[Key, Mapping[str, tuple[str, ...]]]
 
 @dataclass(frozen=True, slots=True)
 class Naming:
-    """The names of all proxies, and the problems of containers that can't find the proxy.
+    """The names of all proxies, and the problems of containers that won't find their proxy.
 
     ``withdrawn`` has, by network, the names that no proxy may have or keep there.
     """
@@ -84,7 +84,7 @@ class _Claim:
             return None
         if self.holders:
             return self.holders[0]
-        needed = [d.key for d in self.claimants if needed_by(d, self.network, self.alias)]
+        needed = [d.key for d in self.claimants if containers_seeking(d, self.network, self.alias)]
         return (needed or [d.key for d in self.claimants])[0]
 
 
@@ -101,7 +101,7 @@ class _NameFacts:
 def assign_aliases(
     desired: Collection[Desired], observed: HostState, settings: PlanSettings, former: FormerNames
 ) -> Naming:
-    """Return the names of the proxies, and problems of containers that won't find the proxy.
+    """Return the names of the proxies, and the problems of containers that won't find their proxy.
 
     ``desired`` is sorted by key. ``former`` has the names that containers have or had.
     """
@@ -125,8 +125,8 @@ def assign_aliases(
     return Naming(aliases, withdrawn, tuple(problems))
 
 
-def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
-    """Return the containers of a proxy on a network that look for the proxy by ``alias``."""
+def containers_seeking(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
+    """Return the names of the containers on a network that look for the proxy by ``alias``."""
     return tuple(member.container.name for member in _seekers(desired, network, alias))
 
 
@@ -178,7 +178,10 @@ def _claim(network: str, alias: str, proxies: Collection[Desired], facts: _NameF
 
 
 def _refusal(alias: str, places: Iterable[tuple[str, str]], facts: _NameFacts) -> str:
-    """Return why no proxy may have a name; empty if a proxy may. Present names are not checked."""
+    """Return why no proxy may have a name; empty if a proxy may.
+
+    Names that containers have now are not checked here (`_Claim.containers`).
+    """
     if refusal := alias_refusal(alias, facts.settings):
         return refusal
     former = next((facts.former[place] for place in places if place in facts.former), "")

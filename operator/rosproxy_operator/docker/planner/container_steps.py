@@ -31,7 +31,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.aliases import Naming, answers_to, needed_by
+from rosproxy_operator.docker.planner.aliases import Naming, answers_to, containers_seeking
 from rosproxy_operator.docker.planner.duplicates import Selection, free_name, select
 from rosproxy_operator.docker.planner.instants import instant
 from rosproxy_operator.docker.planner.label_policy import label_layers
@@ -58,7 +58,8 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 REPLACED = "replaced by another container"
 """The reason in `Remove` for a container that has a successor."""
-_CHANGEABLE = frozenset({"created", "running", "paused", "exited"})
+_CONNECTABLE_STATES = frozenset({"created", "running", "paused", "exited"})
+"""States in which the operator disconnects a sandbox from a network."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +108,9 @@ class PlanContext:
     ) -> Selection:
         """Decide which of the containers ``own`` stays and which goes.
 
-        A right container has the planned ports and ``fingerprint``, and ``fits`` accepts it. If no
-        container can be created, any fingerprint is right.
+        The container that stays should have the planned ports, the ``fingerprint``, and the result
+        true from ``fits``. If no container can be created, any fingerprint will do. ``name`` is
+        the name for the container that stays.
         """
         matching = [o for o in own if o.fingerprint == fingerprint or not self.creatable]
         candidates = [o.container for o in matching if o.range == self.ports]
@@ -119,8 +121,9 @@ class PlanContext:
 class _SandboxChoice:
     """The sandbox for a proxy.
 
-    ``id`` is empty if the plan creates the sandbox. If the plan ``starts`` the sandbox, a proxy in
-    the sandbox has to restart. Otherwise ``started_at`` is the time of the last start.
+    ``id`` is empty if the plan creates the sandbox. ``starts``: the plan starts the sandbox, so a
+    proxy in the sandbox has to restart. ``started_at`` is the time of the last start, as the engine
+    writes times.
     """
 
     name: str
@@ -178,7 +181,7 @@ def disconnect_steps(
     gone = _removed(planned)
     for sandbox in observed.sandboxes_of(desired.key):
         container = sandbox.container
-        if container.state in _CHANGEABLE and container.name not in gone:
+        if container.state in _CONNECTABLE_STATES and container.name not in gone:
             for network in _joined(observed, container):
                 action = Disconnect(container.name, network)
                 unwanted = network not in desired.networks | {uplink}
@@ -192,9 +195,10 @@ def _removed(actions: Iterable[Action]) -> set[str]:
 
 
 def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _SandboxChoice | None]:
-    """Return the actions for the sandbox, and the sandbox; None if no sandbox is going to run.
+    """Return the actions for the sandbox, and the sandbox.
 
-    The actions are None if a sandbox is missing and can't be created.
+    The sandbox is None if no sandbox is going to run. The actions are None if the sandbox is
+    missing and can't be created.
     """
     key = context.desired.key
     sandboxes = context.observed.sandboxes_of(key)
@@ -214,9 +218,9 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _SandboxC
     if kept is None and not selection.waiting:
         action = replace(action, name=free_name(action.name, taken), fingerprint=expected)
         former = former_name(selection.predecessor, action.name, taken)
-        ended = _emptying_steps(context, selection.predecessor) if selection.predecessor else ()
+        emptying = _emptying_steps(context, selection.predecessor) if selection.predecessor else ()
         actions += [
-            *creation_steps(selection, action, former, ended),
+            *creation_steps(selection, action, former, emptying),
             *_connect(context, action.name),
         ]
         return actions, _SandboxChoice(action.name, starts=True)
@@ -233,12 +237,12 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _SandboxC
 
 
 def _usable(sandbox: Container, observed: HostState) -> bool:
-    """Return whether a sandbox runs or can start. To start, all of the networks have to exist."""
+    """Return whether a sandbox runs, or can start because all of its networks exist."""
     return sandbox.state in SERVING or all(_has_network(observed, a) for a in sandbox.attachments)
 
 
 def _has_network(observed: HostState, attachment: Attachment) -> bool:
-    """Return whether the network of an attachment exists: a new network may have the same name."""
+    """Return whether the network of an attachment exists, and not only another of that name."""
     return any(
         network.name == attachment.network and attachment.network_id in ("", network.id)
         for network in observed.networks
@@ -271,7 +275,7 @@ def _lacks_alias(context: PlanContext, kept: Container, network: str) -> bool:
     Only a name that a container looks for counts, since joining again cuts all connections there.
     """
     return any(
-        needed_by(context.desired, network, alias)
+        containers_seeking(context.desired, network, alias)
         for alias in context.aliases(network)
         if not answers_to(kept, network, alias)
     )
@@ -352,7 +356,10 @@ def _process_steps(
 def keep_running_steps(
     selection: Selection, kept: Container, lost: bool = False
 ) -> Iterator[Action]:
-    """Yield the actions that keep a container running. A ``lost`` container restarts."""
+    """Yield the actions that keep a container running.
+
+    A ``lost`` container runs in a former network namespace (`_lost`), and restarts.
+    """
     if selection.predecessor:
         yield Remove(selection.predecessor.name, REPLACED)
     if kept.state == "paused":
@@ -366,7 +373,7 @@ def keep_running_steps(
 
 
 def _lost(kept: Container, home: _SandboxChoice) -> bool:
-    """Return whether a proxy runs in a former network namespace: the sandbox has started later."""
+    """Return whether a proxy runs in a former network namespace: the sandbox started later."""
     if home.starts:
         return True
     # A proxy that restarts enters the present namespace of the sandbox.
@@ -376,7 +383,7 @@ def _lost(kept: Container, home: _SandboxChoice) -> bool:
 
 
 def former_name(old: Container | None, name: str, taken: Collection[str]) -> str:
-    """Return the name for the old container, which frees ``name``; empty without old container."""
+    """Return the name for the old container, so that ``name`` is free; empty if ``old`` is None."""
     if old is None:
         return ""
     return free_name(f"{name}-old", taken) if old.name == name else old.name
@@ -386,16 +393,16 @@ def creation_steps(
     selection: Selection,
     action: CreateSandbox | Create | CreateLanRelay,
     former: str,
-    ended: Iterable[Action] = (),
+    before_removal: Iterable[Action] = (),
 ) -> Iterator[Action]:
     """Yield the actions that create and start a container, in place of the predecessor, if any.
 
-    The predecessor is renamed to ``former``, and removed after the actions ``ended``.
+    The predecessor is renamed to ``former``, and removed after the actions ``before_removal``.
     """
     if selection.predecessor and selection.predecessor.name != former:
         yield Rename(selection.predecessor.name, former)
     yield action
     if selection.predecessor:
-        yield from ended
+        yield from before_removal
         yield Remove(former, REPLACED)
     yield Start(action.name)

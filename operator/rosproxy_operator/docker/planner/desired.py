@@ -5,14 +5,14 @@ from collections.abc import Collection, Iterable, Iterator
 from rosproxy.settings import MOST_ZENOH_PORTS
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.ros2 import LEAST_PORTS
-from rosproxy_operator.docker.planner.labels.readers import BUILT_IN
+from rosproxy_operator.docker.planner.labels.readers import BUILT_IN_NETWORKS
 from rosproxy_operator.docker.planner.model import THIS_HOST, ZENOH, Desired, HostState, Key, Member
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, merged
 
 ROUTERS_STEP = 32
-"""The step in the number of routers of a proxy for rmw_zenoh. A router takes half a megabyte."""
+"""The routers of a proxy for rmw_zenoh come in groups of this size. A router takes 0.5 MB."""
 
 
 def desire(
@@ -24,13 +24,14 @@ def desire(
 ) -> tuple[tuple[Desired, ...], tuple[Problem, ...]]:
     """Return a Desired for each key that a container asks for or that has a proxy, sorted by key.
 
-    Return the problems, too. A member without an existing network is ignored. The labels of an
-    exited container count for ``grace`` seconds: the proxy keeps options and peers, and stays on
-    joined networks, but joins no other network for that container. ``now`` is in monotonic seconds.
+    Also return problems of networks and labels. A living member without a usable network is
+    ignored. The labels of an exited container count for ``grace`` seconds: the proxy keeps options
+    and peers, and stays on joined networks, but joins no other network for that container. ``now``
+    is in monotonic seconds.
     """
     before = _before_uplink(observed, settings.uplink)
     bad = {name for name in before if name.encode() < settings.uplink.encode()}
-    usable = {network.name for network in observed.networks} - BUILT_IN - bad
+    usable = {network.name for network in observed.networks} - BUILT_IN_NETWORKS - bad
     alive = [member for member in members if member.container.alive]
     recent = [
         member

@@ -19,10 +19,10 @@ class Selection:
     """What happens to the containers of a role.
 
     ``kept`` is the container that stays, running or not; None if a container has to be created.
-    ``predecessor`` serves, or has served, until the kept or the new container takes over.
-    ``surplus`` are all other containers. ``waiting``: the engine is removing a container, so
-    nothing can be created, removed or started. ``stuck``: a container is missing and can't be
-    created.
+    ``predecessor`` is the container that the kept or the new container replaces: a running one, or
+    else an idle one. ``surplus`` are all other containers. ``waiting``: the engine is removing a
+    container, so nothing can be created, removed or started. ``stuck``: a container is missing and
+    can't be created.
     """
 
     kept: Container | None = None
@@ -65,7 +65,7 @@ def select(
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
-    """Return the name, with a number at the end if the name is taken."""
+    """Return the name, with a number from 2 on at the end if the name is taken."""
     number = 1
     while (free := name if number == 1 else f"{name}-{number}") in taken:
         number += 1

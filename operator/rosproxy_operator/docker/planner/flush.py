@@ -84,7 +84,7 @@ def flush_steps(
 
 
 def _is_busy(key: Key, observed: HostState) -> bool:
-    """Return whether the operator does not know all about a key's records or sandboxes yet."""
+    """Return whether a record or sandbox of a key has no current inspection yet (`HostState`)."""
     containers = [*observed.flushes, *observed.sandboxes]
     return any(o.key == key and o.container.name in observed.busy for o in containers)
 
@@ -119,7 +119,7 @@ def _steps(
 
 
 def _is_current(record: FlushContainer, sandbox: Sandbox, outdated: Mapping[str, str]) -> bool:
-    """Return whether a record's last run succeeded, later than the ports were published."""
+    """Return whether a record's last run succeeded, and began after the sandbox's last start."""
     ran_at = record.container.started_at
     is_later = instant(ran_at) > instant(sandbox.container.started_at)
     return record.done and is_later and outdated.get(record.container.id) != ran_at

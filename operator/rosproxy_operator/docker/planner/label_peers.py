@@ -16,7 +16,7 @@ from rosproxy_operator.docker.planner.model import ZENOH, Key, Member
 from rosproxy_operator.docker.settings import PlanSettings
 
 MOST_PEERS_OF_PROXY = 256
-"""Most peers of a proxy from labels. These take 66 KiB: a host has 253 characters at most."""
+"""Most peers of a DDS proxy from labels, in 66 KiB: a host has 253 characters at most."""
 
 
 def with_bounded_peers(

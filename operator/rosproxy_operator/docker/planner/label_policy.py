@@ -30,7 +30,7 @@ the denied names.
 def with_bounded_rules(
     members: Collection[Member], settings: PlanSettings
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
-    """Return the members whose rules the proxies can hold, and problems of all other members."""
+    """Return the members whose rules the proxies can hold, and a problem for each other member."""
     common = sum(len(layer.rules) for layer in settings.policy)
     rules: Counter[Key] = Counter()
     layers: Counter[Key] = Counter()
@@ -63,7 +63,8 @@ def label_layers(
 ) -> tuple[PolicyLayer, ...]:
     """Return the layers of living members, each for the container's addresses on ``networks``.
 
-    ``routers``: the ports for containers of a proxy for rmw_zenoh, whose layers need ports.
+    ``routers`` are the ports of the proxy for rmw_zenoh, whose layers need ports; None for other
+    proxies.
     """
     containers = by_reference(observed.containers)
     layers: list[PolicyLayer] = []
@@ -79,10 +80,10 @@ def label_layers(
 
 
 def _ports_at(owner: Container, routers: PortRange, observed: HostState) -> frozenset[int]:
-    """The ports of the proxy for rmw_zenoh at which the rules of a container apply.
+    """Return the ports of the proxy for rmw_zenoh at which the rules of a container apply.
 
-    These are the port of the container's redirect, and all ports that no container has: a container
-    gets its port before the proxy learns of that.
+    These are the port of the container's redirect, and all ports that no container has. A container
+    gets one of the free ports before the proxy learns which.
     """
     alive = {container.id for container in observed.containers if container.alive}
     owner_by_port: dict[int, set[str]] = {}
@@ -94,7 +95,7 @@ def _ports_at(owner: Container, routers: PortRange, observed: HostState) -> froz
 
 
 class RecentLayers:
-    """The layers of containers' labels, also of containers gone in the last `LAYERS_KEPT_S`."""
+    """The layers of labels, also those of containers that have gone in the last `LAYERS_KEPT_S`."""
 
     def __init__(self) -> None:
         self._last_seen: dict[tuple[PolicyLayer, str], float] = {}

@@ -38,7 +38,7 @@ def with_lan_relay(context: PlanContext, steps: list[Action]) -> list[Action]:
     """Return the steps for a proxy, for ROS 2 with the steps for the LAN relay.
 
     If the steps start, create or remove a sandbox, the operator removes the LAN relay first: the
-    new sandbox may publish the LAN relay's port. The next looks then create the LAN relay.
+    new sandbox may publish the LAN relay's port. Later looks create the LAN relay again.
     """
     key = context.desired.key
     if not key.is_ros2:
@@ -50,7 +50,7 @@ def with_lan_relay(context: PlanContext, steps: list[Action]) -> list[Action]:
 
 
 def missing_lan_relay(key: Key, observed: HostState, settings: PlanSettings) -> Problem | None:
-    """The warning that a proxy for ROS 2 lacks the LAN relay; None if nothing is missing."""
+    """Return a warning if a proxy for ROS 2 lacks the LAN relay; None if nothing is missing."""
     if settings.ros2_lan == NOWHERE or _lan(key, observed, settings) or observed.lan_relays_of(key):
         return None
     text = (
@@ -67,17 +67,17 @@ def _starts(step: Action, sandboxes: Collection[str]) -> bool:
 
 
 def _lan(key: Key, observed: HostState, settings: PlanSettings) -> str:
-    """This host's address on the LAN; empty if unknown, or if ``--ros2-lan`` is ``none``."""
+    """Return this host's address on the LAN; empty if unknown, or if ``--ros2-lan`` is ``none``."""
     if settings.ros2_lan:
         return "" if settings.ros2_lan == NOWHERE else settings.ros2_lan
     return key.advertise_host if is_address(key.advertise_host) else observed.default_route_address
 
 
 def _wanted(context: PlanContext) -> CreateLanRelay | None:
-    """The action that creates the LAN relay.
+    """Return the action that creates the LAN relay.
 
-    None without a LAN relay, and while an address is unknown: of the LAN, of the proxy on the
-    uplink, or of the uplink's gateway.
+    None if the proxy gets no LAN relay, or while an address is unknown: this host's on the LAN, the
+    proxy's on the uplink, or the gateway's of the uplink.
     """
     key = context.desired.key
     observed = context.observed
@@ -109,7 +109,7 @@ def _lan_relay_steps(context: PlanContext) -> Iterator[Action]:
 
 
 def _ensure_lan_relay(context: PlanContext, lan_relay: CreateLanRelay) -> Iterator[Action]:
-    """The steps after which the proxy has this LAN relay and no other."""
+    """Yield the steps after which the proxy has this LAN relay and no other."""
     lan_relays = context.observed.lan_relays_of(lan_relay.key)
     observed = context.observed
     expected = lan_relay_fingerprint(

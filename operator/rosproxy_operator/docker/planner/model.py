@@ -49,6 +49,7 @@ class Container:
         network_mode: ``bridge``, ``host``, ``none``, ``container:ID`` or the name of a network.
         master_uri: The variable ROS_MASTER_URI; empty without.
         host_ports: TCP ports of the host that the container publishes now, or after a start.
+        hostname: The host name of the container itself.
         variables: The variables that the operator needs: the ROS version, settings of ROS 2,
             ROS_IP and ROS_HOSTNAME.
         udp_ports: As ``host_ports``, for UDP.
@@ -156,7 +157,7 @@ ZENOH = Key("", "")
 class OwnContainer:
     """A container of this operator on the host, and the content of its labels.
 
-    ``range`` are the proxy's ports. ``fingerprint`` is the hash of how the container was made.
+    ``range`` are the proxy's ports. ``fingerprint`` is a hash of the creation request.
     """
 
     key: Key
@@ -222,8 +223,8 @@ class HostState:
         containers: All containers except the operator's own.
         ephemeral: The range from which the kernel takes ports for outgoing connections.
         listening: TCP ports of the host on which a program listens, except ports of busy
-            sandboxes. Empty if the operator is not in the host's network, as are
-            ``listening_udp``, ``advertise`` and ``default_route_address``.
+            sandboxes. If the operator is not in the host's network, this field is empty. So are
+            then ``listening_udp``, ``advertise`` and ``default_route_address``.
         listening_udp: Bound UDP ports of the host, except ports of busy sandboxes and LAN relays.
         image_id: The id of the proxy's image; empty if the host does not have the image.
         advertise: This host's address towards a master, by the master's host name. A host name
@@ -260,7 +261,7 @@ class HostState:
 
     @property
     def own(self) -> tuple[OwnContainer, ...]:
-        """The sandboxes, proxies and LAN relays; the records of redirects and flushes are not."""
+        """The sandboxes, proxies and LAN relays, but not the records of redirects and flushes."""
         return (*self.sandboxes, *self.proxies, *self.lan_relays)
 
     @property

@@ -11,7 +11,7 @@ network if a container is on both networks.
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 
-from rosproxy_operator.docker.planner.labels.readers import BUILT_IN
+from rosproxy_operator.docker.planner.labels.readers import BUILT_IN_NETWORKS
 from rosproxy_operator.docker.planner.model import Container, HostState
 
 MOST_REMEMBERED_NAMES = 10_000
@@ -39,7 +39,7 @@ def present_names(observed: HostState) -> NamesByNetwork:
             for name in attachment.names:
                 own[attachment.network][name.lower()].add(container.name)
             # No names resolve on built-in networks, so names there are not taken on other networks.
-            neighbours[attachment.network] |= container.networks - BUILT_IN
+            neighbours[attachment.network] |= container.networks - BUILT_IN_NETWORKS
     taken: dict[str, dict[str, frozenset[str]]] = {}
     for network, others in neighbours.items():
         merged: dict[str, set[str]] = defaultdict(set)

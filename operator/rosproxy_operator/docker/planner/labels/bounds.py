@@ -46,7 +46,7 @@ def allowed_planes(settings: PlanSettings) -> frozenset[DataPlane]:
 
 
 def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[str, ...]]:
-    """Return the request reduced to the allowed part, and warnings about the refused part."""
+    """Return the allowed part of a container's request, and warnings about the refused part."""
     warnings: list[str] = []
     limit = max(settings.max_ports, settings.ports)
     if request.ports > limit:

@@ -31,13 +31,14 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 _PREFIX = "rosproxy"
 # An exited container may start again: the proxy stays on its networks for the grace (`desire`).
-_COUNTED = ALIVE | {"exited"}
+_READ_STATES = ALIVE | {"exited"}
+"""States of a container in which the operator reads the labels."""
 MOST_LABELS = 256
-"""Labels of a container that are checked for their spelling. A check takes about 30 µs."""
+"""Most labels of a container whose spelling is checked. A check takes about 30 µs."""
 MOST_UNKNOWN_LABELS = 8
-"""Unknown labels of a container with a warning each. Further unknown labels are only counted."""
+"""Unknown labels of a container that get a warning each. One more warning counts the others."""
 MOST_NAME_CHARACTERS = 80
-"""Characters of a label's name in a warning."""
+"""Most characters of a label's name in a warning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
     requests: list[Member] = []
     problems: list[Problem] = []
     for container in sorted(observed.containers, key=lambda c: (c.name, c.id)):
-        if container.state not in _COUNTED:
+        if container.state not in _READ_STATES:
             continue
         wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
         try:
@@ -183,7 +184,7 @@ def _requests(
     warnings = [*ros_versions.warnings(container, served)]
     for request in requests:
         if request.key.is_ros2:
-            warnings += ros_versions.past_the_proxy(container, request.networks, observed)
+            warnings += ros_versions.static_peer_warnings(container, request.networks, observed)
     warnings += dict.fromkeys(text for _, texts in granted for text in texts)
     members = [request for request, _ in granted]
     if "zenoh" in served:
@@ -209,7 +210,7 @@ def _request(
     uri = "" if is_ros2 else _master_uri(container, settings, proxies)
     host = readers.advertise_host(labels, settings)
     if is_ros2:
-        ros_versions.refuse_unserved(host)
+        ros_versions.refuse_ipv6_host(host)
     networks = readers.networks(container, observed, settings.uplink)
     return Member(
         container,
@@ -231,7 +232,7 @@ def _master_uri(container: Container, settings: PlanSettings, proxies: Collectio
         if not ros_versions.is_guessed(container):
             raise
         raise UnusableLabel(
-            f"{ros_versions.UNKNOWN}. Add the label {ROS}=2 for ROS 2, or the label "
+            f"{ros_versions.UNKNOWN_VERSION}. Add the label {ROS}=2 for ROS 2, or the label "
             f"{MASTER_URI}=http://HOST:11311 for ROS 1"
         ) from None
 
@@ -241,7 +242,7 @@ def _problem(container: Container, text: str, fatal: bool) -> Problem:
 
 
 def _unusable(container: Container, text: str) -> Problem:
-    """Return a problem, fatal only if a label asks for a proxy: a variable alone is no request."""
+    """Return a problem, fatal if a label is for the operator: a variable alone is no request."""
     return _problem(container, text, fatal=bool(_labels_for_operator(container)))
 
 
@@ -292,15 +293,15 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
     if container.labels.get(ENABLE, "").strip().lower() == "false":
         return
     unknown = [name for name in own if name not in LABELS]
-    told = unknown[:MOST_UNKNOWN_LABELS]
-    for name in told:
+    reported = unknown[:MOST_UNKNOWN_LABELS]
+    for name in reported:
         near = nearest(name, LABELS, LEAST_SIMILARITY_WITH_PREFIX)
         fix = f"Did you mean {near}?" if near else f"Known labels: {', '.join(LABELS)}"
         yield f"label {bounded(name, MOST_NAME_CHARACTERS)} is unknown and ignored. {fix}"
-    if left_out := len(unknown) - len(told):
+    if left_out := len(unknown) - len(reported):
         yield f"{left_out} more labels {_PREFIX}.… are unknown and ignored. Remove these labels"
     misspelt = any(
-        nearest(name, LABELS, LEAST_SIMILARITY_WITH_PREFIX) == ENABLE for name in told
+        nearest(name, LABELS, LEAST_SIMILARITY_WITH_PREFIX) == ENABLE for name in reported
     )  # warned of above
     if own and not misspelt and ENABLE not in container.labels and not settings.expose_by_default:
         names = listed(f"label {bounded(name, MOST_NAME_CHARACTERS)}" for name in own)

@@ -12,12 +12,12 @@ from rosproxy.net.addresses import is_loopback
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.docker.planner.model import Container, HostState, Key
 
-VARIABLES = ("ROS_IP", "ROS_HOSTNAME")
+_ADDRESS_VARIABLES = ("ROS_IP", "ROS_HOSTNAME")
 
 
 def wrong_own_address(container: Container, key: Key, observed: HostState) -> str:
-    """Return what is wrong with the own address of a ROS 1 container; empty for no fault."""
-    for name in VARIABLES:
+    """Return what is wrong with ROS_IP or ROS_HOSTNAME of a ROS 1 container; empty for no fault."""
+    for name in _ADDRESS_VARIABLES:
         value = container.variables.get(name, "").strip().lower()
         fix = f"Unset {name}: no node behind a proxy needs this variable"
         if value and is_loopback(value):

@@ -40,7 +40,7 @@ LABELS = (
 
 ALIAS = "rosproxy"
 """The name that every proxy for ROS 1 wants on the networks of its containers."""
-BUILT_IN = frozenset({"bridge", "host", "none"})
+BUILT_IN_NETWORKS = frozenset({"bridge", "host", "none"})
 """Networks that every engine has. No names resolve there, so nodes can't find a proxy."""
 MOST_LABEL_RULES = 100
 """Most rules of a container."""
@@ -74,7 +74,7 @@ def named(label: str, labels: Labels) -> str:
 
 
 def refuse_long_values(labels: Labels) -> None:
-    """Raise UnusableLabel for a long value, since the operator reads all values at each look."""
+    """Raise UnusableLabel for a long value: the operator reads all values at each look."""
     for label in LABELS:
         if len(labels.get(label, "")) > MOST_VALUE_CHARACTERS:
             fix = "Join rules by globs" if label == POLICY else "Shorten the value"
@@ -159,9 +159,14 @@ def advertise_host(labels: Labels, settings: PlanSettings) -> str:
 
 
 def networks(container: Container, observed: HostState, uplink: str) -> frozenset[str]:
-    """Return the network in the label, else all user-defined networks except the uplink."""
+    """Return the network in the label, else all user-defined networks except the uplink.
+
+    A container in the network namespace of another container has the networks of that container.
+    """
     net_owner = network_owner(container, observed)
-    own = (net_owner.networks or _future_network(net_owner, observed)) - BUILT_IN - {uplink}
+    own = (
+        (net_owner.networks or _future_network(net_owner, observed)) - BUILT_IN_NETWORKS - {uplink}
+    )
     if NETWORK in container.labels:
         return frozenset({_named_network(container.labels, own)})
     if not own:
@@ -170,7 +175,7 @@ def networks(container: Container, observed: HostState, uplink: str) -> frozense
 
 
 def _flag(label: str, labels: Labels, usual: str = "true") -> bool | None:
-    """Return whether a label says true; None without the label. The fix names ``usual``."""
+    """Return whether a label says true; None without the label. The error proposes ``usual``."""
     value = labels.get(label, "").strip().lower()
     if label in labels and value not in ("true", "false"):
         text = f"{named(label, labels)} is neither true nor false. Write {label}={usual}"
@@ -179,7 +184,7 @@ def _flag(label: str, labels: Labels, usual: str = "true") -> bool | None:
 
 
 def _wish(wish: Wish, choices: Collection[str], labels: Labels) -> str | bool | None:
-    """Return the value of a label: one of the choices, or a flag if there are no choices."""
+    """Return the value of a label: one of the choices, or true or false if there are none."""
     value = labels[wish.label].strip().lower()
     if not choices:
         return _flag(wish.label, labels)

@@ -7,8 +7,8 @@ The first source that states the version counts:
 3. The label ``rosproxy.master-uri`` or the variable ROS_MASTER_URI: ROS 1.
 4. A label or variable that only ROS 2 has, such as ROS_DOMAIN_ID: ROS 2.
 
-Without such a source, the operator assumes ROS 1. A label or RMW_IMPLEMENTATION states that the
-ROS 2 nodes use rmw_zenoh instead of DDS.
+Without such a source, the operator assumes ROS 1. The label ``rosproxy.rmw`` or the variable
+RMW_IMPLEMENTATION states that the ROS 2 nodes use rmw_zenoh instead of DDS.
 """
 
 import re
@@ -39,13 +39,13 @@ from rosproxy_operator.docker.planner.labels.readers import (
 from rosproxy_operator.docker.planner.model import Container, HostState
 from rosproxy_operator.proxy_spec.spec import WISHES
 
-_OF_ROS1 = (MASTER_URI, REDIRECT, *(w.label for w in WISHES.values() if w.ros == "1"))
-_OF_ROS2 = (RMW, DOMAIN, PEERS)
-_NOT_OF_ZENOH = (
+_ROS1_LABELS = (MASTER_URI, REDIRECT, *(w.label for w in WISHES.values() if w.ros == "1"))
+_ROS2_LABELS = (RMW, DOMAIN, PEERS)
+_NOT_ZENOH_LABELS = (
     *(DOMAIN, PORTS, ADVERTISE_HOST, MASTER_URI),
     *(wish.label for wish in WISHES.values()),
 )
-UNKNOWN = "no label and no variable states the ROS version"
+UNKNOWN_VERSION = "no label and no variable states the ROS version"
 
 
 def versions(container: Container) -> frozenset[str]:
@@ -94,13 +94,13 @@ def _is_marked_ros2(container: Container) -> bool:
     """Whether a container has labels or variables of ROS 2 alone, and no ROS 1 master."""
     if MASTER_URI in container.labels or container.master_uri:
         return False
-    return any(name in container.labels for name in _OF_ROS2) or bool(
+    return any(name in container.labels for name in _ROS2_LABELS) or bool(
         ROS2_VARIABLES & container.variables.keys()
     )
 
 
 def domain(container: Container) -> int:
-    """The domain of a container: from the label, else from ROS_DOMAIN_ID, else 0.
+    """Return the domain of a container: from the label, else from ROS_DOMAIN_ID, else 0.
 
     Raises UnusableLabel.
     """
@@ -117,7 +117,7 @@ def domain(container: Container) -> int:
     return int(digits)
 
 
-def refuse_unserved(host: str) -> None:
+def refuse_ipv6_host(host: str) -> None:
     """Raise UnusableLabel if the advertised host is an IPv6 address."""
     if ":" in host:
         raise UnusableLabel(
@@ -126,10 +126,10 @@ def refuse_unserved(host: str) -> None:
         )
 
 
-def past_the_proxy(
+def static_peer_warnings(
     container: Container, networks: Collection[str], observed: HostState
 ) -> Iterator[str]:
-    """Warnings for hosts outside that the variable ROS_STATIC_PEERS of a container names.
+    """Yield warnings for hosts outside that the variable ROS_STATIC_PEERS of a container names.
 
     ``networks`` are the names of the container's networks. The nodes announce inside addresses
     directly to such a host, and the host can't reach these addresses. A participant keeps the first
@@ -157,10 +157,10 @@ def is_guessed(container: Container) -> bool:
 
 
 def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[str]:
-    """Warnings for a container of these versions. The container gets a proxy nevertheless."""
+    """Yield warnings for a container of these versions. The container gets a proxy nevertheless."""
     labels = container.labels
     if is_guessed(container):
-        yield f"{UNKNOWN}, so the operator assumes ROS 1. Add the label {ROS}=1 or {ROS}=2"
+        yield f"{UNKNOWN_VERSION}, so the operator assumes ROS 1. Add the label {ROS}=1 or {ROS}=2"
     yield from (
         f"label {label} is ignored: {text}"
         for label, text in _ignored(ros_versions).items()
@@ -169,17 +169,17 @@ def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[st
 
 
 def _ignored(ros_versions: Collection[str]) -> dict[str, str]:
-    """The labels without effect on a container of these versions, each with the reason and fix."""
+    """Return the labels without effect on a container of these versions, with reason and fix."""
     without_effect = "the label has no effect on rmw_zenoh. Remove the label"
     if ros_versions == {"zenoh"}:
-        return dict.fromkeys(_NOT_OF_ZENOH, without_effect)
+        return dict.fromkeys(_NOT_ZENOH_LABELS, without_effect)
     ignored: dict[str, str] = {}
     if "1" not in ros_versions:
-        ignored |= dict.fromkeys(_OF_ROS1, _of_another_version("1"))
+        ignored |= dict.fromkeys(_ROS1_LABELS, _of_another_version("1"))
     if "zenoh" in ros_versions:
         ignored[DOMAIN] = without_effect
     elif "2" not in ros_versions:
-        ignored |= dict.fromkeys(_OF_ROS2, _of_another_version("2"))
+        ignored |= dict.fromkeys(_ROS2_LABELS, _of_another_version("2"))
     return ignored
 
 

@@ -1,8 +1,8 @@
 """Read what a container with rmw_zenoh asks for: routers for the proxy, and the redirect.
 
 The label ``rosproxy.peers`` and the variable ZENOH_CONFIG_OVERRIDE of the container name routers.
-The proxy connects to these routers. If the container itself runs a router, the router goes on
-serving the containers around it, and the proxy connects to the router, too.
+The proxy connects to these routers. If the container itself runs a router, the proxy connects to
+that router, too. The router goes on serving its own clients.
 """
 
 from collections.abc import Iterable, Iterator
@@ -81,9 +81,9 @@ def zenoh_member(
     if rules or settings.policy:
         _refuse_detours(container, bool(rules), _has_router(owner, observed))
     own = [*_connected(member, observed)]
-    dialed = [r for r in (*_labelled(labels), *own) if _may_be_dialed(r, settings)]
-    refused = [r for r in (*_labelled(labels), *own) if r not in dialed]
-    peers = {router.peer for router in dialed}
+    allowed = [r for r in (*_labelled(labels), *own) if _is_allowed(r, settings)]
+    refused = [r for r in (*_labelled(labels), *own) if r not in allowed]
+    peers = {router.peer for router in allowed}
     if container.is_zenoh_router:
         port = router_port(container.variables.get(OVERRIDE, ""))
         peers.add(str(HostPort(owner.name, port)))
@@ -91,9 +91,9 @@ def zenoh_member(
     warnings = [*_refusals(refused), *_by_other_protocols(container)]
     if _has_router(owner, observed):
         return member, warnings
-    outside = [router for router in own if router in dialed and not router.neighbour]
+    outside = [router for router in own if router in allowed and not router.neighbour]
     redirected = [router for router in outside if _is_redirectable(router, owner, observed)]
-    warnings += _past_the_proxy(router for router in outside if router not in redirected)
+    warnings += _bypass_warnings(router for router in outside if router not in redirected)
     if not settings.redirect or member.redirect is False:
         if rules:
             raise UnusableLabel(f"label {POLICY} {_NEEDS_REDIRECT}")
@@ -102,14 +102,15 @@ def zenoh_member(
     return replace(member, redirected=tuple(dict.fromkeys(addresses))), warnings
 
 
-def _may_be_dialed(router: _Router, settings: PlanSettings) -> bool:
+def _is_allowed(router: _Router, settings: PlanSettings) -> bool:
+    """Return whether the proxy may connect to a router."""
     return router.neighbour is not None or is_allowed_router(router.address, settings)
 
 
 def with_bounded_containers(
     members: Iterable[Member],
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
-    """Return the members, without excess members of the proxy for rmw_zenoh, and the problems.
+    """Return the members without the excess members of the proxy for rmw_zenoh, and the problems.
 
     This proxy has a router for each of its first `MOST_ZENOH_PORTS` members. Each living member
     beyond that limit gets a problem. All members of other proxies stay.
@@ -125,7 +126,10 @@ def with_bounded_containers(
 
 
 def _rules(labels: Labels, settings: PlanSettings) -> tuple[Rule, ...]:
-    """The rules of the label. Raises UnusableLabel for rules that a router cannot enforce."""
+    """Return the rules of the label.
+
+    Raises UnusableLabel for rules, also of --policy, that a router can't enforce.
+    """
     rules = readers.policy(labels)
     for source, layers in (
         (f"label {POLICY}", (PolicyLayer(POLICY, rules),)),
@@ -161,15 +165,15 @@ def _refuse_detours(container: Container, has_own_rules: bool, has_router: bool)
 
 
 def _labelled(labels: Labels) -> Iterator[_Router]:
-    """The routers that the label ``rosproxy.peers`` names. Raises UnusableLabel."""
+    """Yield the routers that the label ``rosproxy.peers`` names. Raises UnusableLabel."""
     for address in readers.peers(labels, lambda name: read_zenoh_peer(name.lower())):
         yield _Router(address, f"label {PEERS}")
 
 
 def _connected(member: Member, observed: HostState) -> Iterator[_Router]:
-    """The routers to which ZENOH_CONFIG_OVERRIDE connects the nodes of a container.
+    """Yield the routers to which ZENOH_CONFIG_OVERRIDE connects the nodes of a container.
 
-    None for a container that runs a router: the variable then configures this router.
+    A container that runs a router yields nothing: the variable configures this router.
     """
     container = member.container
     if container.is_zenoh_router:
@@ -181,7 +185,7 @@ def _connected(member: Member, observed: HostState) -> Iterator[_Router]:
 
 
 def _neighbour(host: str, member: Member, observed: HostState) -> Container | None:
-    """The container with this name or address on a network of the member; None without."""
+    """Return the container with this name or address on a network of the member, or None."""
     for container in observed.containers:
         for attachment in container.attachments:
             names = {attachment.address, *map(str.lower, attachment.names)}
@@ -219,8 +223,8 @@ def _refusals(refused: Iterable[_Router]) -> Iterator[str]:
         )
 
 
-def _past_the_proxy(routers: Iterable[_Router]) -> Iterator[str]:
-    """Warnings for routers to which the nodes connect directly, not through the proxy."""
+def _bypass_warnings(routers: Iterable[_Router]) -> Iterator[str]:
+    """Yield warnings for routers to which the nodes connect directly, not through the proxy."""
     for router in routers:
         yield (
             f"{router.named_by} connects the nodes to {quoted(router.peer)}, and the operator can "
