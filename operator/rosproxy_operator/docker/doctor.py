@@ -24,7 +24,7 @@ MOST_DOCTORS = 4
 _SUBJECT_KINDS = ("engine", "proxy image", "network", "master", "container", "proxy")
 """The kinds of subjects, causes before consequences."""
 _UNFINISHED_STATES = ("absent", "created")
-"""States of a proxy's container while an operator makes the proxy."""
+"""States of a proxy's container while an operator creates the proxy."""
 
 
 def examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding]:

@@ -10,8 +10,8 @@ _PORT_TAKEN = re.compile(
 _PORT = re.compile(r"(?:[0-9.]+|\[[0-9A-Fa-f:]*\]|::):([0-9]{1,5})\b")
 _FOREIGN_ADDRESS = re.compile(r"(\S+): bind: cannot assign requested address")
 _IDS = re.compile(r"\b[0-9a-f]{64}\b")
-_ENGINES_OWN = re.compile(r"endpoint|network|container")
-"""Words in refusals of the engine. Refusals of a proxy in front of the engine lack these words."""
+_ENGINE_WORDS = re.compile(r"endpoint|network|container")
+"""Words in the engine's own refusals. A proxy in front of the engine does not write these words."""
 
 
 class EngineError(Exception):
@@ -63,7 +63,7 @@ def refusal(status: int, text: str, request: str) -> EngineError:
         message = (
             f"--publish-address: {foreign[1].rpartition(':')[0]} is not an address of this host"
         )
-    elif status in (401, 403, 404, 405) and not _ENGINES_OWN.search(message):
+    elif status in (401, 403, 404, 405) and not _ENGINE_WORDS.search(message):
         message = (
             f"{request} is refused (HTTP {status}: {message[:100]}). If a proxy stands in front of "
             "the engine's socket, allow this request there"

@@ -137,11 +137,11 @@ def wanted_steps(context: PlanContext) -> list[Action] | None:
 
     None if a container is missing and can't be created.
     """
-    actions, home = _sandbox_steps(context)
-    if actions is None or home is None:
+    actions, sandbox = _sandbox_steps(context)
+    if actions is None or sandbox is None:
         return actions
-    process_actions = _process_steps(context, home, _removed(actions))
-    return None if process_actions is None else actions + process_actions
+    proxy_actions = _proxy_steps(context, sandbox, _removed(actions))
+    return None if proxy_actions is None else actions + proxy_actions
 
 
 def removal_steps(
@@ -306,8 +306,8 @@ def _emptying_steps(context: PlanContext, old: Container) -> Iterator[Action]:
             yield Remove(proxy.container.name, "the sandbox is replaced", stop=True)
 
 
-def _process_steps(
-    context: PlanContext, home: _SandboxChoice, gone: Collection[str]
+def _proxy_steps(
+    context: PlanContext, sandbox: _SandboxChoice, gone: Collection[str]
 ) -> list[Action] | None:
     """Return the actions for the proxy's own container; None if no such container can be created.
 
@@ -322,7 +322,7 @@ def _process_steps(
         name,
         key,
         context.ports,
-        home.name,
+        sandbox.name,
         context.desired.spec,
         policy=context.label_policy,
         peers=context.desired.peers,
@@ -332,17 +332,17 @@ def _process_steps(
     expected = proxy_fingerprint(action, context.settings, observed.image_id, observed.secret)
     staying = [p for p in proxies if p.container.name not in gone]
     selection = context.select(
-        staying, wanted_name, expected, lambda c: c.network_container == home.id
+        staying, wanted_name, expected, lambda c: c.network_container == sandbox.id
     )
     kept = selection.kept
-    misplaced = kept and kept.network_container != home.id
+    misplaced = kept and kept.network_container != sandbox.id
     if selection.waiting and (misplaced or not kept):
         return []
     if selection.stuck or misplaced:
         return None
     actions: list[Action] = [Remove(c.name, "left over") for c in selection.surplus]
     if kept:
-        actions += keep_running_steps(selection, kept, _lost(kept, home))
+        actions += keep_running_steps(selection, kept, _lost(kept, sandbox))
         if wanted_name not in (kept.name, *taken) and not selection.waiting:
             actions.append(Rename(kept.name, wanted_name))
         return actions
@@ -372,14 +372,14 @@ def keep_running_steps(
         yield Restart(kept.name)
 
 
-def _lost(kept: Container, home: _SandboxChoice) -> bool:
+def _lost(kept: Container, sandbox: _SandboxChoice) -> bool:
     """Return whether a proxy runs in a former network namespace: the sandbox started later."""
-    if home.starts:
+    if sandbox.starts:
         return True
     # A proxy that restarts enters the present namespace of the sandbox.
-    if not kept.started_at or not home.started_at or kept.state == "restarting":
+    if not kept.started_at or not sandbox.started_at or kept.state == "restarting":
         return False
-    return instant(kept.started_at) < instant(home.started_at)
+    return instant(kept.started_at) < instant(sandbox.started_at)
 
 
 def former_name(old: Container | None, name: str, taken: Collection[str]) -> str:

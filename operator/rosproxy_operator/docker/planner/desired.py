@@ -29,9 +29,9 @@ def desire(
     and peers, and stays on joined networks, but joins no other network for that container. ``now``
     is in monotonic seconds.
     """
-    before = _before_uplink(observed, settings.uplink)
-    bad = {name for name in before if name.encode() < settings.uplink.encode()}
-    usable = {network.name for network in observed.networks} - BUILT_IN_NETWORKS - bad
+    before = _names_before_uplink(observed, settings.uplink)
+    refused = {name for name in before if name.encode() < settings.uplink.encode()}
+    usable = {network.name for network in observed.networks} - BUILT_IN_NETWORKS - refused
     alive = [member for member in members if member.container.alive]
     recent = [
         member
@@ -58,7 +58,7 @@ def desire(
             )
         )
     problems = [
-        (_bad_network if name in bad else _preferred_network)(name, settings.uplink)
+        (_refused_network if name in refused else _preferred_network)(name, settings.uplink)
         for name in sorted(before & _networks(alive))
     ]
     return tuple(desired), (*problems, *_outvoted(desired))
@@ -98,11 +98,11 @@ def _networks(members: Iterable[Member]) -> frozenset[str]:
     return frozenset(name for member in members for name in member.networks)
 
 
-def _before_uplink(observed: HostState, uplink: str) -> set[str]:
-    """Return the networks that would take published ports and default route from the uplink.
+def _names_before_uplink(observed: HostState, uplink: str) -> set[str]:
+    """Return the names of networks that would take ports and default route from the uplink.
 
-    The engine gives ports and default route to a network with IPv4 and IPv6, then to the network
-    whose name sorts first, internal networks aside. Such a move cuts all connections.
+    The engine gives published ports and default route to one network that is not internal. Networks
+    with IPv4 and IPv6 come first, then the name that sorts first. A move cuts all connections.
     """
     # moby sorts by Endpoint.Less (libnetwork/sandbox.go): networks that are not internal first,
     # then networks with gateways for IPv4 and IPv6, then by name. Go compares names by bytes. A
@@ -117,7 +117,7 @@ def _before_uplink(observed: HostState, uplink: str) -> set[str]:
     }
 
 
-def _bad_network(name: str, uplink: str) -> Problem:
+def _refused_network(name: str, uplink: str) -> Problem:
     return Problem(
         f"network {name}",
         f"proxies can't join this network: its name sorts before the name of the uplink network "

@@ -119,7 +119,11 @@ def _steps(
 
 
 def _is_current(record: FlushContainer, sandbox: Sandbox, outdated: Mapping[str, str]) -> bool:
-    """Return whether a record's last run succeeded, and began after the sandbox's last start."""
+    """Return whether a record's last run counts.
+
+    The run must have succeeded, must have begun after the sandbox's last start, and must not be
+    ``outdated``.
+    """
     ran_at = record.container.started_at
     is_later = instant(ran_at) > instant(sandbox.container.started_at)
     return record.done and is_later and outdated.get(record.container.id) != ran_at

@@ -40,7 +40,7 @@ def with_bounded_peers(
     return (
         tuple(replace(m, peers=frozenset()) if m in ignored else m for m in members),
         tuple(
-            Problem(f"container {member.container.name}", _ignored(member.key), fatal=False)
+            Problem(f"container {member.container.name}", _ignored_text(member.key), fatal=False)
             for member in ignored
             if member.container.alive
         ),
@@ -51,7 +51,7 @@ def _most(key: Key) -> int:
     return MOST_ZENOH_PEERS if key == ZENOH else MOST_PEERS_OF_PROXY
 
 
-def _ignored(key: Key) -> str:
+def _ignored_text(key: Key) -> str:
     """Return why the peers of a container are ignored, and the fix."""
     common = "" if key == ZENOH else ", or start the operator with --ros2-peer for common peers"
     return (

@@ -19,7 +19,7 @@ SERVING = STARTED | {"restarting"}
 THIS_HOST = "host.docker.internal"
 """The host name by which containers reach their own host."""
 STARTED_LABEL = "io.rosproxy.started"
-"""Label of a redirect's container: the start time of the container that owns the network."""
+"""Label of a redirect's container: the start time of the container with the network namespace."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class Container:
-    """A container, in the engine's words.
+    """A container, as the engine reports it.
 
     Fields from the inspection are empty while the engine has not answered the inspection.
 
@@ -119,8 +119,8 @@ class Key:
     """The identity of a proxy on a host: the master's URI or the domain, and the advertised host.
 
     A key of ROS 1 has a master. A key of ROS 2 has a domain, and an empty ``master_uri``. A
-    container with both versions has two proxies, since a master and a domain may have different
-    containers. All containers with rmw_zenoh share a single proxy (`ZENOH`), since zenoh itself
+    container with both versions has two proxies, since the containers of a master and of a domain
+    may differ. All containers with rmw_zenoh share a single proxy (`ZENOH`), since zenoh itself
     keeps domains apart. This proxy publishes no port.
     """
 

@@ -28,7 +28,10 @@ mail servers have such ports, and a proxy must not take the place of these serve
 
 
 def refused_master(uri: str, settings: PlanSettings) -> str:
-    """Return why a container may not have the master at ``uri``; empty for an allowed master."""
+    """Return why a container may not have the master at ``uri``; empty for an allowed master.
+
+    Also empty for a text that is no URI of a master.
+    """
     master = parse_slave_uri(uri)
     option = parse_slave_uri((settings.master_uri or "").lower())
     if master is None or master == option or _is_allowed_master(master, settings.allow_master):
