@@ -115,7 +115,7 @@ def docker(
     """
     from rosproxy.telemetry import logs
 
-    _need("docker", "docker")
+    _require_library("docker", "docker")
     logs.set_up(log_format, log_level)
     for library in ("docker", "urllib3"):  # these would log each request
         logging.getLogger(library).setLevel(logging.INFO)
@@ -143,7 +143,7 @@ def _unknown_variables(log: bool = True) -> list[UnknownVariable]:
     return unknown_variables(main, proxy_main, log=log)
 
 
-def _need(library: str, extra: str) -> None:
+def _require_library(library: str, extra: str) -> None:
     """If a library is not installed, print how to install it, and exit."""
     if importlib.util.find_spec(library) is None:
         fail(
@@ -202,7 +202,7 @@ def kubernetes(context: click.Context, /, log_format: str, log_level: str, **opt
     has an environment variable: ROSPROXY_ and the option's name, such as ROSPROXY_PROXY_IMAGE.
     """
     for library in ("kubernetes", "kopf", "cryptography"):
-        _need(library, "kubernetes")
+        _require_library(library, "kubernetes")
     with setting_errors():
         settings = make_kubernetes_settings(options)
         if context.invoked_subcommand is None:

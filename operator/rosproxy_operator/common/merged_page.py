@@ -6,8 +6,8 @@ master on loopback is a different master on each host. A participant of ROS 2 ha
 all proxies: the domain and the unique GUID prefix. If a proxy does not answer, the page shows the
 proxy as a node with the reason.
 
-An attacker may control a proxy. So each proxy gets a fair share of the nodes, links and findings,
-and the operator shortens all texts as a proxy of this release does. A proxy can't forge the key of
+An attacker may control a proxy. So each proxy gets a fair share of the nodes, links and findings.
+The operator shortens all texts as a proxy of this release does. A proxy can't forge the key of
 another proxy or of a node inside another proxy. The operator drops a link if neither end is inside
 the proxy that reports the link.
 """
@@ -50,7 +50,8 @@ from rosproxy.page.page_document import (
 Json = dict[str, Any]
 PROXY = "proxy"
 PARTICIPANT = "participant"
-_LONG_TEXTS = ("text", "fix", "detail")
+"""Kinds of nodes on the page (`PageNode.kind`)."""
+_LONG_TEXT_FIELDS = ("text", "fix", "detail")
 _MOST_LEFT_OUT = 10**9
 Row = TypeVar("Row", PageNode, PageLink, PageFinding, PageProxy)
 _RANKS = {WARNING: 1, BROKEN: 2}
@@ -153,7 +154,7 @@ def _shortened(document: Document) -> Document:
 def _with_short_texts(row: Row) -> Row:
     """Return the row with shortened texts."""
     texts = {
-        name: (shown_text if name in _LONG_TEXTS else shown_name)(text)
+        name: (shown_text if name in _LONG_TEXT_FIELDS else shown_name)(text)
         for name in row.__struct_fields__
         if isinstance(text := getattr(row, name), str)
     }

@@ -23,7 +23,7 @@ disable_created_metrics()  # type: ignore[no-untyped-call]
 
 OUTCOMES = ("ok", "unavailable", "failed")
 """How a look ends."""
-STATES = ("created", "restarting", "running", "paused", "exited", "dead", "removing")
+CONTAINER_STATES = ("created", "restarting", "running", "paused", "exited", "dead", "removing")
 """The states of a container, as the engine names them."""
 POD_STATES = ("ready", "starting", "stuck")
 """The states of a proxy's pod."""
@@ -86,7 +86,7 @@ class DockerMetrics(CommonMetrics):
     """All metrics for a Docker host."""
 
     def __init__(self) -> None:
-        super().__init__("engine", "host", STATES, up="engine_up")
+        super().__init__("engine", "host", CONTAINER_STATES, up="engine_up")
         self.containers = self._gauge("containers", "Running containers that get a proxy.")
 
 

@@ -22,7 +22,7 @@ ADMINISTRATOR = "administrator"
 """Name of the layer from the operator's options. This layer is for all proxies."""
 POLICY_WAIT_S = 3.0
 """Seconds that a started proxy waits for ``POST /policy``. Calls of new callers wait as long."""
-MOST_AUTHORS_RULES = MOST_RULES // 2
+MOST_RULES_OF_AUTHOR = MOST_RULES // 2
 """The most rules of an author: the rules of the administrator and another author must fit."""
 LONGEST_VARIABLE_BYTES = 96 * 1024
 """The most bytes of the variable. Linux allows less than 128 KiB (execve(2), MAX_ARG_STRLEN)."""
@@ -44,8 +44,8 @@ def administrators_policy(rules: Iterable[tuple[Rule, ...]], mode: str) -> tuple
 def excess_reason(layers: Sequence[PolicyLayer]) -> str:
     """Return which bound the layers of an author exceed; empty if the layers are within bounds."""
     count = sum(len(layer.rules) for layer in layers)
-    if count > MOST_AUTHORS_RULES:
-        return f"{count} rules, at most {MOST_AUTHORS_RULES} are accepted"
+    if count > MOST_RULES_OF_AUTHOR:
+        return f"{count} rules, at most {MOST_RULES_OF_AUTHOR} are accepted"
     size = len(_as_json(layers))
     return (
         f"{size} bytes, at most {LONGEST_POLICY_BYTES} are accepted"

@@ -10,16 +10,16 @@ from rosproxy.settings import Settings
 
 OPTION_PREFIX = "proxy-"
 """The prefix of the operator's options for the bounds of proxies."""
-_OWN = {setting.field: setting.default for setting in declared(Settings)}
+_DEFAULTS = {setting.field: setting.default for setting in declared(Settings)}
 
 
 class ProxyBounds(msgspec.Struct, frozen=True):
     """Bounds of each proxy, in MiB and in connections. The defaults are the proxy's defaults."""
 
-    max_buffered: int = _OWN["max_buffered"]
-    max_body: int = _OWN["max_body"]
-    max_connections_per_source: int = _OWN["max_connections_per_source"]
-    max_connections_per_lease: int = _OWN["max_connections_per_lease"]
+    max_buffered: int = _DEFAULTS["max_buffered"]
+    max_body: int = _DEFAULTS["max_body"]
+    max_connections_per_source: int = _DEFAULTS["max_connections_per_source"]
+    max_connections_per_lease: int = _DEFAULTS["max_connections_per_lease"]
 
 
 OWN_BOUNDS = ProxyBounds()

@@ -171,7 +171,7 @@ class DockerController:
         listen(self._engine, self._note_event)
         try:
             await self._loop.run_until(self.look, self._settled, seconds)
-            return self._unsolved()
+            return self._unsolved_problems()
         finally:
             await self._close()
 
@@ -281,7 +281,8 @@ class DockerController:
         names = (proxy_name(desired.key) for desired in planned.desired if desired.live)
         return [name for name in names if not self._proxy_sync.answers(name)]
 
-    def _unsolved(self) -> list[Problem]:
+    def _unsolved_problems(self) -> list[Problem]:
+        """Return the fatal problems, also those of silent proxies and of steps that are left."""
         if self._last is None:
             reason = self._loop.unready() or "the operator has not looked at the engine yet"
             return [Problem("engine", reason)]

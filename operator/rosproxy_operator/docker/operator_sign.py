@@ -20,7 +20,7 @@ def publish_sign(admin: HostPort, engine: str) -> socket.socket | None:
 
     ``engine`` is the URL of the operator's engine. None if the kernel refuses the socket.
     """
-    return signs.publish(f"{_begin(engine)}/{admin}")
+    return signs.publish(f"{_prefix(engine)}/{admin}")
 
 
 def operators(first: HostPort, engine: str) -> list[HostPort]:
@@ -28,12 +28,12 @@ def operators(first: HostPort, engine: str) -> list[HostPort]:
 
     ``first`` comes first, then the endpoints of the signs on loopback or a wildcard address.
     """
-    matches = signs.read_all(_begin(engine) + r"/([0-9a-f.:\[\]]{1,60})")
+    matches = signs.read_all(_prefix(engine) + r"/([0-9a-f.:\[\]]{1,60})")
     listeners = (parse_host_port(match[1]) for match in matches)
     near = (at for at in listeners if at and (is_loopback(at.host) or at.host in ("0.0.0.0", "::")))
     return list(dict.fromkeys([first, *near]))[:MOST_ENDPOINTS_ASKED]
 
 
-def _begin(engine: str) -> str:
+def _prefix(engine: str) -> str:
     """Return the beginning of the signs for an engine: a machine may have several engines."""
     return f"rosproxy-operator/docker/{hashlib.sha256(engine.encode()).hexdigest()[:16]}"

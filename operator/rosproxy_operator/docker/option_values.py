@@ -22,7 +22,7 @@ LEAST_SECRET_CHARACTERS = 32
 _MEMORY = re.compile(r"([0-9]{1,15})([bkmg]?)b?")
 _UNITS = {"": 1, "b": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
 _NETWORK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-_PATTERN = re.compile(
+_HOST_PORT_PATTERN = re.compile(
     r"(?:http://)?(?P<host>[a-z0-9_.*?-]+|\[[0-9a-f:.*?]+\])(?::(?P<port>[0-9*?]{1,5}))?/?"
 )
 _NAME_PATTERN = re.compile(r"[a-z0-9_.*?-]{1,253}")
@@ -34,7 +34,7 @@ def read_host_pattern(text: str) -> str:
     ``*`` and ``?`` are wildcards. A text without a port gets the port ``*``. The text may begin
     with ``http://``, like a master's URI.
     """
-    match = _PATTERN.fullmatch(text.strip().lower())
+    match = _HOST_PORT_PATTERN.fullmatch(text.strip().lower())
     if match is None:
         raise ValueError(
             f"{text[:40]!r} is not of the form HOST or HOST:PORT, such as robot*:11311"

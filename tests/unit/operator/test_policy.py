@@ -16,7 +16,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import SettingError
 from rosproxy_operator.common.policy import (
     LONGEST_POLICY_BYTES,
-    MOST_AUTHORS_RULES,
+    MOST_RULES_OF_AUTHOR,
     administrators_policy,
     as_variable,
 )
@@ -38,8 +38,8 @@ def test_the_options_make_one_layer_or_none() -> None:
 @pytest.mark.parametrize(
     ("count", "glob", "told"),
     [
-        (MOST_AUTHORS_RULES, "/a", ""),
-        (MOST_AUTHORS_RULES + 1, "/a", "501 rules, at most 500 are accepted"),
+        (MOST_RULES_OF_AUTHOR, "/a", ""),
+        (MOST_RULES_OF_AUTHOR + 1, "/a", "501 rules, at most 500 are accepted"),
         (200, "/" + "a" * 255, f"at most {LONGEST_POLICY_BYTES} are accepted"),
         (400, "/" + "a" * 255, f"at most {LONGEST_POLICY_BYTES} are accepted"),  # over the variable
     ],

@@ -182,7 +182,7 @@ def disconnect_steps(
     for sandbox in observed.sandboxes_of(desired.key):
         container = sandbox.container
         if container.state in _CONNECTABLE_STATES and container.name not in gone:
-            for network in _joined(observed, container):
+            for network in _existing_networks(observed, container):
                 action = Disconnect(container.name, network)
                 unwanted = network not in desired.networks | {uplink}
                 misnamed = is_idle and naming.is_misnamed(container, network)
@@ -249,7 +249,7 @@ def _has_network(observed: HostState, attachment: Attachment) -> bool:
     )
 
 
-def _joined(observed: HostState, container: Container) -> list[str]:
+def _existing_networks(observed: HostState, container: Container) -> list[str]:
     """Return the names of a container's networks that still exist."""
     return sorted(a.network for a in container.attachments if _has_network(observed, a))
 
@@ -282,7 +282,7 @@ def _lacks_alias(context: PlanContext, kept: Container, network: str) -> bool:
 
 
 def _start_steps(context: PlanContext, selection: Selection, kept: Container) -> Iterator[Action]:
-    for network in _joined(context.observed, kept):
+    for network in _existing_networks(context.observed, kept):
         if network != context.settings.uplink:
             yield Disconnect(kept.name, network)
     if context.settings.uplink not in kept.networks:

@@ -61,7 +61,7 @@ def desire(
         (_refused_network if name in refused else _preferred_network)(name, settings.uplink)
         for name in sorted(before & _networks(alive))
     ]
-    return tuple(desired), (*problems, *_outvoted(desired))
+    return tuple(desired), (*problems, *_option_warnings(desired))
 
 
 def proxy_spec(key: Key, members: Iterable[Member], settings: PlanSettings) -> ProxySpec:
@@ -138,7 +138,7 @@ def _preferred_network(name: str, uplink: str) -> Problem:
     )
 
 
-def _outvoted(desired: Iterable[Desired]) -> Iterator[Problem]:
+def _option_warnings(desired: Iterable[Desired]) -> Iterator[Problem]:
     """Yield warnings for containers that ask for another option than the proxy has."""
     for wanted in desired:
         plane = wanted.spec.data_plane

@@ -78,7 +78,7 @@ def flush_steps(
         if observed.deletes_udp_entries or not is_published:
             gone = (Remove(r.container.name, "no longer needed") for r in existing)
             yield FlushSteps(key, tuple(gone))
-        elif key in live and (sandbox := _published(key, observed)):
+        elif key in live and (sandbox := _publishing_sandbox(key, observed)):
             steps = _steps(sandbox, existing, outdated, observed, settings)
             yield FlushSteps(key, tuple(steps), _fix(sandbox))
 
@@ -89,7 +89,7 @@ def _is_busy(key: Key, observed: HostState) -> bool:
     return any(o.key == key and o.container.name in observed.busy for o in containers)
 
 
-def _published(key: Key, observed: HostState) -> Sandbox | None:
+def _publishing_sandbox(key: Key, observed: HostState) -> Sandbox | None:
     """Return the running sandbox of a key that publishes UDP ports; None without such a sandbox."""
     running = (s for s in observed.sandboxes_of(key) if s.container.state == "running")
     return next((s for s in running if s.container.udp_ports), None)

@@ -45,13 +45,17 @@ def with_lan_relay(context: PlanContext, steps: list[Action]) -> list[Action]:
         return steps
     sandboxes = {s.container.name for s in context.observed.sandboxes_of(key)}
     if any(_starts(step, sandboxes) for step in steps):
-        return [*_without(context, "the proxy gets another address"), *steps]
+        return [*_removal_steps(context, "the proxy gets another address"), *steps]
     return [*steps, *_lan_relay_steps(context)]
 
 
 def missing_lan_relay(key: Key, observed: HostState, settings: PlanSettings) -> Problem | None:
     """Return a warning if a proxy for ROS 2 lacks the LAN relay; None if nothing is missing."""
-    if settings.ros2_lan == NOWHERE or _lan(key, observed, settings) or observed.lan_relays_of(key):
+    if (
+        settings.ros2_lan == NOWHERE
+        or _lan_address(key, observed, settings)
+        or observed.lan_relays_of(key)
+    ):
         return None
     text = (
         "has no LAN relay, since the operator does not know this host's address on the LAN. Start "
@@ -66,14 +70,14 @@ def _starts(step: Action, sandboxes: Collection[str]) -> bool:
     return begins or isinstance(step, CreateSandbox)
 
 
-def _lan(key: Key, observed: HostState, settings: PlanSettings) -> str:
+def _lan_address(key: Key, observed: HostState, settings: PlanSettings) -> str:
     """Return this host's address on the LAN; empty if unknown, or if ``--ros2-lan`` is ``none``."""
     if settings.ros2_lan:
         return "" if settings.ros2_lan == NOWHERE else settings.ros2_lan
     return key.advertise_host if is_address(key.advertise_host) else observed.default_route_address
 
 
-def _wanted(context: PlanContext) -> CreateLanRelay | None:
+def _creation(context: PlanContext) -> CreateLanRelay | None:
     """Return the action that creates the LAN relay.
 
     None if the proxy gets no LAN relay, or while an address is unknown: this host's on the LAN, the
@@ -82,7 +86,7 @@ def _wanted(context: PlanContext) -> CreateLanRelay | None:
     key = context.desired.key
     observed = context.observed
     settings = context.settings
-    lan = _lan(key, observed, settings)
+    lan = _lan_address(key, observed, settings)
     bind = context.lan_relay
     address = next(
         (
@@ -100,9 +104,9 @@ def _wanted(context: PlanContext) -> CreateLanRelay | None:
 
 
 def _lan_relay_steps(context: PlanContext) -> Iterator[Action]:
-    lan_relay = _wanted(context)
+    lan_relay = _creation(context)
     if context.settings.ros2_lan == NOWHERE:
-        yield from _without(context, f"--ros2-lan is {NOWHERE}")
+        yield from _removal_steps(context, f"--ros2-lan is {NOWHERE}")
     # While an address is unknown, an existing LAN relay stays unchanged.
     elif lan_relay is not None:
         yield from _ensure_lan_relay(context, lan_relay)
@@ -131,7 +135,7 @@ def _ensure_lan_relay(context: PlanContext, lan_relay: CreateLanRelay) -> Iterat
         yield Rename(selection.kept.name, lan_relay.name)
 
 
-def _without(context: PlanContext, reason: str) -> Iterator[Action]:
+def _removal_steps(context: PlanContext, reason: str) -> Iterator[Action]:
     for lan_relay in context.observed.lan_relays_of(context.desired.key):
         if lan_relay.container.state != "removing":
             yield Remove(lan_relay.container.name, reason)

@@ -19,7 +19,7 @@ from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.spec import WISHES
 
-LEAST_PORT = 1024
+LEAST_MASTER_PORT = 1024
 """The least port of a master in a label, if the operator has no --allow-master.
 
 Users start rosmaster without root, usually at 11311, so a master has no port below 1024. Web and
@@ -37,7 +37,7 @@ def refused_master(uri: str, settings: PlanSettings) -> str:
     if master is None or master == option or _is_allowed_master(master, settings.allow_master):
         return ""
     names = ", ".join(settings.allow_master)
-    usual = f"has a port below {LEAST_PORT}, which is not allowed for a master by default"
+    usual = f"has a port below {LEAST_MASTER_PORT}, which is not allowed for a master by default"
     reason = f"matches no --allow-master of the operator ({names})" if names else usual
     return f"{reason}. To allow this master, start the operator with --allow-master {master}"
 
@@ -89,7 +89,7 @@ def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[str
 
 
 def _is_allowed_master(master: HostPort, patterns: tuple[str, ...]) -> bool:
-    return _matches(master, patterns) if patterns else master.port >= LEAST_PORT
+    return _matches(master, patterns) if patterns else master.port >= LEAST_MASTER_PORT
 
 
 def _is_allowed_peer(peer: str, settings: PlanSettings) -> bool:

@@ -250,10 +250,10 @@ def _is_enabled(container: Container, settings: PlanSettings) -> bool:
     """Return whether a container gets a proxy. Raises UnusableLabel."""
     # The other labels of a container with rosproxy.enable=false are not read.
     enabled = readers.enabled(container.labels)
-    return _exposed(container, settings) if enabled is None else enabled
+    return _is_exposed(container, settings) if enabled is None else enabled
 
 
-def _exposed(container: Container, settings: PlanSettings) -> bool:
+def _is_exposed(container: Container, settings: PlanSettings) -> bool:
     """Return whether a container without the label rosproxy.enable gets a proxy.
 
     Raises UnusableLabel.

@@ -25,7 +25,7 @@ def wrong_own_address(container: Container, key: Key, observed: HostState) -> st
                 f"variable {name}={bounded(value, 80)} makes the nodes listen on loopback only, so "
                 f"the proxy can't reach them. {fix}"
             )
-        if value and value in _of_this_host(key, observed):
+        if value and value in _names_of_this_host(key, observed):
             return (
                 f"variable {name}={value} is the address of this host, not of the container. So "
                 f"roslaunch ends with 'Unable to contact my own server'. {fix}"
@@ -33,7 +33,7 @@ def wrong_own_address(container: Container, key: Key, observed: HostState) -> st
     return ""
 
 
-def _of_this_host(key: Key, observed: HostState) -> frozenset[str]:
+def _names_of_this_host(key: Key, observed: HostState) -> frozenset[str]:
     """Return the known addresses and names of this host, in lower case."""
     gateways = (network.gateway for network in observed.networks)
     towards = observed.advertise.values()

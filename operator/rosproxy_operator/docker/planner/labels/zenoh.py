@@ -80,15 +80,15 @@ def zenoh_member(
     owner = readers.network_owner(container, observed)
     if rules or settings.policy:
         _refuse_detours(container, bool(rules), _has_router(owner, observed))
-    own = [*_connected(member, observed)]
-    allowed = [r for r in (*_labelled(labels), *own) if _is_allowed(r, settings)]
-    refused = [r for r in (*_labelled(labels), *own) if r not in allowed]
+    own = [*_routers_of_variable(member, observed)]
+    allowed = [r for r in (*_routers_of_label(labels), *own) if _is_allowed(r, settings)]
+    refused = [r for r in (*_routers_of_label(labels), *own) if r not in allowed]
     peers = {router.peer for router in allowed}
     if container.is_zenoh_router:
         port = router_port(container.variables.get(OVERRIDE, ""))
         peers.add(str(HostPort(owner.name, port)))
     member = replace(member, peers=frozenset(peers))
-    warnings = [*_refusals(refused), *_by_other_protocols(container)]
+    warnings = [*_refusal_warnings(refused), *_protocol_warnings(container)]
     if _has_router(owner, observed):
         return member, warnings
     outside = [router for router in own if router in allowed and not router.neighbour]
@@ -97,7 +97,7 @@ def zenoh_member(
     if not settings.redirect or member.redirect is False:
         if rules:
             raise UnusableLabel(f"label {POLICY} {_NEEDS_REDIRECT}")
-        return member, [*warnings, _not_redirected()]
+        return member, [*warnings, _redirect_warning()]
     addresses = (LOCAL_ROUTER, *(router.address for router in redirected))
     return replace(member, redirected=tuple(dict.fromkeys(addresses))), warnings
 
@@ -164,13 +164,13 @@ def _refuse_detours(container: Container, has_own_rules: bool, has_router: bool)
             )
 
 
-def _labelled(labels: Labels) -> Iterator[_Router]:
+def _routers_of_label(labels: Labels) -> Iterator[_Router]:
     """Yield the routers that the label ``rosproxy.peers`` names. Raises UnusableLabel."""
     for address in readers.peers(labels, lambda name: read_zenoh_peer(name.lower())):
         yield _Router(address, f"label {PEERS}")
 
 
-def _connected(member: Member, observed: HostState) -> Iterator[_Router]:
+def _routers_of_variable(member: Member, observed: HostState) -> Iterator[_Router]:
     """Yield the routers to which ZENOH_CONFIG_OVERRIDE connects the nodes of a container.
 
     A container that runs a router yields nothing: the variable configures this router.
@@ -214,7 +214,7 @@ def _is_redirectable(router: _Router, owner: Container, observed: HostState) -> 
     return is_address(host) and ":" not in host and not owner.networks <= internal
 
 
-def _refusals(refused: Iterable[_Router]) -> Iterator[str]:
+def _refusal_warnings(refused: Iterable[_Router]) -> Iterator[str]:
     for router in refused:
         yield (
             f"{router.named_by} names {quoted(router.peer)}, which the operator does not allow in "
@@ -233,7 +233,7 @@ def _bypass_warnings(routers: Iterable[_Router]) -> Iterator[str]:
         )
 
 
-def _by_other_protocols(container: Container) -> Iterator[str]:
+def _protocol_warnings(container: Container) -> Iterator[str]:
     for protocol, address in connect_endpoints(container.variables.get(OVERRIDE, "")):
         if protocol != "tcp":
             yield (
@@ -243,7 +243,7 @@ def _by_other_protocols(container: Container) -> Iterator[str]:
             )
 
 
-def _not_redirected() -> str:
+def _redirect_warning() -> str:
     return (
         "is not redirected to the proxy, as --no-redirect of the operator or the label "
         f"{REDIRECT} says. So the nodes do not find the proxy. Remove the option or label, or set "
