@@ -8,7 +8,7 @@ from scripts.custom_resource_docs import custom_resource
 
 from rosproxy.access.rules import LONGEST_GLOB
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.policy import MOST_AUTHORS_RULES
+from rosproxy_operator.common.policy import MOST_RULES_OF_AUTHOR
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.cluster import (
     Obstacle,
@@ -145,7 +145,7 @@ def test_options_of_a_proxy_are_the_operators(name: str) -> None:
 def test_bounds_of_a_policy_are_the_operators() -> None:
     """The operator can read everything that the API server accepts."""
     (rule,) = SPEC["spec.policy"]["x-kubernetes-validations"]
-    assert f"<= {MOST_AUTHORS_RULES}" in " ".join(rule["rule"].split())
+    assert f"<= {MOST_RULES_OF_AUTHOR}" in " ".join(rule["rule"].split())
     assert SPEC["spec.policy.rules[].kind"]["enum"] == [*RULE_KINDS]
     for path in ("spec.policy.rules[].names[]", "spec.policy.rules[].nodes[]"):
         assert SPEC[path]["maxLength"] == LONGEST_GLOB

@@ -24,10 +24,9 @@ def desire(
 ) -> tuple[tuple[Desired, ...], tuple[Problem, ...]]:
     """Return a Desired for each key that a container asks for or that has a proxy, sorted by key.
 
-    Also return problems of networks and labels. A living member without a usable network is
-    ignored. The labels of an exited container count for ``grace`` seconds: the proxy keeps options
-    and peers, and stays on joined networks, but joins no other network for that container. ``now``
-    is in monotonic seconds.
+    Return problems, too. A living member without a usable network is ignored. The labels of an
+    exited container count for ``grace`` seconds: the proxy keeps options and peers, and stays on
+    joined networks, but joins no other network. ``now`` is in monotonic seconds.
     """
     before = _names_before_uplink(observed, settings.uplink)
     refused = {name for name in before if name.encode() < settings.uplink.encode()}
