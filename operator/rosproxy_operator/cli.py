@@ -233,7 +233,7 @@ def health() -> None:
     """Exit with 0 if the operator is alive, with 1 if not; for container health checks."""
     from rosproxy.admin.admin_client import AdminClient, AdminError, default_url
 
-    # Without the variable, default_url() has the port of a proxy, 11312. The operator has 11313.
+    # Without the variable, default_url() has port 11312, of a proxy. The operator listens on 11313.
     url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else f"http://{DEFAULT_ADMIN}"
     try:
         AdminClient(url).get("/healthz", within=3.0)

@@ -217,8 +217,8 @@ def local_ports(
 
     The result is the first range of `LOCAL_PORTS` without ports of ``listening``; this range may
     have ports of ``stand_ins``. If there is none, the result is the longest range without ports of
-    ``listening`` and of ``stand_ins``. If ``listening`` had ports of the result, a connection might
-    take a port of the proxy's range before a node needs the port.
+    ``listening`` and of ``stand_ins``. So no connection takes a port of the proxy's range before a
+    node needs the port.
     """
     free = gaps(_UNPRIVILEGED_PORTS, (), [*listening, *stand_ins])
     longest = max(free, key=len, default=LOCAL_PORTS[0])

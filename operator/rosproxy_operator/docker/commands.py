@@ -20,8 +20,8 @@ class CommandContext:
     """The options before a command.
 
     A command asks the operator whose admin endpoint is ``admin`` for the status. If that operator
-    does not answer, or the command line ``has_options``, the command looks at the host itself, with
-    ``settings``. ``resync`` is in seconds.
+    does not answer, the command looks at the host itself, with ``settings``. ``has_options``: the
+    command line has options, so the command asks no operator. ``resync`` is in seconds.
     """
 
     settings: PlanSettings

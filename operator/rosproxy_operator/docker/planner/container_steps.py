@@ -108,9 +108,9 @@ class PlanContext:
     ) -> Selection:
         """Decide which of the containers ``own`` stays and which goes.
 
-        The container that stays should have the planned ports, the ``fingerprint``, and the result
-        true from ``fits``. If no container can be created, any fingerprint will do. ``name`` is
-        the name for the container that stays.
+        A container that fits has the planned ports and the ``fingerprint``, and ``fits`` returns
+        true for it. If no container can be created, any fingerprint counts. ``name`` is the name
+        for the container that stays.
         """
         matching = [o for o in own if o.fingerprint == fingerprint or not self.creatable]
         candidates = [o.container for o in matching if o.range == self.ports]

@@ -26,7 +26,7 @@ def desire(
 
     Return problems, too. A living member without a usable network is ignored. The labels of an
     exited container count for ``grace`` seconds: the proxy keeps options and peers, and stays on
-    joined networks, but joins no other network. ``now`` is in monotonic seconds.
+    joined networks, but joins no other for that container. ``now`` is in monotonic seconds.
     """
     before = _names_before_uplink(observed, settings.uplink)
     refused = {name for name in before if name.encode() < settings.uplink.encode()}
