@@ -223,7 +223,7 @@ def test_a_label_hides_a_topic_from_outside(sides: Sides, controller: Controller
         node.wait_for("got hello ")
     wait_until(
         lambda: f"publish /{topic} of /{hider.name}" in proxy_status(),
-        30, lambda: proxy_status(),
+        30, proxy_status,
     )  # fmt: skip
 
     docker("kill", the_proxy().name)

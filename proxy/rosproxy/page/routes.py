@@ -59,7 +59,7 @@ _FILES = {
     "/findings.js": ("findings.js", "text/javascript"),
     "/page.css": ("page.css", "text/css"),
 }
-_WRONG_TOKEN = '<p role="alert">Wrong token. Enter the token of --admin-token.</p>'
+_REFUSED_HTML = '<p role="alert">Wrong token. Enter the token of --admin-token.</p>'
 
 
 class Page:
@@ -110,7 +110,7 @@ class Page:
             )
         if self.visitors.knows_token(fields.get("token", [""])[0]):
             return self._let_in(request)
-        return self._turn_away(_WRONG_TOKEN)
+        return self._turn_away(_REFUSED_HTML)
 
     def _let_in(self, request: web.BaseRequest) -> web.Response:
         response = web.Response(status=303, headers={**_HEADERS, "Location": "./"})
