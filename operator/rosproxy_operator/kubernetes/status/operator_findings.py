@@ -11,6 +11,7 @@ from rosproxy.admin.doctor_finding import DoctorFinding, error
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.status.operator_options import option_values
 
 OPERATOR_SELECTOR = "app.kubernetes.io/component=operator,app.kubernetes.io/part-of=rosproxy"
 """Label selector of the pods of operators."""
@@ -43,7 +44,7 @@ class Operators(msgspec.Struct, frozen=True):
     @property
     def namespaces(self) -> frozenset[str]:
         """The namespaces that operators manage; empty for all namespaces, or if unknown."""
-        managed = [frozenset(_namespaces(pod)) for pod in self.pods or ()]
+        managed = [_namespaces(pod) for pod in self.pods or ()]
         return frozenset().union(*managed) if all(managed) else frozenset()
 
 
@@ -133,7 +134,7 @@ def service_accounts(operators: Operators, namespace: str) -> tuple[Name, ...]:
 
 def _managers(operators: Operators, namespace: str) -> list[Json]:
     """The pods of the operators that manage a namespace."""
-    managed = [(pod, frozenset(_namespaces(pod))) for pod in operators.pods or ()]
+    managed = [(pod, _namespaces(pod)) for pod in operators.pods or ()]
     return [pod for pod, namespaces in managed if not namespaces or namespace in namespaces]
 
 
@@ -142,12 +143,7 @@ def _id(pod: Json) -> Name:
     return Name(text_at(metadata, "namespace"), text_at(metadata, "name"))
 
 
-def _namespaces(pod: Json) -> Iterator[str]:
-    """The values of ``--namespace VALUE`` and of ``--namespace=VALUE``."""
-    for container in submaps(submap(pod, "spec"), "containers"):
-        words = [str(word) for word in container.get("args") or ()]
-        for word, following in zip(words, [*words[1:], ""], strict=True):
-            if word == _OPTION:
-                yield following
-            elif word.startswith(f"{_OPTION}="):
-                yield word.partition("=")[2]
+def _namespaces(pod: Json) -> frozenset[str]:
+    """The namespaces that an operator manages; empty for all namespaces, or if unknown."""
+    namespaces = frozenset(option_values(pod, _OPTION))
+    return frozenset() if "" in namespaces else namespaces

@@ -14,6 +14,7 @@ from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import INJECT
 from rosproxy_operator.kubernetes.status.operator_findings import describe_operators
+from rosproxy_operator.kubernetes.status.operator_options import option_values
 
 NAME = "wire.rosproxy.io"
 """The name of the webhook in the MutatingWebhookConfiguration."""
@@ -76,9 +77,8 @@ def _missing(operators: tuple[Json, ...] | None) -> DoctorFinding:
 
 
 def _serves(operator: Json) -> bool:
-    containers = submaps(submap(operator, "spec"), "containers")
-    arguments = (str(word) for c in containers for word in c.get("args") or ())
-    return any(word.startswith("--webhook-bind=") for word in arguments)
+    """Whether an operator serves the webhook. The last of several values counts."""
+    return option_values(operator, "--webhook-bind")[-1:] not in ([], ["none"])
 
 
 def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFinding]:

@@ -67,17 +67,27 @@ def put_service(server: ApiServer, *ready: bool) -> None:
     server.put("endpointslices", endpoint_slice, "system")
 
 
-def operator_obj(*args: str, ready: bool = True) -> Obj:
+def operator_obj(*args: str, ready: bool = True, env: tuple[Obj, ...] = ()) -> Obj:
     ready_at = {"type": "Ready", "status": str(ready), "lastTransitionTime": "2026-11-01T00:00:00Z"}
+    container = {"args": ["kubernetes", *args], "env": [*env]}
     return {
         "metadata": {"name": "o", "namespace": "system", "labels": OPERATOR},
-        "spec": {"serviceAccountName": "op", "containers": [{"args": ["kubernetes", *args]}]},
+        "spec": {"serviceAccountName": "op", "containers": [container]},
         "status": {"conditions": [ready_at]},
     }
 
 
-def put_operator(server: ApiServer, *args: str) -> None:
-    server.put("pods", operator_obj(*args), "system")
+def put_operator(server: ApiServer, *args: str, env: tuple[Obj, ...] = ()) -> None:
+    server.put("pods", operator_obj(*args, env=env), "system")
+
+
+def variable(name: str, value: str) -> tuple[Obj, ...]:
+    return ({"name": f"ROSPROXY_{name}", "value": value},)
+
+
+def from_a_field(name: str) -> tuple[Obj, ...]:
+    reference = {"fieldRef": {"fieldPath": "metadata.namespace"}}
+    return ({"name": f"ROSPROXY_{name}", "valueFrom": reference},)
 
 
 async def about_webhook(api: Api, unreached: tuple[str, ...] = ()) -> list[DoctorFinding]:
@@ -212,18 +222,45 @@ def test_operators_that_are_not_ready() -> None:
     assert finding.fix.startswith("read the operator's log: kubectl -n system logs -l")
 
 
-@pytest.mark.parametrize("option", [("--namespace=a", "--namespace=b"), ("--namespace", "a")])
-def test_a_namespace_that_no_operator_manages(option: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    ("option", "env"),
+    [
+        (("--namespace=a", "--namespace=b"), ()),
+        (("--namespace", "a"), ()),
+        ((), variable("NAMESPACE", "a b")),
+    ],
+)
+def test_a_namespace_that_no_operator_manages(
+    option: tuple[str, ...], env: tuple[Obj, ...]
+) -> None:
     """The doctor asked whether the operator runs, and said that no pod is selected."""
-    operators = Operators((operator_obj(*option),))
+    operators = Operators((operator_obj(*option, env=env),))
     (finding,) = cluster_findings([rosproxy_obj()], operators)
     assert finding.severity is Severity.ERROR
     assert finding.text.startswith(f"no operator manages the namespace {NAMESPACE} (option ")
     assert "the chart's value namespaces" in finding.fix
     another = operator_obj(f"--namespace={NAMESPACE}")
-    (finding,) = cluster_findings([rosproxy_obj()], Operators((operator_obj(*option), another)))
+    both = (operator_obj(*option, env=env), another)
+    (finding,) = cluster_findings([rosproxy_obj()], Operators(both))
     assert "has not looked at the last change" in finding.text
     assert "kubectl -n system logs -l" in finding.fix
+
+
+@pytest.mark.parametrize(
+    ("option", "env", "namespaces"),
+    [
+        ((), (), set()),
+        (("--namespace=a",), variable("NAMESPACE", "b"), {"a"}),
+        ((), variable("NAMESPACE", ""), set()),
+        ((), from_a_field("NAMESPACE"), set()),
+        (("--namespace=$(POD_NAMESPACE)",), (), set()),
+    ],
+)
+def test_the_namespaces_of_an_operator(
+    option: tuple[str, ...], env: tuple[Obj, ...], namespaces: set[str]
+) -> None:
+    """The doctor took "$(POD_NAMESPACE)" for the name of a namespace."""
+    assert Operators((operator_obj(*option, env=env),)).namespaces == namespaces
 
 
 async def test_an_operator_that_may_not_write_the_status(server: ApiServer, api: Api) -> None:
@@ -259,8 +296,36 @@ async def test_the_rights_of_the_operator_that_manages_the_namespace_count(
     assert "kubectl -n system logs -l" in finding.fix
 
 
-async def test_a_webhook_that_no_operator_serves(server: ApiServer, api: Api) -> None:
-    put_operator(server)
+@pytest.mark.parametrize(
+    ("args", "env"),
+    [
+        (("--webhook-bind", "x:1"), ()),
+        ((), variable("WEBHOOK_BIND", "x:1")),
+        ((), from_a_field("WEBHOOK_BIND")),
+    ],
+)
+async def test_a_missing_webhook_that_operators_serve(
+    server: ApiServer, api: Api, args: tuple[str, ...], env: tuple[Obj, ...]
+) -> None:
+    """The doctor recognised only --webhook-bind=…, and said webhook.enabled=false."""
+    put_operator(server, *args, env=env)
+    (finding,) = await about_webhook(api)
+    assert finding.severity is Severity.ERROR
+    assert "although operators serve the webhook" in finding.text
+
+
+@pytest.mark.parametrize(
+    ("args", "env"),
+    [
+        ((), ()),
+        (("--webhook-bind=x:1", "--webhook-bind=none"), ()),
+        (("--webhook-bind=none",), variable("WEBHOOK_BIND", "x:1")),
+    ],
+)
+async def test_a_webhook_that_no_operator_serves(
+    server: ApiServer, api: Api, args: tuple[str, ...], env: tuple[Obj, ...]
+) -> None:
+    put_operator(server, *args, env=env)
     (finding,) = await about_webhook(api)
     assert finding.severity is Severity.INFO
     assert "no MutatingWebhookConfiguration has the webhook wire.rosproxy.io" in finding.text
