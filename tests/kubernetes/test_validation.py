@@ -33,7 +33,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no names": ({"master": GOOD, "policy": {"rules": [{**RULE, "names": []}]}}, "names"),
     "names of no topic": (
         {"master": GOOD, "policy": {"rules": [{**RULE, "names": ["camera"]}]}},
-        "begin with / or *",
+        "begin with /, * or ?",
     ),
     "two names in one": (
         {"master": GOOD, "policy": {"rules": [{**RULE, "names": ["/a;/b"]}]}},

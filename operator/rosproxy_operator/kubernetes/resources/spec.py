@@ -264,7 +264,7 @@ def _glob(field: Field, ros_name: bool) -> str:
     """Return a glob: with ``ros_name`` for ROS names, else for methods of the slave API."""
     glob = field.text()
     if not _GLOB.fullmatch(glob) or (ros_name and glob[0] not in "/*?"):
-        begins = ", with / or * at the beginning" if ros_name else ""
+        begins = ", with /, * or ? at the beginning" if ros_name else ""
         fix = f"Write 1 to 256 characters without blanks and ;{begins}"
         raise field.error("is not a pattern of names", fix)
     return glob

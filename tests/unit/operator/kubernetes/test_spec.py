@@ -362,6 +362,7 @@ def test_every_kind_of_rule_has_a_word(kind):
         (rule(kind=None), "spec.policy.rules[0].kind"),
         (rule(names=[]), "spec.policy.rules[0].names: [] is empty. Write the names"),
         (rule(names=["camera"]), "names[0]: 'camera' is not a pattern of names. Write 1 to 256"),
+        (rule(names=["camera"]), "without blanks and ;, with /, * or ? at the beginning"),
         (rule(names=["/a; allow publish *"]), "is not a pattern of names"),
         (rule(names=["/a by /b"]), "is not a pattern of names"),
         (rule(names=["/" + "a" * 256]), "is not a pattern of names"),
