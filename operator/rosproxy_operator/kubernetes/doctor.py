@@ -3,9 +3,8 @@
 The doctor checks in this order: the operators, the statuses of the RosProxies, the labelled pods,
 the webhook, and the last Events (`doctor_facts`). Then the doctor runs ``rosproxy doctor`` in the
 pod of each proxy, as ``kubectl exec`` does: this command tests from the place of the proxy. All
-requests use the rights of the user that calls the doctor. The doctor can't work without the right
-to list RosProxies and the operator's pods. Any other missing right becomes a finding, and the
-doctor checks the rest.
+requests use the rights of the user that calls the doctor. A missing right becomes a finding, and
+the doctor checks the rest.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -31,12 +30,12 @@ from rosproxy_operator.kubernetes.planner.pods.labelled import (
     unreached,
 )
 from rosproxy_operator.kubernetes.resources.checks import submap, text_at, texts_at
-from rosproxy_operator.kubernetes.resources.model import Json
+from rosproxy_operator.kubernetes.resources.model import Json, Pod
 from rosproxy_operator.kubernetes.resources.names import PROXY, component
 from rosproxy_operator.kubernetes.resources.spec import rosproxies as read_rosproxies
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 from rosproxy_operator.kubernetes.status.event_findings import event_findings
-from rosproxy_operator.kubernetes.status.operator_findings import operator_findings
+from rosproxy_operator.kubernetes.status.operator_findings import Operators, operator_findings
 from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
 
 MOST_DOCTORS = 4
@@ -49,23 +48,21 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
     """Return all findings.
 
     If ``names`` are given, the proxies report only on these nodes, topics and services. Raises
-    ApiError if the doctor can't list RosProxies or the operator's pods.
+    ApiError if the API server does not answer, or has no definition of RosProxies.
     """
     api = Api(namespaces)
     try:
-        rosproxies = api.rosproxies()
-        own_pods = api.own_pods()
         facts = DoctorFacts(api, namespaces)
+        listed = facts.rosproxies()
+        rosproxies = listed or ()
+        own_pods = facts.own_pods()
         operators = facts.operators(rosproxies)
         pods = facts.labelled_pods()
         usable, _ = read_rosproxies(rosproxies)
         cut_off = unreached(pods, [*usable.values()], operators.ready_since)
-        with_rosproxy = namespaces_of(rosproxies)
         findings = [
             *operator_findings(operators),
-            *cluster_findings(rosproxies, operators),
-            *missing_rosproxy_findings(pods, with_rosproxy),
-            *misspelt_findings(pods, with_rosproxy),
+            *([] if listed is None else _rosproxy_findings(listed, operators, pods)),
             *webhook_findings(facts.webhook(operators, cut_off)),
             *event_findings(facts.events(rosproxies, own_pods), ready_pods(own_pods)),
             *facts.refused,
@@ -76,6 +73,16 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
     with ThreadPoolExecutor(MOST_DOCTORS) as threads:
         answers = threads.map(lambda pod: [*_ask(pod["metadata"], names)], proxies)
         return [*findings, *without_names_of_others([*answers], names)]
+
+
+def _rosproxy_findings(
+    rosproxies: Sequence[Json], operators: Operators, pods: Sequence[Pod]
+) -> Iterator[DoctorFinding]:
+    """The findings about RosProxies, and about labelled pods in namespaces without a RosProxy."""
+    with_rosproxy = namespaces_of(rosproxies)
+    yield from cluster_findings(rosproxies, operators)
+    yield from missing_rosproxy_findings(pods, with_rosproxy)
+    yield from misspelt_findings(pods, with_rosproxy)
 
 
 def namespaces_of(objs: Iterable[Json]) -> frozenset[str]:

@@ -1,7 +1,8 @@
-"""The facts that the doctor reads besides RosProxies: operators, pods, the webhook and Events.
+"""The facts that the doctor reads: RosProxies, operators, pods, the webhook and Events.
 
 All requests use the rights of the doctor's user. A refused request becomes a finding, most often
-about a missing right, and the doctor sends the next request.
+about a missing right, and the doctor sends the next request. A list of RosProxies or of the
+operator's pods that fails for another reason ends the doctor.
 """
 
 import time
@@ -9,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import TypeVar
 
-from rosproxy.admin.doctor_finding import DoctorFinding, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, error, warning
 from rosproxy_operator.kubernetes.api.api_client import (
     ENDPOINTS,
     WEBHOOKS,
@@ -51,6 +52,20 @@ class DoctorFacts:
         self._api = api
         self._places = tuple(namespaces) or ("",)
         self.refused: list[DoctorFinding] = []
+
+    def rosproxies(self) -> Sequence[Json] | None:
+        """Return the RosProxies; None without the right to list them.
+
+        Raises ApiError if the request fails for another reason.
+        """
+        return self._need("rosproxy", self._api.rosproxies)
+
+    def own_pods(self) -> Sequence[Json]:
+        """Return the pods that the operator has made; none without the right to list pods.
+
+        Raises ApiError if the request fails for another reason.
+        """
+        return self._need("proxy", self._api.own_pods) or ()
 
     def operators(self, rosproxies: Iterable[Json]) -> Operators:
         """Return the operators' pods, and the namespaces where no operator may write a status.
@@ -144,18 +159,33 @@ class DoctorFacts:
         """Return the answer. If the request fails, add a finding to ``refused`` and return None."""
         try:
             return question()
-        except ApiError as error:
-            if right := missing_right(str(error)):
-                text = f"not checked: you lack the right to {right}"
-                fix = (
-                    f"check with kubectl auth can-i {right}; ask a user with this right to run the "
-                    "doctor"
-                )
-            else:
-                text = f"not checked: {error}"
-                fix = ""
+        except ApiError as failure:
+            text, fix = _not_checked(failure)
             self.refused.append(warning(subject, subject, text, fix))
             return None
+
+    def _need(self, subject: str, question: Callable[[], T]) -> T | None:
+        """Return the answer. Without the right, add an error to ``refused`` and return None.
+
+        Without this answer, the doctor checks too little to say that the cluster has no fault.
+        """
+        try:
+            return question()
+        except ApiError as failure:
+            if not missing_right(str(failure)):
+                raise
+            text, fix = _not_checked(failure)
+            self.refused.append(error(subject, subject, text, fix))
+            return None
+
+
+def _not_checked(failure: ApiError) -> tuple[str, str]:
+    """The text and the fix of the finding about a failed request."""
+    right = missing_right(str(failure))
+    if not right:
+        return f"not checked: {failure}", ""
+    fix = f"check with kubectl auth can-i {right}; ask a user with this right to run the doctor"
+    return f"not checked: you lack the right to {right}", fix
 
 
 def ready_pods(pods: Iterable[Json]) -> frozenset[str]:

@@ -522,7 +522,7 @@ def refusal(status: int, reason: str, body: bytes) -> ApiError:
     if status == 422 and message == _TEST_FAILED:
         return ApiConflict("the object has changed meanwhile")
     if status == 401:
-        message = f"the API server does not accept the operator's token or certificate ({message})"
+        message = f"the API server does not accept this program's token or certificate ({message})"
     elif error_type is ApiUnavailable:
         message = f"the API server answers HTTP {status}: {message}"
     return error_type(message)

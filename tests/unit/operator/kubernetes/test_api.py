@@ -223,7 +223,7 @@ def test_no_cluster_is_one_line_that_says_what_to_do(
             ApiNotFound,
             "terminated",
         ),
-        (401, "Unauthorized", ApiUnavailable, "does not accept the operator's token"),
+        (401, "Unauthorized", ApiUnavailable, "does not accept this program's token"),
         (404, 'pods "p" not found', ApiNotFound, 'pods "p" not found'),
         (409, "exists", ApiConflict, "exists"),
         (422, "spec.clusterIP: Invalid value", ApiInvalid, "spec.clusterIP"),

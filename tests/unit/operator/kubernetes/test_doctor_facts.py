@@ -12,7 +12,7 @@ from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api, ApiNotFound
 from rosproxy_operator.kubernetes.api.rbac import missing_right
-from rosproxy_operator.kubernetes.doctor import running_proxies
+from rosproxy_operator.kubernetes.doctor import examine, running_proxies
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
 from rosproxy_operator.kubernetes.planner.pods.labelled import (
     missing_rosproxy_findings,
@@ -364,6 +364,35 @@ async def test_without_the_right_to_pods_it_is_not_known_whether_the_webhook_is_
         True,
     )
     assert "list pods -A" in refused.text
+
+
+@pytest.mark.parametrize(
+    ("kind", "group", "subject", "right"),
+    [
+        ("rosproxies", "rosproxy.io", "rosproxy", "list rosproxies.rosproxy.io -A"),
+        ("pods", "", "proxy", "list pods -A"),
+    ],
+)
+async def test_without_a_right_that_the_doctor_needs_it_checks_the_rest(
+    server: ApiServer, kind: str, group: str, subject: str, right: str
+) -> None:
+    """The doctor ended with "the operator's role lacks a rule": its user lacks the right."""
+    put_webhook(server, "")
+    put_operator(server)
+    server.put("pods", pod_obj("talker", {"rosproxy.io/inject": "true"}), NAMESPACE)
+    forbid(server, kind, group)
+    findings = await in_thread(examine, (), ())
+    (refused,) = [f for f in findings if f.check == subject and f.severity is Severity.ERROR]
+    assert refused.text == f"not checked: you lack the right to {right}"
+    assert "operator's role" not in str(findings)
+    assert "no caBundle" in str([f for f in findings if f.check == "webhook"])
+    assert "has no RosProxy" not in str(findings)
+
+
+async def test_the_doctor_ends_if_the_cluster_has_no_definition(server: ApiServer) -> None:
+    server.refuse("GET", "rosproxies", 404, "404 page not found")
+    with pytest.raises(ApiNotFound, match=r"rosproxies\.rosproxy\.io is not installed"):
+        await in_thread(examine, (), ())
 
 
 def test_what_is_no_right() -> None:
