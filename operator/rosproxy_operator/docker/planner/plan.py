@@ -26,7 +26,7 @@ from rosproxy_operator.docker.planner.label_policy import with_bounded_rules
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
 from rosproxy_operator.docker.planner.labels.zenoh import with_bounded_containers
 from rosproxy_operator.docker.planner.lan_relay import missing_lan_relay, with_lan_relay
-from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
+from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member, Proxy
 from rosproxy_operator.docker.planner.redirect import redirect_steps
 from rosproxy_operator.docker.planner.specs import master, proxy_name, unresolved_master
 from rosproxy_operator.docker.planner.state import DockerMemory, after_look, with_exited
@@ -254,9 +254,9 @@ def _container_problems(observed: HostState, live: Collection[Key]) -> Iterator[
     for own in observed.own:
         name = own.container.name
         if own.key in live and own.container.state == "restarting":
-            yield Problem(
-                f"proxy {name}", f"the container has ended and restarts. Read docker logs {name}"
-            )
+            kind = "proxy" if isinstance(own, Proxy) else "container"  # a sandbox, or a LAN relay
+            text = f"the container has ended and restarts. Read docker logs {name}"
+            yield Problem(f"{kind} {name}", text)
     for host in sorted(host for host, address in observed.masters.items() if not address):
         yield Problem(f"master {host}", unresolved_master(host))
 

@@ -363,3 +363,22 @@ def test_what_gives_a_forged_lan_relay_away(field: str, value: object) -> None:
 )
 def test_labels_of_a_lan_relay_that_are_not_whole(wrong: dict[str, str]) -> None:
     assert read_own({**own_labels(MADE), **wrong}) is None
+
+
+@pytest.mark.parametrize(
+    ("role", "subject"),
+    [
+        ("sandboxes", f"container {BOX.name}"),
+        ("proxies", f"proxy {PROXY.name}"),
+        ("lan_relays", f"container {MADE.name}"),
+    ],
+)
+def test_a_restarting_container_is_reported_by_what_it_is(role: str, subject: str) -> None:
+    """The sandbox was reported as "proxy …-ports", the LAN relay as "proxy …-lan-relay"."""
+    made = running_proxy()
+    (one,) = made[role]
+    made[role] = (replace(one, container=replace(one.container, state="restarting")),)
+    problems = [p for p in look(observed(TALKER, **made)).problems if "restarts" in p.text]
+    assert [(p.subject, p.text.split(". ")[1]) for p in problems] == [
+        (subject, f"Read docker logs {subject.split()[1]}")
+    ]
