@@ -370,16 +370,21 @@ def test_without_a_route_an_address_can_not_be_redirected() -> None:
 
 
 @pytest.mark.parametrize(
-    "named",
+    ("named", "by"),
     [
-        {"labels": {"rosproxy.peers": "10.0.0.9"}},
-        {"override": 'connect/endpoints=["tcp/10.0.0.9:7447"]'},
+        ({"labels": {"rosproxy.peers": "10.0.0.9"}}, "label rosproxy.peers"),
+        (
+            {"override": 'connect/endpoints=["tcp/10.0.0.9:7447"]'},
+            "variable ZENOH_CONFIG_OVERRIDE",
+        ),
     ],
 )
-def test_a_router_that_is_not_allowed_is_not_dialed(named: Any) -> None:
+def test_a_router_that_is_not_allowed_is_not_dialed(named: Any, by: str) -> None:
+    """For a router in the variable, the text said "does not allow in labels"."""
     settings = replace(SETTINGS, allow_peer=("robot*:*",))
     (member,), (text,) = read(node(**named), settings=settings)
     assert (member.peers, member.redirected) == (frozenset(), (LOCAL,))
+    assert text.startswith(f"{by} names '10.0.0.9:7447', which the operator does not allow.")
     assert "start the operator with --allow-peer 10.0.0.9:7447" in text
 
 

@@ -217,9 +217,9 @@ def _is_redirectable(router: _Router, owner: Container, observed: HostState) -> 
 def _refusal_warnings(refused: Iterable[_Router]) -> Iterator[str]:
     for router in refused:
         yield (
-            f"{router.named_by} names {quoted(router.peer)}, which the operator does not allow in "
-            "labels. The proxy does not connect there. To allow this router, start the operator "
-            f"with --allow-peer {router.peer}"
+            f"{router.named_by} names {quoted(router.peer)}, which the operator does not allow. "
+            "The proxy does not connect there. To allow this router, start the operator with "
+            f"--allow-peer {router.peer}"
         )
 
 
