@@ -48,6 +48,8 @@ class DomainWatch:
             self._problems.solved(subject)
         for problem in sorted(current, key=lambda p: p.text):
             if former - current or problem not in former:
-                self._problems.add(subject, f"{problem.text}. Fix: {problem.fix}")
+                # A problem that is not grave may be no fault, and is kept as an event.
+                text = f"{problem.text}. Fix: {problem.fix}"
+                self._problems.add(subject, text, holds=problem.grave)
             if problem not in former:
                 log.warning("%s: %s. Fix: %s", subject, problem.text, problem.fix)

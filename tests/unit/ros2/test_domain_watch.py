@@ -11,7 +11,7 @@ from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_watch import MOST_NOTED, DomainWatch
 from rosproxy.ros2.status import Ros2State
-from rosproxy.telemetry.problems import Problems
+from rosproxy.telemetry.problems import MOST_PROBLEMS, Problems
 
 GOOD = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
 TCP = replace(GOOD, locator_fault="tcp")
@@ -90,3 +90,23 @@ def test_an_address_with_many_problems_hides_no_other() -> None:
     noted = [problem.subject for problem in problems.all()]
     assert "ff.0f" in noted
     assert len(noted) == MOST_NOTED
+
+
+def test_many_events_push_out_no_grave_problem() -> None:
+    """A participant that receives by TCP only was missing in rosproxy status after 50 events."""
+    told = Told()
+    problems = Problems()
+    watch = DomainWatch(told, problems)
+    unproven = replace(GOOD, guid_prefix="02.0f.bb", proven=False)
+    for _ in range(2):
+        look(watch, told, TCP, unproven)
+    assert {p.subject: p.holds for p in problems.all()} == {
+        TCP.guid_prefix: True,
+        "02.0f.bb": False,
+    }
+    for number in range(MOST_PROBLEMS):
+        problems.add(f"peer {number}", "gone")
+    look(watch, told, TCP, unproven)
+    assert TCP.guid_prefix in {problem.subject for problem in problems.all()}
+    look(watch, told, GOOD)
+    assert not any(problem.holds for problem in problems.all())
