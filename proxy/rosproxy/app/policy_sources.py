@@ -64,7 +64,8 @@ class PolicySources:
         except BodyError as error:
             # `Problems.add` would keep an earlier refusal, which has another text.
             problems.solved(OPERATOR_POLICY)
-            problems.add(OPERATOR_POLICY, f"refused: {error}. The previous policy stays in force")
+            text = f"refused: {error}. The previous policy stays in force"
+            problems.add(OPERATOR_POLICY, text, holds=True)
             log.warning("%s refused: %s", OPERATOR_POLICY, error)
             raise
         problems.solved(OPERATOR_POLICY)

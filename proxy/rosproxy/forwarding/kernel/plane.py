@@ -192,6 +192,6 @@ class KernelPlane:
         elif self._settings.data_plane == "kernel":
             text = f"the proxy forwards {traffic} ({plane}), not the kernel: {reason}"
             log.error("%s kernel: %s", SUBJECT, text)
-            self._problems.add(self.syncer.subject, text)
+            self._problems.add(self.syncer.subject, text, holds=True)
         else:
             log.info("the proxy forwards %s (%s), not the kernel: %s", traffic, plane, reason)

@@ -272,7 +272,7 @@ class ForwardSyncer:
             self._accounts.note_peers({})
             text = f"the kernel no longer forwards {self.traffic}: {error}"
             log.error("%s", text)
-            self._problems.add(self.subject, text)
+            self._problems.add(self.subject, text, holds=True)  # until the table is regained
 
     def _wanted(self) -> dict[int, HostPort]:
         current = self._table.forwards

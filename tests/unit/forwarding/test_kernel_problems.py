@@ -1,0 +1,90 @@
+"""A problem of the kernel plane lasts until the kernel forwards."""
+
+import time
+from collections.abc import Mapping
+from types import MappingProxyType, SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from rosproxy.forwarding.kernel import plane
+from rosproxy.forwarding.kernel.plane import KernelPlane
+from rosproxy.forwarding.kernel.syncer import LOST_TABLE_RETRY_S, Clock
+from rosproxy.forwarding.kernel.tools import ToolError
+from rosproxy.telemetry.problems import Problems
+from tests.run_options import parse_settings
+
+
+class FailingTable:
+    """A table that `begin` makes, and that is lost later."""
+
+    has_connections = True
+    weakness = ""
+    tools = None
+    table = SimpleNamespace(name="rosproxy")
+    forwards: Mapping[int, Any] = MappingProxyType({})
+
+    async def begin(self, surroundings: Any) -> None:
+        pass
+
+    async def change(self, *arguments: Any) -> None:
+        raise ToolError("nft is gone")
+
+    make = change
+
+
+class NoHolders(tuple[Any, ...]):
+    """An empty registry."""
+
+    by_port: Mapping[int, Any] = MappingProxyType({})
+
+
+class NoTasks:
+    """Tasks that never run."""
+
+    def repeat(self, *arguments: Any) -> None:
+        pass
+
+
+def kernel_plane(
+    monkeypatch: pytest.MonkeyPatch,
+    problems: Problems,
+    obstacle: str = "",
+    clock: Clock = time.monotonic,
+) -> KernelPlane:
+    async def find_obstacle(*arguments: Any) -> str:
+        return obstacle
+
+    monkeypatch.setattr(plane, "find_obstacle", find_obstacle)
+    settings = parse_settings(
+        {"master_uri": "http://robot:1", "advertise_host": "192.0.2.1", "data_plane": "kernel"}
+    )
+    table = cast(Any, FailingTable())
+    tasks = cast(Any, NoTasks())
+    return KernelPlane(settings, cast(Any, NoHolders()), tasks, problems, clock, table)
+
+
+async def test_that_the_kernel_can_not_forward_is_no_event(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After 5 minutes, the condition Degraded no longer named the reason."""
+    problems = Problems()
+    await kernel_plane(monkeypatch, problems, "nft is missing").start()
+    (problem,) = problems.all()
+    assert problem.text.endswith("not the kernel: nft is missing")
+    assert problem.holds
+
+
+async def test_a_lost_table_is_a_problem_until_the_table_is_regained(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problems = Problems()
+    now = 0.0
+    kernel = kernel_plane(monkeypatch, problems, clock=lambda: now)
+    await kernel.start()
+    kernel.syncer.note_change()
+    await kernel.syncer.run_once()
+    (problem,) = problems.all()
+    assert problem.text == "the kernel no longer forwards topics: nft is gone"
+    assert problem.holds
+    now = LOST_TABLE_RETRY_S + 1
+    await kernel.look()
+    assert problems.all() == []
