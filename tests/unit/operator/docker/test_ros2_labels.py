@@ -104,7 +104,13 @@ def test_where_nothing_says_it_ros_1_is_assumed_and_told() -> None:
 
 
 @pytest.mark.parametrize(
-    "variables", [{"ROS_VERSION": ""}, {"ROS_DISTRO": ""}, {"ROS_VERSION": "one"}]
+    "variables",
+    [
+        {"ROS_VERSION": ""},
+        {"ROS_DISTRO": ""},
+        {"ROS_VERSION": "one"},
+        *({name: ""} for name in sorted(OF_ROS2)),
+    ],
 )
 def test_an_unusable_variable_states_no_version(variables: Mapping[str, str]) -> None:
     members, told = read(

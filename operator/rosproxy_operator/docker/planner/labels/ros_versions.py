@@ -5,7 +5,7 @@ The first source that states the version counts:
 1. The label ``rosproxy.ros``.
 2. The variables ROS_VERSION and ROS_DISTRO, which most images with ROS have.
 3. The label ``rosproxy.master-uri`` or the variable ROS_MASTER_URI: ROS 1.
-4. A label or variable that only ROS 2 has, such as ROS_DOMAIN_ID: ROS 2.
+4. A label or non-empty variable that only ROS 2 has, such as ROS_DOMAIN_ID: ROS 2.
 
 Without such a source, the operator assumes ROS 1. The label ``rosproxy.rmw`` or the variable
 RMW_IMPLEMENTATION states that the ROS 2 nodes use rmw_zenoh instead of DDS.
@@ -91,11 +91,14 @@ def _version_of_image(container: Container) -> str:
 
 
 def _is_marked_ros2(container: Container) -> bool:
-    """Whether a container has labels or variables of ROS 2 alone, and no ROS 1 master."""
+    """Whether a container has labels or variables of ROS 2 alone, and no ROS 1 master.
+
+    ROS 2 treats an empty variable as unset (rcl, domain_id.c), so an empty variable states nothing.
+    """
     if MASTER_URI in container.labels or container.master_uri:
         return False
-    return any(name in container.labels for name in _ROS2_LABELS) or bool(
-        ROS2_VARIABLES & container.variables.keys()
+    return any(name in container.labels for name in _ROS2_LABELS) or any(
+        container.variables.get(name) for name in ROS2_VARIABLES
     )
 
 
