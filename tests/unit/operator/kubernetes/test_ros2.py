@@ -392,10 +392,19 @@ def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
         PodContainer(variables={"ROS_STATIC_PEERS": f"192.0.2.7;{ADDRESS}"}),
         PodContainer(variables={"ROS_STATIC_PEERS": "rosproxy-robot.ros.svc.cluster.local"}),
         PodContainer(variables={"ROS_DOMAIN_ID": "0"}),
+        PodContainer(variables={"ROS_DOMAIN_ID": ""}),
     ],
 )
 def test_what_is_well_is_not_told(container: PodContainer):
     assert list(ros2_findings(pod(container), of2(), ADDRESS)) == []
+
+
+def test_an_empty_domain_is_domain_0():
+    """The nodes were in domain 0, and the operator reported nothing."""
+    container = PodContainer(variables={"ROS_DOMAIN_ID": ""})
+    (finding,) = ros2_findings(pod(container), of2(Ros2Spec(domain=5)), ADDRESS)
+    assert finding.reason == "OtherDomain"
+    assert "ROS_DOMAIN_ID=(empty, so 0) is not domain 5 of RosProxy" in finding.text
 
 
 def test_a_pod_that_no_webhook_has_seen_is_told():

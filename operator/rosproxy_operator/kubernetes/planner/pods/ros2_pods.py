@@ -89,11 +89,11 @@ def _problems(
         yield "NotWired", f"{text}. {fix}"
     domain = get("ROS_DOMAIN_ID")
     number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
-    if domain not in (None, VALUE_AT_RUNTIME) and str(domain).strip() not in (str(number), ""):
-        text = (
-            f"variable ROS_DOMAIN_ID={_shown(str(domain))} is not domain {number} of RosProxy "
-            f"{rosproxy.id.name}"
-        )
+    # rcl treats an empty variable as unset (rcl, domain_id.c), and the webhook keeps the variable.
+    if domain not in (None, VALUE_AT_RUNTIME) and (str(domain).strip() or "0") != str(number):
+        value = _shown(str(domain)) or "(empty, so 0)"
+        name = rosproxy.id.name
+        text = f"variable ROS_DOMAIN_ID={value} is not domain {number} of RosProxy {name}"
         fix = f"Change the variable or spec.domain, then run {recreate_command(pod)}"
         yield "OtherDomain", f"{text}. {fix}"
     distro = _OLD.search(get("ROS_DISTRO", "").lower()) or _OLD.search(container.image.lower())
