@@ -109,7 +109,7 @@ def test_where_nothing_says_it_ros_1_is_assumed_and_told() -> None:
         {"ROS_VERSION": ""},
         {"ROS_DISTRO": ""},
         {"ROS_VERSION": "one"},
-        *({name: ""} for name in sorted(OF_ROS2)),
+        *({name: ""} for name in sorted(ROS2_VARIABLES)),
     ],
 )
 def test_an_unusable_variable_states_no_version(variables: Mapping[str, str]) -> None:
