@@ -9,6 +9,7 @@ from rosproxy.ros2.protocol.rtps import (
     FAST_DDS,
     HEADER_BYTES,
     INFO_DST,
+    MAY_BE_EMPTY,
     PREFIX_BYTES,
     STATISTICS,
     Overwrite,
@@ -183,13 +184,14 @@ def carries_samples(datagram: bytes) -> bool:
     kinds = _WITHOUT_SAMPLES_OF.get(datagram[6:8], _WITHOUT_SAMPLES)
     offset = HEADER_BYTES
     while offset < size:
-        if datagram[offset] not in kinds or offset + 4 > size:
+        kind = datagram[offset]
+        if kind not in kinds or offset + 4 > size:
             return True
         first = datagram[offset + 2]
         second = datagram[offset + 3]
         length = first + (second << 8) if datagram[offset + 1] & 1 else (first << 8) + second
-        # Length 0: the last submessage, up to the end (9.4.5.1.3).
-        offset = offset + 4 + length if length else size
+        # Length 0: the last submessage, up to the end, except PAD and INFO_TS (9.4.5.1.3).
+        offset = offset + 4 + length if length or kind in MAY_BE_EMPTY else size
     return offset > size
 
 

@@ -102,7 +102,8 @@ _INFO_SRC = SubmessageId.INFO_SRC.value
 INFO_DST = SubmessageId.INFO_DST.value
 _DATA_FRAG = SubmessageId.DATA_FRAG.value
 _WITH_SAMPLE = frozenset({SubmessageId.DATA.value, _DATA_FRAG})
-_MAY_BE_EMPTY = frozenset({SubmessageId.PAD.value, SubmessageId.INFO_TS.value})
+MAY_BE_EMPTY = frozenset({SubmessageId.PAD.value, SubmessageId.INFO_TS.value})
+"""Submessages for which length 0 means an empty body, not the rest of the message (9.4.5.1.3)."""
 
 
 class Span(msgspec.Struct, frozen=True):
@@ -294,7 +295,7 @@ def walk_submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
         submessage_id, flags, first, second = datagram[offset:body]
         length = first + (second << 8) if flags & _LITTLE else (first << 8) + second
         offset = body + length
-        if length == 0 and submessage_id not in _MAY_BE_EMPTY:
+        if length == 0 and submessage_id not in MAY_BE_EMPTY:
             offset = size  # length 0: the last submessage, up to the end (9.4.5.1.3)
         if offset > size:
             raise RtpsError(f"submessage {submessage_id:#x} is longer than the message")

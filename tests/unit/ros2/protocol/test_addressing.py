@@ -15,6 +15,8 @@ from tests.unit.ros2.recorded import VENDORS, recorded
 
 ACKNACK = submessage(SubmessageId.ACKNACK, 0, bytes(24))
 HEARTBEAT = submessage(SubmessageId.HEARTBEAT, 0, bytes(28))
+INVALIDATED_TIME = submessage(SubmessageId.INFO_TS, 0x02, b"")
+EMPTY_PAD = submessage(SubmessageId.PAD, 0, b"")
 ENCRYPTED = submessage(0x33, 0, bytes(24))
 SAMPLE = data(b"12345678", writer=0x00001203)
 
@@ -29,6 +31,10 @@ SAMPLE = data(b"12345678", writer=0x00001203)
         (message(ENCRYPTED), True),
         (message(*[ACKNACK] * (LONGEST_WITHOUT_SAMPLES_BYTES // 28)), True),
         (message(ACKNACK)[:-1], True),
+        (message(INVALIDATED_TIME, SAMPLE), True),
+        (message(INVALIDATED_TIME, ACKNACK), False),
+        (message(EMPTY_PAD, SAMPLE), True),
+        (message(submessage(SubmessageId.ACKNACK, 0, b""), SAMPLE), False),
         (b"", True),
     ],
 )
