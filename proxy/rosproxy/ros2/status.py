@@ -35,7 +35,9 @@ from rosproxy.ros2.registry.participants import (
 from rosproxy.ros2.servers.domain_server import DomainServer
 
 MOST_LISTED_ENDPOINTS = 8192
-"""Readers and writers of a side of a domain whose names are listed, with fair shares by address.
+"""The most readers and writers that the status lists by name, for each side of a domain.
+
+Each address gets a fair share.
 
 A host with fifty nodes has some 1,000. Listing 8,192 takes 30 ms, and the event loop waits
 meanwhile."""
@@ -122,7 +124,8 @@ class Ros2State(Collector):
         )
         unproven = GaugeMetricFamily(
             "rosproxy_ros2_unproven_participants",
-            "Participants at addresses that have not proved to receive; many mean forged sources.",
+            "Participants at addresses that have not answered the proxy's question. A large number "
+            "is a sign of forged sources.",
             labels=["domain", "side"],
         )
         for server in self._servers:
@@ -134,8 +137,8 @@ class Ros2State(Collector):
             }
             for side, counts in sides.items():
                 gauge.add_metric([number, side], counts.total())
-                are_unproven = (n for a, n in counts.items() if not domain.proofs.has(a))
-                unproven.add_metric([number, side], sum(are_unproven))
+                unproven_counts = (n for a, n in counts.items() if not domain.proofs.has(a))
+                unproven.add_metric([number, side], sum(unproven_counts))
         yield gauge
         yield unproven
 
@@ -177,22 +180,27 @@ class Ros2State(Collector):
         """Each participant of a side, and the number of its readers and writers to list."""
         every = list(participants)
         most = MOST_LISTED_ENDPOINTS if self.with_names else 0
-        wanted = [len(participant.endpoints) for participant in every]
+        counts = [len(participant.endpoints) for participant in every]
         owners = [participant.address for participant in every]
-        return zip(every, fair_shares_by_owner(owners, wanted, most), strict=True)
+        return zip(every, fair_shares_by_owner(owners, counts, most), strict=True)
 
     def _inside(
-        self, participant: InsideParticipant, most: int, shortage: PortShortage, kept: bool
+        self,
+        participant: InsideParticipant,
+        most: int,
+        shortage: PortShortage,
+        ports_confirmed: bool,
     ) -> document.ParticipantStatus:
         return msgspec.structs.replace(
             self._status_of(participant, most),
-            kept=kept,
+            kept=ports_confirmed,
             problem=shortage.text,
             shortage=shortage.kind.value,
         )
 
     def _outside(self, participant: OutsideParticipant, most: int) -> document.ParticipantStatus:
         status = self._status_of(participant, most)
+        # ``proven`` is about the ports of the range. `AddressProofs` is about the address.
         return msgspec.structs.replace(status, proven=participant.comes_in)
 
     def _status_of(self, participant: Participant, most: int) -> document.ParticipantStatus:
@@ -225,7 +233,7 @@ class Ros2State(Collector):
 
 
 def _first_endpoints(participant: Participant, most: int) -> list[DdsEndpoint]:
-    """At most ``most`` readers and writers; readers that name a node come first."""
+    """At most ``most`` readers and writers; readers that name a node (`_node_of`) come first."""
     endpoints = participant.endpoints.values()
     if most < len(endpoints):
         return list(islice(sorted(endpoints, key=lambda e: _node_of(e) is None), most))
@@ -233,7 +241,7 @@ def _first_endpoints(participant: Participant, most: int) -> list[DdsEndpoint]:
 
 
 def _node_of(endpoint: DdsEndpoint) -> str | None:
-    """The ROS node that a reader names; None if the reader or writer names none."""
+    """The ROS node that a reader names by its topic (`ros_node`); None for any other endpoint."""
     if endpoint.kind is not EndpointKind.READER:
         return None
     return ros_node(endpoint.topic, endpoint.type_name)

@@ -67,9 +67,9 @@ from rosproxy.ros2.ports.locator_ports import LocatorPorts, NamedBy
 from rosproxy.ros2.ports.mappings import PortMappings
 from rosproxy.ros2.ports.stand_ins import LocatorStandIns, StandInUser
 from rosproxy.ros2.protocol.addressing import (
+    addressed_to_all,
     carries_samples,
     destinations,
-    for_all,
     may_be_discovery,
 )
 from rosproxy.ros2.protocol.relay_envelope import unwrapped
@@ -604,9 +604,9 @@ class Domain:
             sent += self._port_reminders(insider, mapping_count, now)
         if not is_new and len(insider.mappings) > mapping_count:
             insider.separation_due_from = now  # Fast DDS outside accepts no new locators
-        # An announcement may name the discovery participant as its destination. `for_all` makes the
-        # announcement a message for all participants outside.
-        sent += self.to_outside.of_inside(insider, for_all(exported), now)
+        # An announcement may name the discovery participant as its destination. `addressed_to_all`
+        # makes the announcement a message for all participants outside.
+        sent += self.to_outside.of_inside(insider, addressed_to_all(exported), now)
         if is_new:
             sent += self.to_inside.of_outside(self.outside.by_prefix.values(), [insider], now)
         sent += self.proxy_participants.question_to_inside(

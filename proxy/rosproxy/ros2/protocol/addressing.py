@@ -1,8 +1,8 @@
 """For which participants an RTPS message is, and whether the proxy has to read the message.
 
-Both follow from the headers of the submessages, without the samples. DATA, HEARTBEAT, ACKNACK and
-the like name a reader and a writer by their entity ids. An INFO_DST before such a submessage names
-the participant that is to receive it.
+Both follow from the first bytes of each submessage, without the samples. DATA, HEARTBEAT, ACKNACK
+and the like name a reader and a writer by their entity ids. An INFO_DST before such a submessage
+names the participant that is to receive it, by its GUID prefix.
 """
 
 from rosproxy.ros2.protocol.rtps import (
@@ -28,7 +28,7 @@ MOST_UNREAD_SUBMESSAGES = 16
 dozen."""
 
 LONGEST_HEARTBEAT_BYTES = 160
-"""The most bytes of a message that can count as a heartbeat alone. Messages of Fast DDS have 112:
+"""A message with more bytes does not count as a single heartbeat. Messages of Fast DDS have 112:
 header 20, INFO_DST 16, heartbeat 32, statistics 44."""
 
 _WRITER_AT: dict[int, int] = {
@@ -51,12 +51,12 @@ _NAMELESS = frozenset(
         SubmessageId.INFO_DST,
     )
 )
-"""Submessages without a reader and a writer. Such a submessage qualifies the next submessages."""
+"""Submessages without a reader and a writer. All but PAD qualify the next submessages."""
 _NAMELESS_OF = {FAST_DDS: _NAMELESS | {STATISTICS}}
 """Submessages without a reader and a writer, by vendor, for vendors with submessages of their
 own."""
 LONGEST_WITHOUT_SAMPLES_BYTES = 256
-"""The most bytes of a message without samples. So the proxy looks only into small messages."""
+"""A message with more bytes counts as a message with samples: the proxy does not look into it."""
 _WITHOUT_SAMPLES = _NAMELESS | frozenset(
     kind.value
     for kind in (
@@ -91,9 +91,10 @@ def destination(datagram: bytes) -> bytes | None:
 
 
 def is_destination(datagram: bytes, prefix: bytes) -> bool:
-    """Whether a part of a message is for the participant with a GUID prefix. Raises RtpsError.
+    """Whether a message has an INFO_DST with a participant's GUID prefix. Raises RtpsError.
 
-    Cyclone DDS puts submessages for several participants at the same locator into one message.
+    A part for all participants does not count. Cyclone DDS puts submessages for several
+    participants at the same locator into one message.
     """
     info_dst = (body.start for kind, _, body in submessages(datagram) if kind == INFO_DST)
     return any(datagram[start : start + PREFIX_BYTES] == prefix for start in info_dst)
@@ -117,7 +118,7 @@ def destinations(datagram: bytes) -> set[bytes]:
     return prefixes
 
 
-def for_all(datagram: bytes) -> bytes:
+def addressed_to_all(datagram: bytes) -> bytes:
     """The message without its destinations, so that all participants accept the message.
 
     Raises RtpsError.

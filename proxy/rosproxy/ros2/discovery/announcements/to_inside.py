@@ -17,7 +17,7 @@ from rosproxy.net.addresses import HostPort, is_ipv6_link_local, is_loopback
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
 from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings, Outgoing, sent_to
-from rosproxy.ros2.protocol.addressing import for_all
+from rosproxy.ros2.protocol.addressing import addressed_to_all
 from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant, TrafficKind
@@ -170,7 +170,7 @@ class AnnouncementsToInside:
         near = newcomer.proxy_address
         settings = self.settings
         own = {HostPort(near, p) for p in (settings.unicast_port, settings.multicast_port)}
-        announcement = for_all(message.datagram)
+        announcement = addressed_to_all(message.datagram)
         return [
             Outgoing(p.metatraffic, announcement)
             for p in self.inside.by_prefix.values()
