@@ -98,8 +98,9 @@ class DockerClient:
     def events(self) -> Iterator[Json]:
         """Connect, and return the events of EVENT_FILTERS from now on.
 
-        The iterator ends with the connection. When this method returns, the connection is open. So
-        a later list shows all earlier changes, and each later change causes an event.
+        The iterator ends with the connection. When this method returns, the connection is open. A
+        list requested from now on shows all changes before the connection opened. Each change since
+        then causes an event.
         """
         with self._translated():
             # The stream has a client of its own, because reading the stream does not end. The SDK

@@ -185,8 +185,8 @@ def read_container(
     row: Json, inspected: Json | None, networks: Iterable[Network] = ()
 ) -> Container:
     """Return a container, from a row of the engine's list and an inspection, if there is any."""
-    # The engine repeats the network of the creation call, by name or id. Without a network in that
-    # call, engines say "default", newer engines "bridge" (moby: container_routes.go).
+    # ``NetworkMode`` is the network of the creation call, by name or id. Without a network in that
+    # call, it is "default", with newer engines "bridge" (moby: container_routes.go).
     network_names = {network.id: network.name for network in networks} | {"default": "bridge"}
     mode = dig(row, "HostConfig", "NetworkMode") or ""
     name = name_of(row)
@@ -212,8 +212,8 @@ def read_container(
         ),
         master_uri=variables.get("ROS_MASTER_URI", ""),
         variables={name: text for name, text in variables.items() if name in _VARIABLES},
-        host_ports=_bound_ports(inspected, "tcp") | _public_ports(row, "tcp"),
-        udp_ports=_bound_ports(inspected, "udp") | _public_ports(row, "udp"),
+        host_ports=_requested_ports(inspected, "tcp") | _public_ports(row, "tcp"),
+        udp_ports=_requested_ports(inspected, "udp") | _public_ports(row, "udp"),
         hostname=dig(inspected, "Config", "Hostname") or "",
         started_at="" if started.startswith(_NEVER_STARTED) else started,
         exit_code=dig(inspected, "State", "ExitCode") or 0,
@@ -244,7 +244,7 @@ def _aliases(endpoint: Json) -> list[str]:
     return [*(endpoint.get("Aliases") or ()), *(endpoint.get("DNSNames") or ())]
 
 
-def _bound_ports(inspected: Json | None, protocol: str) -> frozenset[int]:
+def _requested_ports(inspected: Json | None, protocol: str) -> frozenset[int]:
     """Return the host ports that a container requests. A range counts with all ports."""
     return frozenset(
         port

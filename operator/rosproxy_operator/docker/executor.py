@@ -66,12 +66,12 @@ RETRY_PAUSES_S = (1.0, 2.0, 5.0, 15.0, 60.0)
 FAILURE_REMEMBERED_S = 120.0
 """Seconds after which a failure of an action is forgotten, if the action has not failed again.
 
-If the same failure comes again within this time, the operator does not log another warning. Retries
-come at least every 60 s, so a lasting failure is logged as a warning once. Meanwhile the status
-reports the problem.
+If the same failure comes again within this time, the operator does not log another warning. A retry
+starts at most 60 s after the end of the last run. So a lasting failure is logged as a warning once,
+unless a run takes longer than the other 60 s. Meanwhile the status reports the problem.
 """
 STOP_TIMEOUT_S = 2
-"""Seconds that a container has to end before the engine kills it."""
+"""Seconds that the engine gives a container to end, before it kills the container."""
 HARMLESS_ERRORS: dict[type, tuple[str, ...]] = {
     # moby has these texts in libnetwork and in
     # daemon/{unpause,rename,delete,container_operations}.go.
@@ -89,7 +89,7 @@ HARMLESS_ERRORS: dict[type, tuple[str, ...]] = {
 """For each type of action: texts in the engine's errors that mean that nothing is left to do.
 
 For these types, the error NoSuchObject also means that nothing is left to do. For all other types
-every error is a failure.
+every error is a failure, except a Conflict with the operator's own container (`_create`).
 """
 
 LONGEST_HELPER_RUN_S = 30.0
@@ -150,8 +150,8 @@ class Executor:
 
     @property
     def busy(self) -> frozenset[str]:
-        """The running jobs, by the subject of their problems (`Problem.subject`)."""
-        return frozenset(map(_subject, self._busy))
+        """The subjects of the running jobs, as in `Problem.subject`."""
+        return frozenset(map(_problem_subject, self._busy))
 
     @property
     def problems(self) -> list[Problem]:
@@ -191,7 +191,7 @@ class Executor:
             waiting = failure and failure.actions == actions and now < failure.retry_at
             if actions and not waiting and job not in self._busy:
                 work = self._run(job, by_job[job], actions, carry_out)
-                self._busy[job] = self._tasks.spawn(work, f"work for {_subject(job)}")
+                self._busy[job] = self._tasks.spawn(work, f"work for {_problem_subject(job)}")
 
     async def _run(
         self, job: Job, groups: list[Group], actions: list[Action], carry_out: CarryOut
@@ -204,8 +204,8 @@ class Executor:
             problems = [await self._carry_out_group(group, carry_out) for group in groups]
             problem = next(filter(None, problems), None)
         except Exception as error:  # a fault of the operator: wait as after other failures
-            log.exception("work for %s failed", _subject(job))
-            problem = Problem(_subject(job), f"the operator failed: {error!r}")
+            log.exception("work for %s failed", _problem_subject(job))
+            problem = Problem(_problem_subject(job), f"the operator failed: {error!r}")
         finally:
             previous = self._failures.pop(job, None)
             if problem is not None:
@@ -232,7 +232,7 @@ class Executor:
                 break
             except EngineError as error:
                 fix = f". {group.fix}" if group.fix else ""
-                subject = _subject((group.key, group.subject))
+                subject = _problem_subject((group.key, group.subject))
                 text = f"{action}: {error}{fix}"
                 # A later failure may be a consequence of the first. The log has both.
                 problem = problem or Problem(subject, text, group.fatal)
@@ -268,7 +268,8 @@ class Executor:
             log.debug("%s: %s in %.3f s", action, outcome, self._now() - started)
 
 
-def _subject(job: Job) -> str:
+def _problem_subject(job: Job) -> str:
+    """The subject of the problems of a job."""
     key, subject = job
     return subject or (f"proxy {proxy_name(key)}" if key else "uplink")
 
@@ -384,9 +385,10 @@ class DockerActions:
                 self._engine.do("stop", name, timeout=STOP_TIMEOUT_S)
             except EngineError as error:
                 log.debug("container not stopped, so it is killed: %s: %s", name, error)
-        # When a sandbox ends, the engine publishes the ports anew over each network that the
-        # sandbox still has, which takes 2 s per network. So disconnect the networks while the
-        # sandbox runs. No sandbox is stopped above: ``action.stop`` is for containers of proxies.
+        # The engine publishes the ports of a sandbox over one network. When a sandbox ends, the
+        # engine publishes them anew over each network that the sandbox still has, which takes 2 s
+        # per network. So disconnect the networks while the sandbox runs, except the uplink, which
+        # has the ports. No sandbox is stopped above: ``action.stop`` is for containers of proxies.
         networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
         for network in networks:
             # The engine disconnects no container from the network host.

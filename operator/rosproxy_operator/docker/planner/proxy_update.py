@@ -73,7 +73,8 @@ class NetworkFacts:
         addresses: The addresses of running containers on the proxy's networks.
         taken: The addresses of all containers and gateways.
         subnets: The subnets of the proxy's networks.
-        arrivals: The running containers of the proxy; none for ROS 2 and rmw_zenoh.
+        arrivals: One arrival for each running member and network, including arrivals of which the
+            operator has told the proxy already; none for ROS 2 and rmw_zenoh.
         running: The ids of all running containers.
         selected: The addresses of the proxy's containers on the proxy's networks. These addresses
             may use the proxy as their master.
@@ -122,7 +123,7 @@ class AddressHistory:
         }
 
     def _follow(self, latest: NetworkFacts, now: float) -> None:
-        """Note a move if a container has left a network and is still on another network."""
+        """Note a move if a container has left a network and is now on another network."""
         for container, network in list(self._absent):
             # A network that the container has just joined comes first (False sorts before True):
             # the container has probably moved there. Otherwise any network of the container counts.
@@ -148,12 +149,12 @@ class AddressHistory:
         times += [since + MOVE_REPEATED_FOR_S for _, since in self._moves.values()]
         return min(times, default=None)
 
-    def moved(self, nodes: Collection[str]) -> dict[str, str]:
+    def moved(self, addresses: Collection[str]) -> dict[str, str]:
         """The new address by old address, for each old address that a node of the proxy has.
 
-        ``nodes`` are the addresses of the proxy's nodes.
+        ``addresses`` are the addresses of the proxy's nodes.
         """
-        return {old: new for old, (new, _) in self._moves.items() if old in nodes}
+        return {old: new for old, (new, _) in self._moves.items() if old in addresses}
 
 
 class ProxyUpdate:
@@ -183,16 +184,17 @@ class ProxyUpdate:
             for arrival in latest.arrivals
         }
 
-    def body(self, nodes: Collection[str], now: float) -> dict[str, Any]:
+    def body(self, addresses: Collection[str], now: float) -> dict[str, Any]:
         """Return the body of ``POST /containers`` for a proxy with nodes at these addresses.
 
         The body has the addresses that are ``gone``, that have ``moved``, and at which containers
-        have ``arrived``. The body is empty if nothing is due.
+        have ``arrived``. The body is empty if nothing is due. Each call also records the facts of
+        the last look in the history of addresses, at the time ``now``.
         """
         self._history.record(self.facts, now)
         body = {
-            "gone": sorted(node for node in nodes if self._gone(node)),
-            "moved": self._history.moved(nodes),
+            "gone": sorted(address for address in addresses if self._is_gone(address)),
+            "moved": self._history.moved(addresses),
             "arrived": [
                 {"address": arrival.address, "names": sorted(arrival.names)}
                 for arrival, times in sorted(self._due.items(), key=lambda item: item[0].address)
@@ -202,14 +204,15 @@ class ProxyUpdate:
         self._moving = bool(body["moved"])
         return {key: value for key, value in body.items() if value}
 
-    def _gone(self, node: str) -> bool:
-        """Whether the container of a node is gone: no container has the node's address.
+    def _is_gone(self, address: str) -> bool:
+        """Whether the container of the node at an address is gone.
 
-        Only addresses on networks of the proxy, present or former, count: the engine knows all
-        containers there.
+        No container has the address, and no container may come back to the address or has moved
+        from there. Only addresses on networks of the proxy, present or former, count: the engine
+        knows all containers there.
         """
-        is_known = node in self.facts.taken or node in self._history.reserved_addresses
-        return not is_known and is_inside(node, tuple(self._subnets))
+        is_known = address in self.facts.taken or address in self._history.reserved_addresses
+        return not is_known and is_inside(address, tuple(self._subnets))
 
     def mark_delivered(self, now: float) -> None:
         """Record that the proxy has received all updates that were due at the time ``now``."""
@@ -241,7 +244,7 @@ def network_facts(
     joined = {a.network for a in sandbox.container.attachments if a.address} if sandbox else set()
     containers = by_reference(observed.containers)
     running = [container for container in observed.containers if container.state in STARTED]
-    routers = proxy.range if proxy.key == ZENOH else None
+    router_ports = proxy.range if proxy.key == ZENOH else None
     own_members = [member for member in members if member.key == proxy.key]
     return NetworkFacts(
         master_address="" if not host or is_address(host) else observed.masters.get(host, ""),
@@ -270,7 +273,7 @@ def network_facts(
             if member.container.alive
             for a in _attachments(network_owner(member.container, containers), joined)
         ),
-        policy=(*policy, *label_layers(own_members, observed, joined, routers)),
+        policy=(*policy, *label_layers(own_members, observed, joined, router_ports)),
     )
 
 
@@ -281,14 +284,14 @@ def _attachments(container: Container, networks: Collection[str]) -> list[Attach
 def _arrivals(
     member: Member, observed: HostState, containers: ByReference, joined: set[str]
 ) -> list[ContainerArrival]:
-    """The arrivals of a running member, one for each network of ``joined``; else none."""
+    """The arrivals of a member, one for each network of ``joined``; none if it does not run."""
     container = member.container
-    host = network_owner(container, containers)
-    if container.state not in STARTED or host.state not in STARTED:
+    owner = network_owner(container, containers)
+    if container.state not in STARTED or owner.state not in STARTED:
         return []
-    own = {container.name, container.hostname, container.id[:12], host.hostname}
+    own = {container.name, container.hostname, container.id[:12], owner.hostname}
     # Before the redirect, nodes reach the real master by address, and register there directly. The
-    # registered URI then has the host that these variables name.
+    # registered URI then has the host that ROS_IP or ROS_HOSTNAME names.
     if member.redirected:
         own |= {container.variables.get(name, "") for name in ("ROS_IP", "ROS_HOSTNAME")}
         own = {name for name in own if not is_loopback(name)}
@@ -299,7 +302,7 @@ def _arrivals(
             attachment.address,
             attachment.endpoint,
             frozenset(name for name in attachment.names | own if _HOST_NAME.fullmatch(name)),
-            redirect_record_name(observed, member.key, host),
+            redirect_record_name(observed, member.key, owner),
         )
-        for attachment in _attachments(host, joined)
+        for attachment in _attachments(owner, joined)
     ]
