@@ -10,8 +10,8 @@ from rosproxy_operator.kubernetes.status.fixes import fix_for
 from rosproxy_operator.kubernetes.status.operator_findings import (
     UNKNOWN,
     Operators,
-    unmanaged,
-    unnoticed,
+    unmanaged_finding,
+    unnoticed_finding,
 )
 
 _BAD_STATUS = {
@@ -57,11 +57,11 @@ def _findings_of(rosproxy: Json, operators: Operators) -> Iterator[DoctorFinding
     id = Name(metadata["namespace"], metadata["name"])
     subject = f"rosproxy {id}"
     conditions = {text_at(c, "type"): c for c in submaps(status, "conditions")}
-    if foreign := unmanaged(id, operators):
+    if foreign := unmanaged_finding(id, operators):
         yield foreign
         return
     if is_unnoticed(rosproxy) and not operators.missing:
-        yield unnoticed(id, operators)
+        yield unnoticed_finding(id, operators)
     messages: set[str] = set()
     for kind, bad in _BAD_STATUS.items():
         condition = conditions.get(kind, {})

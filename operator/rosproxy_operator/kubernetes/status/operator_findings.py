@@ -69,7 +69,7 @@ def operator_findings(operators: Operators) -> Iterator[DoctorFinding]:
         yield error(_CHECK, _CHECK, text, fix)
 
 
-def unmanaged(rosproxy: Name, operators: Operators) -> DoctorFinding | None:
+def unmanaged_finding(rosproxy: Name, operators: Operators) -> DoctorFinding | None:
     """The error about a RosProxy in a namespace that no operator manages, else None."""
     managed = operators.namespaces
     if not managed or rosproxy.namespace in managed:
@@ -85,7 +85,7 @@ def unmanaged(rosproxy: Name, operators: Operators) -> DoctorFinding | None:
     return error(_CHECK, f"rosproxy {rosproxy}", text, fix)
 
 
-def unnoticed(rosproxy: Name, operators: Operators) -> DoctorFinding:
+def unnoticed_finding(rosproxy: Name, operators: Operators) -> DoctorFinding:
     """The error about a RosProxy for whose last change no operator has written a status."""
     subject = f"rosproxy {rosproxy}"
     namespace = rosproxy.namespace

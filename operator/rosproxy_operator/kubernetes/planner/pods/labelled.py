@@ -1,4 +1,7 @@
-"""Findings of the doctor about labelled pods. The doctor reads the pods without an operator."""
+"""Findings of the doctor about labelled pods.
+
+The doctor reads the pods itself: no operator has to run.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -18,7 +21,7 @@ from rosproxy_operator.kubernetes.resources.names import INJECT
 MOST_COMMANDS = 5
 """Most commands in a fix."""
 MOST_MISSPELT_FINDINGS = 10
-"""Most findings about misspelt names of pods."""
+"""Most findings about misspelt labels and annotations of pods."""
 
 
 def missing_rosproxy_findings(
@@ -41,9 +44,10 @@ def missing_rosproxy_findings(
 
 
 def misspelt_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> list[DoctorFinding]:
-    """Return an error for each misspelt name of pods, in namespaces without a RosProxy.
+    """Return errors about misspelt labels and annotations of pods, in namespaces without RosProxy.
 
-    In a namespace with a RosProxy, the status of the RosProxy reports the name.
+    Pods with the same text and the same fix share an error. The list has at most
+    MOST_MISSPELT_FINDINGS. In a namespace with a RosProxy, the status of the RosProxy reports them.
     """
     unserved = sorted((p for p in pods if p.id.namespace not in with_rosproxy), key=lambda p: p.id)
     first: dict[tuple[str, str], Pod] = {}

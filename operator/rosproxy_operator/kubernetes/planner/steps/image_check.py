@@ -30,7 +30,7 @@ _RESOURCES: Json = {"requests": {"cpu": "1m", "memory": "32Mi"}, "limits": {"mem
 class ImageState(Enum):
     """The result of the check of an image on a node."""
 
-    MISSING = "missing"  # no check of this image exists, or the check is being deleted
+    UNCHECKED = "unchecked"  # no check of this image exists, or the check is being deleted
     CHECKING = "checking"
     USABLE = "usable"
     UNUSABLE = "unusable"
@@ -53,7 +53,7 @@ def image_state(context: ClusterContext, proxy: ProxyPod, site: ProxySite) -> Im
     expected = fingerprint_of(image_check_pod(site, context.settings))
     check = next((c for c in _checks(context, site.rosproxy) if c.node == proxy.node), None)
     if check is None or check.fingerprint != expected or check.pod.deleting:
-        return ImageState.MISSING
+        return ImageState.UNCHECKED
     if check.pod.phase == "Succeeded":
         return ImageState.USABLE
     is_bad = check.stuck is not None or check.pod.ended
@@ -62,12 +62,12 @@ def image_state(context: ClusterContext, proxy: ProxyPod, site: ProxySite) -> Im
 
 def check_image(context: ClusterContext, site: ProxySite) -> Iterator[Action]:
     """Yield the action that creates the check of a proxy's next image, if no check exists."""
-    of = site.rosproxy.id
-    id = image_check_id(of, site.node.name)
+    rosproxy_id = site.rosproxy.id
+    id = image_check_id(rosproxy_id, site.node.name)
     # A check of another image has the same name. `remove_image_checks` deletes that check first.
     is_there = any(c.node == site.node.name for c in _checks(context, site.rosproxy))
-    if not is_there and context.retries.is_due(Task(of, "create", id)):
-        yield CreateHelper(of, image_check_pod(site, context.settings), IMAGE_CHECK)
+    if not is_there and context.retries.is_due(Task(rosproxy_id, "create", id)):
+        yield CreateHelper(rosproxy_id, image_check_pod(site, context.settings), IMAGE_CHECK)
 
 
 def remove_image_checks(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
@@ -77,7 +77,7 @@ def remove_image_checks(context: ClusterContext, rosproxy: RosProxy) -> Iterator
         if check.pod.deleting or _is_needed(context, rosproxy, check):
             continue
         if context.retries.is_due(task):
-            why = "the proxy has the image, or needs another image"
+            why = "the proxy has the image, needs another image, or is gone or unwanted"
             yield DeleteHelper(check.of, check.pod.id, check.pod.uid, why, IMAGE_CHECK)
 
 

@@ -31,16 +31,17 @@ _RESOURCES: Json = {"requests": {"cpu": "10m", "memory": "32Mi"}, "limits": {"me
 
 
 def lan_relay_pod(
-    site: ProxySite, lan_relay: HostPort, proxy: ProxyPod, settings: ClusterSettings
+    site: ProxySite, address: HostPort, proxy: ProxyPod, settings: ClusterSettings
 ) -> Json:
-    """The pod of a LAN relay that listens at ``lan_relay`` and serves this proxy.
+    """The pod of a LAN relay that listens at ``address`` and serves this proxy.
 
-    The image is the present image of the proxy, which may not be the image of the site yet.
+    The LAN relay gets the image that the proxy has now. The image in the settings of ``site`` may
+    be a newer image, which the proxy gets after the check of that image.
     """
     ros2 = site.rosproxy.spec.ros2
     target = HostPort(proxy.pod.ip, site.ports.first)
     number = ros2.number if ros2 else 0
-    variables = lan_relay_variables(number, lan_relay.host, lan_relay, target, site.relay_secret)
+    variables = lan_relay_variables(number, address.host, address, target, site.relay_secret)
     container = {
         "name": LAN_RELAY,
         "image": proxy.image,
@@ -48,7 +49,7 @@ def lan_relay_pod(
         "env": [{"name": name, "value": value} for name, value in variables.items()],
         # With the hostPort the scheduler keeps the port free of other pods. In the host's network
         # the containerPort has to be the same port.
-        "ports": [{"containerPort": lan_relay.port, "hostPort": lan_relay.port, "protocol": "UDP"}],
+        "ports": [{"containerPort": address.port, "hostPort": address.port, "protocol": "UDP"}],
         "resources": _RESOURCES,
     }
     id = lan_relay_id(site.rosproxy.id, site.node.name)
@@ -82,6 +83,7 @@ def reconcile_lan_relays(context: ClusterContext, rosproxy: RosProxy) -> Iterato
 def lan_relay_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
     """Yield a finding for each node on which a proxy can't have its LAN relay."""
     for place in context.view.places.get(rosproxy.id, ()) if rosproxy.spec.multicast else ():
+        # A proxy that no pod wants any more exists for a while, without a site.
         site = site_of(context, place) if place in context.view.wanted else None
         if isinstance(site, ProxySite) and site.lan_relay is None:
             text = (
@@ -96,10 +98,10 @@ def _reconcile_lan_relay(
 ) -> Iterator[Action]:
     """Yield the next actions for the LAN relay of a place: delete outdated pods, or create one."""
     current = context.view.current.get(place)
-    wanted = place in context.view.wanted
-    site = site_of(context, place) if wanted else None
-    address = current.pod.ip if current is not None and not current.pod.ended else ""
-    if current is None or not isinstance(site, ProxySite) or site.lan_relay is None or not address:
+    # A proxy that no pod wants any more has no site.
+    site = site_of(context, place) if place in context.view.wanted else None
+    proxy_ip = current.pod.ip if current is not None and not current.pod.ended else ""
+    if current is None or not isinstance(site, ProxySite) or site.lan_relay is None or not proxy_ip:
         return
     if current.fingerprint != proxy_fingerprint(site, context.settings):
         return  # the operator will recreate this proxy

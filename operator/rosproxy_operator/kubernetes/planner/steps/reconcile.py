@@ -1,10 +1,11 @@
 """Plans the actions for the Service of a RosProxy, and for the proxy on each node.
 
 Each ``reconcile_…`` function compares the wanted objects with the existing objects, and yields the
-next actions. Later looks yield the actions after these. The comparison reads only the fingerprint
-annotation and the image of an object. A pod with another fingerprint is deleted, and a later look
-creates the pod again under the same name. If only the image differs, the operator sets the image of
-the pod. `Retries` delays the next try of an action that had no effect.
+next actions. Later looks yield the actions after these. An object with another owner or name is
+deleted. Of the content, the comparison reads only the fingerprint annotation and the image. A pod
+with another fingerprint is deleted, and a later look creates the pod again under the same name. If
+only the image differs, the operator sets the image of the pod. `Retries` delays the next try of an
+action that had no effect.
 """
 
 from collections import Counter
@@ -89,15 +90,16 @@ def reconcile_proxies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
 
     A change of the image or of the settings is a rollout. A rollout stops a working proxy, or
     checks its next image, only while fewer than ``spec.maxUnavailable`` proxies are down or have
-    such a check. The other proxies wait. A proxy that moves to other ports or to another master
-    does not wait, except for the check of a new image.
+    such a check. The other proxies wait for their turn. A proxy that moves to other ports or to
+    another master does not wait for its turn. If the image changes as well, the operator first
+    checks the image, and the proxy waits for its turn to begin this check.
     """
     places = context.view.places.get(rosproxy.id, ())
-    wanted = [place for place in places if _is_creatable(context, place)]
-    working = {place for place in wanted if _works(context, place, wanted)}
-    down = [p for p in wanted if p not in working and not _lacks_ports(context, p)]
-    checked = [place for place in working if _image_check_is_open(context, place)]
-    room = rosproxy.spec.max_unavailable.of(len(wanted)) - len(down) - len(checked)
+    creatable = [place for place in places if _is_creatable(context, place)]
+    working = {place for place in creatable if _works(context, place, creatable)}
+    down = [p for p in creatable if p not in working and not _lacks_ports(context, p)]
+    in_check = [place for place in working if _image_check_is_open(context, place)]
+    room = rosproxy.spec.max_unavailable.of(len(creatable)) - len(down) - len(in_check)
     for place in places:
         may_stop = room > 0 or place not in working
         actions = [*_reconcile_proxy(context, place, may_stop)]
@@ -208,7 +210,7 @@ def _reconcile_existing(
         state = image_state(context, proxy, site)
         if state is ImageState.USABLE:
             yield from _replace_or_set_image(context, proxy, site, may_stop)
-        elif state is ImageState.MISSING and may_stop:
+        elif state is ImageState.UNCHECKED and may_stop:
             yield from check_image(context, site)
     else:
         yield from _replace_or_set_image(context, proxy, site, may_stop)
@@ -224,8 +226,8 @@ def _replace_or_set_image(
     image = manifests.image_of(site.rosproxy, context.settings)
     fingerprint = manifests.proxy_fingerprint(site, context.settings)
     # If the successor can't find the nodes at the master, the present proxy unregisters the nodes
-    # (`retire`). A range with the same first port has only grown or shrunk at the end, so the
-    # nodes keep their ports.
+    # (`retire`). A range with the same first port has only grown or shrunk at the end. So the
+    # nodes keep their ports, except nodes at ports that were cut off at the end.
     moved = proxy.range.first != site.ports.first
     unregisters = moved or not manifests.keeps_registrations(proxy.fingerprint, fingerprint)
     if not may_stop and not unregisters:
@@ -264,10 +266,11 @@ def _delete_pod(
 
 
 def _keep_creation_count(context: ClusterContext, place: ProxyPlace) -> None:
-    """Keep the retry record of the creation of a proxy while the proxy does not serve.
+    """Keep counting the tries to create a proxy until the proxy serves.
 
-    If no pod of the proxy ever runs, the operator waits longer before each further creation
-    (`PROMPT_RECREATIONS`).
+    `Retries` forgets a task that no plan asks for, and with it the count. `note_effect` keeps the
+    count while the pod exists. So if no pod of the proxy ever runs, the operator waits longer
+    before each further creation (`PROMPT_RECREATIONS`).
     """
     current = context.view.current.get(place)
     if current is None or not serves(current):
@@ -296,9 +299,10 @@ def reconcile_orphans(context: ClusterContext) -> Iterator[Action]:
 
 
 def seconds_to_deadlines(context: ClusterContext) -> Iterator[float]:
-    """Yield the seconds until a grace ends, a missing node counts as gone, or a range is given up.
+    """Yield the seconds until the next plan may differ, although no watch event reports a change.
 
-    No watch event reports these ends.
+    These are the ends of graces, the times at which missing nodes count as gone, and the times at
+    which the operator gives proxies other ports, because their ports were refused.
     """
     ready = {name for name, node in context.observed.nodes.items() if node.ready}
     yield from (context.grace_left(place) for place in context.state.absent if place.node in ready)
