@@ -1,4 +1,7 @@
-"""Rules about the names in the user's question: which pairs are not connected, and why."""
+"""Rules about the names that the user gave to ``rosproxy doctor``.
+
+The findings say which pairs of publisher and subscriber are not connected, and why.
+"""
 
 from collections.abc import Iterator
 from difflib import get_close_matches
@@ -12,12 +15,12 @@ from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.telemetry.text import listed, quoted, size
 
 PAIR = "pair"
-"""The check of all findings here, except UNKNOWN_NAME."""
+"""The name of the check in all findings of this module, except those with UNKNOWN_NAME."""
 ANY_TYPE = "*"
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """All findings about the names in the user's question."""
+    """All findings about the names that the user gave."""
     if not facts.names:
         return
     if facts.graph is None:
@@ -38,8 +41,8 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
-    graph = facts.system
-    names = sorted(graph.names() | graph.topics | {*graph.services})
+    system = facts.system
+    names = sorted(system.names() | system.topics | {*system.services})
     alike = get_close_matches(name, names, 3, 0.7)
     # The user asked for /scan, and there is /robot/scan: the namespace was missing.
     alike += [n for n in names if n.endswith(name) and n not in alike][:3]
@@ -50,11 +53,11 @@ def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
 
 
 def _one_sided_topic(facts: DoctorFacts, topic: str) -> DoctorFinding:
-    graph = facts.system
-    published = bool(graph.publishers.get(topic))
+    system = facts.system
+    published = bool(system.publishers.get(topic))
     verb, lacks = ("published", "subscribes to") if published else ("subscribed to", "publishes")
-    text = f"{verb} by {listed(graph.sides(topic))}; no node {lacks} {topic}"
-    topics = sorted(graph.topics - {topic})
+    text = f"{verb} by {listed(system.sides(topic))}; no node {lacks} {topic}"
+    topics = sorted(system.topics - {topic})
     alike = [t for t in topics if t.rpartition("/")[2] == topic.rpartition("/")[2]]
     fix = (
         f"run rostopic info {quoted(topic)}; after a restart of roscore, restart the nodes outside"
@@ -127,7 +130,7 @@ def _reason_unconnected(
         text = f"types differ: {publisher.name} publishes {offered}, "
         text += f"{subscriber.name} subscribes to {wanted}"
         return text, "use the same message type on both sides"
-    return _reason_without_transport(facts, topic, publisher, subscriber)
+    return _transport_reason(facts, topic, publisher, subscriber)
 
 
 def _unreachable(facts: DoctorFacts, node: NodeFacts) -> bool:
@@ -137,7 +140,7 @@ def _unreachable(facts: DoctorFacts, node: NodeFacts) -> bool:
     return node.attempt.failed or node.slave is None
 
 
-def _reason_without_transport(
+def _transport_reason(
     facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: NodeFacts
 ) -> tuple[str, str]:
     address, attempt = facts.data_ports.get((publisher.name, topic), ("", Attempt()))
@@ -164,7 +167,10 @@ def _reason_without_transport(
         )
     if facts.is_ours(subscriber.slave) and not facts.is_ours(publisher.slave):
         return _reason_from_inside(facts, address, publisher, subscriber)
-    text = "both nodes answer and the types match. Perhaps the message definitions differ (md5sum)"
+    text = (
+        "both nodes answer, and no difference in types is known. Perhaps the message definitions "
+        "differ (md5sum)"
+    )
     return text, f"read the log of {quoted(subscriber.name)}; {restart}"
 
 
