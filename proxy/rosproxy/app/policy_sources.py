@@ -1,8 +1,8 @@
 """The sources of the policy in a running proxy: options, policy file, operator.
 
 The rules of the options stay. The rules of the file and of the operator may change at any time.
-After a change of the file, each stack notices the new version of the policy by itself. When an
-operator posts rules, the stacks apply the rules before the proxy answers.
+After a change of the file, each stack (ROS 1, ROS 2, rmw_zenoh) notices the new version of the
+policy by itself. When an operator posts rules, the stacks apply the rules before the proxy answers.
 """
 
 import logging
@@ -62,7 +62,8 @@ class PolicySources:
         try:
             self._use_operator_layers(body)
         except BodyError as error:
-            # `Problems.add` would keep an earlier refusal, which has another text.
+            # `Problems.add` does not replace a problem with another text. So the earlier refusal
+            # has to go first.
             problems.solved(OPERATOR_POLICY)
             text = f"refused: {error}. The previous policy stays in force"
             problems.add(OPERATOR_POLICY, text, holds=True)
@@ -83,10 +84,11 @@ class PolicySources:
             raise BodyError(f"layers: {error}") from None
 
 
-def read_policy_file(settings: Settings) -> None:
+def check_policy_file(settings: Settings) -> None:
     """Check the policy file of the settings, if one is set. Raises SettingError.
 
-    The bounds hold for the rules of file and options together, as in a running proxy.
+    The limits on the number of layers and rules count file and options together, as in a running
+    proxy.
     """
     if settings.policy_file:
         metrics = Metrics()

@@ -62,9 +62,9 @@ def run(check: bool, deep: bool, log_format: str, log_level: str, **given: Any) 
 
 def _check(settings: Any, deep: bool) -> None:
     """Check the policy file, and with ``deep`` print findings and exit. Raises SettingError."""
-    from rosproxy.app.policy_sources import read_policy_file
+    from rosproxy.app.policy_sources import check_policy_file
 
-    read_policy_file(settings)
+    check_policy_file(settings)
     if deep:
         from rosproxy.cli.deep_check import deep_check
         from rosproxy.cli.questions import print_findings

@@ -1,7 +1,7 @@
 """The terminal: prints a text once, or draws a text repeatedly (``--watch``).
 
-On a terminal, rich colours important words, unless NO_COLOR is set, and ``--watch`` uses a separate
-screen. A pipe or a file gets the plain text. Characters that the encoding lacks are escaped. rich
+On a terminal, ``--watch`` uses a separate screen, and rich colours important words unless NO_COLOR
+is set. A pipe or a file gets the plain text. Characters that the encoding lacks are escaped. rich
 reads no markup in a text.
 """
 

@@ -3,12 +3,12 @@
 A call may name its object by ``extra=`` (``node``, ``port``, ``container`` or ``proxy``), such as
 ``log.info("...", extra={"node": "/talker", "port": 45000})``. JSON lines have these fields beside
 ``time`` (ISO 8601, UTC), ``level``, ``logger``, ``message`` and, with a traceback, ``error``. Text
-lines have only the message.
+lines have the time, the level, the message and the traceback, but no fields of ``extra``.
 
 Messages quote nodes, labels and documents, which may be hostile. This module makes all messages
 harmless. A message is a line of at most LONGEST characters, without characters that move the cursor
-or reorder text (`harmless`). Repeated messages do not fill the disk (`LogRateLimit`). Tracebacks
-stay the same, except the texts of the exceptions.
+or reorder text (`harmless`). The count of left-out messages may follow. Repeated messages do not
+fill the disk (`LogRateLimit`). Tracebacks stay the same, except the texts of the exceptions.
 """
 
 import contextlib
@@ -30,15 +30,17 @@ LONGEST = 2000
 to 400."""
 SUBJECT_BURST = 20
 """Warnings and errors of one kind about one subject that are written in a burst. A real node causes
-a few messages a minute at most. An address may have several nodes with five topics each."""
+a few messages a minute at most. A subject can be an address: 20 is four nodes there, with five
+topics each."""
 SUBJECT_INTERVAL_S = 5.0
 """Seconds after a burst until one more message about the subject is written."""
 KIND_BURST = 2000
-"""Messages of one kind that are written in a burst: a line for each of 1,000 nodes that start."""
+"""Messages of one kind that are written in a burst. 1,000 nodes that start at once use half of
+these, with a line for each node."""
 KIND_INTERVAL_S = 1.0
 """Seconds after a burst until one more message of the kind is written."""
 USUAL_CHARACTERS = 200
-"""Characters for which a message counts once more: a long message counts several times."""
+"""For each 200 characters, a message counts one more time."""
 MOST_BUCKETS = 1024
 """Buckets of kinds and subjects. A further bucket replaces the one that was unused for longest."""
 
