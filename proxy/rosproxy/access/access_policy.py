@@ -25,8 +25,9 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, Refusals
 
-OUTWARD_KINDS = frozenset({RuleKind.PUBLISH, RuleKind.SERVE})
-"""The kinds of rules that the proxy enforces on TCPROS connections from outside."""
+OFFER_KINDS = frozenset({RuleKind.PUBLISH, RuleKind.SERVE})
+"""The kinds of rules about what nodes inside offer: the proxy enforces these on TCPROS connections
+from outside."""
 PARAMETER_KINDS = frozenset({RuleKind.GET_PARAM, RuleKind.SET_PARAM})
 """The kinds of rules about parameters."""
 
@@ -51,7 +52,7 @@ class AccessPolicy:
         self._option_layers = tuple(option_layers)
         self._operator_layers = tuple(operator_layers)
         self._file_layers = tuple[PolicyLayer, ...]()
-        self._has_operator_layers = asyncio.Event()
+        self._operator_wait_over = asyncio.Event()
         self.checks: list[Callable[[Sequence[PolicyLayer]], None]] = []
         self._by_kind: dict[RuleKind, tuple[PolicyLayer, ...]] = {}
         self.version = 0
@@ -74,7 +75,7 @@ class AccessPolicy:
         self._check((*self._option_layers, *self._file_layers, *layers))
         self._operator_layers = tuple(layers)
         self._note_change()
-        self._has_operator_layers.set()
+        self._operator_wait_over.set()
 
     async def wait_for_operator(self, seconds: float) -> None:
         """Wait until an operator has sent layers, but at most ``seconds``.
@@ -83,8 +84,8 @@ class AccessPolicy:
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
-                await self._has_operator_layers.wait()
-        self._has_operator_layers.set()
+                await self._operator_wait_over.wait()
+        self._operator_wait_over.set()
 
     def judge(self, kind: RuleKind, name: str, callers: Sequence[str], address: str) -> Verdict:
         """The verdict on a name for all of ``callers``, without a report.

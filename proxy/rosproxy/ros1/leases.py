@@ -1,4 +1,6 @@
-"""Leases: the ports of the range, which are reserved from the start and listen only while leased.
+"""Leases: the ports of the range, which the proxy reserves from the start.
+
+A port listens only while it is a lease or a fast port of an endpoint, or while it is lent.
 
 Each endpoint holds a *lease*, which is a port of the range. An endpoint may also have a *fast port*
 for its topics, which the kernel forwards where possible (`rosproxy.leases.fast_ports`). Both ports
@@ -31,7 +33,10 @@ class LeaseServer(Protocol):
         """Serve a connection from the address ``peer``."""
 
     def end_calls(self, port: int, /) -> None:
-        """End the kept connections of a port, which refuses connections from now on."""
+        """End the XML-RPC connections of a port, which refuses connections from now on.
+
+        A busy connection ends after the current call.
+        """
 
 
 class Leases:
@@ -96,10 +101,11 @@ class Leases:
         return error
 
     def close(self, endpoint: Endpoint) -> None:
-        """Make the ports of an endpoint refuse connections; open connections stay.
+        """Make the ports of an endpoint refuse connections, and end XML-RPC connections.
 
-        If the endpoint no longer holds the lease, nothing happens: another node may have the port,
-        because callers may have waited meanwhile.
+        Open connections of topics and services stay. If the endpoint no longer holds the lease,
+        nothing happens: another node may have the port, because the code that calls `close` may
+        have awaited something since it looked up the endpoint.
         """
         if self._registry.by_port.get(endpoint.port) is not endpoint:
             return
@@ -116,7 +122,10 @@ class Leases:
             self._registry.remove(endpoint)
 
     def close_all(self) -> None:
-        """Close all ports and release the range for good; endpoints and registrations stay."""
+        """Close and release all ports for good, except lent ports.
+
+        A lent port stays until its `lend` ends. Endpoints and registrations stay.
+        """
         self._closed = True
         for endpoint in self._registry:
             self.close(endpoint)
@@ -129,7 +138,7 @@ class Leases:
         if self._lent:
             self._take_back(next(iter(self._lent)))
             return True
-        return self._give_fast_port_back() is not None
+        return self._withdraw_least_used_fast_port() is not None
 
     def withdraw_fast_port(self, endpoint: Endpoint) -> None:
         """Take back the fast port of an endpoint, so that its topics use the lease."""
@@ -146,18 +155,18 @@ class Leases:
             self.end(oldest)
         return oldest is not None
 
-    async def wait_until_cleared(self, endpoint: Endpoint) -> None:
+    async def wait_until_unforwarded(self, endpoint: Endpoint) -> None:
         """Wait until the kernel no longer forwards a new lease that was a fast port.
 
-        Waits for FORWARD_TIMEOUT_S at most (`ForwardSyncer.wait_until_cleared`).
+        Waits for FORWARD_TIMEOUT_S at most (`ForwardSyncer.wait_until_unforwarded`).
         """
-        await self._kernel.wait_until_cleared(endpoint.port)
+        await self._kernel.wait_until_unforwarded(endpoint.port)
 
-    async def fast_port(self, endpoint: Endpoint, node_port: int) -> int | None:
-        """The port that the kernel forwards to a TCPROS port of the endpoint's node; None if none.
+    async def obtain_fast_port(self, endpoint: Endpoint, node_port: int) -> int | None:
+        """Return the port that the kernel forwards to a TCPROS port of the node; None if none.
 
-        The endpoint gets the fast port when a subscriber first asks for a topic, if that port is
-        free.
+        An endpoint without a fast port first gets the partner of its lease, if the partner is free
+        (`fast_ports.claim`).
         """
         if self._kernel.may_forward(endpoint):
             if endpoint.fast_port is None and fast_ports.claim(self._pool, endpoint):
@@ -180,14 +189,14 @@ class Leases:
         """
         port = next(filter(self._pool.claim, order), None)
         if port is None and or_fast:
-            spare = self._give_fast_port_back()
+            spare = self._withdraw_least_used_fast_port()
             port = spare if spare is not None and self._pool.claim(spare) else None
         if port is None:
             yield None
             return
         self._lent.add(port)
         try:
-            await self._kernel.wait_until_cleared(port)
+            await self._kernel.wait_until_unforwarded(port)
             if port in self._lent:  # otherwise a node has needed the port meanwhile
                 self._accept(port, handler)
             yield port
@@ -240,11 +249,12 @@ class Leases:
         if acceptor is not None and port is not None:
             acceptor.close()
             self.server.end_calls(port)
-            # If another program is faster, `_accept` tries again when a node next needs the port.
+            # If another program binds the port first, `_accept` tries again when a node next needs
+            # the port.
             self._reserve(port)
 
-    def _give_fast_port_back(self) -> int | None:
-        """Give back the least used fast port, and return it; None if there is none."""
+    def _withdraw_least_used_fast_port(self) -> int | None:
+        """Withdraw the least used fast port, and return it; None if there is none."""
         holder = fast_ports.least_used_holder(self._registry)
         if holder is None:
             return None

@@ -142,12 +142,12 @@ async def test_a_node_that_is_down_or_gone_is_not_forwarded(bench: Bench) -> Non
     other = await bench.forwarded(1)
     endpoint.health.end(1.0)
     bench.plane.syncer.note_change(endpoint)
-    await bench.plane.syncer.wait_until_cleared(45002)
+    await bench.plane.syncer.wait_until_unforwarded(45002)
     assert set(bench.tools.forwards) == {45003}
     fast_ports.give_back(bench.context.registry.pool, other)
     bench.context.registry.remove(other)
     bench.plane.syncer.note_change(other)
-    await bench.plane.syncer.wait_until_cleared(45003)
+    await bench.plane.syncer.wait_until_unforwarded(45003)
     assert bench.tools.forwards == {}
     assert bench.plane.status_of(endpoint)["reason"] == "the node does not answer"
 
@@ -211,7 +211,7 @@ async def test_a_stand_in_that_has_gone_is_not_forwarded(bench: Bench) -> None:
     assert await bench.plane.syncer.forwards(stand_in, 50000)
     bench.context.stand_ins.remove(stand_in)
     bench.plane.syncer.note_change(stand_in)
-    await bench.plane.syncer.wait_until_cleared(stand_in.port)
+    await bench.plane.syncer.wait_until_unforwarded(stand_in.port)
     assert bench.tools.forwards == {}
 
 

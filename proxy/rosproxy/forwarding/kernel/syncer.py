@@ -173,7 +173,7 @@ class ForwardSyncer:
             await self._wait_until(lambda: leads() or not self.may_forward(endpoint))
         return leads()
 
-    async def wait_until_cleared(self, port: int) -> None:
+    async def wait_until_unforwarded(self, port: int) -> None:
         """Wait until the kernel no longer forwards a port, for FORWARD_TIMEOUT_S at most."""
         await self._wait_until(lambda: not self.usable or port not in self._table.forwards)
 

@@ -225,7 +225,7 @@ class SlaveApi:
         if topic_port is not None:
             endpoint.note_topic_port(parsed.string(1) or "", topic_port)
             if self._policy.may_bypass(endpoint):
-                port = await self._leases.fast_port(endpoint, topic_port) or port
+                port = await self._leases.obtain_fast_port(endpoint, topic_port) or port
         reached = HostPort(call.local.host, port) if is_local else addressing.outside(port)
         return slave_api.rewrite_reply(parsed, reply, reached, view)
 

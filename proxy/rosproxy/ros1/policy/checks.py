@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Sequence
 from dataclasses import replace
 
-from rosproxy.access.access_policy import OUTWARD_KINDS, PARAMETER_KINDS, AccessPolicy
+from rosproxy.access.access_policy import OFFER_KINDS, PARAMETER_KINDS, AccessPolicy
 from rosproxy.access.layers import Verdict, strictest
 from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
@@ -277,7 +277,7 @@ class Ros1Policy:
 
     def may_bypass(self, endpoint: Endpoint) -> bool:
         """Whether the kernel may forward a node's topics, so that the proxy reads no header."""
-        return not self.rules.may_deny(OUTWARD_KINDS, endpoint.caller_ids, endpoint.address)
+        return not self.rules.may_deny(OFFER_KINDS, endpoint.caller_ids, endpoint.address)
 
     # What a node inside asks of outside
 

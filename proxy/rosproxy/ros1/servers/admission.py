@@ -138,7 +138,7 @@ class NodeAdmission:
             return Passing.FOREIGN_URI
         admitted = await self.take_in(uri, node, location, caller)
         if isinstance(admitted, Endpoint):
-            await self._leases.wait_until_cleared(admitted)
+            await self._leases.wait_until_unforwarded(admitted)
             first_probe = self._probe_first(admitted, caller.caller_id)
             self._context.tasks.spawn(first_probe, f"first probe of {uri}")
         return admitted

@@ -4,11 +4,11 @@ There are three occasions:
 
 - A container has arrived whose nodes may have registered directly (`adopt`).
 - A node that registered directly now registers through the proxy (`take_over`).
-- The master calls ``shutdown`` for a node that has registered directly once more
-  (`absorb_shutdown`).
+- The master calls ``shutdown`` for a node of the proxy that has registered again, this time
+  directly (`absorb_shutdown`).
 
-In all cases `Registrar.reclaim` takes back what the master has by the node's own URI, and registers
-the same through the proxy.
+In all cases `Registrar.reclaim` unregisters what is registered with the node's own URI, and
+registers the same through the proxy.
 """
 
 import asyncio
@@ -99,12 +99,13 @@ class Adopter:
                 raise Unreachable(str(error)) from error
 
     async def absorb_shutdown(self, endpoint: Endpoint, caller_id: str, reason: str) -> bool:
-        """Keep a needless ``shutdown`` from a node; return whether it was needless.
+        """Return whether a ``shutdown`` is needless: the caller does not pass it on to the node.
 
-        The proxy then registers anew what the node registered directly. The proxy also keeps back a
-        ``shutdown`` for a name that the node never had, because another node had this port before.
+        If the node has registered directly, the proxy then makes the same registrations with the
+        advertised URI. A ``shutdown`` for a name that the node never had is needless, too: another
+        node had this port before.
         """
-        name = decisions.renamed_node(caller_id, reason)
+        name = decisions.name_registered_again(caller_id, reason)
         if name is None:
             return False
         if name not in endpoint.callers:
@@ -119,12 +120,18 @@ class Adopter:
             return False
         text = "%s registered directly at the master; the proxy does not pass on the shutdown"
         log.info(text, name)
+        # The node may have registered through the proxy again since: then the master has the
+        # advertised URI, and there is nothing to reclaim. If the master has no URI, the proxy is
+        # already registering the node anew, so reclaim what the node's own URI still has.
         former = {} if uri == advertised else {name: (endpoint, uri or endpoint.uri)}
         self._context.tasks.spawn(self._reclaim(endpoint, former), f"taking over {endpoint.uri}")
         return True
 
     async def _reclaim(self, endpoint: Endpoint, former: FormerUris) -> None:
-        """Reclaim names once more, and repair the effects of direct calls."""
+        """Reclaim the names in ``former``, and repair the effects of direct calls.
+
+        ``former`` may be empty. Failures are logged only.
+        """
         try:
             async with self._lock:
                 await self._registrar.reclaim(former)
@@ -199,11 +206,12 @@ class Adopter:
         if not isinstance(endpoint, Endpoint):
             return None
         endpoint.pending += 1
-        await self._leases.wait_until_cleared(endpoint)
+        await self._leases.wait_until_unforwarded(endpoint)
         now = self._context.now()
         known_pid = endpoint.health.pid
         endpoint.mark_alive(info.pid, info.topic_ports, now)
-        # The endpoint was that of another process: the prober takes back what this process left.
+        # Another process had this endpoint before. The prober unregisters what the former process
+        # has left.
         if known_pid not in (None, info.pid):
             endpoint.health.suspect()
         self._leases.open(endpoint)

@@ -1,11 +1,13 @@
 """Send subscribers the publishers of a topic, also those that the master does not know.
 
 The list for a node inside has the publishers of the master and the hidden publishers
-(`rosproxy.ros1.policy`). When hidden publishers change, the proxy tells the subscribers inside. For
-a subscriber that the master knows, the proxy needs the list of the master. To get the list, the
-proxy registers the subscriber again, which sends no node an update.
+(`rosproxy.ros1.policy`). The list for a hidden subscriber has all publishers inside, and none
+outside. When hidden publishers change, the proxy tells the subscribers inside. For a subscriber
+that the master knows, the proxy needs the list of the master. To get the list, the proxy registers
+the subscriber again, which sends no node an update.
 
-Updates of the same topic wait for each other, so that an older list never follows a newer list.
+Updates of the same topic by `PublisherUpdates.update_subscribers` wait for each other, so that an
+older list never follows a newer list. Other updates do not wait.
 """
 
 import asyncio

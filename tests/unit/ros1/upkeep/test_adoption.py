@@ -194,7 +194,7 @@ REASONS = [
 
 @pytest.mark.parametrize(("caller_id", "reason", "name"), REASONS)
 def test_whose_uri_has_changed(caller_id: str, reason: str, name: str | None) -> None:
-    assert policy.renamed_node(caller_id, reason) == name
+    assert policy.name_registered_again(caller_id, reason) == name
 
 
 LITERAL = "http://c1:40001/"

@@ -94,7 +94,7 @@ def locate(
     return located, doubts
 
 
-def renamed_node(caller_id: str, reason: str) -> str | None:
+def name_registered_again(caller_id: str, reason: str) -> str | None:
     """The name with a changed URI, if that is the reason of a ``shutdown`` call; else None."""
     match = _NEW_URI.match(reason)
     return match[1] if match and caller_id == "/master" else None
