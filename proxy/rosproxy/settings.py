@@ -414,20 +414,22 @@ class Settings:
             text = f"{advertise} has {len(advertise)} ports and --port-range {ports} has"
             text += f" {len(ports)}; both need the same number"
             raise SettingError("--advertise-port-range", text)
-        uses = dict.fromkeys(ports.ports(), f"lies in --port-range {ports}")
-        for option, port in (
-            ("--master-port", self.master_port),
-            ("--publish-master", self.publish_master),
-            ("--admin-bind", self.admin.port),
-        ):
-            if port in uses:
-                raise SettingError(option, f"port {port} {uses[port]}; move one of them")
-            if port is not None:
-                uses[port] = f"is taken by {option}"
-        for option, port in self.zenoh_listeners():
+        uses: dict[int, str] = {}
+        if self.range_versions:
+            uses = dict.fromkeys(ports.ports(), f"lies in --port-range {ports}")
+        for option, port in self._listeners():
             if port in uses:
                 raise SettingError(option, f"port {port} {uses[port]}; move one of them")
             uses[port] = f"is taken by {option}"
+
+    def _listeners(self) -> Iterator[tuple[str, int]]:
+        """Yield the option and the port of each listener, except the listeners of the range."""
+        if self.for_ros1:
+            yield "--master-port", self.master_port
+        if self.for_ros1 and self.publish_master is not None:
+            yield "--publish-master", self.publish_master
+        yield "--admin-bind", self.admin.port
+        yield from self.zenoh_listeners()
 
     def _check_ros2(self) -> None:
         count = len(self.domains)

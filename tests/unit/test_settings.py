@@ -199,6 +199,21 @@ def test_what_rmw_zenoh_can_not_have(name: str, value: object, complaint: str) -
     assert str(caught.value).startswith(complaint)
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"ros": ("zenoh",), "zenoh_ports": "11300-11311"},
+        {"ros": ("zenoh",), "zenoh_ports": "11000-11010"},
+        {"ros": ("zenoh",), "zenoh_listen": 11311, "publish_master": 7448},
+        {"ros": ("2",), "advertise_host": "robot-host", "port_range": "11300-11311"},
+    ],
+)
+def test_ports_of_ros_versions_that_the_proxy_does_not_serve_are_free(
+    given: dict[str, Any],
+) -> None:
+    parse_settings(given)
+
+
 def test_a_lan_relay_needs_a_secret() -> None:
     """Other programs may have the relay's address. The error names the missing option."""
     given = {**GIVEN, "ros": ("2",), "ros2_lan_relay": "172.17.0.1:7500"}
