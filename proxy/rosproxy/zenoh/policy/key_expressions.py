@@ -28,7 +28,7 @@ def check_glob(glob: str) -> None:
     """Raise ValueError if key expressions cannot match the same names as a glob."""
     if "?" in glob:
         raise ValueError(f"rmw_zenoh has no ? in {glob}. Write names, or *")
-    stars = sum(len(re.findall(r"(?<=[^/])\*+(?=[^/])", part)) for part in glob.split("/"))
+    stars = len(re.findall(r"(?<=[^/])\*(?=[^/])", with_single_stars(glob)))
     if stars > MOST_STARS:
         text = f"rmw_zenoh takes at most {MOST_STARS} * within names, {glob} has more"
         raise ValueError(f"{text}. Shorten the glob")
@@ -37,6 +37,11 @@ def check_glob(glob: str) -> None:
 def matches_no_name(glob: str) -> bool:
     """Whether a glob has characters that no name of ROS 2 has, and so matches no name."""
     return _FOREIGN.search(glob) is not None
+
+
+def with_single_stars(glob: str) -> str:
+    """The glob with a single ``*`` in place of several: both match the same names."""
+    return re.sub(r"\*+", "*", glob)
 
 
 @lru_cache(maxsize=4096)
@@ -55,14 +60,14 @@ def in_cache(key: str, owner: str) -> str:
 
 def token_key(glob: str, kind: str) -> str:
     """The key expression of the tokens of a kind, such as ``MP``, for the names of a glob."""
-    name = re.sub(r"\*+", "*", glob).replace("/", "%")
+    name = with_single_stars(glob).replace("/", "%")
     chunk = "*" if name == "*" else name.replace("*", "$*")
     return f"@ros2_lv/*/*/*/*/{kind}/*/*/*/{chunk}/*/*/*"
 
 
 def _paths(glob: str) -> Iterator[list[str]]:
     """The chunks of the names that match a glob, one list for each alternative."""
-    parts = re.sub(r"\*+", "*", glob).split("/")
+    parts = with_single_stars(glob).split("/")
     if parts[0] == "":  # a name begins with a slash
         parts = parts[1:]
     elif parts[0] == "*" and len(parts) > 1:  # "*/a" matches /a, too: the "*" may be empty

@@ -12,7 +12,11 @@ from typing import NamedTuple
 
 from rosproxy.access.layers import PolicyLayer, PolicyMode
 from rosproxy.access.rules import Rule, RuleAction, RuleKind, matches
-from rosproxy.zenoh.policy.key_expressions import check_glob, matches_no_name
+from rosproxy.zenoh.policy.key_expressions import (
+    check_glob,
+    matches_no_name,
+    with_single_stars,
+)
 
 KINDS = (RuleKind.PUBLISH, RuleKind.SUBSCRIBE, RuleKind.SERVE, RuleKind.CALL)
 """The kinds of rules that hold on rmw_zenoh."""
@@ -87,7 +91,7 @@ def _names_of(layer: PolicyLayer, kind: RuleKind) -> NameSet:
         except ValueError as error:
             raise ValueError(f"layer {layer.name!r}: rule '{rule}': {error}") from None
         rules.append(rule)
-        if rule.glob in _EVERY_NAME:  # later rules decide nothing
+        if _is_for_all(rule):  # later rules decide nothing
             break
     try:
         return _as_set(rules)
@@ -95,14 +99,19 @@ def _names_of(layer: PolicyLayer, kind: RuleKind) -> NameSet:
         raise ValueError(f"layer {layer.name!r}: {error}") from None
 
 
+def _is_for_all(rule: Rule) -> bool:
+    """Whether the glob of a rule matches every name."""
+    return with_single_stars(rule.glob) in _EVERY_NAME
+
+
 def _as_set(rules: Sequence[Rule]) -> NameSet:
     """The set of names that rules allow. The first rule that matches a name decides.
 
     Raises ValueError if there is no such set, or if the rules are too many.
     """
-    denies_rest = bool(rules) and rules[-1].glob in _EVERY_NAME
+    denies_rest = bool(rules) and _is_for_all(rules[-1])
     denies_rest = denies_rest and rules[-1].action is RuleAction.DENY
-    globs = [rule for rule in rules if rule.glob not in _EVERY_NAME]
+    globs = [rule for rule in rules if not _is_for_all(rule)]
     if len(globs) > MOST_MIXED_RULES and len({rule.action for rule in globs}) > 1:
         text = f"rmw_zenoh takes at most {MOST_MIXED_RULES} rules of a kind that allow and deny"
         raise ValueError(f"{text}. Join rules by globs")

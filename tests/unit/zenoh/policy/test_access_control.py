@@ -123,6 +123,15 @@ def test_rules_that_a_router_can_not_have_are_refused(rules: str, complaint: str
     check_layers([layer(rules, mode=PolicyMode.AUDIT)])
 
 
+def test_a_double_star_counts_as_a_single_star() -> None:
+    for glob in ("/*a/*b/*c/*d", "/**a/**b/**c/**d"):
+        check_layers([layer(f"deny publish {glob}")])
+    with pytest.raises(ValueError, match=f"at most {MOST_STARS} \\* within names"):
+        check_layers([layer("deny publish /a**a**a**a**a")])
+    rules = "allow publish /a/b; deny publish "
+    assert access_control([layer(f"{rules}**")]) == access_control([layer(f"{rules}*")])
+
+
 @pytest.mark.parametrize(
     "rules",
     [
