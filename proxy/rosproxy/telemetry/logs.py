@@ -97,13 +97,17 @@ class LogRateLimit(logging.Filter):
 
 
 def _take(bucket: _Bucket, record: logging.LogRecord, weight: int) -> bool:
-    """Whether a bucket allows a record. Moves the count of left-out messages to the record."""
+    """Whether a bucket allows a record. Moves the count of left-out messages to the record.
+
+    The count of a record that is left out goes to the bucket.
+    """
+    left_out = getattr(record, "left_out", 0)
     if bucket.remaining < 1:
-        bucket.left_out += 1
+        bucket.left_out += left_out + 1
         return False
     bucket.remaining -= weight
     if bucket.left_out:
-        record.left_out = getattr(record, "left_out", 0) + bucket.left_out
+        record.left_out = left_out + bucket.left_out
         bucket.left_out = 0
     return True
 

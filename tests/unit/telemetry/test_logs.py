@@ -167,6 +167,21 @@ def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int
     assert later.__dict__["left_out"] == more
 
 
+def test_the_count_of_a_subject_survives_if_the_bound_of_the_kind_leaves_out_the_next(
+    clock: Clock,
+) -> None:
+    floods = LogRateLimit(clock)
+    same = [record("%s: gone", "/a") for _ in range(SUBJECT_BURST + 7)]
+    assert len(written(floods, same)) == SUBJECT_BURST
+    clock.now += SUBJECT_BURST * KIND_INTERVAL_S
+    others = [record("%s: gone", f"/{n % 1000}") for n in range(KIND_BURST)]
+    assert written(floods, others) == others
+    assert not written(floods, [record("%s: gone", "/a")])
+    clock.now += KIND_INTERVAL_S
+    (later,) = written(floods, [record("%s: gone", "/b")])
+    assert later.__dict__["left_out"] == 7 + 1
+
+
 def test_long_names_fill_no_disk_either(clock: Clock) -> None:
     floods = LogRateLimit(clock)
     names = (record("%s is new", f"/{n}" + "x" * LONGEST, level=logging.INFO) for n in range(5000))
