@@ -118,7 +118,7 @@ class ZenohState(Collector):
                 )
                 for node in nodes
             ),
-            left_out=self._left_out,
+            left_out=0 if failure else self._left_out,
         )
 
     def collect(self) -> Iterable[Metric]:

@@ -110,7 +110,7 @@ def test_a_link_is_up_while_the_routers_run() -> None:
     process.failure = "no report for 10 s"
     assert not state.is_up(state.links[0])
     status = state.status()
-    assert (status.sessions, status.nodes) == ((), ())
+    assert (status.sessions, status.nodes, status.left_out) == ((), (), 0)
 
 
 def test_metrics() -> None:
