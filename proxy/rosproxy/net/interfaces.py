@@ -64,13 +64,14 @@ def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
     """The networks of the interfaces of this machine, without loopback and IPv6 link-local.
 
     ``without_uplink``: also without the interface of the default route, unless there is no other.
+    Of several default routes, the kernel uses the route with the lowest metric.
     """
     by_interface: dict[str, list[Network]] = {}
-    uplink = ""
+    default_routes: list[tuple[int, str]] = []
     for line in _lines("/proc/net/route")[1:]:
-        interface, target, gateway, *_, mask = line.split()[:8]
+        interface, target, gateway, *_, metric, mask = line.split()[:8]
         if target == "00000000":
-            uplink = interface
+            default_routes.append((int(metric), interface))
         elif interface != "lo" and gateway == "00000000":
             network = ip_network(f"{_quad(target)}/{_quad(mask)}", strict=False)
             by_interface.setdefault(interface, []).append(network)
@@ -81,6 +82,7 @@ def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
         if interface != "lo" and not address.is_link_local:
             network = ip_network(f"{address}/{int(prefix, 16)}", strict=False)
             by_interface.setdefault(interface, []).append(network)
+    _, uplink = min(default_routes, default=(0, ""))
     if without_uplink and by_interface.keys() - {uplink}:
         by_interface.pop(uplink, None)
     return tuple(network for networks in by_interface.values() for network in networks)

@@ -5,7 +5,12 @@ from ipaddress import ip_network
 import pytest
 
 from rosproxy.net import interfaces
-from rosproxy.net.interfaces import address_into, default_gateways, route_towards
+from rosproxy.net.interfaces import (
+    address_into,
+    default_gateways,
+    interface_networks,
+    route_towards,
+)
 
 ROUTES = """\
 Iface Destination Gateway  Flags RefCnt Use Metric Mask     MTU Window IRTT
@@ -13,6 +18,8 @@ eth0  00000000    010013AC 0003  0      0   0      00000000 0   0      0
 eth0  000013AC    00000000 0001  0      0   0      0000FFFF 0   0      0
 eth1  000012AC    00000000 0001  0      0   0      0000FFFF 0   0      0
 """
+BACKUP = "eth1 00000000 010012AC 0003 0 0 600 00000000 0 0 0"
+"""A second default route, which the kernel uses only without the first."""
 
 
 @pytest.mark.parametrize("network", ["127.0.0.0/8", "127.0.0.1/32", "127.0.0.0/31"])
@@ -34,3 +41,24 @@ def test_there_is_no_route_to_what_is_no_address() -> None:
 def test_the_gateway_of_the_default_route(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(interfaces, "_lines", lambda _: ROUTES.splitlines())
     assert default_gateways() == {"172.19.0.1"}
+
+
+def set_routes(monkeypatch: pytest.MonkeyPatch, routes: list[str]) -> None:
+    monkeypatch.setattr(interfaces, "_lines", lambda path: routes if "route" in path else [])
+
+
+def test_the_network_of_the_default_route_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_routes(monkeypatch, ROUTES.splitlines())
+    networks = (ip_network("172.19.0.0/16"), ip_network("172.18.0.0/16"))
+    assert interface_networks() == networks
+    assert interface_networks(without_uplink=True) == networks[1:]
+
+
+@pytest.mark.parametrize("place", [1, 4])
+def test_of_two_default_routes_the_one_with_the_lower_metric_is_the_uplink(
+    monkeypatch: pytest.MonkeyPatch, place: int
+) -> None:
+    routes = ROUTES.splitlines()
+    routes.insert(place, BACKUP)
+    set_routes(monkeypatch, routes)
+    assert interface_networks(without_uplink=True) == (ip_network("172.18.0.0/16"),)
