@@ -143,6 +143,13 @@ def test_a_node_behind_the_proxy_that_does_not_answer(
     assert fix in finding.fix
 
 
+def test_fixes_have_ipv6_addresses_without_brackets() -> None:
+    address = "[fd00::5]:40001"
+    assert "nc -vz fd00::5 40001" in inside(address=address, state="silent").fix
+    on_loopback = inside(address=address, state="ok", uri="http://localhost:40001/")
+    assert "set ROS_IP=fd00::5;" in on_loopback.fix
+
+
 def test_a_dead_node_with_clean_up_switched_off() -> None:
     status = make_status(make_node(state="refused"), settings={"cleanup_after": 0})
     assert "rosnode cleanup" in only(check(make_facts(status=status))).fix

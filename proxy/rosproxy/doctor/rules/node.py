@@ -110,7 +110,7 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
             f"registered as {node.uri}, so the node listens on loopback only. Nodes in other "
             "containers or on other machines can't connect"
         )
-        host = quoted(address.rpartition(":")[0])
+        host, _ = _host_and_port(address)
         fix = f"where the node runs: unset ROS_IP ROS_HOSTNAME, or set ROS_IP={host}; "
         fix += "then restart the node"
         yield error(INSIDE, name, text, fix)
@@ -124,8 +124,8 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
         yield warning(INSIDE, name, text, "run the doctor again in some seconds")
     elif state == "silent":
         text = f"does not answer at {address}: the node hangs, or the network drops the packets"
-        host, _, port = address.rpartition(":")
-        fix = f"restart the node; test from the proxy: nc -vz {quoted(host)} {quoted(port)}"
+        host, port = _host_and_port(address)
+        fix = f"restart the node; test from the proxy: nc -vz {host} {port}"
         yield error(INSIDE, name, text, fix)
     elif state == "unverified":
         text = f"was found at the master when the proxy started; {address} has not answered yet"
@@ -138,6 +138,12 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
         yield warning(INSIDE, name, text, "restart the node")
     elif state == "ok":
         yield from _namesakes(facts, node, name)
+
+
+def _host_and_port(address: str) -> tuple[str, str]:
+    """The host (IPv6 without brackets) and the port of an address, each as a word of a shell."""
+    host, _, port = address.rpartition(":")
+    return quoted(host.strip("[]")), quoted(port)
 
 
 def _only_on_loopback(node: EndpointStatus) -> bool:
