@@ -4,7 +4,7 @@ These rules serve ``rosproxy doctor``, the log and the status of the proxy, and
 ``rosproxy run --check --deep`` before a start. Findings name the first cause, not the consequences.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
 from rosproxy.admin.requests import PortProbe, RangeProbe
@@ -48,6 +48,17 @@ def _fix_by_own_address() -> str:
     """The fix for an advertised host that is a loopback address."""
     address = how_to("advertised host")
     return f"give the address of this host in the network of the robots: {address}"
+
+
+def is_all_here(outside: Iterable[Collection[str]], lan_relay: bool) -> bool:
+    """Whether all nodes outside are on this machine, as in a trial.
+
+    ``outside``: for the master and each peer, its names and addresses. A loopback address among
+    them means this machine. ``lan_relay``: whether participants on the LAN are outside, too. False
+    if there is neither a master nor a peer, because nothing tells where outside is.
+    """
+    is_here = [any(map(is_loopback, names)) for names in outside]
+    return bool(is_here) and all(is_here) and not lan_relay
 
 
 def advertised_host(host: str, addresses: Sequence[str], all_here: bool) -> Iterator[DoctorFinding]:

@@ -27,14 +27,16 @@ from rosproxy.admin.setup_rules import (
     HOST,
     RANGE,
     advertised_host,
+    is_all_here,
     probe_result,
     published_range,
 )
 from rosproxy.admin.status_document import PortsStatus, RangeProbeStatus, to_json
 from rosproxy.app.stacks import Stack
-from rosproxy.net.addresses import is_loopback, parse_authority
+from rosproxy.net.addresses import parse_authority
 from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
+from rosproxy.settings import Settings
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +50,13 @@ for two minutes.
 """
 LEAST_INTERVAL_S = 30.0
 """Seconds between a change and the next test, so that many changes cause a single test."""
+
+
+async def peer_addresses(settings: Settings) -> list[str]:
+    """The addresses of the peers of ROS 2; the name of a peer whose name can't be resolved."""
+    peers = settings.ros2_peer if settings.for_ros2 else ()
+    resolved = [await resolve(peer.host) or [peer.host] for peer in peers]
+    return [address for addresses in resolved for address in addresses]
 
 
 class SelfCheck:
@@ -124,18 +133,14 @@ class SelfCheck:
         self._note(HOST, advertised_host(host, self._addresses, all_here))
 
     async def _all_here(self) -> bool:
-        """Whether master and peers are all on loopback, as in a trial on a single machine.
-
-        False if there is neither a master nor a peer.
-        """
+        """Whether the master and all peers are on this machine, without a LAN relay."""
         settings = self._runtime.settings
-        hosts = [peer.host for peer in settings.ros2_peer] if settings.for_ros2 else []
+        outside = [[address] for address in await peer_addresses(settings)]
         if settings.for_ros1:
             master = parse_authority(settings.master_uri)
-            hosts += [settings.master_address or (master.host if master else "")]
-        # An unresolvable host name counts as another machine.
-        resolved = [await resolve(host) or [host] for host in hosts]
-        return bool(resolved) and all(any(map(is_loopback, addresses)) for addresses in resolved)
+            host = settings.master_address or (master.host if master else "")
+            outside.append([host, *await resolve(host)])
+        return is_all_here(outside, settings.for_ros2 and settings.ros2_lan_relay is not None)
 
     async def _try_range(self, or_fast: bool) -> RangeProbe:
         """Test ports of the range, and report faults.

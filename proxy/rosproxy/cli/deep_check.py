@@ -11,14 +11,14 @@ from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import DoctorFinding, error
 from rosproxy.admin.requests import RangeProbe
-from rosproxy.admin.status_document import PortsStatus, ProxyStatus, StatusSettings
+from rosproxy.admin.status_document import DomainStatus, PortsStatus, ProxyStatus, StatusSettings
+from rosproxy.app.self_check import peer_addresses
 from rosproxy.app.stacks import make_stacks
 from rosproxy.binding import setting_error_if_taken
 from rosproxy.doctor.facts import DoctorFacts, SystemState
 from rosproxy.doctor.graph_survey import look_at_master
 from rosproxy.doctor.rules import proxy as rules
 from rosproxy.net import sockets
-from rosproxy.net.addresses import is_loopback
 from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
@@ -37,7 +37,6 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
     facts = DoctorFacts(
         advertise_host=host,
         advertised_addresses=tuple(await resolve(host)) if host else (),
-        is_all_local=not settings.for_ros1 and all(is_loopback(p.host) for p in settings.ros2_peer),
         # The check does not ask for the graph. None would mean that the master has not answered.
         graph=SystemState(),
         status=ProxyStatus(
@@ -47,6 +46,7 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
                 if settings.range_versions
                 else PortsStatus()
             ),
+            domains=(await _outside_of_domain(settings),) if settings.for_ros2 else (),
         ),
     )
     if settings.for_ros1:
@@ -64,6 +64,14 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
     finally:
         await runtime.tasks.cancel()
     return list(rules.setup(facts))
+
+
+async def _outside_of_domain(settings: Settings) -> DomainStatus:
+    """A domain with its peers and its LAN relay alone."""
+    relay = settings.ros2_lan_relay
+    return DomainStatus(
+        peers=tuple(await peer_addresses(settings)), lan_relay=str(relay) if relay else ""
+    )
 
 
 async def _try_ports(runtime: Runtime) -> RangeProbe:

@@ -19,7 +19,6 @@ from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.domain_survey import ask_participants
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant, SystemState
 from rosproxy.doctor.graph_survey import ask_graph
-from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.net.resolver import resolve
 
 
@@ -77,16 +76,7 @@ async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
         probe = await asyncio.to_thread(admin.probe)
     except AdminError as error:
         reason = str(error)
-    facts = replace(await graph_task, probe=probe, probe_error=reason)
-    return replace(facts, is_all_local=_all_here(status))
-
-
-def _all_here(status: ProxyStatus) -> bool:
-    """Whether all peers are on loopback; False with ROS 1 or with a LAN relay."""
-    peers = [peer for domain in status.domains for peer in domain.peers]
-    hosts = [target.host if (target := parse_host_port(peer)) else peer for peer in peers]
-    lan_relays = [domain.lan_relay for domain in status.domains if domain.lan_relay]
-    return not status.settings.for_ros1 and not lan_relays and all(map(is_loopback, hosts))
+    return replace(await graph_task, probe=probe, probe_error=reason)
 
 
 async def collect_running(

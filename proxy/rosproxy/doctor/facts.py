@@ -240,7 +240,7 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     ``uses_simulated_time``: the parameter /use_sim_time is true. ``names``: the nodes, topics and
     services in the user's question. ``data_ports``: by publisher and topic, the TCPROS address for
     subscribers, and the attempt to reach this address. ``heard_participants``: participants on the
-    networks inside. ``is_all_local``: all participants outside are on this machine.
+    networks inside.
     """
 
     admin: str = ""
@@ -260,7 +260,6 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     names: tuple[str, ...] = ()
     data_ports: Mapping[tuple[str, str], tuple[str, Attempt]] = {}
     heard_participants: tuple[HeardParticipant, ...] = ()
-    is_all_local: bool = False
 
     @property
     def proxy(self) -> ProxyStatus:

@@ -150,6 +150,28 @@ async def test_loopback_is_fine_where_all_is_on_one_machine(start_process):
     assert not await problems(process)
 
 
+RELAY = {"ros2_lan_relay": "127.0.0.1:7500", "ros2_lan_relay_secret": "0123456789abcdef"}
+
+
+@pytest.mark.parametrize(
+    ("given", "is_fault"),
+    [
+        ({"ros2_peer": "localhost"}, False),
+        ({"ros2_peer": "localhost", **RELAY}, True),
+        (RELAY, True),
+        ({}, True),
+    ],
+)
+async def test_all_checks_agree_whether_outside_is_on_this_machine(start_process, given, is_fault):
+    options = options_for(ros="2", ros2_domain=204, advertise_host="127.0.0.1", **given)
+    deep = await asyncio.to_thread(started, {**options, "check": True, "deep": True})
+    process: Process = start_process(**options)
+    doctor = await run("doctor", "--admin", admin_of(process))
+    texts = {"deep": deep.stdout, "doctor": doctor.out, "self": "\n".join(await problems(process))}
+    told = {name: "127.0.0.1 is a loopback address" in text for name, text in texts.items()}
+    assert told == dict.fromkeys(texts, is_fault), texts
+
+
 async def test_a_range_that_outside_does_not_reach_is_told_once_it_was_tried(start_process):
     """Neither the proxy nor the master reaches 192.0.2.1."""
     process: Process = start_process(advertise_host="192.0.2.1")

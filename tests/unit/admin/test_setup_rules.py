@@ -6,7 +6,13 @@ import pytest
 
 from rosproxy.admin.doctor_finding import Severity
 from rosproxy.admin.requests import PortProbe, RangeProbe
-from rosproxy.admin.setup_rules import advertised_host, free_ports, probe_result, published_range
+from rosproxy.admin.setup_rules import (
+    advertised_host,
+    free_ports,
+    is_all_here,
+    probe_result,
+    published_range,
+)
 from rosproxy.admin.status_document import PortsStatus
 
 
@@ -30,6 +36,23 @@ def test_where_the_advertised_host_leads(host, addresses, all_here, severity, te
     assert all(
         text in finding.text and "--advertise-host ADDRESS" in finding.fix for finding in findings
     )
+
+
+@pytest.mark.parametrize(
+    ("outside", "lan_relay", "all_here"),
+    [
+        ([["127.0.0.1"]], False, True),
+        ([["robot", "127.0.1.1"], ["::1"]], False, True),
+        ([["127.0.0.1"], ["192.0.2.7"]], False, False),
+        ([["127.0.0.1"]], True, False),
+        ([["unresolvable"]], False, False),
+        ([[]], False, False),
+        ([], False, False),
+        ([], True, False),
+    ],
+)
+def test_outside_is_here_if_the_master_and_all_peers_are(outside, lan_relay, all_here) -> None:
+    assert is_all_here(outside, lan_relay) == all_here
 
 
 def test_udp_that_does_not_come_back_proves_little() -> None:

@@ -137,6 +137,26 @@ def test_loopback_is_fine_where_all_is_on_one_machine(master: Any) -> None:
     assert not of("advertised host", make_facts(advertise_host="127.0.0.1", master=master))
 
 
+@pytest.mark.parametrize(
+    ("ros", "domain", "is_fault"),
+    [
+        (["2"], {"peers": ["127.0.0.1", "[::1]:11400"]}, False),
+        (["2"], {"peers": ["127.0.0.1"], "lan_relay": "172.17.0.1:7500"}, True),
+        (["2"], {"peers": ["127.0.0.1", "192.0.2.7:11400"]}, True),
+        (["2"], {}, True),
+        (["1", "2"], {}, False),
+        (["1", "2"], {"peers": ["192.0.2.7"]}, True),
+    ],
+)
+def test_loopback_is_fine_where_all_peers_are_on_this_machine(
+    ros: list[str], domain: dict[str, Any], is_fault: bool
+) -> None:
+    status = {**make_status(make_node(), settings={"ros": ros}), "domains": [domain]}
+    master = make_master(uri="http://localhost:11311") if "1" in ros else None
+    facts = make_facts(advertise_host="127.0.0.1", status=status, master=master)
+    assert bool(of("advertised host", facts)) == is_fault
+
+
 def test_an_advertised_name_that_is_unknown_here() -> None:
     finding = only(of("advertised host", without_proxy(advertised_addresses=())))
     assert "robot-host can't be resolved here" in finding.text

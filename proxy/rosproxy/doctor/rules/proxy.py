@@ -4,11 +4,18 @@ from collections.abc import Iterator
 from urllib.parse import urlsplit
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
-from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, free_ports, published_range
+from rosproxy.admin.setup_rules import (
+    HOST,
+    RANGE,
+    advertised_host,
+    free_ports,
+    is_all_here,
+    published_range,
+)
 from rosproxy.admin.status_bounds import left_out
 from rosproxy.doctor.facts import DoctorFacts, MasterFacts, ReachOutcome
 from rosproxy.fixes import how_to
-from rosproxy.net.addresses import is_loopback
+from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.telemetry.text import duration, quoted
 
 
@@ -122,16 +129,30 @@ def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     # A loopback address is right if the master is on this machine. Without facts about the master
     # this is unknown.
     if facts.master or not facts.proxy.settings.for_ros1 or not is_loopback(host):
-        all_here = facts.is_all_local or local_master(facts)
-        yield from advertised_host(host, facts.advertised_addresses, all_here)
+        yield from advertised_host(host, facts.advertised_addresses, _all_here(facts))
+
+
+def _all_here(facts: DoctorFacts) -> bool:
+    """Whether the master and all peers are on this machine, without a LAN relay."""
+    domains = facts.proxy.domains
+    peers = [peer for domain in domains for peer in domain.peers]
+    targets = [(parse_host_port(peer), peer) for peer in peers]
+    outside = [[target.host if target else peer] for target, peer in targets]
+    if facts.proxy.settings.for_ros1:
+        outside.append([*_master_hosts(facts)])
+    return is_all_here(outside, any(domain.lan_relay for domain in domains))
 
 
 def local_master(facts: DoctorFacts) -> bool:
     """Whether the master is on loopback, so that all of ROS is on this machine."""
+    return any(map(is_loopback, _master_hosts(facts)))
+
+
+def _master_hosts(facts: DoctorFacts) -> tuple[str, ...]:
+    """The host name and the addresses of the master; empty without facts about the master."""
     if facts.master is None:
-        return False
-    host = urlsplit(facts.master.uri).hostname or ""
-    return is_loopback(host) or any(map(is_loopback, facts.master.addresses))
+        return ()
+    return (urlsplit(facts.master.uri).hostname or "", *facts.master.addresses)
 
 
 def _range(facts: DoctorFacts) -> Iterator[DoctorFinding]:
