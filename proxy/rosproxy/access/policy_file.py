@@ -33,6 +33,8 @@ class PolicyFile:
         self._policy = policy
         self._problems = problems
         self._last_signature: tuple[int, ...] | None = None
+        self._refused_version: int | None = None
+        """The version of the policy whose check refused the file; None if no check refused it."""
 
     def read(self) -> None:
         """Put the rules of the file in force.
@@ -40,6 +42,7 @@ class PolicyFile:
         Raises ValueError, which names the fault: of the file, of a rule, or of a check of the
         policy.
         """
+        self._refused_version = None
         try:
             with self._path.open("rb") as file:
                 # Before the read: if the file changes during the read, the next check reads again.
@@ -49,15 +52,22 @@ class PolicyFile:
                 raise ValueError(f"{self._path} is longer than {LONGEST_FILE_BYTES} bytes")
             rules = parse_rules(text.decode())
         except OSError as error:
+            self._last_signature = None
             raise ValueError(f"{self._path} can't be read: {error.strerror}") from None
         except UnicodeDecodeError:
             raise ValueError(f"{self._path} is not UTF-8 text") from None
+        self._refused_version = self._policy.version
         self._policy.use_file(PolicyLayer(f"{OPTION} {self._path}", rules, self._mode))
+        self._refused_version = None
 
     async def look(self) -> None:
-        """Read the file again if it has changed; report a fault as a problem."""
+        """Read the file again if it has changed; report a fault as a problem.
+
+        Also read the file again after a read error. If a check refused the file, also read the file
+        again after a change of the other layers, because the check depends on all layers.
+        """
         try:
-            if _signature(self._path.stat()) == self._last_signature:
+            if _signature(self._path.stat()) == self._last_signature and not self._is_refusal_old:
                 return
         except OSError:
             self._last_signature = None
@@ -73,6 +83,11 @@ class PolicyFile:
         else:
             log.info("%s %s was read again", OPTION, self._path)
             self._problems.solved(OPTION)
+
+    @property
+    def _is_refusal_old(self) -> bool:
+        """Whether a check refused the file together with layers that have changed meanwhile."""
+        return self._refused_version not in (None, self._policy.version)
 
 
 def _signature(stat: os.stat_result) -> tuple[int, ...]:

@@ -1,5 +1,7 @@
 """The policy in force: sources of layers, and the policy in the status."""
 
+import errno
+import io
 from pathlib import Path
 
 import pytest
@@ -104,3 +106,41 @@ async def test_a_bad_file_leaves_the_rules_in_force(
     assert problems.all() == []
     assert denies(policy, "/mended")
     assert not denies(policy, "/filed")
+
+
+async def test_a_file_that_operator_layers_left_no_room_for_is_read_again_once_they_change(
+    policy: AccessPolicy, problems: Problems, tmp_path: Path
+) -> None:
+    path = tmp_path / "rules"
+    path.write_text("deny publish /filed")
+    file = PolicyFile(str(path), PolicyMode.ENFORCE, policy, problems)
+    policy.use_operator_layers([layer("deny publish /first;" * 999)])
+    for _ in range(2):
+        await file.look()
+        assert [problem.subject for problem in problems.all()] == ["--policy-file"]
+    policy.use_operator_layers([layer("deny publish /first")])
+    await file.look()
+    assert problems.all() == []
+    assert denies(policy, "/filed")
+
+
+class UnreadableFile(io.FileIO):
+    """A file on a device that fails."""
+
+    def read(self, _: int | None = -1) -> bytes:
+        raise OSError(errno.EIO, "Input/output error")
+
+
+async def test_a_file_whose_read_failed_is_read_again(
+    policy: AccessPolicy, problems: Problems, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "rules"
+    path.write_text("deny publish /filed")
+    file = PolicyFile(str(path), PolicyMode.ENFORCE, policy, problems)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", UnreadableFile)
+        await file.look()
+    assert [problem.subject for problem in problems.all()] == ["--policy-file"]
+    await file.look()
+    assert problems.all() == []
+    assert denies(policy, "/filed")
