@@ -35,6 +35,11 @@ GRAPH = SystemState(
 )
 
 
+GRAPH_WITH_OTHER_TALKER = SystemState(
+    {"/chatter": ["/other"], "/a": ["/talker"]}, {"/chatter": ["/listener"]}, {}
+)
+
+
 def check(names: Sequence[str], **changes: Any) -> list[DoctorFinding]:
     return [*pair_rules.check(make_facts(names=tuple(names), **changes))]
 
@@ -142,7 +147,22 @@ def test_a_topic_that_a_node_has_nothing_to_do_with() -> None:
     graph = SystemState(
         {"/chatter": ["/talker"]}, {"/chatter": ["/listener"], "/c": ["/other"]}, {}
     )
-    assert only(check(["/chatter", "/other"], graph=graph, nodes=nodes)).check == "pair"
+    finding = only(check(["/chatter", "/other"], graph=graph, nodes=nodes))
+    assert (finding.check, finding.subject) == ("pair", "/chatter and /other")
+    assert finding.text == "/other neither publishes /chatter nor subscribes to it"
+    assert finding.fix.startswith("compare: rosnode info /other; rostopic info /chatter; ")
+
+
+def test_a_topic_that_none_of_two_nodes_publishes_to_the_other() -> None:
+    finding = only(check(["/talker", "/chatter", "/listener"], graph=GRAPH_WITH_OTHER_TALKER))
+    assert finding.text == "none of /talker, /listener publishes /chatter to another of them"
+    assert finding.fix.startswith("compare: rosnode info /talker /listener; rostopic info /chatter")
+
+
+def test_a_topic_with_one_side_only_is_told_once_if_a_node_is_named() -> None:
+    graph = SystemState({"/chatter": ["/talker"]}, {}, {})
+    finding = only(check(["/talker", "/chatter"], graph=graph))
+    assert finding.text == "published by /talker; no node subscribes to /chatter"
 
 
 def test_a_connected_pair_with_what_it_moves() -> None:

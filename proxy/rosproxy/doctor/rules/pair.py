@@ -32,12 +32,33 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     yield from (_one_sided_topic(facts, topic) for topic in scope.one_sided_topics)
     yield from (judge_pair(facts, *pair) for pair in scope.pairs)
     yield from (_service(facts, service) for service in scope.services)
-    together = [name for name in facts.names if name not in {*scope.services, *scope.unknown}]
-    if scope.named_nodes and len(together) > 1 and not scope.pairs:
+    if scope.named_nodes and not scope.pairs:
+        yield from _without_pair(facts)
+
+
+def _without_pair(facts: DoctorFacts) -> Iterator[DoctorFinding]:
+    """The finding about nodes without a pair among the names in the user's question.
+
+    No finding if the only topics in the question lack a publisher or a subscriber: these topics
+    have findings of their own.
+    """
+    nodes = facts.scope.named_nodes
+    named_topics = [name for name in facts.names if name in facts.system.topics]
+    topics = [topic for topic in named_topics if topic not in facts.scope.one_sided_topics]
+    together = [name for name in facts.names if name in {*nodes, *topics}]
+    if len(together) == 1 or (named_topics and not topics):
+        return
+    if not topics:
         text = "no topic in common: none of these publishes a topic to which another subscribes"
-        nodes = " ".join(map(quoted, together))
-        fix = f"compare: rosnode info {nodes}; check namespaces and remappings"
-        yield error(PAIR, " and ".join(together), text, fix)
+    elif len(nodes) == 1:
+        shown = " or ".join(topics)
+        text = f"{nodes[0]} neither publishes {shown} nor subscribes to it"
+    else:
+        text = f"none of {listed(nodes)} publishes {' or '.join(topics)} to another of them"
+    commands = [f"rosnode info {' '.join(map(quoted, nodes))}"]
+    commands += [f"rostopic info {quoted(topic)}" for topic in topics]
+    fix = f"compare: {'; '.join(commands)}; check namespaces and remappings"
+    yield error(PAIR, " and ".join(together), text, fix)
 
 
 def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
