@@ -80,7 +80,11 @@ def heard_participant(datagram: bytes, source: str) -> HeardParticipant | None:
 
 
 def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
-    """The participants that answer on the network of an own address. Raises OSError."""
+    """The participants that answer on the network of an own address.
+
+    Raises OSError if the network takes no announcement. If the network fails later, the answers
+    until then count.
+    """
     by_prefix: dict[str, HeardParticipant] = {}
     with contextlib.closing(datagrams.bind(own_address, 0)) as sock:
         # Without multicast loop: the proxy on this machine would count the doctor as a participant.
@@ -89,15 +93,26 @@ def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
         targets = list(_targets(own_address, domains))
         own_locator = HostPort(own_address, sock.getsockname()[1])
         _send(sock, announcement(prefix, [own_locator], LEASE_DURATION_S, SPDP_ENDPOINTS), targets)
-        deadline = time.monotonic() + ANSWER_TIMEOUT_S
-        while len(by_prefix) < MOST_HEARD and (remaining := deadline - time.monotonic()) > 0:
-            sock.settimeout(remaining)
-            with contextlib.suppress(TimeoutError):
-                datagram, sender = sock.recvfrom(datagrams.LARGEST_DATAGRAM)
-                participant = heard_participant(datagram, plain_address(sender[0]))
-                by_prefix |= {participant.guid_prefix: participant} if participant else {}
-        _send(sock, dispose_message(prefix), targets)
+        with contextlib.suppress(OSError):
+            for participant in _answers(sock):
+                by_prefix[participant.guid_prefix] = participant
+                if len(by_prefix) == MOST_HEARD:
+                    break
+            _send(sock, dispose_message(prefix), targets)
     return list(by_prefix.values())
+
+
+def _answers(sock: socket.socket) -> Iterator[HeardParticipant]:
+    """Yield each participant that answers within ANSWER_TIMEOUT_S. Raises OSError."""
+    deadline = time.monotonic() + ANSWER_TIMEOUT_S
+    while (remaining := deadline - time.monotonic()) > 0:
+        sock.settimeout(remaining)
+        try:
+            datagram, sender = sock.recvfrom(datagrams.LARGEST_DATAGRAM)
+        except TimeoutError:
+            return
+        if participant := heard_participant(datagram, plain_address(sender[0])):
+            yield participant
 
 
 def _targets(own_address: str, domains: Collection[int]) -> Iterator[tuple[str, int]]:

@@ -1,11 +1,13 @@
 """The doctor's reading of a participant's answer."""
 
+import errno
 import struct
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.doctor import domain_survey
 from rosproxy.doctor.domain_survey import ask_participants, heard_participant
 from rosproxy.doctor.facts import HeardParticipant
 from rosproxy.net.addresses import HostPort
@@ -50,3 +52,43 @@ def test_whatever_is_answered(rest: bytes) -> None:
 @pytest.mark.parametrize("network", ["somewhere", "fd00::/64", "192.0.2.0/24", "10.0.0.0/99"])
 def test_a_network_that_this_machine_is_not_in_is_not_asked(network: str) -> None:
     assert ask_participants(network, [0]) == []
+
+
+class FailingSocket:
+    """A socket with a single answer. The network is gone after the answer."""
+
+    def __init__(self, receives: bool) -> None:
+        self._receives = receives
+        self._answers = [answer(7410)]
+        self._has_answered = False
+
+    def sendto(self, _: bytes, __: tuple[str, int]) -> None:
+        if self._has_answered:
+            raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    def recvfrom(self, _: int) -> tuple[bytes, tuple[str, int]]:
+        if self._answers:
+            self._has_answered = True
+            return self._answers.pop(), (SOURCE, 7410)
+        if self._receives:
+            raise TimeoutError
+        raise OSError(errno.ENETDOWN, "Network is down")
+
+    def getsockname(self) -> tuple[str, int]:
+        return "127.0.0.1", 50_000
+
+    def settimeout(self, _: float | None) -> None:
+        """Ignore the time-out."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+@pytest.mark.parametrize("receives", [True, False])
+def test_answers_count_if_the_network_is_gone_afterwards(
+    monkeypatch: pytest.MonkeyPatch, receives: bool
+) -> None:
+    monkeypatch.setattr(domain_survey, "send_through", lambda *_, **__: None)
+    monkeypatch.setattr("rosproxy.forwarding.datagrams.bind", lambda *_: FailingSocket(receives))
+    (participant,) = ask_participants("127.0.0.0/8", [0])
+    assert participant.guid_prefix == NAME
