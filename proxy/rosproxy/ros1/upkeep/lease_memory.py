@@ -73,10 +73,12 @@ class LeaseMemory:
             return ""
 
     async def _write(self, text: str) -> None:
-        if text == self._stored:
-            return
         upstream = self._context.upstream
         problems = self._context.problems
+        if not text:  # there is nothing that the master could refuse to keep
+            problems.solved(self.parameter)
+        if text == self._stored:
+            return
         try:
             if text:
                 await upstream.call_master("setParam", self.parameter, text)
