@@ -155,7 +155,7 @@ def heartbeat_stream(datagram: bytes) -> bytes | None:
     try:
         nameless = _NAMELESS_OF.get(source_vendor(datagram), _NAMELESS)
         for kind, flags, body in walk_submessages(datagram):
-            if kind == INFO_DST and not stream:
+            if kind == INFO_DST and len(stream) <= PREFIX_BYTES:
                 stream = datagram[body.start : body.start + PREFIX_BYTES]
             elif kind == SubmessageId.HEARTBEAT and len(stream) <= PREFIX_BYTES:
                 require_size(body, _HEARTBEAT_BYTES)

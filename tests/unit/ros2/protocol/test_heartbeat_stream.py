@@ -33,6 +33,13 @@ def test_a_later_heartbeat_is_of_the_same_stream():
     assert first == later
 
 
+def test_the_last_destination_before_the_heartbeat_counts():
+    stream = heartbeat_stream(fast_dds(info_dst(HERE), info_dst(THERE), heartbeat()))
+    assert stream == heartbeat_stream(fast_dds(info_dst(THERE), heartbeat()))
+    after = heartbeat_stream(fast_dds(info_dst(THERE), heartbeat(), info_dst(HERE)))
+    assert after == stream
+
+
 @pytest.mark.parametrize(
     "other",
     [
