@@ -28,14 +28,12 @@ from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.sockets import Acceptor
-from rosproxy.ros1.clients.master_client import MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_service_uri, slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry import stand_ins
 from rosproxy.ros1.registry.client_kinds import ClientKind
-from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.rewriting import slave_api
 from rosproxy.ros1.rewriting.addressing import Caller
@@ -43,6 +41,7 @@ from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros_server import TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
 from rosproxy.ros1.stand_ins.outside_nodes import Outside, OutsideNode
+from rosproxy.ros1.stand_ins.publisher_lookup import PublisherLookup
 from rosproxy.ros1.stand_ins.udpros_relays import UdprosRelays
 
 log = logging.getLogger(__name__)
@@ -82,11 +81,7 @@ class StandInPorts:
         self._outside = Outside(context, self._note_refused)
         self.udpros = UdprosRelays(context, self._outside)
         self._closed = False
-        self._query_lock = asyncio.Lock()
-        self._pending_topics: set[str] = set()
-        """Topics of the next question to the master: callers wait for their publishers."""
-        self._publishers: dict[str, set[str]] = {}
-        """The publishers in the master's last answer: slave URIs by topic."""
+        self._lookup = PublisherLookup(context.upstream)
 
     async def listen_for(self, uris: Iterable[str], caller: Caller) -> None:
         """Open a port for each URI that needs one, before inside gets the URI.
@@ -119,7 +114,7 @@ class StandInPorts:
         address = self._stand_ins.address(caller.proxy)
         known_uris = {uri for uri in targets if self._stand_ins.find(address, uri)}
         if len(known_uris) < len(targets):
-            known_uris |= await self._publishers_of(topic)
+            known_uris |= await self._lookup.publishers_of(topic)
         await self.listen_for((uri for uri in targets if uri in known_uris), caller)
 
     def with_address(self, body: bytes, call: xmlrpc.Call) -> bytes:
@@ -208,36 +203,6 @@ class StandInPorts:
             return {}
         pairs = ((uri, self._context.addressing.stand_in_target(uri)) for uri in uris)
         return {uri: target for uri, target in pairs if target}
-
-    async def _publishers_of(self, topic: str) -> set[str]:
-        """The slave URIs of a topic's publishers at the master; empty without an answer.
-
-        The master gets one question at a time, for all topics that callers have asked for
-        meanwhile.
-        """
-        self._pending_topics.add(topic)
-        async with self._query_lock:
-            if topic in self._pending_topics:  # no other caller has asked meanwhile
-                topics = self._pending_topics
-                self._pending_topics = set()
-                self._publishers = await self._ask_publishers(topics)
-            return self._publishers.get(topic, set())
-
-    async def _ask_publishers(self, topics: set[str]) -> dict[str, set[str]]:
-        upstream = self._context.upstream
-        try:
-            state = await upstream.read_registrations()
-            names = [
-                name
-                for name, registrations in state.items()
-                if any(r.kind is Kind.PUBLISHER and r.name in topics for r in registrations)
-            ]
-            graph = Graph(state, await upstream.look_up("lookupNode", names))
-        except (Unreachable, MasterError) as error:
-            log.debug("the master gives no list of publishers: %s", error)
-            return {}
-        publishers = graph.by_topic(Kind.PUBLISHER)
-        return {topic: set(publishers.get(topic, ())) for topic in topics}
 
     def _listen(self, uri: str, target: HostPort, address: str) -> None:
         """Open the port for a URI, or report why that fails."""
