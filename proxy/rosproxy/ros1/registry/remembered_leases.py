@@ -63,7 +63,8 @@ def lease_at(parameters: object, advertised: HostPort) -> RememberedLease | None
     """
     name = _name_of(advertised.host)
     items = parameters.items() if isinstance(parameters, dict) else ()
-    values = [v for key, v in items if str(key).startswith(name)]
+    # Only the port may follow: leases_robot_lan_50000 also begins with leases_robot_.
+    values = [v for key, v in items if re.fullmatch(rf"{name}\d+", str(key))]
     return next((lease for v in values for p, lease in _read(v) if p == advertised.port), None)
 
 

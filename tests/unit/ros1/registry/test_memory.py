@@ -74,6 +74,14 @@ def test_what_any_proxy_has_at_an_address_is_told() -> None:
     assert lease_at("nothing", HostPort("robot", 30003)) is None
 
 
+def test_a_host_whose_name_begins_alike_has_other_leases() -> None:
+    parameters = {"leases_robot_lan_30000": "30003 /10.0.0.9:40001/\n"}
+    assert lease_at(parameters, HostPort("robot", 30003)) is None
+    assert lease_at(parameters, HostPort("robot.lan", 30003)) is not None
+    parameters["leases_robot_30000"] = "30003 /10.0.0.5:40001/\n"
+    assert lease_at(parameters, HostPort("robot", 30003)) == RememberedLease(PLACE)
+
+
 @given(st.text() | st.integers() | st.lists(st.text()) | st.dictionaries(st.text(), st.text()))
 def test_nothing_that_somebody_writes_there_is_an_error(value: object) -> None:
     read_leases(value, PORTS)
