@@ -25,12 +25,3 @@ def changes(before: Json, after: Json) -> Json:
         key: after.get(key) for key in keys.difference(_TABLES) if before.get(key) != after.get(key)
     }
     return update
-
-
-def apply_update(before: Json, update: Json) -> Json:
-    """The document that ``update`` makes of ``before``; `changes` has made the update."""
-    after = {**before, **update}
-    for table in _TABLES:
-        rows = {**before[table], **update.get(table, {})}
-        after[table] = {key: row for key, row in rows.items() if row is not None}
-    return after

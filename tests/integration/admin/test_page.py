@@ -28,6 +28,7 @@ from tests.integration.net import (
     until,
 )
 from tests.integration.proxy import Proxy
+from tests.page_updates import apply_update
 
 TOKEN = "0123456789abcdef"
 FILES = ("/page.js", "/view.js", "/picture.js", "/findings.js", "/page.css")
@@ -77,8 +78,6 @@ class Stream:
 
     async def follow(self) -> None:
         """Process the next event."""
-        from rosproxy.page.changes import apply_update
-
         kind, update = await self.event()
         self.kinds.append(kind)
         if kind == "all":

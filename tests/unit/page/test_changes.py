@@ -6,7 +6,8 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.page.changes import apply_update, changes
+from rosproxy.page.changes import changes
+from tests.page_updates import apply_update
 
 ROWS = st.dictionaries(st.sampled_from("abcd"), st.fixed_dictionaries({"n": st.integers(0, 2)}))
 DOCUMENTS = st.fixed_dictionaries({"nodes": ROWS, "links": ROWS, "left_out": st.integers(0, 2)})
