@@ -3,7 +3,7 @@
 import socket
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
 
 import pytest
 
@@ -14,15 +14,21 @@ from tests.docker.robot import Robot
 from tests.docker.traffic import traffic
 
 FIRST = WINDOW[0]
+UNUSED = range(13500, 13600)
+"""Ports of no other test. At these ports, no connections of an earlier proxy are in TIME_WAIT."""
 
 
 def occupy(port: int, *, listen: bool) -> socket.socket:
     """Hold a port of this host. A port without `listen` is in no list of listening sockets."""
-    holder = socket.socket()
-    holder.bind(("0.0.0.0", port))
-    if listen:
-        holder.listen()
-    return holder
+    with ExitStack() as stack:
+        holder = stack.enter_context(socket.socket())
+        if listen:  # connections of an earlier proxy may still be in TIME_WAIT at the port
+            holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        holder.bind(("0.0.0.0", port))
+        if listen:
+            holder.listen()
+        stack.pop_all()
+        return holder
 
 
 @pytest.fixture
@@ -53,15 +59,17 @@ def test_range_keeps_clear_of_all_others(
 def test_next_range_when_the_engine_says_taken(
     start_controller: Callable[..., Controller], net: Inside
 ) -> None:
-    with closing(occupy(FIRST + 1, listen=False)):
-        controller = start_controller("--ports", "4")
+    taken = UNUSED.start + 1
+    with closing(occupy(taken, listen=False)):
+        window = f"{UNUSED[0]}-{UNUSED[-1]}"
+        controller = start_controller("--ports", "4", "--port-window", window)
         net.idle(net.network())
 
         ports = the_proxy().ports
 
     assert len(ports) == 4
-    assert FIRST + 1 not in ports
-    assert str(FIRST + 1) in controller.logs()
+    assert taken not in ports
+    assert str(taken) in controller.logs()
 
 
 def test_exhausted_window_is_told_with_numbers(
