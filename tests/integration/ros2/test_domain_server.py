@@ -13,7 +13,7 @@ from examples.demo.fake_http import free_ports
 from rosproxy.forwarding.datagrams import bind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.domain_settings import DomainSettings, Outgoing
+from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink, Outgoing
 from rosproxy.ros2.ports.former_ports import ANSWER_TIMEOUT_S
 from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S, SETTLING_PERIOD_S
 from rosproxy.ros2.ports.stand_ins import stand_in_port
@@ -25,6 +25,7 @@ from rosproxy.ros2.sources.rates import DiscoveryRates, Standing
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import (
+    PROOF,
     SEDP_WRITERS,
     A,
     B,
@@ -37,6 +38,7 @@ from tests.unit.ros2.protocol.messages import message, submessage
 PROXY = "127.0.7.1"
 INSIDE = "127.0.7.2"
 OUTSIDE = "127.0.7.9"
+RELAY = "127.0.7.3"
 DOMAIN = own_domain()
 
 
@@ -124,6 +126,28 @@ async def test_no_stand_in_is_announced_that_can_not_be_opened(
         (opened,) = server.domain.stand_ins.by_port
         assert told == HostPort(PROXY, opened)
         assert opened != wanted
+
+
+async def test_a_participant_on_the_lan_relays_machine_is_not_inside() -> None:
+    """Such a participant announces itself on the inside network, often before it does on the LAN.
+
+    The proxy then took the participant for one of inside, and refused the LAN relay's announcement.
+    """
+    settings = settings_of()
+    settings.relay = LanRelayLink(HostPort(RELAY, 1), PROOF)
+    inside = {INSIDE, RELAY}
+    times = chain([0.0], repeat(EVIDENCE_PERIOD_S + 1))
+    server = DomainServer(settings, PROXY, times.__next__, inside.__contains__, lambda: None)
+    server.start()
+    well_known = PROXY, settings.unicast_port
+    try:
+        with participant(RELAY) as on_host, participant(INSIDE) as insider:
+            on_host.sendto(spdp(B, RELAY, on_host.getsockname()[1]), well_known)
+            insider.sendto(spdp(A, INSIDE, insider.getsockname()[1]), well_known)
+            await until(lambda: server.domain.inside.by_prefix, "a participant is served")
+    finally:
+        server.close()
+    assert server.domain.inside.by_prefix.keys() == {A}
 
 
 async def test_an_unselected_source_has_an_allowance_of_discovery(

@@ -346,6 +346,8 @@ class DomainServer:
         self._loop.add_reader(sock, self._take_in, sock, take, must_queue)
 
     def _must_queue_inside(self, datagram: bytes, source: str) -> bool:
+        if self._is_at_relay(source):
+            return False
         return self._is_inside(source) and self.domain.must_queue_inside(datagram, source)
 
     def _must_queue_discovery(self, datagram: bytes, source: str) -> bool:
@@ -371,7 +373,7 @@ class DomainServer:
         If an address inside is not selected, hold announcements from there, because the operator
         may select the address soon.
         """
-        if not self._is_inside(source):
+        if not self._is_inside(source) or self._is_at_relay(source):
             return False
         if self._selected.admits(source, now):
             return True
@@ -382,6 +384,15 @@ class DomainServer:
                     if message.of_participant is not None:
                         self._selected.hold(source, message.datagram)
         return False
+
+    def _is_at_relay(self, source: str) -> bool:
+        """Whether an address is that of the LAN relay, whose machine is outside.
+
+        A participant there announces itself on all networks of its machine: also on the inside
+        network, and often there first. As a participant inside, it would get no data from inside.
+        """
+        relay = self.domain.settings.relay
+        return relay is not None and source == relay.address.host
 
     def _at_discovery(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         if self._secret and datagram == self._secret:
