@@ -57,18 +57,25 @@ def lab(topology: Topology, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 
 
 def label(lab: Lab, role: str, topic: str) -> str:
-    """Wait for the participant on a machine that has a topic, and return the label."""
+    """Wait for the participant on a machine that has a topic, and return the label.
+
+    The label of a ROS node is its name, which the page learns after the topic.
+    """
     labels: list[str] = []
 
     def is_there() -> bool:
         domain = lab.domain()
-        prefixes = {
-            f"{domain.domain} {p.guid_prefix}"
+        vendors = {
+            f"{domain.domain} {p.guid_prefix}": p.vendor
             for p in (*domain.inside, *domain.outside)
             if p.address == lab.place(role).address and topic in (*p.publishes, *p.subscribes)
         }
         nodes = lab.page()["nodes"]
-        labels[:] = [nodes[key]["label"] for key in prefixes if key in nodes]
+        labels[:] = [
+            nodes[key]["label"]
+            for key, vendor in vendors.items()
+            if key in nodes and (vendor != "Fast DDS" or nodes[key]["label"].startswith("/"))
+        ]
         return bool(labels)
 
     wait_until(f"{topic} of {role} is known", is_there)
