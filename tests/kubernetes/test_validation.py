@@ -49,7 +49,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
             "master": GOOD,
             "policy": {"rules": [{**RULE, "names": ["/a"] * 17, "nodes": ["/b"]}] * 30},
         },
-        "at most 500 names",
+        "rules are too many",
     ),
     "mode": ({"master": GOOD, "policy": {"mode": "Tell"}}, "mode"),
     "publish": ({"master": {**GOOD, "publish": 11302}}, "publish"),
