@@ -8,7 +8,7 @@ proven sources inside, proven sources outside, other sources inside, and other s
 """
 
 import heapq
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
@@ -51,9 +51,13 @@ class Waiting(Generic[Item]):
 class FairQueue(Generic[Item]):
     """Items by source. The source with the smallest used share goes first.
 
-    A share is a number of bytes on a line: `_now` is the start of the last item taken, and `_next`
-    the start of the next item of each source. A source that was silent starts at `_now`, so silence
-    saves nothing.
+    A share is a number of bytes on a line: `_next` is the start of the next item of each source,
+    and `_now` the used share of a source that always has an item. A source that was silent starts
+    at `_now`, so silence saves nothing. `_now` grows with all bytes taken: a source that comes back
+    waits for a round at most, although new sources may come all the time.
+
+    The queue remembers the shares of as many silent sources as may wait. All others have been
+    silent for about a round, so these shares no longer matter.
     """
 
     most_sources: int
@@ -62,8 +66,10 @@ class FairQueue(Generic[Item]):
     _waiting: dict[str, deque[Waiting[Item]]] = field(default_factory=dict)
     _replaceable: dict[Hashable, Waiting[Item]] = field(default_factory=dict)
     _sizes: dict[str, int] = field(default_factory=dict)
-    _order: list[tuple[int, str]] = field(default_factory=list)
+    _order: list[tuple[int, int, str]] = field(default_factory=list)
+    _arrivals: int = 0
     _next: dict[str, int] = field(default_factory=dict)
+    _silent: OrderedDict[str, None] = field(default_factory=OrderedDict)
     _now: int = 0
     _size: int = 0
 
@@ -83,8 +89,9 @@ class FairQueue(Generic[Item]):
             self._replaceable[key] = waiting
         if source not in self._waiting:
             self._waiting[source] = deque()
+            self._silent.pop(source, None)
             self._next[source] = max(self._now, self._next.get(source, 0))
-            heapq.heappush(self._order, (self._next[source], source))
+            self._line_up(source)
         self._waiting[source].append(waiting)
         self._count(source, waiting.size)
         return True
@@ -100,11 +107,11 @@ class FairQueue(Generic[Item]):
     def pop(self) -> Waiting[Item] | None:
         """Take the next item; None if no item waits."""
         while self._order:
-            start, source = heapq.heappop(self._order)
+            start, _, source = heapq.heappop(self._order)
             if start < self._next[source]:  # `charge` has moved the source back
-                heapq.heappush(self._order, (self._next[source], source))
+                self._line_up(source)
                 continue
-            self._now = start
+            self._now = max(self._now, start)
             return self._take(source)
         return None
 
@@ -112,15 +119,22 @@ class FairQueue(Generic[Item]):
         """Add bytes to the used share of a source."""
         if source in self._next:
             self._next[source] += size
+            self._now += size // max(len(self._waiting), 1)
+
+    def _line_up(self, source: str) -> None:
+        """Give a source its place in the order. Of equal shares, the first to arrive goes first."""
+        self._arrivals += 1
+        heapq.heappush(self._order, (self._next[source], self._arrivals, source))
 
     def _take(self, source: str) -> Waiting[Item]:
         waiting = self._waiting[source].popleft()
         self._leave(waiting)
-        self._next[source] += waiting.size
+        self.charge(source, waiting.size)
         if self._waiting[source]:
-            heapq.heappush(self._order, (self._next[source], source))
+            self._line_up(source)
         else:
             del self._waiting[source]
+            self._silent[source] = None
             self._forget_silent()
         return waiting
 
@@ -158,11 +172,10 @@ class FairQueue(Generic[Item]):
         """Forget the used shares of silent sources, if these no longer matter."""
         if not self._waiting:
             self._next.clear()
-        elif len(self._next) > 2 * self.most_sources:
-            kept = self._waiting.keys() | {
-                s for s, start in self._next.items() if start > self._now
-            }
-            self._next = {source: self._next[source] for source in kept}
+            self._silent.clear()
+        elif len(self._silent) > self.most_sources:
+            longest_silent, _ = self._silent.popitem(last=False)
+            del self._next[longest_silent]
 
 
 class DiscoveryQueue(Generic[Item]):
