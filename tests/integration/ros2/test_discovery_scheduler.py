@@ -1,4 +1,7 @@
-"""Discovery is read a little in each round of the event loop, and everything else comes first."""
+"""Discovery is read a little in each round of the event loop, and everything else comes first.
+
+The time is a fake: only the tests and the datagrams that they read let time pass.
+"""
 
 import asyncio
 from collections.abc import Callable, Sequence
@@ -8,19 +11,36 @@ import pytest
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.servers.discovery_scheduler import (
-    LONGEST_ROUND_BYTES,
-    ROUND_BYTES,
+    LONGEST_ROUND_S,
+    SHORTEST_ROUND_S,
     DiscoveryScheduler,
 )
 from rosproxy.ros2.sources.fair_queue import MOST_BYTES_PER_SOURCE, OVERHEAD_BYTES
 from rosproxy.ros2.sources.rates import Standing
 
 
+class Time:
+    """A clock that stands still until it is told to go on. ``now`` is in seconds."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
 def reading(
-    names: list[str], source: str, sent: Sequence[Outgoing] = ()
+    names: list[str],
+    source: str,
+    sent: Sequence[Outgoing] = (),
+    takes: tuple[Time, float] | None = None,
 ) -> Callable[[], Sequence[Outgoing]]:
+    """A datagram that is read. ``takes`` is the clock, and the seconds that reading takes."""
+
     def read() -> Sequence[Outgoing]:
         names.append(source)
+        if takes:
+            takes[0].now += takes[1]
         return sent
 
     return read
@@ -32,10 +52,12 @@ async def until_read(names: list[str], count: int) -> None:
 
 
 async def test_something_else_runs_between_two_long_datagrams() -> None:
-    reader = DiscoveryScheduler()
+    clock = Time()
+    reader = DiscoveryScheduler(clock)
     names = list[str]()
+    long = clock, SHORTEST_ROUND_S
     for _ in range(3):
-        reader.put("robot", Standing.PROVEN, ROUND_BYTES, reading(names, "robot"))
+        reader.put("robot", Standing.PROVEN, 0, reading(names, "robot", takes=long))
     for count in (1, 2, 3):
         asyncio.get_running_loop().call_soon(names.append, f"else {count}")
         await until_read(names, 2 * count)
@@ -43,7 +65,7 @@ async def test_something_else_runs_between_two_long_datagrams() -> None:
 
 
 async def test_what_a_datagram_leads_to_counts_as_well() -> None:
-    reader = DiscoveryScheduler()
+    reader = DiscoveryScheduler(Time())
     names = list[str]()
     copies = [Outgoing(HostPort("10.0.0.9", 7410), bytes(1000))] * 32
     for _ in range(3):
@@ -54,7 +76,7 @@ async def test_what_a_datagram_leads_to_counts_as_well() -> None:
 
 
 async def test_the_last_of_datagrams_that_say_the_same_is_read() -> None:
-    reader = DiscoveryScheduler()
+    reader = DiscoveryScheduler(Time())
     names = list[str]()
     reader.put("robot", Standing.PROVEN, 0, reading(names, "first"), "stream")
     assert reader.is_behind
@@ -66,32 +88,32 @@ async def test_the_last_of_datagrams_that_say_the_same_is_read() -> None:
 
 
 async def test_short_datagrams_share_a_round() -> None:
-    reader = DiscoveryScheduler()
+    clock = Time()
+    reader = DiscoveryScheduler(clock)
     names = list[str]()
     for _ in range(20):
-        reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
+        short = clock, SHORTEST_ROUND_S / 20
+        reader.put("robot", Standing.PROVEN, 0, reading(names, "robot", takes=short))
     await asyncio.sleep(0)
     assert len(names) == 20
 
 
-async def test_a_round_is_longer_after_much_has_come() -> None:
+@pytest.mark.parametrize(("others", "length"), [(0.011, 0.011), (60, LONGEST_ROUND_S)])
+async def test_a_round_takes_as_long_as_everything_else_since_the_last(others, length) -> None:
     """With rounds of the same length, receiving from a crowd takes all the time."""
-    reader = DiscoveryScheduler()
+    clock = Time()
+    reader = DiscoveryScheduler(clock)
     names = list[str]()
-    count = ROUND_BYTES // OVERHEAD_BYTES
-    for _ in range(4 * count):
-        reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
+    for _ in range(1000):
+        short = clock, 0.001
+        reader.put("robot", Standing.PROVEN, 0, reading(names, "robot", takes=short))
+    clock.now += others
     await asyncio.sleep(0)
-    assert len(names) == 4 * count
-    for _ in range(2 * LONGEST_ROUND_BYTES // OVERHEAD_BYTES):
-        reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
-    names.clear()
-    await asyncio.sleep(0)
-    assert len(names) == LONGEST_ROUND_BYTES // OVERHEAD_BYTES
+    assert len(names) == pytest.approx(length * 1000, abs=1)
 
 
 async def test_what_comes_while_none_waits_is_read_at_once() -> None:
-    reader = DiscoveryScheduler()
+    reader = DiscoveryScheduler(Time())
     names = list[str]()
     for name in ("robot", "laptop"):
         assert reader.read(name, Standing.PROVEN, 0, reading(names, name))
@@ -99,10 +121,12 @@ async def test_what_comes_while_none_waits_is_read_at_once() -> None:
 
 
 async def test_what_comes_after_a_full_round_waits_for_its_turn() -> None:
-    reader = DiscoveryScheduler()
+    clock = Time()
+    reader = DiscoveryScheduler(clock)
     names = list[str]()
     copies = [Outgoing(HostPort("10.0.0.9", 7410), bytes(1000))] * 8
-    reader.read("announces", Standing.PROVEN, 0, reading(names, "announces", copies))
+    long = clock, SHORTEST_ROUND_S
+    reader.read("announces", Standing.PROVEN, 0, reading(names, "announces", copies, long))
     reader.read("announces", Standing.PROVEN, 0, reading(names, "announces"))
     reader.read("robot", Standing.PROVEN, 0, reading(names, "robot"))
     assert names == ["announces"]
@@ -113,7 +137,7 @@ async def test_what_comes_after_a_full_round_waits_for_its_turn() -> None:
 
 
 async def test_what_comes_behind_a_datagram_that_waits_waits_as_well() -> None:
-    reader = DiscoveryScheduler()
+    reader = DiscoveryScheduler(Time())
     names = list[str]()
     reader.put("robot", Standing.PROVEN, 0, reading(names, "first"))
     reader.read("robot", Standing.PROVEN, 0, reading(names, "second"))
@@ -123,7 +147,7 @@ async def test_what_comes_behind_a_datagram_that_waits_waits_as_well() -> None:
 
 
 async def test_a_datagram_that_raises_an_error_does_not_end_the_scheduler() -> None:
-    reader = DiscoveryScheduler()
+    reader = DiscoveryScheduler(Time())
     names = list[str]()
     failures = list[str]()
     asyncio.get_running_loop().set_exception_handler(
@@ -144,7 +168,7 @@ async def test_a_datagram_that_raises_an_error_does_not_end_the_scheduler() -> N
 
 
 async def test_nothing_is_read_after_the_end() -> None:
-    reader = DiscoveryScheduler()
+    reader = DiscoveryScheduler(Time())
     names = list[str]()
     reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
     reader.close()
@@ -154,11 +178,12 @@ async def test_nothing_is_read_after_the_end() -> None:
 
 
 async def test_what_has_no_room_is_told() -> None:
-    count = MOST_BYTES_PER_SOURCE // (ROUND_BYTES + OVERHEAD_BYTES)
-    reader = DiscoveryScheduler()
+    size = 8 * 1024
+    count = MOST_BYTES_PER_SOURCE // (size + OVERHEAD_BYTES)
+    reader = DiscoveryScheduler(Time())
     names = list[str]()
     has_room = [
-        reader.put("many", Standing.PROVEN, ROUND_BYTES, reading(names, "many")) for _ in range(200)
+        reader.put("many", Standing.PROVEN, size, reading(names, "many")) for _ in range(200)
     ]
     assert has_room == [True] * count + [False] * (200 - count)
     await until_read(names, count)

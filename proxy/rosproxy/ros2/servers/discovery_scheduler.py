@@ -1,47 +1,52 @@
 """Reads received discovery in small parts, one part in each round of the event loop.
 
 User data and the admin endpoint come first. The sockets are read at once, and discovery waits in a
-`DiscoveryQueue`. If no other discovery waits and the round has bytes left, discovery does not wait
+`DiscoveryQueue`. If no other discovery waits and the round has time left, discovery does not wait
 either. Between two rounds the event loop serves all that is ready.
 """
 
 import asyncio
+import time
 from collections.abc import Callable, Hashable, Sequence
 
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.sources.fair_queue import OVERHEAD_BYTES, DiscoveryQueue
 from rosproxy.ros2.sources.rates import Standing
 
-ROUND_BYTES = 8 * 1024
-"""Bytes that a round reads and sends. A round with a datagram of the greatest length takes 5 ms."""
-LONGEST_ROUND_BYTES = 64 * 1024
-"""Bytes of the longest round."""
-BYTES_PER_RECEIVED = 512
-"""Bytes of a round for each datagram since the last round, up to `LONGEST_ROUND_BYTES`.
-Reading these bytes takes about as long as receiving a datagram. With rounds of constant length,
-many sockets would leave no time to read what they receive (receive livelock; Mogul, Ramakrishnan:
-TOCS 1997)."""
+SHORTEST_ROUND_S = 0.005
+"""Seconds that a round may always take. Reading a datagram of the greatest length takes as long."""
+LONGEST_ROUND_S = 0.02
+"""Seconds that a round may take at most.
+
+In between, a round may take as long as everything else since the last round. Shorter rounds would
+leave no time to read what many sockets receive (receive livelock; Mogul, Ramakrishnan: TOCS 1997).
+Longer rounds would delay user data and answers: an answer of the admin endpoint waits for several
+rounds."""
 
 Read = Callable[[], Sequence[Outgoing]]
 """Reads a datagram, sends the datagrams that follow from it, and returns these."""
 
 
 class DiscoveryScheduler:
-    """Reads datagrams in a fair order, until `close`. Needs a running event loop."""
+    """Reads datagrams in a fair order, until `close`. Needs a running event loop.
 
-    def __init__(self) -> None:
+    ``clock`` tells the time in seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._queue = DiscoveryQueue[Read]()
         self._loop = asyncio.get_running_loop()
+        self._clock = clock
         self._round: asyncio.Handle | None = None
-        self._spent = 0
-        """Bytes that this round has read and sent."""
-        self._received = 0
-        """Datagrams that have come since the start of this round."""
+        self._ended = clock()
+        """When the last round ended."""
+        self._spent_s = 0.0
+        """Seconds of this round in which datagrams have been read."""
 
     @property
     def is_behind(self) -> bool:
         """Whether a new datagram has to wait."""
-        return bool(self._queue) or self._spent >= ROUND_BYTES
+        return bool(self._queue) or self._spent_s >= SHORTEST_ROUND_S
 
     def read(
         self, source: str, standing: Standing, size: int, read: Read, key: Hashable = None
@@ -54,21 +59,21 @@ class DiscoveryScheduler:
         if self.is_behind:
             return self.put(source, standing, size, read, key)
         self._schedule()
-        self._spent += size + OVERHEAD_BYTES + _size_of(read())
+        began = self._clock()
+        read()
+        self._spent_s += self._clock() - began
         return True
 
     def put(
         self, source: str, standing: Standing, size: int, read: Read, key: Hashable = None
     ) -> bool:
         """Let a datagram wait for the turn of the source. Return False if the queue has no room."""
-        self._received += 1
         has_room = self._queue.put(source, standing, read, size, key)
         self._schedule()
         return has_room
 
     def replace(self, key: Hashable, read: Read) -> bool:
         """Replace the waiting datagram with a key. Return False if there is none."""
-        self._received += 1
         return self._queue.replace(key, read)
 
     def close(self) -> None:
@@ -84,16 +89,16 @@ class DiscoveryScheduler:
 
     def _begin_round(self) -> None:
         self._round = None
-        self._spent = 0
-        budget = max(ROUND_BYTES, min(self._received * BYTES_PER_RECEIVED, LONGEST_ROUND_BYTES))
-        self._received = 0
+        self._spent_s = 0.0
+        began = self._clock()
+        length = min(max(began - self._ended, SHORTEST_ROUND_S), LONGEST_ROUND_S)
         try:
-            while self._spent < budget and (waiting := self._queue.pop()):
-                sent_bytes = _size_of(waiting.item())
-                self._queue.charge(waiting.source, sent_bytes)
-                self._spent += waiting.size + sent_bytes
+            while self._spent_s < length and (waiting := self._queue.pop()):
+                self._queue.charge(waiting.source, _size_of(waiting.item()))
+                self._spent_s = self._clock() - began
         finally:
-            if self._spent or self._queue:
+            self._ended = self._clock()
+            if self._spent_s or self._queue:
                 self._schedule()
 
 
