@@ -39,9 +39,7 @@ class LongCall:
         if len(self._head) == self.size and self._watch.passes(self._head):
             yield self._head
             return
-        for piece in cut(self._head):  # other tasks run between two pieces
-            self._watch.see(piece)
-            await asyncio.sleep(0)
+        await self._see(self._head)
         # Each piece waits for the next piece. rosmaster and nodes read the whole body before
         # parsing. So a refused call without the last piece has no effect.
         previous = self._head
@@ -51,11 +49,17 @@ class LongCall:
                     piece = await self._rest.readany()
             except (OSError, BadBody) as error:  # a TimeoutError is an OSError
                 raise Unreachable(f"the caller did not send the whole body: {error}") from error
-            self._watch.see(piece)
+            await self._see(piece)
             yield previous
             previous = piece
         self._watch.end()
         yield previous
+
+    async def _see(self, part: bytes) -> None:
+        """Watch a part of the body. Other tasks run after each piece."""
+        for piece in cut(part):
+            self._watch.see(piece)
+            await asyncio.sleep(0)
 
 
 class LongCalls(Protocol):

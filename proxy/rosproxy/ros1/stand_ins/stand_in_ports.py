@@ -48,8 +48,10 @@ log = logging.getLogger(__name__)
 
 MOST_RETRIES = 32
 """Nodes that have refused and that the proxy tries again at the same time."""
-PORTS_PER_TURN = 50
+PORTS_PER_TURN = 10
 """Ports that the proxy opens before the event loop does other work."""
+URIS_PER_TURN = 200
+"""URIs that the proxy reads before the event loop does other work. A master may name thousands."""
 TIDY_INTERVAL_S = 30.0
 SERVICE_PROBLEM_KEPT_S = 600.0
 """Seconds to keep a problem with a service: each call of a client looks the service up anew."""
@@ -88,7 +90,7 @@ class StandInPorts:
 
         The URIs must come from the master.
         """
-        targets = self._targets(uris)
+        targets = await self._targets(uris)
         if not targets:
             return
         retried = self._refused.keys() & targets.keys()
@@ -110,7 +112,7 @@ class StandInPorts:
         address to other hosts. A node outside may put any URI into its bus info. So before the
         proxy opens a port, it asks the master whether the URI is a publisher of the topic.
         """
-        targets = self._targets(uris)
+        targets = await self._targets(uris)
         address = self._stand_ins.address(caller.proxy)
         known_uris = {uri for uri in targets if self._stand_ins.find(address, uri)}
         if len(known_uris) < len(targets):
@@ -138,7 +140,7 @@ class StandInPorts:
         self.udpros.sweep()
         for problem in self._context.problems.all():
             uri = problem.subject
-            for target in self._targets([uri]).values():
+            for target in (await self._targets([uri])).values():
                 if parse_service_uri(uri):
                     ended = time.time() - problem.when > SERVICE_PROBLEM_KEPT_S
                 else:
@@ -197,12 +199,17 @@ class StandInPorts:
         """Whether any URI may need a stand-in now."""
         return self._stand_ins.is_bidirectional or self._context.upstream.master_address is not None
 
-    def _targets(self, uris: Iterable[str]) -> dict[str, HostPort]:
+    async def _targets(self, uris: Iterable[str]) -> dict[str, HostPort]:
         """The URIs that need a stand-in, each with the host and port of the target."""
+        targets = dict[str, HostPort]()
         if not self._active or self._closed:
-            return {}
-        pairs = ((uri, self._context.addressing.stand_in_target(uri)) for uri in uris)
-        return {uri: target for uri, target in pairs if target}
+            return targets
+        for number, uri in enumerate(uris, start=1):
+            if number % URIS_PER_TURN == 0:
+                await asyncio.sleep(0)
+            if target := self._context.addressing.stand_in_target(uri):
+                targets[uri] = target
+        return targets
 
     def _listen(self, uri: str, target: HostPort, address: str) -> None:
         """Open the port for a URI, or report why that fails."""

@@ -27,6 +27,8 @@ from rosproxy.ros1.protocol.xmlrpc.document import (
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.protocol.xmlrpc.values import text_of
 
+PIECE_BYTES = 16 * 1024
+"""Bytes that are watched before other tasks run. A piece full of tags takes about 10 ms."""
 SHORT_BYTES = 64 * 1024
 """Bytes up to which the proxy reads any document as a whole, in some milliseconds."""
 HEAD_BYTES = 4096
@@ -287,5 +289,5 @@ class MulticallWatch(CallWatch):
 
 
 def cut(body: bytes) -> Iterator[bytes]:
-    """A body in pieces of at most SHORT_BYTES. To watch a piece takes some milliseconds."""
-    return (body[start : start + SHORT_BYTES] for start in range(0, len(body), SHORT_BYTES))
+    """A body in pieces of at most PIECE_BYTES."""
+    return (body[start : start + PIECE_BYTES] for start in range(0, len(body), PIECE_BYTES))
