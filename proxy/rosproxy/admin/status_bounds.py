@@ -13,7 +13,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, takewhile
 from typing import Any, TypeVar
 
 import msgspec
@@ -241,7 +241,8 @@ def _shortened(row: Row, room: int) -> Row:
     for name in getattr(row, "__struct_fields__", ()):
         entries = getattr(row, name)
         if isinstance(entries, tuple):
-            used = [size for size in accumulate(_size(e) + 1 for e in entries) if size <= room]
+            sizes = accumulate(_size(entry) + 1 for entry in entries)
+            used = list(takewhile(room.__ge__, sizes))
             lists[name] = entries[: len(used)]
             room -= used[-1] if used else 0
             left_out += 0 if name == _UNCOUNTED_LIST else len(entries) - len(used)
