@@ -7,8 +7,8 @@ The neighbour's calls and raw connections come from `tests.integration.net`. If 
 to belong to other machines, a test gets `apart`, the same in a network namespace
 (:mod:`tests.abuse.apart`). The attack is in the body of ``with abused.watched():``, which checks:
 
-  - /healthz answers within 0.3 s throughout, to another process. Time in which the two wait for a
-    processor does not count (:mod:`tests.abuse.health`);
+  - /healthz answers within 0.3 s of a reference processor throughout, to another process. Time in
+    which the two wait for a processor does not count (:mod:`tests.abuse.health`);
   - memory grows by 16 MiB at most, or by the bytes that a test gives with a reason;
   - the log grows by 64 KiB at most, and has no traceback; /status has 1 MiB at most.
 
@@ -44,7 +44,7 @@ MEBIBYTE = 1024 * 1024
 MEMORY = 256 * MEBIBYTE
 GROWTH = 16 * MEBIBYTE
 LONGEST_ANSWER = 0.3
-"""Seconds that an answer of /healthz may take."""
+"""Seconds of a reference processor that an answer of /healthz may take."""
 PATIENT = {"probe_interval": 5, "probe_timeout": 20, "cleanup_after": 0, "linger": 600}
 """The fakes answer late, because the same process makes the neighbours' huge documents."""
 LOG = 64 * 1024

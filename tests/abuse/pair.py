@@ -3,8 +3,9 @@
     python -m tests.abuse.pair PREFIX INSIDE OUTSIDE TARGET TARGET_PORT PROXY
 
 A separate process, so that the test cannot hold up the pair. Standard input is the socket that
-receives, and that announces the participant. On SIGTERM the process prints the number of sent and
-lost messages, and the longest time without a message in seconds.
+receives, and that announces the participant. The process prints a line before the first message. On
+SIGTERM it prints the number of sent and lost messages, and the longest time without a message in
+seconds.
 """
 
 import json
@@ -22,6 +23,7 @@ from tests.unit.ros2.discovery.domains import spdp
 INTERVAL = 0.01
 ANNOUNCED_EACH = 100
 """Messages after which the participant inside announces itself again."""
+STARTED = "started\n"
 LAST_WAIT = 0.5
 """Seconds that the last messages may take."""
 
@@ -89,6 +91,9 @@ class Pair:
         self._process = subprocess.Popen(
             self._command, stdin=self._data.fileno(), stdout=subprocess.PIPE, text=True
         )
+        assert self._process.stdout is not None
+        # An attack that is over sooner than a process starts would meet no pair.
+        assert self._process.stdout.readline() == STARTED
         return self
 
     def __exit__(
@@ -115,6 +120,7 @@ def main() -> None:
     receiver = socket.socket(fileno=sys.stdin.fileno())
     stream = Stream(udp(outside), receiver, (host, int(port)))
     announcement = spdp(bytes.fromhex(prefix), address)
+    print(STARTED, end="", flush=True)
     count = 0
     while not ended:
         if count % ANNOUNCED_EACH == 0:
