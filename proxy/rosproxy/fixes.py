@@ -114,14 +114,19 @@ FIXES = {
     "zenoh outside": Fix(
         "set --zenoh-peer HOST to connect to a router, or --zenoh-listen 7447 to be reached",
         "add the label rosproxy.peers=HOST to a container of this proxy. HOST runs a router",
-        "start a proxy for rmw_zenoh by hand: docs/guide/zenoh.md",
+        "add HOST to spec.peers. HOST runs a router",
+    ),
+    "zenoh hub": Fix(
+        "if the other proxy runs, set --zenoh-listen there, and let the firewall accept the port",
+        "if the other proxy runs, set --zenoh-listen there, and let the firewall accept the port",
+        "if the other proxy runs, let the proxies connect to each other at port 7447 (firewall)",
     ),
     "zenoh nodes": Fix(
         "set for the nodes in containers: RMW_IMPLEMENTATION=rmw_zenoh_cpp and "
         """ZENOH_CONFIG_OVERRIDE='mode="client";connect/endpoints=["tcp/PROXY:{port}"]'""",
         "start nodes with RMW_IMPLEMENTATION=rmw_zenoh_cpp in a container with the label "
         "rosproxy.enable=true. Unset ZENOH_SESSION_CONFIG_URI there",
-        "start a proxy for rmw_zenoh by hand: docs/guide/zenoh.md",
+        _INJECTED.format(nodes="nodes with RMW_IMPLEMENTATION=rmw_zenoh_cpp"),
     ),
     "LAN relay": Fix(
         "run rosproxy lan-relay and set --ros2-lan-relay",

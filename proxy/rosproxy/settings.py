@@ -26,6 +26,8 @@ MOST_ZENOH_PORTS = 256
 """Routers for containers of a proxy; each takes half a megabyte."""
 MOST_ZENOH_PEERS = 64
 """Links of the hub router to other routers."""
+MOST_ZENOH_HUBS = 128
+"""Hubs of other hosts. Each hub has a session with each other hub."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -377,6 +379,19 @@ class Settings:
             note="separated by spaces",
         ),
     ] = ()
+    zenoh_hub: Annotated[
+        tuple[HostPort, ...],
+        Option(
+            "rmw_zenoh: proxy on another host that serves the same graph, at the port of its "
+            "`--zenoh-listen`. Without a port: 7447. Unlike with `--zenoh-peer`, both proxies may "
+            "name each other, and a proxy that is away is no fault. Repeatable.",
+            kinds.ZENOH_PEER,
+            variables=("ROSPROXY_ZENOH_HUBS",),
+            repeatable=True,
+            default="none",
+            note="separated by spaces",
+        ),
+    ] = ()
     zenoh_listen: Annotated[
         int | None,
         Option(
@@ -456,6 +471,9 @@ class Settings:
         if len(self.zenoh_peer) > MOST_ZENOH_PEERS:
             text = f"{len(self.zenoh_peer)} routers; give at most {MOST_ZENOH_PEERS}"
             raise SettingError("--zenoh-peer", text)
+        if len(self.zenoh_hub) > MOST_ZENOH_HUBS:
+            text = f"{len(self.zenoh_hub)} proxies; give at most {MOST_ZENOH_HUBS}"
+            raise SettingError("--zenoh-hub", text)
 
     @property
     def ports(self) -> PortMap:

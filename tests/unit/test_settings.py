@@ -191,6 +191,7 @@ def test_rmw_zenoh_alone_needs_neither_master_nor_advertised_host() -> None:
         ("zenoh_listen", 0, "--zenoh-listen: 0 is not in the range"),
         ("zenoh_peer", ("robot:x",), "--zenoh-peer: 'robot:x' is not of the form HOST or HOST"),
         ("zenoh_peer", tuple(f"h{n}" for n in range(65)), "--zenoh-peer: 65 routers; give at"),
+        ("zenoh_hub", tuple(f"h{n}" for n in range(129)), "--zenoh-hub: 129 proxies; give at"),
     ],
 )
 def test_what_rmw_zenoh_can_not_have(name: str, value: object, complaint: str) -> None:

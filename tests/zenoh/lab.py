@@ -54,14 +54,19 @@ class Lab:
 
     def start_proxy(self, *options: str, with_robot: bool = True) -> None:
         """Start the proxy and wait until ready."""
+        robot = ["--zenoh-peer", self.topology.plan.robot] if with_robot else []
+        self.proxy = self.start_proxy_on("px", *robot, *options)
+
+    def start_proxy_on(self, role: str, *options: str) -> Process:
+        """Start a proxy on a machine, and wait until ready."""
         argv = [sys.executable, "-m", "rosproxy", "run", "--ros", "zenoh"]
         argv += ["--zenoh-ports", f"{min(PORTS.values())}-{max(PORTS.values())}"]
-        argv += ["--zenoh-peer", self.topology.plan.robot] if with_robot else []
         argv += options
         (packages,) = (ENVIRONMENTS / OWN_VERSION).glob("lib/python3*/site-packages")
         paths = [*(path for path in sys.path if path), str(packages)]
-        self.proxy = self.start("px", argv, {"PYTHONPATH": os.pathsep.join(paths)})
-        self.proxy.wait_for("listening: ")
+        proxy = self.start(role, argv, {"PYTHONPATH": os.pathsep.join(paths)})
+        proxy.wait_for("listening: ")
+        return proxy
 
     def restart_proxy(self, *options: str) -> None:
         """Kill the process of the proxy, and start another."""
@@ -115,9 +120,9 @@ class Lab:
             enter = ("ip", "netns", "exec", self.topology.places[role].namespace)
             run_command(*enter, "nft", "delete", "table", "ip", "zenoh_redirect")
 
-    def status(self) -> ProxyStatus:
-        """The status of the proxy."""
-        with self.topology.places["px"].entered():
+    def status(self, role: str = "px") -> ProxyStatus:
+        """The status of the proxy on a machine."""
+        with self.topology.places[role].entered():
             asking = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
             with closing(asking):
                 asking.request("GET", "/status")
@@ -134,9 +139,9 @@ class Lab:
                 told = answer.read()
                 assert answer.status == 200, told
 
-    def zenoh(self) -> ZenohStatus:
-        """The status of the proxy's routers."""
-        zenoh = self.status().zenoh
+    def zenoh(self, role: str = "px") -> ZenohStatus:
+        """The status of the routers of the proxy on a machine."""
+        zenoh = self.status(role).zenoh
         assert zenoh is not None
         return zenoh
 

@@ -363,13 +363,15 @@ class DomainStatus(msgspec.Struct, frozen=True):
 class ZenohLinkStatus(msgspec.Struct, frozen=True):
     """A link of the hub to the router outside at ``peer``. ``since``: the age of this state.
 
-    ``error``: why the link is not up, a value of `rosproxy.zenoh.links.LinkFault`.
+    ``error``: why the link is not up, a value of `rosproxy.zenoh.links.LinkFault`. ``hub``: the
+    router is the hub of another proxy (``--zenoh-hub``), which may be away.
     """
 
     peer: str = ""
     up: bool = False
     error: str = ""
     since: Seconds = 0.0
+    hub: bool = False
 
 
 class ZenohSessionStatus(msgspec.Struct, frozen=True):

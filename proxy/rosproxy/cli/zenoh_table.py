@@ -40,9 +40,11 @@ def _summary(zenoh: ZenohStatus) -> str:
     ended = f", ended {plural(zenoh.restarts, 'time')}" if zenoh.restarts else ""
     state = f"do not run: {clean(zenoh.failure)}" if zenoh.failure else f"run{ended}"
     listens = "" if zenoh.listen is None else f"; port {zenoh.listen} for outside"
-    links = listed(map(_link, zenoh.links)) or "none"
+    links = listed(_link(link) for link in zenoh.links if not link.hub) or "none"
+    hubs = listed(_link(link) for link in zenoh.links if link.hub)
     ports = f"ports {clean(zenoh.ports)} for containers{listens}"
-    return f"zenoh routers {state}; {ports}; links to outside: {links}"
+    text = f"zenoh routers {state}; {ports}; links to outside: {links}"
+    return f"{text}; proxies on other hosts: {hubs}" if hubs else text
 
 
 def _link(link: ZenohLinkStatus) -> str:

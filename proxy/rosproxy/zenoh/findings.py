@@ -47,7 +47,7 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
         return
     for link in zenoh.links:
         is_tried = link.error != LinkFault.NOT_TRIED.value
-        if not link.up and is_tried and link.since >= LINK_GRACE_S:
+        if not link.up and not link.hub and is_tried and link.since >= LINK_GRACE_S:
             yield _link_fault(link)
     yield from _shared_routers(zenoh)
 

@@ -29,10 +29,12 @@ class Link:
 
     ``fault``: None if the link is up. ``since``: the time in seconds at which the link went up or
     down.
+    ``is_hub``: the router is the hub of another proxy, and is no fault while away.
     """
 
     peer: HostPort
     since: float
+    is_hub: bool = False
     addresses: tuple[str, ...] = ()
     fault: LinkFault | None = LinkFault.NOT_TRIED
 
@@ -49,10 +51,9 @@ class Link:
 def is_linked(
     peer: HostPort, addresses: Collection[str], routers: Iterable[Ends], listen: int | None
 ) -> bool:
-    """Whether one of the hub's sessions with ``routers`` is with a peer at these addresses.
+    """Whether a connection of the hub with one of ``routers`` is with a peer at these addresses.
 
-    The peer may have dialed the hub, at the port ``listen``; None: the hub has no such port. Two
-    routers keep a single session.
+    The peer may have dialed the hub, at the port ``listen``; None: the hub has no such port.
     """
     return any(
         ends.remote.host in addresses

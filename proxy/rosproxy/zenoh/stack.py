@@ -44,6 +44,8 @@ LINK_INTERVAL_S = 5.0
 """Seconds between look-ups of the peers' addresses, and between tries of links that are down."""
 FAULT_INTERVAL_S = 1.0
 """Seconds between two searches for faults."""
+MOST_LOOKS = 32
+"""Links that the proxy looks at, at a time: the proxy may look up 64 host names at a time."""
 POLICY_INTERVAL_S = 0.5
 """Seconds between checks of the policy, and of the sessions at the ports for containers."""
 _ROS_OPTION = "--ros zenoh"
@@ -58,9 +60,8 @@ class Zenoh:
         self._faults: dict[str, DoctorFinding] = {}
         self._applying = asyncio.Lock()
         settings = runtime.settings
-        self._plan = RouterPlan(
-            settings.bind, settings.zenoh_ports, settings.zenoh_listen, settings.zenoh_peer
-        )
+        dialed = tuple(dict.fromkeys((*settings.zenoh_peer, *settings.zenoh_hub)))
+        self._plan = RouterPlan(settings.bind, settings.zenoh_ports, settings.zenoh_listen, dialed)
         runtime.policy.checks.append(self._check_layers)
         self._policy = RouterPolicy(runtime.policy, settings.zenoh_ports)
         self._access: dict[int, object] = {}
@@ -112,6 +113,7 @@ class Zenoh:
         """The text for the log: the ports for nodes inside, and the ways to outside."""
         settings = self._settings
         outside = [f"peers {listed(map(str, settings.zenoh_peer))}"] if settings.zenoh_peer else []
+        outside += [f"hubs {listed(map(str, settings.zenoh_hub))}"] if settings.zenoh_hub else []
         if settings.zenoh_listen is not None:
             outside.append(f"port {settings.zenoh_listen} for outside")
         ports = f"rmw_zenoh nodes connect to ports {settings.zenoh_ports}"
@@ -193,7 +195,13 @@ class Zenoh:
             raise ValueError(NO_DIRECTORY)
 
     async def _look_at_links(self) -> None:
-        await asyncio.gather(*(self._look_at(link) for link in self.state.links))
+        room = asyncio.Semaphore(MOST_LOOKS)
+
+        async def look_at(link: Link) -> None:
+            async with room:
+                await self._look_at(link)
+
+        await asyncio.gather(*map(look_at, self.state.links))
 
     async def _look_at(self, link: Link) -> None:
         """Look up the addresses of a peer, and record why the link to the peer is down."""

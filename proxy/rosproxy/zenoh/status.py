@@ -17,7 +17,14 @@ from rosproxy.admin.status_document import (
 from rosproxy.settings import Settings
 from rosproxy.zenoh.links import Link, is_linked
 from rosproxy.zenoh.protocol.liveliness import ZenohNode, nodes_of, parse_token
-from rosproxy.zenoh.protocol.report import Ends, Report, RouterReport, RouterSession, ends_of
+from rosproxy.zenoh.protocol.report import (
+    Ends,
+    Report,
+    RouterReport,
+    RouterSession,
+    all_ends_of,
+    ends_of,
+)
 from rosproxy.zenoh.router_policy import InsideName
 
 MODES = ("client", "peer", "router")
@@ -45,15 +52,18 @@ class ZenohState(Collector):
         self._hub_routers: tuple[Ends, ...] = ()
         self._nodes: tuple[ZenohNode, ...] = ()
         self._left_out = 0
-        self.links = [Link(peer, now()) for peer in dict.fromkeys(settings.zenoh_peer)]
+        hubs = dict.fromkeys(settings.zenoh_hub, True)
+        peers = dict.fromkeys(settings.zenoh_peer, False)
+        self.links = [Link(peer, now(), is_hub) for peer, is_hub in (peers | hubs).items()]
 
     def take(self, report: Report) -> None:
         """Replace the sessions by those of a report, and also the nodes if the tokens changed."""
         self._sessions = tuple(self._sessions_of(report.routers))
         self._hub_routers = tuple(
             ends
-            for port, session, ends in self._sessions
+            for port, session, _ in self._sessions
             if port is None and session.whatami == "router"
+            for ends in all_ends_of(session)
         )
         if report.tokens is not None:
             entities = [parse_token(key) for key in report.tokens]
@@ -134,7 +144,13 @@ class ZenohState(Collector):
             "rosproxy_zenoh_link_up", "1 if the link to a router outside is up.", labels=["peer"]
         )
         for link in status.links:
-            links.add_metric([link.peer], float(link.up))
+            if not link.hub:
+                links.add_metric([link.peer], float(link.up))
+        hubs = GaugeMetricFamily(
+            "rosproxy_zenoh_hubs_up",
+            "Proxies on other hosts to which the hub is linked.",
+            sum(1 for link in status.links if link.hub and link.up),
+        )
         sessions = GaugeMetricFamily(
             "rosproxy_zenoh_sessions", "Sessions of the zenoh routers by mode.", labels=["mode"]
         )
@@ -147,7 +163,7 @@ class ZenohState(Collector):
         inside = sum(1 for node in status.nodes if node.address)
         nodes.add_metric(["inside"], inside)
         nodes.add_metric(["outside"], len(status.nodes) - inside)
-        yield from (links, sessions, nodes)
+        yield from (links, hubs, sessions, nodes)
 
     def _sessions_of(self, routers: Sequence[RouterReport]) -> Iterator[_PlacedSession]:
         """The sessions with programs other than the routers themselves."""
@@ -165,4 +181,5 @@ class ZenohState(Collector):
             up=link.fault is None,
             error=link.fault.value if link.fault else "",
             since=round(max(self._now() - link.since, 0.0), 1),
+            hub=link.is_hub,
         )

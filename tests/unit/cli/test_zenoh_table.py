@@ -51,3 +51,10 @@ NODE            DOMAIN  ADDRESS     PUB  SUB  SRV
 
 def test_the_routers() -> None:
     assert render(STATUS, 100) == SHOWN
+
+
+def test_proxies_on_other_hosts_stand_apart() -> None:
+    hub = ZenohLinkStatus("node2:7447", False, "unresolvable", 3.0, hub=True)
+    zenoh = ZenohStatus(ports="7448-7448", links=(hub,))
+    shown = render(ProxyStatus(settings=StatusSettings(ros=("zenoh",)), zenoh=zenoh), 200)
+    assert "links to outside: none; proxies on other hosts: node2:7447 DOWN (unresolvable)" in shown

@@ -56,6 +56,18 @@ def test_without_outside_and_without_nodes_the_doctor_says_what_to_set() -> None
     assert 'mode="client";connect/endpoints=["tcp/PROXY:7448"]' in told[1].fix
 
 
+def test_a_hub_that_is_away_is_a_note() -> None:
+    links = (
+        ZenohLinkStatus("a:7447", True, hub=True),
+        ZenohLinkStatus("b", error="refused", hub=True),
+    )
+    told = findings(ZenohStatus(links=links, sessions=GOOD.sessions))
+    assert [finding.severity for finding in told] == [Severity.OK, Severity.INFO, Severity.OK]
+    assert f"{told[1].subject}: {told[1].text}" == (
+        "zenoh hub b: not linked (refused). The hub tries again"
+    )
+
+
 def test_names_that_the_user_asks_for() -> None:
     told = texts(GOOD, "/chatter", "/cmd_vel", "/add", "/robot", "/nothing")[2:]
     assert told == [

@@ -56,6 +56,11 @@ def test_a_link_has_time_to_come_up() -> None:
     assert not [*faults(down(LinkFault.NOT_TRIED.value))]
 
 
+def test_a_hub_that_is_away_is_no_fault() -> None:
+    hub = replace(LINK, up=False, error="refused", hub=True)
+    assert not [*faults(replace(GOOD, links=(LINK, hub)))]
+
+
 def test_peers_of_two_containers_at_a_port_are_told() -> None:
     other = replace(SESSION, zid="cd", remote="172.18.0.4:50000")
     again = replace(SESSION, zid="ef", remote="172.18.0.3:50001")

@@ -29,6 +29,16 @@ def test_a_link_is_a_session_with_the_peer(
     assert not is_linked(PEER, (), [Ends(local, remote)], listen)
 
 
+def test_two_routers_that_dial_each_other_have_two_connections() -> None:
+    """Behind NAT, only the connection that the hub itself has opened shows the peer's address."""
+    ends = [
+        Ends(HostPort("10.244.0.2", 7447), HostPort("10.88.0.12", 50000)),
+        Ends(HostPort("10.244.0.2", 50001), HostPort("192.0.2.7", 7447)),
+    ]
+    assert is_linked(PEER, ADDRESSES, ends, 7447)
+    assert not is_linked(PEER, ADDRESSES, ends[:1], 7447)
+
+
 def test_a_link_knows_since_when_it_is_up_or_down() -> None:
     link = Link(PEER, 1.0)
     assert link.note(LinkFault.REFUSED, 2.0)

@@ -113,6 +113,30 @@ def test_a_link_is_up_while_the_routers_run() -> None:
     assert (status.sessions, status.nodes, status.left_out) == ((), (), 0)
 
 
+def test_hubs_are_links_that_may_be_away() -> None:
+    hubs = ("192.0.2.7", "hub:7448")  # the first is a router outside as well
+    options = {"ros": ("zenoh",), "zenoh_peer": ("192.0.2.7", "robot"), "zenoh_hub": hubs}
+    state = ZenohState(parse_settings(options), FakeProcess(), lambda: 10.0)
+    told = [(link.peer, link.hub) for link in state.status().links]
+    assert told == [("192.0.2.7:7447", True), ("robot:7447", False), ("hub:7448", True)]
+    registry = CollectorRegistry()
+    registry.register(state)
+    lines = generate_latest(registry).decode().splitlines()
+    assert [line for line in lines if line.startswith("rosproxy_zenoh_link_up{")] == [
+        'rosproxy_zenoh_link_up{peer="robot:7447"} 0.0'
+    ]
+    assert "rosproxy_zenoh_hubs_up 0.0" in lines
+
+
+def test_every_connection_of_a_session_counts() -> None:
+    state = make_state(FakeProcess())
+    first = SessionConnection("tcp/172.18.0.2:7447", "tcp/10.0.0.9:50003")
+    second = SessionConnection("tcp/172.18.0.2:50004", "tcp/192.0.2.8:7447")
+    hub = RouterSession("04", "router", (first, second))
+    state.take(Report((*REPORT.routers[:2], RouterReport("03", (hub,)))))
+    assert [state.is_up(link) for link in state.links] == [False, True]
+
+
 def test_metrics() -> None:
     registry = CollectorRegistry()
     registry.register(make_state(FakeProcess()))

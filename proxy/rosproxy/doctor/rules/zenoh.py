@@ -8,6 +8,7 @@ from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.fixes import how_to
 from rosproxy.telemetry.text import listed, plural
 from rosproxy.zenoh.findings import ROUTERS, faults
+from rosproxy.zenoh.links import LinkFault
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
@@ -32,8 +33,12 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 def _outside(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
     for link in zenoh.links:
+        kind = "hub" if link.hub else "peer"
         if link.up:
-            yield ok("link", f"zenoh peer {link.peer}", "linked")
+            yield ok("link", f"zenoh {kind} {link.peer}", "linked")
+        elif link.hub and link.error != LinkFault.NOT_TRIED.value:
+            text = f"not linked ({link.error}). The hub tries again"
+            yield note("link", f"zenoh hub {link.peer}", text, how_to("zenoh hub"))
     if not zenoh.links and zenoh.listen is None:
         text = "no router outside is set, and the proxy listens for none. Nodes in containers "
         text += "reach only each other"

@@ -4,6 +4,7 @@ A router describes itself in zenoh's admin space at ``@/ZID/router``. A report h
 this description. The router process bounds a report, and the proxy bounds the line.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import msgspec
@@ -70,12 +71,16 @@ def read_report(line: bytes) -> Report:
 
 def ends_of(session: RouterSession) -> Ends | None:
     """The two ends of a session's first connection by TCP, TLS or QUIC; None if there is none."""
+    return next(all_ends_of(session), None)
+
+
+def all_ends_of(session: RouterSession) -> Iterator[Ends]:
+    """The two ends of each connection by TCP, TLS or QUIC; two if both routers have dialed."""
     for link in session.links:
         local = _end(link.src)
         remote = _end(link.dst)
         if local and remote:
-            return Ends(local, remote)
-    return None
+            yield Ends(local, remote)
 
 
 def _end(locator: str) -> HostPort | None:
