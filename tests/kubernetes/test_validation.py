@@ -53,10 +53,14 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "mode": ({"master": GOOD, "policy": {"mode": "Tell"}}, "mode"),
     "publish": ({"master": {**GOOD, "publish": 11302}}, "publish"),
-    "ROS 3": ({"ros": 3}, 'ros is 1, 2 or "1,2"'),
+    "ROS 3": ({"ros": 3}, 'ros is 1, 2 or "1,2", or zenoh'),
     "ROS 2 with a master": ({"ros": 2, "master": GOOD}, "ROS 2 has none"),
     "both versions without a master": ({"ros": "1,2"}, "ROS 1 needs a master"),
     "ROS 1 with a domain": ({"master": GOOD, "domain": 3}, "are for ROS 2"),
+    "rmw_zenoh and others": ({"ros": "1,2,zenoh", "master": GOOD}, "in pods of their own"),
+    "rmw_zenoh with a master": ({"ros": "zenoh", "master": GOOD}, "ROS 2 has none"),
+    "rmw_zenoh with ports": ({"ros": "zenoh", "ports": 64}, "has no ports on the node"),
+    "rmw_zenoh with a domain": ({"ros": "zenoh", "domain": 1}, "takes peers alone"),
     "no domain": ({"ros": 2, "domain": 233}, "domain"),
     "no peer": ({"ros": 2, "peers": ["a b"]}, "peers[0]"),
     "few ports for ROS 2": ({"ros": 2, "ports": 4, "multicast": True}, "too low for ROS 2"),
@@ -92,7 +96,8 @@ def test_rules_of_a_policy_are_taken(net: Namespace) -> None:
 @pytest.mark.parametrize(
     "spec",
     [{"ros": 2}, {"ros": "2", "domain": 0, "peers": ["robot", "192.0.2.9:11400"]},
-     {"ros": "1,2", "master": GOOD, "multicast": True}, {"ros": 1, "master": GOOD}],
+     {"ros": "1,2", "master": GOOD, "multicast": True}, {"ros": 1, "master": GOOD},
+     {"ros": "zenoh"}, {"ros": "zenoh", "peers": ["robot:7447"], "podEgress": "Proxy"}],
 )  # fmt: skip
 def test_versions_of_ros_are_taken(spec: dict[str, Any], net: Namespace) -> None:
     stored = rosproxy(net.name, **spec).body["spec"]

@@ -8,8 +8,8 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from rosproxy.net.addresses import HostPort, parse_host_port
-from rosproxy.setting_kinds import ZENOH_PORT
+from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
+from rosproxy.setting_kinds import ZENOH_PORT, read_zenoh_peer
 
 OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
 SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"
@@ -24,6 +24,14 @@ class Endpoint(NamedTuple):
 
     protocol: str
     address: HostPort
+
+
+def read_router_name(text: str) -> str:
+    """Parse and return a router: ``host:port``, in lower case. Raises ValueError."""
+    router = read_zenoh_peer(text.lower())
+    if is_loopback(router.host):
+        raise ValueError("a loopback address, which means the proxy itself")
+    return str(router)
 
 
 def connect_endpoints(override: str) -> list[Endpoint]:

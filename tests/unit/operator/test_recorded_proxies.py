@@ -127,6 +127,7 @@ KUBERNETES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
             "policy": {"rules": RULES},
         },
     ),
+    "zenoh": ({"policy": POLICY}, {"ros": "zenoh", "peers": ["robot"]}),
     # The fingerprint has the former range for outgoing connections: `manifests._FORMER_LOCAL_PORTS`
     "high ports": (
         {"ephemeral": PortRange(61000, 65535)},

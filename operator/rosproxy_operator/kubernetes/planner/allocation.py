@@ -41,6 +41,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPlace,
     RosProxySpec,
 )
+from rosproxy_operator.kubernetes.resources.names import ROUTERS
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status.findings import finding
 
@@ -62,11 +63,16 @@ class ClusterRanges(msgspec.Struct, frozen=True):
 def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> ClusterRanges:
     """Return a range for each wanted proxy: the present or former range, else the first free range.
 
+    All proxies for rmw_zenoh have the same range, which is not published.
+
     A proxy keeps the ports that it has, unless the RosProxy or the settings now forbid these ports.
     """
     ranges = ClusterRanges()
     kernel = {"NodePorts": settings.node_ports, "the nodes' ephemeral ports": settings.ephemeral}
-    places = group_by_key((place.node, place) for place in view.wanted)
+    for place in view.wanted:
+        if view.rosproxies[place.of].spec.zenoh:  # no hostPort, so no conflict
+            ranges.given[place] = ROUTERS
+    places = group_by_key((p.node, p) for p in view.wanted if p not in ranges.given)
     refused = group_by_key(state.taken)
     for node, wanted in sorted(places.items()):
         _Node(view, state, kernel, node, {*refused.get(node, ())}, ranges).allocate(wanted)
@@ -132,7 +138,8 @@ class _Node(msgspec.Struct):
         ranges = [PortRange(r.first, min(r.last, r.first + most)) for r in self._past(place)]
         allowed = [r for r in ranges if within(r, spec.window) and is_free(r, reserved, kernel)]
         current = self.view.current.get(place)
-        is_held = current is not None and has_ports(current) and allowed[:1] == ranges[:1]
+        keeps_first = bool(allowed) and allowed[0] == ranges[0]
+        is_held = current is not None and has_ports(current) and keeps_first
         taken = set[int]() if is_held else self._taken(place)
         # If possible, a new range is not the former range of another RosProxy on this node.
         others = (r.former_ranges.get(self.node) for r in self.view.rosproxies.values())
@@ -147,16 +154,19 @@ class _Node(msgspec.Struct):
         )
 
     def _past(self, place: ProxyPlace) -> Iterator[PortRange]:
-        """Yield the present and former ranges of a proxy, first the range of the present pod."""
+        """Yield the present and former ranges of a proxy, first the range of the present pod.
+
+        The ports of a former proxy for rmw_zenoh are no range of the node.
+        """
         current = self.view.current.get(place)
         proxies = [p for p in self.proxies if place_of(p) == place]
-        yield from (p.range for p in sorted(proxies, key=lambda p: p is not current))
-        remembered = (
+        known = (
+            *(p.range for p in sorted(proxies, key=lambda p: p is not current)),
             self.state.given.get(place),
             self.state.served.get(place),
             self.view.rosproxies[place.of].former_ranges.get(self.node),
         )
-        yield from filter(None, remembered)
+        yield from (r for r in known if r is not None and r != ROUTERS)
 
     def _taken(self, place: ProxyPlace) -> set[int]:
         """Return the ports that a proxy can't get back.

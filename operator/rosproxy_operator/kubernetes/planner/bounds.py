@@ -20,6 +20,7 @@ from msgspec.structs import replace
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.setting_kinds import read_peer
+from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.port_ranges import within
 from rosproxy_operator.kubernetes.resources.checks import quoted
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
@@ -29,6 +30,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Ros2Spec,
     RosProxy,
     RosProxySpec,
+    ZenohSpec,
 )
 from rosproxy_operator.kubernetes.resources.names import ALLOW_FROM
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
@@ -96,13 +98,7 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
                 field = "spec.master.uri" if spec.master.uri else "spec.master.service"
                 fix = f"Choose a master that fits {_any_of(bounds.masters)}"
                 yield _refusal(field, uri, fix, "allow.masters")
-    if spec.ros2:
-        yield from _ros2_violations(spec.ros2, bounds)
-    yield from _port_violations(spec, bounds)
-    if spec.proxy.data_plane not in bounds.data_planes:
-        choices = " or ".join(p.capitalize() for p in bounds.data_planes)
-        value = spec.proxy.data_plane.capitalize()
-        yield _refusal("spec.dataPlane", value, f"Choose {choices}", "allow.dataPlanes")
+    yield from _violations_of_versions(spec, settings)
     if spec.pod_egress == "proxy" and not settings.network_policy:
         yield _refusal("spec.podEgress", "Proxy", "Choose Any", "proxy.networkPolicy.enabled")
     patterns = (settings.image, *bounds.images)
@@ -111,16 +107,51 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
         yield _refusal("spec.image", spec.image, f"Remove the field{choice}", "allow.images")
 
 
+def _violations_of_versions(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
+    """Yield the violations in the fields for DDS, for rmw_zenoh, and for all but rmw_zenoh."""
+    if spec.ros2:
+        yield from _ros2_violations(spec.ros2, settings.bounds)
+    if spec.zenoh:  # has neither hostPorts nor a data plane
+        yield from _zenoh_violations(spec.zenoh, settings)
+        return
+    yield from _port_violations(spec, settings.bounds)
+    yield from _data_plane_violations(spec, settings.bounds)
+
+
 def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
     """Yield the violations in the peers and multicast of ROS 2."""
-    for peer in spec.peers if bounds.peers else ():
+    yield from _peer_violations(spec.peers, bounds)
+    if spec.multicast and not bounds.multicast:
+        fix = "Remove the field, and name the hosts outside in spec.peers"
+        yield _refusal("spec.multicast", True, fix, "allow.multicast")
+
+
+def _zenoh_violations(spec: ZenohSpec, settings: ClusterSettings) -> Iterator[str]:
+    """Yield the violations in the peers, and rules of the administrator that zenoh can't hold."""
+    yield from _peer_violations(spec.peers, settings.bounds)
+    try:
+        check_layers(settings.policy)
+    except ValueError as error:
+        yield (
+            f"spec.ros: rmw_zenoh can't hold the operator's policy: {error}. Ask the operator's "
+            "administrator to change the rules (chart value policy.rules)"
+        )
+
+
+def _peer_violations(peers: Iterable[str], bounds: Bounds) -> Iterator[str]:
+    """Yield the violations in ``spec.peers``."""
+    for peer in peers if bounds.peers else ():
         uri = slave_uri(HostPort(read_peer(peer).host, 1))
         if not is_allowed_master(uri, tuple(f"http://{p}:1" for p in bounds.peers)):
             fix = f"Choose a peer that fits {_any_of(bounds.peers)}"
             yield _refusal("spec.peers", peer, fix, "allow.peers")
-    if spec.multicast and not bounds.multicast:
-        fix = "Remove the field, and name the hosts outside in spec.peers"
-        yield _refusal("spec.multicast", True, fix, "allow.multicast")
+
+
+def _data_plane_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
+    if spec.proxy.data_plane not in bounds.data_planes:
+        choices = " or ".join(p.capitalize() for p in bounds.data_planes)
+        value = spec.proxy.data_plane.capitalize()
+        yield _refusal("spec.dataPlane", value, f"Choose {choices}", "allow.dataPlanes")
 
 
 def _port_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:

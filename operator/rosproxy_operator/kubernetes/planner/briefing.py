@@ -24,9 +24,9 @@ class Briefing(msgspec.Struct, frozen=True):
 
     ``policy`` has all layers. ``callers`` has the IP addresses of the pods that may use the proxy.
     Both are None if the RosProxy is gone, is being deleted or can't be read: the proxy then keeps
-    the policy and callers that it has. ``peers`` has the ROS 2 peers, None without ROS 2.
-    ``former_ports`` has the ports of ROS 2 participants at the former proxy. ``gone`` has IP
-    addresses that no pod has any more.
+    the policy and callers that it has. A proxy for rmw_zenoh knows no callers. ``peers`` has the
+    ROS 2 peers, None without ROS 2. ``former_ports`` has the ports of ROS 2 participants at the
+    former proxy. ``gone`` has IP addresses that no pod has any more.
     """
 
     policy: tuple[PolicyLayer, ...] | None = None
@@ -57,6 +57,7 @@ def briefings(
         policy = callers = None
         if rosproxy := rosproxies.get(proxy.owner):
             policy = policy_of(rosproxy, settings)
+        if rosproxy and rosproxy.spec.zenoh is None:
             nearby = pods.get((rosproxy.id.namespace, proxy.node), ())
             ips = {ip for p in nearby if selects(rosproxy, p) for ip in (p.ip, *p.ips) if ip}
             callers = tuple(sorted(ips))

@@ -20,6 +20,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Name,
     RosProxy,
     RosProxySpec,
+    ZenohSpec,
 )
 from rosproxy_operator.kubernetes.resources.names import (
     ADMIN_PORT,
@@ -27,11 +28,14 @@ from rosproxy_operator.kubernetes.resources.names import (
     API_VERSION,
     CONTAINER,
     FINGERPRINT,
+    HUB_PORT,
     KIND,
     MASTER_PORT,
     NODE,
     PORT_RANGE,
     PROXY,
+    ROUTERS,
+    hubs_service_id,
     own_labels,
     proxy_id,
     service_id,
@@ -77,7 +81,7 @@ class ProxySite(msgspec.Struct, frozen=True):
     a Service. If ``address`` is empty, the proxy resolves the host name. If ``publish`` is 0, the
     proxy does not publish the master. ``peers`` has the ROS 2 peers: the peers that the RosProxy
     names, and the proxies on other nodes. ``relay_secret`` is the shared secret of the proxy and
-    the LAN relay.
+    the LAN relay. ``hubs`` has the proxies for rmw_zenoh on other nodes.
     """
 
     rosproxy: RosProxy
@@ -88,6 +92,7 @@ class ProxySite(msgspec.Struct, frozen=True):
     token_hash: str = ""
     peers: tuple[str, ...] = ()
     relay_secret: str = ""
+    hubs: tuple[str, ...] = ()
 
     @property
     def own_ports(self) -> PortRange:
@@ -138,8 +143,9 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
         ADVERTISE_HOST: site.advertise_host,
     }
     meta = pod_metadata(rosproxy, proxy_id(rosproxy.id, site.node.name), annotations, settings)
-    # The operator also sends new peers to a running proxy. Peers come and go with the nodes.
-    live = {*LIVE_VARIABLES, variable("ros2_peer")}
+    # Peers and hubs come and go with the nodes. The operator sends new peers to a running proxy. A
+    # running hub needs no names of new hubs, because new hubs dial this hub.
+    live = {*LIVE_VARIABLES, *map(variable, ("ros2_peer", "zenoh_hub"))}
     env = [v for v in container["env"] if v["name"] not in live]
     # The digest has the ports of former operators, so a correction recreates no running proxy.
     former_ports = _container_ports(site, site.ports)
@@ -160,7 +166,7 @@ def proxy_fingerprint(site: ProxySite, settings: ClusterSettings) -> str:
     """The fingerprint of a proxy's pod, from a cache while the inputs are the same.
 
     Without the cache, the fingerprints of a thousand proxies would take half the time of a look.
-    The peers are no input.
+    The peers and hubs are no input.
     """
     rosproxy = site.rosproxy
     inputs = (rosproxy.uid, rosproxy.spec, site.node, site.advertise_host, site.ports, site.master)
@@ -198,14 +204,37 @@ def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
     return body
 
 
+def hubs_service(rosproxy: RosProxy) -> Json:
+    """The headless Service by which the hubs of a RosProxy for rmw_zenoh find each other.
+
+    DNS then has a name for each pod with a host name and with this Service as its subdomain.
+    """
+    annotations: dict[str, str] = {}
+    meta = metadata(rosproxy, hubs_service_id(rosproxy.id), annotations)
+    spec: dict[str, Any] = {
+        "type": "ClusterIP",
+        "clusterIP": "None",
+        "selector": meta["labels"],
+        # Hubs link before their proxies are ready.
+        "publishNotReadyAddresses": True,
+        "ports": [_service_port("hub", HUB_PORT)],
+    }
+    body = {"apiVersion": "v1", "kind": "Service", "metadata": meta, "spec": spec}
+    annotations[FINGERPRINT] = digest(body)
+    return body
+
+
 def _service_ports(rosproxy: RosProxy) -> Iterator[Json]:
-    listening = []
     if rosproxy.spec.ros1:
-        listening.append(("master", MASTER_PORT, "TCP"))
+        yield _service_port("master", MASTER_PORT)
     if rosproxy.spec.ros2:
-        listening.append(("discovery", discovery_port(rosproxy.spec.ros2.number), "UDP"))
-    for name, port, protocol in listening:
-        yield {"name": name, "port": port, "targetPort": port, "protocol": protocol}
+        yield _service_port("discovery", discovery_port(rosproxy.spec.ros2.number), "UDP")
+    if rosproxy.spec.zenoh:
+        yield _service_port("router", ROUTERS.first)
+
+
+def _service_port(name: str, port: int, protocol: str = "TCP") -> Json:
+    return {"name": name, "port": port, "targetPort": port, "protocol": protocol}
 
 
 def keeps_registrations(old: str, new: str) -> bool:
@@ -307,12 +336,15 @@ def _spec(site: ProxySite, settings: ClusterSettings, local_ports: PortRange) ->
     # A safe sysctl, which every kubelet allows: k8s.io/kubernetes,
     # pkg/kubelet/sysctl/safe_sysctls.go.
     value = f"{local_ports.first} {local_ports.last}"
+    id = proxy_id(site.rosproxy.id, site.node.name)
+    hub = {"hostname": id.name, "subdomain": hubs_service_id(site.rosproxy.id).name}
     sysctls = [{"name": "net.ipv4.ip_local_port_range", "value": value}]
     return {
         **bound_to(site.node.name, spec, settings),
         "terminationGracePeriodSeconds": TERMINATION_GRACE_S,
         "securityContext": {**pod_security_context(settings), "sysctls": sysctls},
         **({"hostAliases": aliases} if aliases else {}),
+        **(hub if spec.zenoh else {}),
     }
 
 
@@ -416,8 +448,20 @@ def _container_ports(site: ProxySite, tcp_ports: PortRange) -> list[Json]:
 
 def _settings_fields(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:
     """The settings of a proxy, by field of `Settings`, in the order of the variables."""
-    spec = site.rosproxy.spec
+    zenoh = site.rosproxy.spec.zenoh
     policy = policy_of(site.rosproxy, settings)
+    return {
+        **(_zenoh_settings_fields(site, zenoh) if zenoh else _ros_settings_fields(site, settings)),
+        **msgspec.structs.asdict(settings.proxy_bounds),
+        # Without a policy the proxy does not wait, because a wait costs a second at each restart.
+        "await_policy": POLICY_WAIT_S if policy else None,
+        "policy_layers": as_variable(policy),
+    }
+
+
+def _ros_settings_fields(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:
+    """The settings of a proxy of ROS 1 or DDS, without those that all proxies have."""
+    spec = site.rosproxy.spec
     return {
         "master_uri": site.master.uri,
         "master_address": site.master.address,
@@ -442,10 +486,19 @@ def _settings_fields(site: ProxySite, settings: ClusterSettings) -> Mapping[str,
         "ros2_peer": site.peers,
         "ros2_lan_relay": site.lan_relay,
         "ros2_lan_relay_secret": site.relay_secret if site.lan_relay else None,
-        **msgspec.structs.asdict(settings.proxy_bounds),
-        # Without a policy the proxy does not wait, because a wait costs a second at each restart.
-        "await_policy": POLICY_WAIT_S if policy else None,
-        "policy_layers": as_variable(policy),
+    }
+
+
+def _zenoh_settings_fields(site: ProxySite, spec: ZenohSpec) -> Mapping[str, Any]:
+    """The settings of a proxy of rmw_zenoh, without those that all proxies have."""
+    return {
+        "admin": HostPort("0.0.0.0", ADMIN_PORT),
+        "admin_token_hash": site.token_hash,
+        "ros": ("zenoh",),
+        "zenoh_ports": ROUTERS,
+        "zenoh_peer": spec.peers,
+        "zenoh_hub": site.hubs,
+        "zenoh_listen": HUB_PORT,
     }
 
 

@@ -8,13 +8,16 @@ the part like a whole cluster. `merge_state` puts the new state of the part into
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, HelperPod
+from rosproxy_operator.kubernetes.resources.model import Name
+
+T = TypeVar("T")
 
 
 class Partition(msgspec.Struct, frozen=True):
@@ -55,7 +58,7 @@ def partitions(observed: ClusterSnapshot) -> Iterator[Partition]:
     pending = {r.id.namespace for r in observed.rosproxies}
     pending |= {name.namespace for name in observed.unusable}
     pending |= {namespace for namespace, _ in _uses(observed)}
-    pending |= {name.namespace for name in (*observed.services, *observed.policies)}
+    pending |= {name.namespace for name in _own_objects(observed)}
     pods = (*observed.unselected_pods, *observed.misspelt_pods)
     pending |= {pod.id.namespace for pod in pods}
     while pending:
@@ -96,9 +99,19 @@ def partition_snapshot(observed: ClusterSnapshot, partition: Partition) -> Clust
         proxies=tuple(p for p in observed.proxies if p.of.namespace in namespaces),
         lan_relays=_within(observed.lan_relays, namespaces),
         image_checks=_within(observed.image_checks, namespaces),
-        services={id: s for id, s in observed.services.items() if id.namespace in namespaces},
-        policies={id: p for id, p in observed.policies.items() if id.namespace in namespaces},
+        services=_named_within(observed.services, namespaces),
+        hub_services=_named_within(observed.hub_services, namespaces),
+        policies=_named_within(observed.policies, namespaces),
     )
+
+
+def _own_objects(observed: ClusterSnapshot) -> Iterator[Name]:
+    """Yield the names of RosProxies that have Services, and of NetworkPolicies."""
+    yield from (*observed.services, *observed.hub_services, *observed.policies)
+
+
+def _named_within(objects: Mapping[Name, T], namespaces: frozenset[str]) -> dict[Name, T]:
+    return {id: obj for id, obj in objects.items() if id.namespace in namespaces}
 
 
 def _within(helpers: tuple[HelperPod, ...], namespaces: frozenset[str]) -> tuple[HelperPod, ...]:

@@ -53,6 +53,7 @@ from rosproxy_operator.kubernetes.planner.steps.network_policy import (
     reconcile_policies,
 )
 from rosproxy_operator.kubernetes.planner.steps.reconcile import (
+    reconcile_hubs_service,
     reconcile_orphans,
     reconcile_proxies,
     reconcile_service,
@@ -75,6 +76,7 @@ from rosproxy_operator.kubernetes.status.rosproxy_status import status_of, statu
 
 _STEPS = (
     reconcile_service,
+    reconcile_hubs_service,
     reconcile_policies,
     reconcile_proxies,
     reconcile_lan_relays,

@@ -32,6 +32,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPlace,
     RosProxySpec,
 )
+from rosproxy_operator.kubernetes.resources.names import ROUTERS
 from rosproxy_operator.kubernetes.status.findings import finding
 
 TRIED_RANGE_REPORTED_S = 60.0
@@ -124,8 +125,9 @@ def moves(
     """Yield a finding for each proxy that recently had to leave its ports."""
     for moved, has_served in ((state.moved, True), (state.tried, False)):
         for place, move in sorted(moved.items()):
-            if place in ranges and is_moved(move.ports, ranges[place]):
-                rosproxy = view.rosproxies[place.of]
+            rosproxy = view.rosproxies[place.of]
+            is_published = not rosproxy.spec.zenoh and move.ports != ROUTERS
+            if place in ranges and is_published and is_moved(move.ports, ranges[place]):
                 why = "the old ports are not free. Nothing needs to be done"
                 if has_served:
                     lost = advice_after_move(rosproxy.spec.ros1, rosproxy.spec.ros2 is not None)

@@ -16,6 +16,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPlace,
     RosProxy,
 )
+from rosproxy_operator.kubernetes.resources.names import ROUTERS, hubs_service_id, service_id
 
 
 class PodFailure(Enum):
@@ -61,6 +62,11 @@ class ProxyPod(OwnPod, frozen=True, kw_only=True):
     restarts: int = 0
     runs: bool = False
 
+    @property
+    def has_registrations(self) -> bool:
+        """Whether nodes of the proxy are known outside by ports. With rmw_zenoh they are not."""
+        return self.range != ROUTERS
+
 
 class HelperPod(OwnPod, frozen=True, kw_only=True):
     """A LAN relay or an image check: ``component`` is LAN_RELAY or IMAGE_CHECK (`names`)."""
@@ -69,7 +75,10 @@ class HelperPod(OwnPod, frozen=True, kw_only=True):
 
 
 class ProxyService(msgspec.Struct, frozen=True):
-    """The Service of a RosProxy. At its address, each pod reaches the proxy on its own node."""
+    """A Service of a RosProxy. At its address, each pod reaches the proxy on its own node.
+
+    ``names_hubs``: the Service is headless, and gives the proxies for rmw_zenoh their names.
+    """
 
     of: Name
     owner: str
@@ -77,6 +86,12 @@ class ProxyService(msgspec.Struct, frozen=True):
     cluster_ip: str
     fingerprint: str
     deleting: bool = False
+    names_hubs: bool = False
+
+    @property
+    def id(self) -> Name:
+        """The namespace and name of the Service."""
+        return hubs_service_id(self.of) if self.names_hubs else service_id(self.of)
 
 
 class MasterService(msgspec.Struct, frozen=True):
@@ -191,7 +206,8 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     - ``pods``: all pods that a RosProxy selects, and all pods of the operator. On the nodes of
       these pods, also all pods with hostPorts, and all pods of some namespaces: the namespaces with
       a RosProxy or with a pod of the operator.
-    - ``services``: the Services of RosProxies, by RosProxy.
+    - ``services``: the Services of RosProxies, by RosProxy. ``hub_services``: the Services that
+      name the proxies for rmw_zenoh.
     - ``masters``: for each Service that a RosProxy names as its master, the address and the
       problem. Either the address or the problem is empty.
     - ``consents``: for each such Service, other namespaces whose RosProxies may name the Service.
@@ -222,6 +238,7 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     lan_relays: tuple[HelperPod, ...] = ()
     image_checks: tuple[HelperPod, ...] = ()
     services: Mapping[Name, ProxyService] = {}
+    hub_services: Mapping[Name, ProxyService] = {}
     masters: Mapping[Name, tuple[str, str]] = {}
     consents: Mapping[Name, frozenset[str]] = {}
     selected: frozenset[str] = frozenset()

@@ -78,6 +78,12 @@ class Ros2Spec(msgspec.Struct, frozen=True):
         return self.domain or 0
 
 
+class ZenohSpec(msgspec.Struct, frozen=True):
+    """The fields of a RosProxy for rmw_zenoh. ``peers`` are routers outside, as ``host:port``."""
+
+    peers: tuple[str, ...] = ()
+
+
 class Advertise(Enum):
     """Type of the node's address that is the advertised host (``status.addresses[].type``)."""
 
@@ -110,7 +116,9 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     means the administrator's default (`pod_defaults`).
 
     ``ros1``: the proxies are for ROS 1. Without ``ros1``, ``master`` has no meaning. ``ros2`` None:
-    the proxies are not for ROS 2.
+    the proxies are not for DDS. ``zenoh``: the proxies are for rmw_zenoh, and for nothing else.
+    Such proxies have no ports of the node, so ``ports``, ``window`` and ``advertise`` have no
+    meaning.
     """
 
     master: MasterSpec
@@ -133,6 +141,7 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     host_aliases: tuple[Json, ...] = ()
     ros1: bool = True
     ros2: Ros2Spec | None = None
+    zenoh: ZenohSpec | None = None
 
     @property
     def multicast(self) -> bool:

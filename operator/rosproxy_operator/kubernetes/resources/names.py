@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from functools import lru_cache
 
+from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.ros2 import relay_secret
 from rosproxy_operator.kubernetes.resources.model import Name
 
@@ -59,12 +60,18 @@ OWN_SELECTOR = ",".join(
 
 MASTER_PORT = 11311
 ADMIN_PORT = 11312
+HUB_PORT = 7447
+"""At this port of a proxy for rmw_zenoh, the proxies of other nodes reach the hub."""
+ROUTERS = PortRange(7448, 7448)
+"""The port of a proxy for rmw_zenoh at which pods reach a router. This is the range of such a
+proxy, and no hostPort."""
 CONTAINER = "proxy"
 """Name of the container in a proxy's pod."""
 TOKEN_VARIABLE = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
 """Variable in which former operators wrote the token itself."""
 
 _PREFIX = "rosproxy-"
+_HUBS_PREFIX = "hubs-of-rosproxy-"
 _HASH_DIGITS = 6
 """Hex digits of the hash in a pod's name."""
 _MOST_HOST_NAME_CHARACTERS = 63
@@ -123,6 +130,23 @@ def image_check_id(rosproxy: Name, node: str) -> Name:
     """Return the namespace and name of the image check for a RosProxy's proxy on a node."""
     proxy = proxy_id(rosproxy, node)
     return Name(proxy.namespace, f"{proxy.name}-{IMAGE_CHECK}")
+
+
+def hubs_service_id(rosproxy: Name) -> Name:
+    """Return the namespace and name of the headless Service that names the hubs of a RosProxy.
+
+    A name of `service_id` begins with ``rosproxy-``, so this name differs from all of them.
+    """
+    return Name(rosproxy.namespace, f"{_HUBS_PREFIX}{rosproxy.name}")
+
+
+def hub_host(rosproxy: Name, node: str) -> str:
+    """Return the name by which the hubs of other nodes reach the hub on a node.
+
+    The name stays the same when the proxy's pod is recreated with another address.
+    """
+    hubs = hubs_service_id(rosproxy)
+    return f"{proxy_id(rosproxy, node).name}.{hubs.name}.{hubs.namespace}.svc"
 
 
 def policy_id(rosproxy: Name) -> Name:

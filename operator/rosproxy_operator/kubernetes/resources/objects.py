@@ -178,7 +178,8 @@ def service(obj: Json) -> ProxyService | None:
     labels = texts_at(meta, "labels")
     owner = _owner(meta)
     rosproxy = Name(text_at(meta, "namespace"), labels.get(names.PROXY_OF, ""))
-    if not names.is_own(labels) or not owner or names.service_id(rosproxy) != name_of(meta):
+    own_ids = (names.service_id(rosproxy), names.hubs_service_id(rosproxy))
+    if not names.is_own(labels) or not owner or name_of(meta) not in own_ids:
         return None
     return ProxyService(
         of=rosproxy,
@@ -187,6 +188,7 @@ def service(obj: Json) -> ProxyService | None:
         cluster_ip="" if address == "None" else address,
         fingerprint=text_at(submap(meta, "annotations"), names.FINGERPRINT),
         deleting=is_deleted(meta),
+        names_hubs=name_of(meta) == names.hubs_service_id(rosproxy),
     )
 
 

@@ -14,11 +14,19 @@ from urllib.parse import urlsplit
 from rosproxy.access.layers import PolicyLayer, PolicyMode
 from rosproxy.access.rules import Rule, RuleAction, RuleKind
 from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
+from rosproxy.net.addresses import (
+    HostPort,
+    is_address,
+    is_loopback,
+    parse_address,
+    parse_host_port,
+)
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.settings import LEAST_PORTS_PER_DOMAIN
+from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.policy import excess_reason
 from rosproxy_operator.common.ros2 import LAST_DOMAIN, LEAST_PORTS, MOST_PEERS, read_peer_name
+from rosproxy_operator.common.zenoh import read_router_name
 from rosproxy_operator.kubernetes.resources.checks import (
     int_at,
     is_label,
@@ -45,16 +53,31 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
     RosProxySpec,
     Selector,
+    ZenohSpec,
 )
 from rosproxy_operator.kubernetes.resources.names import MASTER_PORT, REMAKE, service_id
 from rosproxy_operator.kubernetes.resources.objects import is_deleted, name_of
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, words
 
+OWN_PORTS = 32
+"""The default of ``spec.ports``."""
 MOST_PORTS = 500
 MOST_NAME_CHARACTERS = 46
 """Characters of a RosProxy's name. With more, a proxy's name would not fit in a host name."""
-_FIELDS_BY_VERSION = {"1": ("master", WISHES["udp"].field), "2": ("domain", "peers", "multicast")}
+_FIELDS_BY_VERSION = {"1": ("master", WISHES["udp"].field), "2": ("domain", "multicast")}
 """The fields that belong to a single ROS version."""
+_ALL_VERSIONS = ("1", "2", "1,2", "zenoh")
+_NOT_OF_ZENOH = {
+    "ports": "ports",
+    "portWindow": "window",
+    "advertise": "advertise",
+    "cleanupAfterSeconds": "cleanup_after",
+}
+"""Fields that proxies for rmw_zenoh do not have, each with the field of `RosProxySpec`. The API
+server fills in the defaults, so a default does not count as given."""
+_WINDOW = PortRange(11412, 29999)
+# The window lies above the ports of roscore (11311) and rosserial (11411), and below the NodePorts
+# (from 30000).
 _POLICY_MODE = {"Enforce": PolicyMode.ENFORCE, "Audit": PolicyMode.AUDIT}
 _ACTION = {"Allow": RuleAction.ALLOW, "Deny": RuleAction.DENY}
 RULE_KINDS = {
@@ -100,7 +123,9 @@ def rosproxy(obj: Json) -> RosProxy:
     status = submap(obj, "status")
     id = name_of(meta)
     service = parse_slave_uri(text_at(status, "masterURI"))
-    address = service.host if service else text_at(status, "staticPeers")
+    router = parse_host_port(text_at(status, "routerEndpoint").removeprefix("tcp/"))
+    named = service or router
+    address = named.host if named else text_at(status, "staticPeers")
     if not is_label(id.name) or len(id.name) > MOST_NAME_CHARACTERS:
         fix = f"Use at most {MOST_NAME_CHARACTERS} characters a-z, 0-9 and -"
         raise Field("metadata.name", id.name).error("can't be the name of a RosProxy", fix)
@@ -129,21 +154,18 @@ def invalid(obj: Json, error: InvalidField) -> InvalidRosProxy:
 
 
 def _spec(field: Field, of: Name) -> RosProxySpec:
-    ports = field["ports"].number(32, 1, MOST_PORTS)
+    ports = field["ports"].number(OWN_PORTS, 1, MOST_PORTS)
     for_ros = _versions(field["ros"])
-    for ros, names in _FIELDS_BY_VERSION.items():
-        for name in names if ros not in for_ros else ():
-            if field[name].value not in (None, [], False):
-                fix = "Remove the field" + (", or set spec.ros: 2" if ros == "2" else "")
-                raise field[name].error(f"is for ROS {ros}, but spec.ros is {for_ros[0]}", fix)
+    _check_versions(field, for_ros)
     ros2 = _ros2_spec(field) if "2" in for_ros else None
     least = LEAST_PORTS if ros2 and ros2.multicast else LEAST_PORTS_PER_DOMAIN
     if ros2 and ports < least:
         fix = f"Write at least {least}: a participant takes up to three ports"
         raise field["ports"].error("is too low for ROS 2", fix)
-    return RosProxySpec(
+    spec = RosProxySpec(
         ros1="1" in for_ros,
         ros2=ros2,
+        zenoh=ZenohSpec(_peers(field, read_router_name)) if "zenoh" in for_ros else None,
         master=_master(field["master"], of) if "1" in for_ros else MasterSpec(),
         ports=ports,
         window=_window(field["portWindow"], ports),
@@ -156,39 +178,79 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
         max_unavailable=_max_unavailable(field["maxUnavailable"]),
         proxy=_proxy_spec(field),
         policy=_policy(field["policy"], of),
-        pod_egress=_pod_egress(field),
+        pod_egress=_pod_egress(field, needs_direction="zenoh" not in for_ros),
         image=field["image"].text(),
         image_pull_policy=field["imagePullPolicy"].one_of(_PULL_POLICY, ""),
         image_pull_secrets=_given(field["imagePullSecrets"], _maps),
         resources=_given(field["resources"], Field.map),
         host_aliases=tuple(_host_alias(alias) for alias in field["hostAliases"].items()),
     )
+    if spec.zenoh:
+        _check_zenoh(field, spec)
+    return spec
 
 
 def _versions(field: Field) -> tuple[str, ...]:
-    """Return the ROS versions in ``spec.ros``: 1 (the default), 2, or both for "1,2"."""
+    """Return the ROS versions in ``spec.ros``: 1 (the default), 2, both for "1,2", or zenoh."""
     value = "1" if field.value is None else field.value
     text = str(value).replace(" ", "") if type(value) in (int, str) else ""
-    if text not in ("1", "2", "1,2"):
-        raise field.error("is unknown", "Write 1, 2 or '1,2'")
+    if text not in _ALL_VERSIONS:
+        fix = "Write 1, 2 or '1,2', or zenoh alone. A pod has a single RosProxy: run nodes of "
+        raise field.error("is unknown", f"{fix}rmw_zenoh in pods of their own")
     return tuple(text.split(","))
+
+
+def _check_versions(field: Field, for_ros: tuple[str, ...]) -> None:
+    """Raise InvalidField for a field of a ROS version that the RosProxy does not serve."""
+    for ros, names in _FIELDS_BY_VERSION.items():
+        for name in names if ros not in for_ros else ():
+            _check_absent(field[name], ros, for_ros)
+    if for_ros == ("1",):
+        _check_absent(field["peers"], "2", for_ros)
+
+
+def _check_absent(field: Field, ros: str, for_ros: tuple[str, ...]) -> None:
+    if field.value not in (None, [], False):
+        fix = "Remove the field" + (", or set spec.ros: 2" if ros == "2" else "")
+        raise field.error(f"is for ROS {ros}, but spec.ros is {for_ros[0]}", fix)
+
+
+def _check_zenoh(field: Field, spec: RosProxySpec) -> None:
+    """Raise InvalidField for a field that has no effect on rmw_zenoh, or that zenoh can't hold."""
+    default = RosProxySpec(MasterSpec(), OWN_PORTS, _WINDOW)
+    unused = [f for f, n in _NOT_OF_ZENOH.items() if getattr(spec, n) != getattr(default, n)]
+    wishes = ((w.field, name) for name, w in WISHES.items())
+    unused += [f for f, name in wishes if getattr(spec.proxy, name) != getattr(OWN_SPEC, name)]
+    for path in unused:
+        for key in path.split("."):
+            field = field[key]
+        raise field.error("has no effect with spec.ros: zenoh", "Remove the field")
+    try:
+        check_layers(spec.policy)
+    except ValueError as error:
+        raise InvalidField(f"{field['policy']['rules'].path}: {error}") from None
 
 
 def _ros2_spec(field: Field) -> Ros2Spec:
     domain = field["domain"]
-    peers = field["peers"].items()
-    if len(peers) > MOST_PEERS:
-        raise field["peers"].error("has too many hosts", f"Name at most {MOST_PEERS} hosts")
     return Ros2Spec(
         domain=None if domain.value is None else domain.number(0, 0, LAST_DOMAIN),
-        peers=tuple(sorted({_peer(peer) for peer in peers})),
+        peers=_peers(field, read_peer_name),
         multicast=field["multicast"].boolean(),
     )
 
 
-def _peer(field: Field) -> str:
+def _peers(field: Field, read: Callable[[str], str]) -> tuple[str, ...]:
+    """Return the peers, sorted, as ``read`` returns each."""
+    peers = field["peers"].items()
+    if len(peers) > MOST_PEERS:
+        raise field["peers"].error("has too many hosts", f"Name at most {MOST_PEERS} hosts")
+    return tuple(sorted({_peer(peer, read) for peer in peers}))
+
+
+def _peer(field: Field, read: Callable[[str], str]) -> str:
     try:
-        return read_peer_name(field.text())
+        return read(field.text())
     except ValueError:
         fix = "Write the robot's name or address, or HOST:PORT of another proxy"
         raise field.error("is not a peer", fix) from None
@@ -213,9 +275,13 @@ def _max_unavailable(field: Field) -> MaxUnavailable:
     return MaxUnavailable(int(field.number(1, 1, 10_000)))
 
 
-def _pod_egress(field: Field) -> PodEgress:
+def _pod_egress(field: Field, needs_direction: bool) -> PodEgress:
+    """Return ``spec.podEgress``. ``needs_direction``: the value Proxy needs ``direction: Both``.
+
+    With rmw_zenoh, the proxy carries both directions anyway.
+    """
     egress = field["podEgress"].one_of(_POD_EGRESS, "Any")
-    if egress == "proxy" and _proxy_spec(field).direction == "out":
+    if egress == "proxy" and needs_direction and _proxy_spec(field).direction == "out":
         problem = "needs spec.direction: Both; otherwise the pods receive nothing from outside"
         raise field["podEgress"].error(problem, "Set spec.direction: Both")
     return egress
@@ -271,10 +337,9 @@ def _glob(field: Field, ros_name: bool) -> str:
 
 
 def _window(field: Field, ports: int) -> PortRange:
-    # The default lies above the ports of roscore (11311) and rosserial (11411), and below the
-    # NodePorts (from 30000).
     window = PortRange(
-        field["first"].number(11412, *_LISTEN_PORTS), field["last"].number(29999, *_LISTEN_PORTS)
+        field["first"].number(_WINDOW.first, *_LISTEN_PORTS),
+        field["last"].number(_WINDOW.last, *_LISTEN_PORTS),
     )
     if window.last - window.first + 1 < ports:
         raise InvalidField(

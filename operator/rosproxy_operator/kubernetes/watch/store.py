@@ -171,12 +171,17 @@ class ClusterStore:
         """The present state of the cluster. ``key`` is the key of the proxies' tokens."""
         rosproxies = tuple(self._records_of(PLURAL, RosProxy))
         masters = self._masters(rosproxies)
-        services = self._records_of("services", ProxyService)
+        services = [
+            service
+            for service in self._records_of("services", ProxyService)
+            if self._is_managed(service.of.namespace)
+        ]
         snapshot = ClusterSnapshot(
             rosproxies=rosproxies,
             unusable={r.id: r for r in self._records_of(PLURAL, InvalidRosProxy)},
             nodes={node.name: node for node in self._records_of("nodes", ClusterNode)},
-            services={s.of: s for s in services if self._is_managed(s.of.namespace)},
+            services={s.of: s for s in services if not s.names_hubs},
+            hub_services={s.of: s for s in services if s.names_hubs},
             masters={id: read_master(s, id, ports) for id, (s, ports) in masters.items()},
             consents={id: s.allowed if s else frozenset() for id, (s, _) in masters.items()},
             misspelt_services={id: s.misspelt for id, (s, _) in masters.items() if s},

@@ -82,6 +82,7 @@ def site(of: RosProxy, on: ClusterNode, ports: PortRange = RANGE, publish: int =
     """A site for a proxy of a RosProxy, with the planner's defaults."""
     host = on.advertise_host or on.addresses["InternalIP"]
     (of,) = with_pod_defaults(ClusterSnapshot(rosproxies=(of,)), SETTINGS.pod).rosproxies
+    host = "" if of.spec.zenoh else host
     return ProxySite(of, on, host, ports, replace(of.spec.master, publish=publish))
 
 

@@ -4,6 +4,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy.setting_kinds import hash_token
+from rosproxy.settings import MOST_ZENOH_HUBS
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
 from rosproxy_operator.kubernetes.planner.cluster_view import View
 from rosproxy_operator.kubernetes.planner.manifests import TERMINATION_GRACE_S, ProxySite
@@ -21,6 +22,8 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
+    HUB_PORT,
+    hub_host,
     proxy_id,
     relay_secret_of,
     token_of,
@@ -99,7 +102,12 @@ def master_of(rosproxy: RosProxy, observed: ClusterSnapshot) -> tuple[MasterSpec
 
 
 def advertise_host(rosproxy: RosProxy, node: ClusterNode) -> tuple[str, str]:
-    """Return the host name or address at which outside reaches a node, or "" and the fault."""
+    """Return the host name or address at which outside reaches a node, or "" and the fault.
+
+    Both are empty for rmw_zenoh: outside connects to no proxy.
+    """
+    if rosproxy.spec.zenoh:
+        return "", ""
     if node.advertise_host:
         problem = host_problem(node.advertise_host)
         fix = "Give the name or address at which outside reaches the node"
@@ -163,6 +171,7 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
         token_hash,
         peers_of(context, place),
         relay_secret_of(context.observed.key, name, node.name),
+        hubs_of(context, place),
     )
 
 
@@ -184,6 +193,18 @@ def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
             if not problem and ":" not in host:
                 peers.add(f"{host}:{ports.first}")
     return tuple(sorted(peers))
+
+
+def hubs_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
+    """The hubs of other nodes that a proxy for rmw_zenoh dials, sorted.
+
+    A hub beyond the bound is dialed by no hub, and dials the hubs within the bound itself.
+    """
+    if context.view.rosproxies[place.of].spec.zenoh is None:
+        return ()
+    others = (other for other in context.view.places.get(place.of, ()) if other != place)
+    hosts = sorted(hub_host(o.of, o.node) for o in others if o.node in context.observed.nodes)
+    return tuple(f"{host}:{HUB_PORT}" for host in hosts[:MOST_ZENOH_HUBS])
 
 
 def peers(context: ClusterContext) -> dict[str, tuple[str, ...]]:

@@ -40,10 +40,12 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     ProxyService,
 )
 from rosproxy_operator.kubernetes.resources.model import (
+    Json,
     ProxyPlace,
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
+    hubs_service_id,
     proxy_id,
     service_id,
 )
@@ -67,10 +69,32 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
     if service is None:
         if context.retries.is_due(Task(rosproxy.id, "create", service_id(rosproxy.id))):
             yield CreateService(rosproxy.id, body)
-    elif service.owner != rosproxy.uid:
+    else:
+        # A later look creates the Service again, with the address that the status keeps.
+        yield from _replace_service(context, rosproxy, service, body)
+
+
+def reconcile_hubs_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
+    """Yield the action that creates or deletes the headless Service for rmw_zenoh."""
+    service = context.observed.hub_services.get(rosproxy.id)
+    if rosproxy.spec.zenoh is None:
+        if service is not None:
+            yield from _delete_service(context, service, "spec.ros is not zenoh")
+        return
+    body = manifests.hubs_service(rosproxy)
+    if service is not None:
+        yield from _replace_service(context, rosproxy, service, body)
+    elif context.retries.is_due(Task(rosproxy.id, "create", hubs_service_id(rosproxy.id))):
+        yield CreateService(rosproxy.id, body)
+
+
+def _replace_service(
+    context: ClusterContext, rosproxy: RosProxy, service: ProxyService, body: Json
+) -> Iterator[Action]:
+    """Yield the deletion of a Service that differs from ``body``."""
+    if service.owner != rosproxy.uid:
         yield from _delete_service(context, service, "its former RosProxy is gone")
     elif service.fingerprint != manifests.fingerprint_of(body):
-        # A later look creates the Service again, with the address that the status keeps.
         yield from _delete_service(
             context, service, "replaced, since the RosProxy or the operator has changed"
         )
@@ -78,7 +102,7 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
 
 def _delete_service(context: ClusterContext, service: ProxyService, why: str) -> Iterator[Action]:
     """Yield the deletion of a Service, unless the Service is being deleted already."""
-    name = service_id(service.of)
+    name = service.id
     if not service.deleting and context.retries.is_due(
         Task(service.of, "delete", name, service.uid)
     ):
@@ -260,6 +284,7 @@ def _delete_pod(
     """
     node = context.observed.nodes.get(proxy.node)
     runs = serves(proxy) and node is not None and node.ready
+    retire = retire and proxy.has_registrations
     useful = not proxy.pod.deleting or (retire and runs)
     if useful and context.retries.is_due(Task(proxy.of, "delete", proxy.pod.id, proxy.pod.uid)):
         yield DeleteProxy(proxy.of, proxy.pod.id, proxy.pod.uid, why, retire)
@@ -293,7 +318,8 @@ def reconcile_orphans(context: ClusterContext) -> Iterator[Action]:
         yield from _delete_pod(context, proxy, "its RosProxy is gone", retire=not takes_over)
     # An unusable RosProxy is not gone. So its Service stays, and its pods keep the address.
     unusable = {r.uid for r in context.observed.unusable.values()}
-    for service in context.observed.services.values():
+    services = (*context.observed.services.values(), *context.observed.hub_services.values())
+    for service in services:
         if service.of not in context.view.rosproxies and service.owner not in unusable:
             yield from _delete_service(context, service, "its RosProxy is gone")
 

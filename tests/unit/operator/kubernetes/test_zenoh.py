@@ -1,0 +1,339 @@
+"""rmw_zenoh in a RosProxy: what is read, made, and told to pods, proxies and users."""
+
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from rosproxy.access.rules import parse_rules
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common.policy import administrators_policy
+from rosproxy_operator.kubernetes.planner import manifests
+from rosproxy_operator.kubernetes.planner.actions import (
+    CreateProxy,
+    CreateService,
+    DeleteProxy,
+    DeleteService,
+)
+from rosproxy_operator.kubernetes.planner.bounds import bounds_violation
+from rosproxy_operator.kubernetes.resources import names, objects
+from rosproxy_operator.kubernetes.resources.cluster import ProxyService
+from rosproxy_operator.kubernetes.resources.fields import InvalidField
+from rosproxy_operator.kubernetes.resources.model import (
+    Json,
+    MasterSpec,
+    Pod,
+    Ros2Spec,
+    RosProxy,
+    ZenohSpec,
+)
+from rosproxy_operator.kubernetes.resources.spec import rosproxy as read
+from rosproxy_operator.kubernetes.settings import Bounds
+from tests.run_options import settings_of
+from tests.unit.operator.kubernetes import objects as some
+from tests.unit.operator.kubernetes.builders_api import rosproxy_obj
+from tests.unit.operator.kubernetes.objects import (
+    ROBOT,
+    SETTINGS,
+    creation,
+    done,
+    kinds,
+    look,
+    node,
+    observed,
+    proxy,
+    service,
+    site,
+)
+
+DEFAULTS = {
+    "ports": 32,
+    "portWindow": {"first": 11412, "last": 29999},
+    "advertise": "InternalIP",
+    "cleanupAfterSeconds": 30,
+    "dataPlane": "Auto",
+    "direction": "Out",
+    "udp": False,
+    "policy": {"slaveControl": "Any"},
+}
+"""What the API server fills in."""
+EXCEPTION = [
+    {"action": "Allow", "kind": "Publish", "names": ["/camera/info"]},
+    {"action": "Deny", "kind": "Publish", "names": ["/camera/*"]},
+]
+"""Rules that zenoh can't hold."""
+
+
+def ofz(*peers: str, **changes: Any) -> RosProxy:
+    """A RosProxy for rmw_zenoh."""
+    spec: dict[str, Any] = {"ros1": False, "zenoh": ZenohSpec(peers), "master": MasterSpec()}
+    return some.rosproxy(**spec | changes)
+
+
+def pod(**changes: Any) -> Pod:
+    return some.pod(**{"wired_master_uri": ""} | changes)
+
+
+def proxy_of(of: RosProxy, on: Any = None, **changes: Any) -> Any:
+    return proxy(of, on, names.ROUTERS, **changes)
+
+
+def hubs_service(of: RosProxy, **changes: Any) -> ProxyService:
+    """The headless Service, as the API server lists the Service."""
+    body: Any = manifests.hubs_service(of)
+    body = {**body, "metadata": {**body["metadata"], "uid": "uid-hubs"}}
+    listed = objects.service(body)
+    assert listed is not None
+    return replace(listed, **changes)
+
+
+def seen(of: RosProxy, *more: Any, **changes: Any) -> Any:
+    """A cluster with both Services of a RosProxy."""
+    hubs = {"hub_services": {of.id: hubs_service(of)}}
+    return observed(of, service(of), *more, **hubs | changes)
+
+
+def env_of(body: Json) -> dict[str, str]:
+    return {
+        variable["name"]: variable["value"] for variable in body["spec"]["containers"][0]["env"]
+    }
+
+
+def specified(**spec: Any) -> Any:
+    return read({**rosproxy_obj(), "spec": spec}).spec
+
+
+def test_what_is_read():
+    spec = specified(ros="zenoh", **DEFAULTS, peers=["Robot", "192.0.2.9:7448", "robot:7447"])
+
+    assert (spec.ros1, spec.ros2, spec.master) == (False, None, MasterSpec())
+    assert spec.zenoh == ZenohSpec(("192.0.2.9:7448", "robot:7447"))
+    assert specified(ros="zenoh").zenoh == ZenohSpec()
+    assert specified(ros=2).zenoh is None
+
+
+def test_no_way_out_but_the_proxy_needs_no_direction():
+    assert specified(ros="zenoh", podEgress="Proxy").pod_egress == "proxy"
+
+
+@pytest.mark.parametrize(
+    ("spec", "text"),
+    [
+        ({"master": {"uri": "http://robot:11311"}}, "spec.master"),
+        ({"domain": 1}, "spec.domain: 1 is for ROS 2, but spec.ros is zenoh"),
+        ({"multicast": True}, "spec.multicast"),
+        ({"udp": True, "direction": "Both"}, "spec.udp"),
+        ({"direction": "Both"}, "spec.direction: 'Both' has no effect with spec.ros: zenoh"),
+        ({"ports": 64}, "spec.ports: 64 has no effect"),
+        ({"portWindow": {"first": 12000}}, "spec.portWindow"),
+        ({"advertise": "Hostname"}, "spec.advertise"),
+        ({"cleanupAfterSeconds": 5}, "spec.cleanupAfterSeconds"),
+        ({"dataPlane": "Splice"}, "spec.dataPlane"),
+        (
+            {"policy": {"slaveControl": "Master"}},
+            "spec.policy.slaveControl: 'Master' has no effect",
+        ),
+        (
+            {"policy": {"rules": EXCEPTION}},
+            "spec.policy.rules: layer 'RosProxy robots/arm': rmw_zenoh",
+        ),
+        ({"peers": ["a b"]}, "spec.peers[0]: 'a b' is not a peer"),
+        ({"peers": ["localhost"]}, "spec.peers[0]: 'localhost' is not a peer"),
+        ({"peers": ["a"] * 33}, "has too many hosts"),
+        ({"ros": "1,2,zenoh"}, "run nodes of rmw_zenoh in pods of their own"),
+    ],
+)
+def test_what_is_refused(spec: Any, text: str):
+    with pytest.raises(InvalidField) as refused:
+        specified(**{"ros": "zenoh", **spec})
+    assert text in str(refused.value)
+
+
+def test_rules_of_all_kinds_are_read():
+    """Rules about parameters and about the slave API match nothing, as with DDS."""
+    rules = [{"action": "Deny", "kind": kind, "names": ["*"]} for kind in ("Publish", "Slave")]
+    assert len(specified(ros="zenoh", policy={"rules": rules}).policy[0].rules) == 2
+
+
+def test_the_address_of_the_service_stays_in_the_status():
+    obj = rosproxy_obj(status={"routerEndpoint": "tcp/10.96.1.7:7448"})
+    assert read({**obj, "spec": {"ros": "zenoh"}}).cluster_ip == "10.96.1.7"
+
+
+def test_the_administrators_bounds_hold():
+    allowed = replace(SETTINGS, bounds=Bounds(peers=("192.0.2.*",)))
+    assert not bounds_violation(ofz("192.0.2.7:7447"), {}, allowed)
+    refusal = bounds_violation(ofz("robot:7447"), {}, allowed)
+    assert refusal.startswith("spec.peers: the operator does not allow 'robot:7447'")
+    assert "allow.peers" in refusal
+
+
+def test_bounds_of_ports_do_not_concern_a_proxy_without_ports():
+    narrow = replace(SETTINGS, bounds=Bounds(max_ports=1))
+    assert not bounds_violation(ofz(ports=32), {}, narrow)
+
+
+def test_bounds_of_data_planes_do_not_concern_a_proxy_without_a_data_plane():
+    """The definition allows the default alone, which the administrator may have excluded."""
+    narrow = replace(SETTINGS, bounds=Bounds(data_planes=("splice",)))
+    assert not bounds_violation(ofz(), {}, narrow)
+    assert "allow.dataPlanes" in bounds_violation(some.rosproxy(), {}, narrow)
+
+
+def test_a_policy_of_the_administrator_that_zenoh_can_not_hold_is_told():
+    rules = parse_rules("allow publish /camera/info; deny publish /camera/*")
+    settings = replace(SETTINGS, policy=administrators_policy([rules], "enforce"))
+    assert "rmw_zenoh can't hold the operator's policy" in bounds_violation(ofz(), {}, settings)
+    audit = replace(SETTINGS, policy=administrators_policy([rules], "audit"))
+    assert not bounds_violation(ofz(), {}, audit)
+
+
+def test_a_proxy_understands_its_variables_and_has_no_hostport():
+    of = ofz("192.0.2.7:7447", "robot:7448")
+    place = replace(site(of, node(), names.ROUTERS), hubs=("hub.hubs.ros.svc:7447",))
+
+    body = manifests.proxy_pod(place, SETTINGS)
+
+    settings = settings_of(env_of(body))
+    assert settings.ros == ("zenoh",)
+    assert settings.zenoh_ports == names.ROUTERS
+    assert settings.zenoh_listen == names.HUB_PORT
+    assert settings.zenoh_peer == (HostPort("192.0.2.7", 7447), HostPort("robot", 7448))
+    assert settings.zenoh_hub == (HostPort("hub.hubs.ros.svc", 7447),)
+    assert body["spec"]["containers"][0]["ports"] == []
+    assert not {"ROSPROXY_PORT_RANGE", "ROS_MASTER_URI"} & env_of(body).keys()
+    security = body["spec"]["containers"][0]["securityContext"]
+    assert security["capabilities"] == {"drop": ["ALL"]}
+
+
+def test_the_pod_has_the_name_that_other_hubs_dial():
+    of = ofz()
+    body = manifests.proxy_pod(site(of, node(), names.ROUTERS), SETTINGS)
+    hubs = manifests.hubs_service(of)
+    host = f"{body['spec']['hostname']}.{body['spec']['subdomain']}"
+    assert names.hub_host(of.id, "one") == f"{host}.ros.svc"
+    assert body["spec"]["subdomain"] == hubs["metadata"]["name"]
+    assert (hubs["spec"]["clusterIP"], hubs["spec"]["publishNotReadyAddresses"]) == ("None", True)
+    assert hubs["spec"]["selector"].items() <= body["metadata"]["labels"].items()
+    other = manifests.proxy_pod(site(some.rosproxy(), node()), SETTINGS)
+    assert not {"hostname", "subdomain"} & other["spec"].keys()
+
+
+@pytest.mark.parametrize("name", ["a", "x" * 46])
+def test_names_fit_in_a_label_and_differ_from_other_services(name: str):
+    of = replace(ROBOT, name=name)
+    assert len(names.hubs_service_id(of).name) <= 63
+    assert names.hubs_service_id(of) != names.service_id(replace(ROBOT, name=f"{name}-hubs"))
+
+
+def test_hubs_come_and_go_without_a_proxy_being_made_anew():
+    place = site(ofz("robot:7447"), node(), names.ROUTERS)
+    bodies = [manifests.proxy_pod(replace(place, hubs=h), SETTINGS) for h in ((), ("a.b:7447",))]
+    assert len({manifests.fingerprint_of(body) for body in bodies}) == 1
+    assert env_of(bodies[0]) != env_of(bodies[1])
+    moved = manifests.proxy_pod(site(ofz("arm:7447"), node(), names.ROUTERS), SETTINGS)
+    assert manifests.fingerprint_of(moved) != manifests.fingerprint_of(bodies[0])
+
+
+def test_the_service_leads_to_the_router():
+    (port,) = manifests.service(ofz())["spec"]["ports"]
+    assert (port["port"], port["protocol"]) == (7448, "TCP")
+
+
+def test_proxies_of_other_nodes_are_hubs():
+    of = ofz()
+    far = node("two", addresses={})
+    plan = look(seen(of, node(), far, pod(), pod(name="b", on="two")))
+    made = [action for action in done(plan) if isinstance(action, CreateProxy)]
+    hubs = {some.node_of(action): env_of(action.body)["ROSPROXY_ZENOH_HUBS"] for action in made}
+    assert hubs == {
+        "one": f"{names.hub_host(of.id, 'two')}:7447",
+        "two": f"{names.hub_host(of.id, 'one')}:7447",
+    }
+
+
+def test_a_proxy_needs_neither_ports_nor_an_address_of_the_node():
+    of = ofz(ports=500)
+    full = pod(name="stranger", labels={}, host_ports=frozenset({7448, 7447}))
+    action = creation(look(seen(of, node(addresses={}), pod(), full)))
+    assert some.ports_of(action) == "7448-7448"
+
+
+def test_two_proxies_on_a_node_have_no_conflict():
+    of = ofz()
+    other = replace(ofz(), id=replace(of.id, name="arm"), uid="uid-arm")
+    labels = ({names.INJECT: "robot"}, {names.INJECT: "arm"})
+    pods = [pod(name=name, labels=own) for name, own in zip("ab", labels, strict=True)]
+    hubs = {rosproxy.id: hubs_service(rosproxy) for rosproxy in (of, other)}
+    plan = look(observed(of, other, service(of), service(other), *pods, hub_services=hubs))
+    assert kinds(plan) == [CreateProxy, CreateProxy]
+
+
+def test_both_services_are_made_and_later_nothing_more():
+    of = ofz()
+    made = [
+        action for action in done(look(observed(of, pod()))) if isinstance(action, CreateService)
+    ]
+    assert [action.body["metadata"]["name"] for action in made] == [
+        "rosproxy-robot",
+        "hubs-of-rosproxy-robot",
+    ]
+    assert not done(look(seen(of, pod(), proxy_of(of))))
+
+
+@pytest.mark.parametrize("change", ["other version", "other uid", "RosProxy gone", "outdated"])
+def test_a_headless_service_that_is_not_right_goes(change: str):
+    of = ofz()
+    present = {
+        "other version": (some.rosproxy(ros1=False, ros2=Ros2Spec()), hubs_service(of)),
+        "other uid": (of, hubs_service(of, owner="uid-former")),
+        "RosProxy gone": (None, hubs_service(of)),
+        "outdated": (of, hubs_service(of, fingerprint="0")),
+    }[change]
+    rosproxy, hubs = present
+    services = {of.id: service(rosproxy)} if rosproxy else {}
+    cluster = replace(observed(), services=services, hub_services={of.id: hubs})
+    cluster = replace(cluster, rosproxies=tuple(filter(None, [rosproxy])))
+    (action,) = done(look(cluster))
+    assert isinstance(action, DeleteService)
+    assert action.id == names.hubs_service_id(of.id)
+
+
+def test_a_proxy_of_zenoh_unregisters_nothing_when_it_goes():
+    of = ofz()
+    later = look(seen(of, proxy_of(of)), now=100.0)
+    gone = look(seen(of, proxy_of(of)), later.state, now=100.0 + of.spec.grace + 1)
+    (action,) = done(gone)
+    assert isinstance(action, DeleteProxy)
+    assert not action.retire
+
+
+def test_another_version_is_another_proxy():
+    of = ofz()
+    former = proxy(replace(some.rosproxy(), uid=of.uid))
+    (action,) = done(look(seen(of, pod(), former)))
+    assert isinstance(action, DeleteProxy)
+    assert action.retire  # the nodes of ROS 1 are registered at the master
+    back = some.rosproxy()
+    (action,) = done(look(observed(back, service(back), some.pod(), proxy_of(ofz()))))
+    assert isinstance(action, DeleteProxy)
+    assert not action.retire
+
+
+def test_the_port_of_the_router_is_no_former_range():
+    """A RosProxy that was for rmw_zenoh may now have a window with the port of the router."""
+    back = some.rosproxy(window=PortRange(7000, 7999))
+    former = proxy_of(ofz())
+    going = look(observed(back, service(back), some.pod(), former))
+    made = creation(look(observed(back, service(back), some.pod()), going.state))
+    assert some.ports_of(made) == "7000-7003"
+
+
+def test_a_proxy_is_told_its_policy_and_no_callers():
+    rules = parse_rules("deny publish *")
+    settings = replace(SETTINGS, policy=administrators_policy([rules], "enforce"))
+    of = ofz()
+    (briefing,) = look(seen(of, pod(), proxy_of(of)), settings=settings).briefings.values()
+    assert briefing.policy == settings.policy
+    assert (briefing.callers, briefing.peers, briefing.gone) == (None, None, ())
