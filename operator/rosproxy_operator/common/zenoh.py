@@ -26,6 +26,33 @@ class Endpoint(NamedTuple):
     address: HostPort
 
 
+def client_override(router: HostPort) -> str:
+    """Return the value of ZENOH_CONFIG_OVERRIDE that makes nodes clients of a router."""
+    return f'mode="client";connect/endpoints=["{tcp_endpoint(router)}"]'
+
+
+def tcp_endpoint(router: HostPort) -> str:
+    """Return the endpoint of a router, such as ``tcp/10.96.0.7:7448``."""
+    return f"tcp/{router}"
+
+
+def with_client_override(override: str, router: HostPort) -> str:
+    """Return a container's own override, extended to make nodes clients of a router.
+
+    The result is empty if the override itself sets the mode or the endpoints.
+    """
+    keys = {pair.partition("=")[0].strip() for pair in override.split(";")}
+    if any(key in ("mode", "connect") or key.startswith("connect/endpoints") for key in keys):
+        return ""
+    return ";".join(filter(None, [override.strip().rstrip(";"), client_override(router)]))
+
+
+def is_client(override: str) -> bool:
+    """Whether an override makes nodes clients."""
+    modes = re.findall(r"(?:^|;)\s*mode\s*=\s*[\"']?(\w+)", override)
+    return modes[-1:] == ["client"]
+
+
 def read_router_name(text: str) -> str:
     """Parse and return a router: ``host:port``, in lower case. Raises ValueError."""
     router = read_zenoh_peer(text.lower())

@@ -95,6 +95,7 @@ def _wiring(pod: Pod) -> tuple[object, ...]:
         pod.ended,
         pod.wired_master_uri,
         pod.static_peers,
+        pod.router_endpoint,
         pod.own_masters,
         pod.controller,
         labels,

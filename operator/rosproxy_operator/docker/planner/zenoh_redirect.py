@@ -20,6 +20,7 @@ from string import Template
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import ZENOH_PORT
+from rosproxy_operator.common.zenoh import OVERRIDE, client_override
 from rosproxy_operator.docker.planner.model import ZENOH, Container, Member, RedirectContainer
 
 LOCAL_ROUTER = HostPort("127.0.0.1", ZENOH_PORT)
@@ -91,9 +92,7 @@ def zenoh_sysctls(is_set: bool) -> dict[str, str]:
 
 def as_client(proxy: str) -> str:
     """Return the variable that makes nodes use the proxy, given by name, without a redirect."""
-    return (
-        f"""ZENOH_CONFIG_OVERRIDE='mode="client";connect/endpoints=["tcp/{proxy}:{FIRST_PORT}"]'"""
-    )
+    return f"{OVERRIDE}='{client_override(HostPort(proxy, FIRST_PORT))}'"
 
 
 def with_all_routers(

@@ -34,6 +34,7 @@ from rosproxy_operator.kubernetes.planner.pods.unselected import (
     unselected_waits,
 )
 from rosproxy_operator.kubernetes.planner.pods.wiring import wiring_finding
+from rosproxy_operator.kubernetes.planner.pods.zenoh_pods import zenoh_findings
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
 from rosproxy_operator.kubernetes.planner.steps.context import (
@@ -248,6 +249,7 @@ def _problems(
             (wiring_finding(p, rosproxy, address, webhook) for p in pods if rosproxy.spec.ros1),
         ),
         *(f for pod in pods for f in ros2_findings(pod, rosproxy, address, webhook)),
+        *(f for pod in pods for f in zenoh_findings(pod, rosproxy, address, webhook)),
         *lan_relay_findings(context, rosproxy),
         *misspellings(context.view, rosproxy),
     )

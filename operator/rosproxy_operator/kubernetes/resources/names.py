@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy_operator.common.ros2 import relay_secret
 from rosproxy_operator.kubernetes.resources.model import Name
 
@@ -37,6 +38,10 @@ ALLOW_FROM = "rosproxy.io/allow-from"
 
 STATIC_PEERS = "rosproxy.io/static-peers"
 """Annotation of users' pods: the ROS_STATIC_PEERS that the webhook has set."""
+
+ROUTER_ENDPOINT = "rosproxy.io/router-endpoint"
+"""Annotation of users' pods: the endpoint of the router in the ZENOH_CONFIG_OVERRIDE that the
+webhook has set."""
 
 REMAKE = "rosproxy.io/remake-unwired"
 """Annotation of RosProxies. With "true" the operator evicts unwired pods."""
@@ -175,6 +180,17 @@ def token_of(key: bytes, proxy: Name, node: str) -> str:
 def relay_secret_of(key: bytes, proxy: Name, node: str) -> str:
     """Return the secret of a proxy and its LAN relay, empty without a key."""
     return relay_secret(key, f"{proxy} {node}") if key else ""
+
+
+def router_of(cluster_ip: str) -> HostPort:
+    """Return the router for pods at the cluster IP of the RosProxy's Service."""
+    return HostPort(cluster_ip, ROUTERS.first)
+
+
+def router_host(endpoint: str) -> str:
+    """Return the host of an endpoint such as ``tcp/10.96.0.7:7448``; empty if it has none."""
+    router = parse_host_port(endpoint.removeprefix("tcp/"))
+    return router.host if router else ""
 
 
 def master_uri(cluster_ip: str) -> str:

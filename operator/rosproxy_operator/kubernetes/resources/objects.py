@@ -9,6 +9,7 @@ from itertools import islice
 from typing import Any
 
 from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.common.zenoh import OVERRIDE
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.checks import (
     int_at,
@@ -46,6 +47,7 @@ ROS2_VARIABLES = frozenset(
         "ROS_LOCALHOST_ONLY",
         "ROS_AUTOMATIC_DISCOVERY_RANGE",
         "RMW_IMPLEMENTATION",
+        OVERRIDE,
     }
 )
 """Variables from which the operator tells what does not work with ROS 2 in a pod."""
@@ -106,6 +108,7 @@ def pod(obj: Json) -> Pod:
         own_masters=tuple(uri for uri in masters if not wired or uri != wired),
         wired_master_uri=wired,
         static_peers=_short(text_at(submap(meta, "annotations"), names.STATIC_PEERS)),
+        router_endpoint=_short(text_at(submap(meta, "annotations"), names.ROUTER_ENDPOINT)),
         containers=tuple(map(_container, submaps(spec, "containers")[:MOST_CONTAINERS])),
         ips=tuple(filter(None, (text_at(pod_ip, "ip") for pod_ip in submaps(status, "podIPs")))),
         controller=text_at(_controller(meta), "kind"),
@@ -248,14 +251,19 @@ def _is_ready(status: Json) -> bool:
 
 def _container(obj: Json) -> PodContainer:
     """Return a container: the image, and the ROS 2 variables that the container itself sets."""
-    variables = {
+    variables = {name: _short(value) for name, value in ros2_variables(obj).items()}
+    return PodContainer(_short(text_at(obj, "image")), variables)
+
+
+def ros2_variables(container: Json) -> dict[str, str]:
+    """Return the ROS 2 variables that a container itself sets, with values of any length."""
+    return {
         name: VALUE_AT_RUNTIME
         if variable.get("valueFrom") is not None
-        else _short(text_at(variable, "value"))
-        for variable in submaps(obj, "env")
+        else text_at(variable, "value")
+        for variable in submaps(container, "env")
         if (name := text_at(variable, "name")) in ROS2_VARIABLES
     }
-    return PodContainer(_short(text_at(obj, "image")), variables)
 
 
 def _kept_labels(meta: Json) -> dict[str, str]:

@@ -14,13 +14,7 @@ from urllib.parse import urlsplit
 from rosproxy.access.layers import PolicyLayer, PolicyMode
 from rosproxy.access.rules import Rule, RuleAction, RuleKind
 from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import (
-    HostPort,
-    is_address,
-    is_loopback,
-    parse_address,
-    parse_host_port,
-)
+from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.settings import LEAST_PORTS_PER_DOMAIN
 from rosproxy.zenoh.policy.name_sets import check_layers
@@ -55,7 +49,12 @@ from rosproxy_operator.kubernetes.resources.model import (
     Selector,
     ZenohSpec,
 )
-from rosproxy_operator.kubernetes.resources.names import MASTER_PORT, REMAKE, service_id
+from rosproxy_operator.kubernetes.resources.names import (
+    MASTER_PORT,
+    REMAKE,
+    router_host,
+    service_id,
+)
 from rosproxy_operator.kubernetes.resources.objects import is_deleted, name_of
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, words
 
@@ -123,9 +122,8 @@ def rosproxy(obj: Json) -> RosProxy:
     status = submap(obj, "status")
     id = name_of(meta)
     service = parse_slave_uri(text_at(status, "masterURI"))
-    router = parse_host_port(text_at(status, "routerEndpoint").removeprefix("tcp/"))
-    named = service or router
-    address = named.host if named else text_at(status, "staticPeers")
+    others = text_at(status, "staticPeers") or router_host(text_at(status, "routerEndpoint"))
+    address = service.host if service else others
     if not is_label(id.name) or len(id.name) > MOST_NAME_CHARACTERS:
         fix = f"Use at most {MOST_NAME_CHARACTERS} characters a-z, 0-9 and -"
         raise Field("metadata.name", id.name).error("can't be the name of a RosProxy", fix)

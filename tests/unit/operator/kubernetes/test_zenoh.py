@@ -17,6 +17,12 @@ from rosproxy_operator.kubernetes.planner.actions import (
     DeleteService,
 )
 from rosproxy_operator.kubernetes.planner.bounds import bounds_violation
+from rosproxy_operator.kubernetes.planner.pods.wiring import (
+    needs_recreation,
+    pod_variables,
+    wire,
+)
+from rosproxy_operator.kubernetes.planner.pods.zenoh_pods import zenoh_findings
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import ProxyService
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
@@ -24,6 +30,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Json,
     MasterSpec,
     Pod,
+    PodContainer,
     Ros2Spec,
     RosProxy,
     ZenohSpec,
@@ -337,3 +344,162 @@ def test_a_proxy_is_told_its_policy_and_no_callers():
     (briefing,) = look(seen(of, pod(), proxy_of(of)), settings=settings).briefings.values()
     assert briefing.policy == settings.policy
     assert (briefing.callers, briefing.peers, briefing.gone) == (None, None, ())
+
+
+ADDRESS = "10.96.1.1"
+ENDPOINT = f"tcp/{ADDRESS}:7448"
+AS_CLIENT = f'mode="client";connect/endpoints=["{ENDPOINT}"]'
+OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
+RMW = "RMW_IMPLEMENTATION"
+ROBOTS = 'connect/endpoints=["tcp/192.0.2.7:7447"]'
+
+
+def wired(env: dict[str, str], address: str = ADDRESS, former: str = "") -> tuple[Any, Any]:
+    """The variables and annotations of a pod after the webhook."""
+    variables = [{"name": name, "value": value} for name, value in env.items()]
+    annotations = {names.ROUTER_ENDPOINT: former} if former else {}
+    container = {"name": "main", "env": variables}
+    body = {"metadata": {"annotations": annotations}, "spec": {"containers": [container]}}
+    wiring = wire(body, pod_variables(ofz(), address))
+    spec: Any = wiring.spec or body["spec"]
+    made = {v["name"]: v["value"] for v in spec["containers"][0]["env"]}
+    assert len(made) == len(spec["containers"][0]["env"])
+    return made, wiring.annotations
+
+
+@pytest.mark.parametrize("rmw", [None, "", "rmw_zenoh_cpp", "$(CHOSEN)"])
+def test_nodes_become_clients_of_the_router(rmw: str | None):
+    given = {} if rmw is None else {RMW: rmw}
+    env, annotations = wired(given)
+    assert env == {OVERRIDE: AS_CLIENT, **given}
+    assert annotations == {names.ROUTER_ENDPOINT: ENDPOINT}
+
+
+def test_an_address_of_ipv6_stands_in_brackets():
+    env, _ = wired({}, "fd00::1")
+    assert env[OVERRIDE] == 'mode="client";connect/endpoints=["tcp/[fd00::1]:7448"]'
+
+
+def test_nodes_of_dds_stay_as_they_are():
+    assert wired({RMW: "rmw_fastrtps_cpp"}) == ({RMW: "rmw_fastrtps_cpp"}, {})
+
+
+@pytest.mark.parametrize(
+    ("own", "made"),
+    [
+        ("", AS_CLIENT),
+        (
+            "transport/shared_memory/enabled=true",
+            f"transport/shared_memory/enabled=true;{AS_CLIENT}",
+        ),
+        ('namespace="r1"; ', f'namespace="r1";{AS_CLIENT}'),
+        ("connect/timeout_ms=5", f"connect/timeout_ms=5;{AS_CLIENT}"),
+        (ROBOTS, ROBOTS),
+        ('mode="router"', 'mode="router"'),
+        ("connect={endpoints:[]}", "connect={endpoints:[]}"),
+        ("connect/endpoints/0=1", "connect/endpoints/0=1"),
+        ("$(OTHER)", "$(OTHER)"),
+    ],
+)
+def test_an_override_of_the_template_is_joined_or_kept(own: str, made: str):
+    env, annotations = wired({OVERRIDE: own})
+    assert env == {OVERRIDE: made}
+    assert bool(annotations) == (ENDPOINT in made)
+
+
+def test_a_long_override_is_kept_whole():
+    """The operator keeps only the beginning of long values, but the webhook may not cut any."""
+    own = f'namespace="r1";transport/x="{"x" * 5000}"'
+    env, _ = wired({OVERRIDE: own})
+    assert env == {OVERRIDE: f"{own};{AS_CLIENT}"}
+    assert not findings(env, router_endpoint=ENDPOINT)
+
+
+def test_a_value_that_is_known_at_run_time_is_kept():
+    source = {"name": OVERRIDE, "valueFrom": {"configMapKeyRef": {"name": "a", "key": "b"}}}
+    body = {"metadata": {}, "spec": {"containers": [{"name": "main", "env": [source]}]}}
+    assert wire(body, pod_variables(ofz(), ADDRESS)).spec is None
+
+
+def test_a_second_wiring_changes_nothing_and_a_copy_gets_the_new_address():
+    env, _ = wired({OVERRIDE: 'namespace="r1"'})
+    again, annotations = wired(env, former=ENDPOINT)
+    assert (again, annotations) == (env, {names.ROUTER_ENDPOINT: ENDPOINT})
+    moved, annotations = wired(env, "10.96.1.9", former=ENDPOINT)
+    assert moved == {OVERRIDE: env[OVERRIDE].replace(ADDRESS, "10.96.1.9")}
+    assert annotations == {names.ROUTER_ENDPOINT: "tcp/10.96.1.9:7448"}
+
+
+def test_variables_of_other_versions_are_not_set():
+    variables = pod_variables(ofz(), ADDRESS)
+    assert (variables.uri, variables.static_peers, variables.domain) == ("", "", None)
+    assert pod_variables(some.rosproxy(), ADDRESS).router is None
+
+
+def findings(*containers: dict[str, str], **changes: Any) -> list[tuple[str, str]]:
+    own = pod(containers=tuple(PodContainer("", c) for c in containers), **changes)
+    return [(f.reason, f.text) for f in zenoh_findings(own, ofz(), ADDRESS)]
+
+
+def test_a_pod_that_is_wired_has_no_finding():
+    assert not findings({OVERRIDE: AS_CLIENT}, {}, router_endpoint=ENDPOINT)
+    by_name = 'mode="client";connect/endpoints=["tcp/rosproxy-robot:7448"]'
+    assert not findings({OVERRIDE: by_name})
+    assert not findings({OVERRIDE: "$()"})
+    assert not [*zenoh_findings(pod(), some.rosproxy(), ADDRESS)]
+
+
+@pytest.mark.parametrize(
+    ("env", "reason", "text"),
+    [
+        ({RMW: "rmw_fastrtps_cpp"}, "NoZenoh", "RMW_IMPLEMENTATION=rmw_fastrtps_cpp is DDS"),
+        ({OVERRIDE: ROBOTS}, "NotWired", "connects the nodes past the proxy. Remove mode and"),
+        ({OVERRIDE: 'mode="client"'}, "NotWired", "past the proxy"),
+        ({OVERRIDE: f'connect/endpoints=["{ENDPOINT}"]'}, "NotWired", "passes no messages between"),
+        ({}, "NotWired", "has no variable ZENOH_CONFIG_OVERRIDE with the address of the proxy"),
+    ],
+)
+def test_faults_of_pods(env: dict[str, str], reason: str, text: str):
+    ((found, told),) = findings(env)
+    assert found == reason
+    assert text in told
+
+
+def test_a_pod_with_a_former_address_is_told():
+    former = AS_CLIENT.replace(ADDRESS, "10.96.1.9")
+    ((reason, text),) = findings({OVERRIDE: former}, router_endpoint="tcp/10.96.1.9:7448")
+    assert reason == "NotWired"
+    assert text.startswith("was wired to tcp/10.96.1.9:7448")
+
+
+@pytest.mark.parametrize(
+    ("env", "endpoint", "expected"),
+    [
+        ({}, "", True),
+        ({OVERRIDE: 'namespace="r1"'}, "", True),
+        ({OVERRIDE: AS_CLIENT}, ENDPOINT, False),
+        ({OVERRIDE: AS_CLIENT.replace(ADDRESS, "10.96.1.9")}, "tcp/10.96.1.9:7448", True),
+        ({OVERRIDE: ROBOTS}, "", False),
+        ({RMW: "rmw_cyclonedds_cpp"}, "", False),
+    ],
+)
+def test_pods_to_recreate(env: dict[str, str], endpoint: str, expected: bool):
+    own = pod(containers=(PodContainer("", env),), router_endpoint=endpoint)
+    assert needs_recreation(own, ofz(), ADDRESS) is expected
+
+
+def test_the_service_gets_the_address_to_which_pods_are_wired():
+    own = pod(router_endpoint="tcp/10.96.1.7:7448")
+    made = done(look(observed(ofz(), own)))
+    assert made[0].body["spec"]["clusterIP"] == "10.96.1.7"  # type: ignore[union-attr]
+
+
+def test_what_the_webhook_has_set_is_read():
+    annotations = {names.ROUTER_ENDPOINT: ENDPOINT}
+    container = {"name": "a", "env": [{"name": OVERRIDE, "value": AS_CLIENT}]}
+    read_pod = objects.pod(
+        {"metadata": {"annotations": annotations}, "spec": {"containers": [container]}}
+    )
+    assert read_pod.router_endpoint == ENDPOINT
+    assert read_pod.containers[0].variables == {OVERRIDE: AS_CLIENT}
+    assert not read_pod.misspelt

@@ -70,7 +70,7 @@ def unreached(pods: Iterable[Pod], rosproxies: Sequence[RosProxy], ready_since: 
         for pod, rosproxy in chosen
         if isinstance(rosproxy, RosProxy)
         and rosproxy.cluster_ip
-        and not (pod.wired_master_uri or pod.static_peers)
+        and not (pod.wired_master_uri or pod.static_peers or pod.router_endpoint)
         and needs_recreation(pod, rosproxy, rosproxy.cluster_ip)
         and should_be_wired(pod, rosproxy, ready_since)
     )

@@ -14,6 +14,7 @@ from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
     UNKNOWN_WEBHOOK,
     has_peers,
+    is_of_service,
     missing_variable_text,
     recreate_command,
 )
@@ -25,7 +26,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     PodContainer,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.names import service_id
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 BEFORE_IRON = ("ardent", "bouncy", "crystal", "dashing", "eloquent", "foxy", "galactic", "humble")
@@ -77,7 +77,8 @@ def _problems(
         text = (
             f"variable RMW_IMPLEMENTATION={_shown(rmw)} is not DDS, and a proxy forwards DDS only"
         )
-        yield "NoDds", f"{text}. Use rmw_fastrtps_cpp or rmw_cyclonedds_cpp"
+        fix = "Use rmw_fastrtps_cpp or rmw_cyclonedds_cpp, or a RosProxy with spec.ros: zenoh"
+        yield "NoDds", f"{text}. {fix}"
     peers = get("ROS_STATIC_PEERS")
     if (
         peers is not None
@@ -114,11 +115,7 @@ def _problems(
 
 def _names_service(peers: str, rosproxy: RosProxy, address: str) -> bool:
     """Whether static peers name a RosProxy's Service. A semicolon separates two peers."""
-    service = service_id(rosproxy.id)
-    short = f"{service.name}.{service.namespace}"
-    hosts = (h.strip().lower().rstrip(".") for h in peers.split(";"))
-    names = (address, service.name, short)
-    return any(host in names or f"{host}.".startswith(f"{short}.svc.") for host in hosts)
+    return any(is_of_service(host.strip(), rosproxy.id, address) for host in peers.split(";"))
 
 
 def _shown(text: str) -> str:

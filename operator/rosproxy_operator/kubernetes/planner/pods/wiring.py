@@ -1,9 +1,10 @@
 """Wires pods to the proxy at admission, and finds pods that are not wired.
 
-The containers of a wired pod have ROS_MASTER_URI and ROS_IP, or ROS_STATIC_PEERS for ROS 2.
-ROS_MASTER_URI and ROS_STATIC_PEERS name the RosProxy's Service, which leads to the proxy on the
-same node. The webhook uses `wire`. The planner finds pods that do not use their proxy:
-`wiring_finding` for ROS 1, `ros2_pods` for ROS 2.
+The containers of a wired pod have ROS_MASTER_URI and ROS_IP, or ROS_STATIC_PEERS for DDS, or
+ZENOH_CONFIG_OVERRIDE for rmw_zenoh. ROS_MASTER_URI, ROS_STATIC_PEERS and the endpoint in
+ZENOH_CONFIG_OVERRIDE name the RosProxy's Service, which leads to the proxy on the same node. The
+webhook uses `wire`. The planner finds pods that do not use their proxy: `wiring_finding` for ROS 1,
+`ros2_pods` for DDS, `zenoh_pods` for rmw_zenoh.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -15,6 +16,9 @@ import msgspec
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
+from rosproxy_operator.common.ros2 import is_dds
+from rosproxy_operator.common.zenoh import OVERRIDE, tcp_endpoint, with_client_override
+from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.cluster import WebhookState
 from rosproxy_operator.kubernetes.resources.model import (
@@ -31,8 +35,10 @@ from rosproxy_operator.kubernetes.resources.names import (
     MASTER_PORT,
     MASTER_URI,
     REPLACED_URI,
+    ROUTER_ENDPOINT,
     STATIC_PEERS,
     master_uri,
+    router_of,
     service_id,
 )
 from rosproxy_operator.kubernetes.resources.objects import MASTER_VARIABLE
@@ -61,14 +67,22 @@ class PodVariables(msgspec.Struct, frozen=True):
     """The variables that the webhook sets in a pod. An empty value or None sets no variable.
 
     ``uri`` is for ROS_MASTER_URI, ``static_peers`` for ROS_STATIC_PEERS, ``domain`` for
-    ROS_DOMAIN_ID. ``masters`` has the hosts and ports of the real master. The webhook replaces a
-    ROS_MASTER_URI of the template that names this master.
+    ROS_DOMAIN_ID, ``router`` for ZENOH_CONFIG_OVERRIDE. ``masters`` has the hosts and ports of the
+    real master. The webhook replaces a ROS_MASTER_URI of the template that names this master.
     """
 
     uri: str = ""
     static_peers: str = ""
     domain: int | None = None
     masters: frozenset[HostPort] = frozenset()
+    router: HostPort | None = None
+
+    @property
+    def name(self) -> str:
+        """The variable, for messages."""
+        if self.router:
+            return OVERRIDE
+        return "ROS_MASTER_URI and ROS_IP" if self.uri else "ROS_STATIC_PEERS"
 
 
 def pod_variables(rosproxy: RosProxy, cluster_ip: str) -> PodVariables:
@@ -79,6 +93,7 @@ def pod_variables(rosproxy: RosProxy, cluster_ip: str) -> PodVariables:
         cluster_ip if ros2 else "",
         ros2.domain if ros2 else None,
         _masters_of(rosproxy) if rosproxy.spec.ros1 else frozenset(),
+        router_of(cluster_ip) if rosproxy.spec.zenoh else None,
     )
 
 
@@ -89,6 +104,7 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
 
     - ROS 1: ROS_MASTER_URI, and ROS_IP if the template sets no ROS_HOSTNAME either.
     - ROS 2: ROS_STATIC_PEERS, and ROS_DOMAIN_ID if the RosProxy names a domain.
+    - rmw_zenoh: ZENOH_CONFIG_OVERRIDE, unless the container uses DDS (`wired_override`).
 
     New variables come first, because Kubernetes expands ``$(ROS_MASTER_URI)`` only in the variables
     after it. The webhook replaces a ROS_MASTER_URI that names the real master of the RosProxy, and
@@ -102,9 +118,7 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
     if MIRROR_ANNOTATION in annotations:
         warning = (
             "rosproxy: this pod was not wired to a proxy: the pod is a static pod, made from a "
-            "file on its node. Set "
-            f"{'ROS_MASTER_URI and ROS_IP' if wanted.uri else 'ROS_STATIC_PEERS'} in that file, or "
-            "run an ordinary pod"
+            f"file on its node. Set {wanted.name} in that file, or run an ordinary pod"
         )
         return Wiring(warnings=(warning,))
     spec = submap(pod, "spec")
@@ -125,6 +139,14 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
             _value(c, variable) == value for kind in _CONTAINER_FIELDS for c in wired.get(kind, ())
         )
     }
+    if wanted.router:
+        endpoint = tcp_endpoint(wanted.router)
+        if any(
+            endpoint in _value(c, OVERRIDE)
+            for kind in _CONTAINER_FIELDS
+            for c in wired.get(kind, ())
+        ):
+            new_annotations[ROUTER_ENDPOINT] = endpoint
     if replaced and MASTER_URI in new_annotations:
         new_annotations[REPLACED_URI] = replaced
     return Wiring({**spec, **wired} if changed else None, new_annotations)
@@ -145,9 +167,10 @@ def wiring_finding(
 def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
     """Whether a pod does not use its proxy, and the webhook would wire a recreated pod.
 
-    True if ROS_MASTER_URI or ROS_STATIC_PEERS is missing or outdated, or if the pod was wired for a
-    former RosProxy. A variable that the template sets does not count, except a ROS_MASTER_URI that
-    names the real master of the RosProxy. False for a pod without the label.
+    True if ROS_MASTER_URI, ROS_STATIC_PEERS or the endpoint in ZENOH_CONFIG_OVERRIDE is missing or
+    outdated, or if the pod was wired for a former RosProxy. A variable that the template sets does
+    not count, except a ROS_MASTER_URI that names the real master of the RosProxy, and a
+    ZENOH_CONFIG_OVERRIDE that the webhook can extend. False for a pod without the label.
     """
     masters = _masters_of(rosproxy)
     lacks_master = (
@@ -155,13 +178,34 @@ def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
         and all(_names_master(uri, masters) for uri in pod.own_masters)
         and (pod.wired_master_uri != master_uri(cluster_ip) or _is_of_former(pod, rosproxy))
     )
+    lacks_router = rosproxy.spec.zenoh is not None and any(
+        wired_override(c.variables, router_of(cluster_ip), pod.router_endpoint)
+        for c in pod.containers
+    )
     peers = {c.variables["ROS_STATIC_PEERS"] for c in pod.containers if has_peers(c)}
     lacks_peers = (
         rosproxy.spec.ros2 is not None
         and peers <= {pod.static_peers}
         and pod.static_peers != cluster_ip
     )
-    return INJECT in pod.labels and (lacks_master or lacks_peers)
+    return INJECT in pod.labels and (lacks_master or lacks_peers or lacks_router)
+
+
+def wired_override(variables: Mapping[str, str], router: HostPort, former: str) -> str:
+    """Return the ZENOH_CONFIG_OVERRIDE with which a container uses a router.
+
+    ``variables`` are those of the container, ``former`` is the endpoint that the webhook has set
+    before. The result is empty if the container stays as it is: the container uses DDS, its own
+    value names an endpoint or a mode, or its own value is only known at run time.
+    """
+    rmw = variables.get("RMW_IMPLEMENTATION", "")
+    own = variables.get(OVERRIDE, "")
+    if (rmw and is_dds(rmw) and VALUE_AT_RUNTIME[:2] not in rmw) or VALUE_AT_RUNTIME[:2] in own:
+        return ""
+    endpoint = tcp_endpoint(router)
+    if former and former != endpoint and f'"{former}"' in own:
+        return own.replace(f'"{former}"', f'"{endpoint}"')
+    return with_client_override(own, router)
 
 
 def has_peers(container: PodContainer) -> bool:
@@ -280,11 +324,16 @@ def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:
     if uri == VALUE_AT_RUNTIME:
         return True
     master = parse_slave_uri(uri.strip())
-    service = service_id(rosproxy_id)
     if master is None or master.port != MASTER_PORT:
         return False
-    host = master.host.lower().rstrip(".")
+    return is_of_service(master.host, rosproxy_id, cluster_ip)
+
+
+def is_of_service(host: str, rosproxy_id: Name, cluster_ip: str) -> bool:
+    """Whether a host is the address or a name of a RosProxy's Service."""
+    service = service_id(rosproxy_id)
     name = f"{service.name}.{service.namespace}"
+    host = host.lower().rstrip(".")
     return host in (cluster_ip.lower(), service.name, name) or f"{host}.".startswith(f"{name}.svc.")
 
 
@@ -350,7 +399,18 @@ def _wired(container: Json, wanted: PodVariables, annotations: Mapping[str, str]
     if wanted.domain is not None and "ROS_DOMAIN_ID" not in names:
         added.append({"name": "ROS_DOMAIN_ID", "value": str(wanted.domain)})
     env = [*added, *variables]
+    if wanted.router:
+        env = _with_router(container, env, wanted.router, annotations.get(ROUTER_ENDPOINT, ""))
     return {**container, "env": env} if env else container
+
+
+def _with_router(container: Json, env: list[Json], router: HostPort, former: str) -> list[Json]:
+    """Return the variables of a container with ZENOH_CONFIG_OVERRIDE for a router."""
+    value = wired_override(objects.ros2_variables(container), router, former)
+    if not value:
+        return env
+    others = [variable for variable in env if variable.get("name") != OVERRIDE]
+    return [{"name": OVERRIDE, "value": value}, *others]
 
 
 def _value(container: Json, name: str) -> str:

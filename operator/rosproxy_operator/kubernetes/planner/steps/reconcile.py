@@ -47,6 +47,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.names import (
     hubs_service_id,
     proxy_id,
+    router_host,
     service_id,
 )
 
@@ -61,7 +62,8 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
     pods = context.view.selected_pods.get(rosproxy.id, ())
     wired = (master.host for pod in pods if (master := parse_slave_uri(pod.wired_master_uri)))
     static_peers = (pod.static_peers for pod in pods if not pod.wired_master_uri)
-    hosts = Counter(host for host in (*wired, *static_peers) if is_address(host))
+    routers = (router_host(pod.router_endpoint) for pod in pods)
+    hosts = Counter(host for host in (*wired, *static_peers, *routers) if is_address(host))
     # If the status has no address, the Service gets the address to which most pods are wired.
     most_wired = min(hosts, key=lambda host: (-hosts[host], host), default="")
     body = manifests.service(rosproxy, rosproxy.cluster_ip or most_wired)
