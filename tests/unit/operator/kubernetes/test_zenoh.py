@@ -23,6 +23,7 @@ from rosproxy_operator.kubernetes.planner.pods.wiring import (
     wire,
 )
 from rosproxy_operator.kubernetes.planner.pods.zenoh_pods import zenoh_findings
+from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import ProxyService
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
@@ -503,3 +504,21 @@ def test_what_the_webhook_has_set_is_read():
     assert read_pod.router_endpoint == ENDPOINT
     assert read_pod.containers[0].variables == {OVERRIDE: AS_CLIENT}
     assert not read_pod.misspelt
+
+
+def test_pods_reach_the_router_and_proxies_reach_the_hub():
+    admin = replace(SETTINGS, admin_from=())
+    pods, hubs, operators = policy(ofz(), admin, {names.ROUTERS})["spec"]["ingress"]
+    assert [port["port"] for port in pods["ports"]] == [7448]
+    assert pods["from"] == [
+        {
+            "podSelector": {
+                "matchExpressions": [
+                    {"key": names.INJECT, "operator": "In", "values": ["robot", "true"]}
+                ]
+            }
+        }
+    ]
+    assert [port["port"] for port in hubs["ports"]] == [7447]
+    assert hubs["from"] == [{"podSelector": {"matchLabels": names.own_labels("robot")}}]
+    assert operators["from"] == []

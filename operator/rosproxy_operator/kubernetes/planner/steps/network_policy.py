@@ -5,6 +5,9 @@
 - Any source: ``spec.portWindow`` and a published master. ROS 1 uses TCP, ROS 2 and UDPROS use UDP.
 - The selected pods: the master port and the discovery port of ROS 2. With ``direction: Both`` or
   for ROS 2 also the ports of stand-ins. UDPROS from pods to outside goes through these ports, too.
+  For rmw_zenoh, the port of the router, and nothing else.
+- The proxies of the same RosProxy, for rmw_zenoh: the port of the hub. At this port no rules apply,
+  so no other pod may reach the hub.
 - The sources in ``settings.admin_from``, such as the operator's pod: the admin port. Without this
   setting any source may reach the admin port.
 
@@ -42,8 +45,10 @@ from rosproxy_operator.kubernetes.resources.cluster import ProxyPolicy
 from rosproxy_operator.kubernetes.resources.model import Json, Name, RosProxy
 from rosproxy_operator.kubernetes.resources.names import (
     ADMIN_PORT,
+    HUB_PORT,
     INJECT,
     MASTER_PORT,
+    ROUTERS,
     own_labels,
     pods_policy_id,
     policy_id,
@@ -180,9 +185,16 @@ def _spec(rosproxy: RosProxy, settings: ClusterSettings, ranges: Collection[Port
             # A rule with an empty list of ports would open all ports.
             *([{"ports": public_ports}] if public_ports else []),
             {"ports": [*_pod_ports(rosproxy)], "from": [{"podSelector": _pod_selector(rosproxy)}]},
+            *_hub_rules(rosproxy),
             admin,
         ],
     }
+
+
+def _hub_rules(rosproxy: RosProxy) -> Iterator[Json]:
+    if rosproxy.spec.zenoh:
+        proxies = {"matchLabels": own_labels(rosproxy.id.name)}
+        yield {"ports": [_port(HUB_PORT)], "from": [{"podSelector": proxies}]}
 
 
 def _public_ports(rosproxy: RosProxy, ranges: Collection[PortRange]) -> Iterator[Json]:
@@ -211,6 +223,8 @@ def _pod_ports(rosproxy: RosProxy) -> Iterator[Json]:
         yield _port(MASTER_PORT)
     if rosproxy.spec.ros2:
         yield _port(discovery_port(rosproxy.spec.ros2.number), protocol="UDP")
+    if rosproxy.spec.zenoh:
+        yield _port(ROUTERS.first)
     for protocol in proxy_ports.stand_in_protocols(rosproxy.spec):
         yield _port(proxy_ports.STAND_INS.first, proxy_ports.STAND_INS.last, protocol)
 
