@@ -10,7 +10,12 @@ from collections.abc import Mapping
 from itertools import islice
 
 from rosproxy.admin.requests import is_guid_prefix
-from rosproxy.admin.status_document import EndpointStatus, ParticipantStatus, ProxyStatus
+from rosproxy.admin.status_document import (
+    EndpointStatus,
+    ParticipantStatus,
+    ProxyStatus,
+    ZenohNodeStatus,
+)
 from rosproxy.net.addresses import parse_host_port, plain_address
 
 Leases = Mapping[str, tuple[int, ...]]
@@ -42,6 +47,11 @@ def participants_by_address(status: ProxyStatus) -> Mapping[str, tuple[Participa
         for participant in domain.inside:
             participants[plain_address(participant.address)].append(participant)
     return {address: tuple(group) for address, group in participants.items()}
+
+
+def nodes_inside(status: ProxyStatus) -> tuple[ZenohNodeStatus, ...]:
+    """Return the nodes of rmw_zenoh that are connected to a proxy, without nodes outside."""
+    return tuple(node for node in (status.zenoh.nodes if status.zenoh else ()) if node.address)
 
 
 def leases(status: ProxyStatus) -> Leases:

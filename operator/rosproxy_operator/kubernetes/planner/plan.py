@@ -61,6 +61,7 @@ from rosproxy_operator.kubernetes.planner.steps.reconcile import (
     seconds_to_deadlines,
 )
 from rosproxy_operator.kubernetes.planner.steps.remake import remake_unwired
+from rosproxy_operator.kubernetes.planner.zenoh_hubs import apart_findings, due_in
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Obstacle, RosProxyOnNode
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
@@ -171,6 +172,8 @@ def _waits(context: ClusterContext, departed: departures.Departures) -> Iterator
     yield from context.retries.pauses()
     yield from departures.next_checks(departed, context.now)
     yield from unselected_waits(context.state.unselected, context.now)
+    waits = (due_in(since, context.now) for since in context.state.apart.values())
+    yield from (seconds for seconds in waits if seconds > 0)
 
 
 def _status(
@@ -251,6 +254,7 @@ def _problems(
         *(f for pod in pods for f in ros2_findings(pod, rosproxy, address, webhook)),
         *(f for pod in pods for f in zenoh_findings(pod, rosproxy, address, webhook)),
         *lan_relay_findings(context, rosproxy),
+        *apart_findings(context.state.apart, rosproxy, context.now),
         *misspellings(context.view, rosproxy),
     )
 

@@ -24,6 +24,7 @@ from rosproxy_operator.common.port_ranges import (
 from rosproxy_operator.kubernetes.planner.cluster_view import View, has_ports, place_of, serves
 from rosproxy_operator.kubernetes.planner.former_ports import FormerPorts, remember
 from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
+from rosproxy_operator.kubernetes.planner.zenoh_hubs import Apart, hubs_apart
 from rosproxy_operator.kubernetes.resources.cluster import PodFailure
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
@@ -58,6 +59,7 @@ class ClusterState(msgspec.Struct, frozen=True):
       no look has seen a pod with it.
     - ``former``: see `former_ports`.
     - ``unselected``: the time since when no RosProxy selects a labelled pod.
+    - ``apart``: see `zenoh_hubs.hubs_apart`.
     """
 
     begun: bool = False
@@ -75,6 +77,7 @@ class ClusterState(msgspec.Struct, frozen=True):
     strange: Mapping[tuple[str, str], float] = {}
     former: Mapping[ProxyPlace, FormerPorts] = {}
     unselected: Mapping[Name, float] = {}
+    apart: Apart = {}
 
 
 def learn(view: View, state: ClusterState, now: float) -> ClusterState:
@@ -103,6 +106,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
         moved=_recent(view, state.moved, now - MOVE_REPORTED_S),
         tried=_recent(view, state.tried, now - TRIED_RANGE_REPORTED_S),
         unselected={p.id: state.unselected.get(p.id, now) for p in view.observed.unselected_pods},
+        apart=hubs_apart(view, state.apart, now),
     )
 
 

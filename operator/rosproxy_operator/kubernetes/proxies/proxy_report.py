@@ -2,7 +2,12 @@
 
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import ProblemStatus, ProxyStatus
+from rosproxy.admin.status_document import (
+    ProblemStatus,
+    ProxyStatus,
+    ZenohLinkStatus,
+    ZenohStatus,
+)
 from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, problem_subject
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
@@ -10,9 +15,10 @@ from rosproxy_operator.common.proxy_status import (
     inside_addresses,
     leases,
     nodes_by_address,
+    nodes_inside,
     participants_by_address,
 )
-from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
+from rosproxy_operator.kubernetes.resources.cluster import ProxyReport, ZenohReport
 
 RECENT_S = 300.0
 """Seconds for which a problem counts after the event. The proxy keeps listing its last problems."""
@@ -35,6 +41,8 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
     participants = participants_by_address(status)
     for participant in (p for group in participants.values() for p in group):
         topics.update(participant.publishes + participant.subscribes)
+    for inside in nodes_inside(status):
+        topics.update(inside.publishes + inside.subscribes)
     up = master.up or "1" not in status.settings.ros
     return ProxyReport(
         answered=True,
@@ -53,7 +61,22 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
         problems=tuple(short(f"{p.subject}: {p.text}") for p in status.problems if _is_reported(p)),
         range_probe=replace(status.range_probe, age=0.0) if status.range_probe else None,
         unregistered_addresses=inside_addresses(status) - nodes.keys() - participants.keys(),
+        zenoh=_zenoh_report(status) if status.zenoh else None,
     )
+
+
+def _zenoh_report(status: ProxyStatus) -> ZenohReport:
+    zenoh = status.zenoh or ZenohStatus()
+    return ZenohReport(
+        nodes=tuple(sorted({node.name for node in nodes_inside(status)})),
+        sessions=sum(1 for session in zenoh.sessions if session.port is not None),
+        peers={short(link.peer): _fault(link) for link in zenoh.links if not link.hub},
+        hubs={short(link.peer): _fault(link) for link in zenoh.links if link.hub},
+    )
+
+
+def _fault(link: ZenohLinkStatus) -> str:
+    return "" if link.up else short(link.error) or "not linked"
 
 
 def _is_reported(problem: ProblemStatus) -> bool:

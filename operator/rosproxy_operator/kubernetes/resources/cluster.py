@@ -121,6 +121,20 @@ class ProxyPolicy(msgspec.Struct, frozen=True):
     deleting: bool = False
 
 
+class ZenohReport(msgspec.Struct, frozen=True):
+    """The part of a `ProxyReport` about rmw_zenoh.
+
+    ``nodes`` are the names of ROS nodes in pods, ``sessions`` counts their sessions. ``peers`` and
+    ``hubs`` have the routers outside and the hubs of other nodes as ``host:port``, with the error
+    of the link; an empty error for a link that is up.
+    """
+
+    nodes: tuple[str, ...] = ()
+    sessions: int = 0
+    peers: Mapping[str, str] = {}
+    hubs: Mapping[str, str] = {}
+
+
 class ProxyReport(msgspec.Struct, frozen=True):
     """The part of a proxy's ``/status`` that the operator uses.
 
@@ -137,6 +151,7 @@ class ProxyReport(msgspec.Struct, frozen=True):
       so that an unchanged result gives an equal report.
     - ``unregistered_addresses``: addresses of nodes that the proxy has given up after a long
       silence. Such a node may come back.
+    - ``zenoh``: the routers for rmw_zenoh; None without routers.
     """
 
     answered: bool
@@ -150,6 +165,7 @@ class ProxyReport(msgspec.Struct, frozen=True):
     leases: Mapping[str, tuple[int, ...]] = {}
     range_probe: RangeProbeStatus | None = None
     unregistered_addresses: frozenset[str] = frozenset()
+    zenoh: ZenohReport | None = None
 
     @property
     def addresses(self) -> frozenset[str]:

@@ -17,6 +17,7 @@ from rosproxy_operator.kubernetes.status.operator_findings import (
 _BAD_STATUS = {
     "MasterReachable": "False",
     "PortsReachable": "False",
+    "PeersReachable": "False",
     "PortsAllocated": "False",
     "Ready": "False",
     "Degraded": "True",

@@ -39,9 +39,12 @@ STUCK = "ProxyStuck"
 SILENT = "ProxyUnreachable"
 NO_MASTER = "MasterUnreachable"
 NO_WAY_IN = "PortsUnreachable"
+NO_PEER = "PeerUnreachable"
 WARNS = "ProxyWarns"
 REFUSES = "PolicyRefused"
 _MOST_TEXT_CHARACTERS = 600
+_ZENOH_PEER = "zenoh peer "
+"""The beginning of a problem about a router outside (rosproxy.zenoh.findings)."""
 _UNRESOLVED = "can't be resolved"
 """Part of the error of a proxy about a host name (rosproxy.net.http_client)."""
 
@@ -192,8 +195,14 @@ def _answered(
     probe = answer.range_probe
     if probe is not None and probe.reached is False:
         yield _finding(rosproxy, subject, no_way_in(state, probe), NO_WAY_IN)
-    for problem in _own_problems(answer):
-        yield ClusterFinding(subject, problem, fatal=False, reason=WARNS, of=rosproxy.id)
+    yield from (_told(rosproxy, subject, problem) for problem in _own_problems(answer))
+
+
+def _told(rosproxy: RosProxy, subject: str, problem: str) -> ClusterFinding:
+    """The finding for a problem that a proxy reports."""
+    if problem.startswith(_ZENOH_PEER):
+        return finding(rosproxy, NO_PEER, bounded(problem, _MOST_TEXT_CHARACTERS), subject=subject)
+    return ClusterFinding(subject, problem, fatal=False, reason=WARNS, of=rosproxy.id)
 
 
 def _own_problems(answer: ProxyReport) -> list[str]:

@@ -22,13 +22,17 @@ _BY_REASON = {
     "MasterUnreachable": "start the master, allow connections, or correct spec.master, as the "
     f"message says: {_EDIT}",
     "NameTaken": "delete the object that the message names, or create it under another name",
+    "HubsApart": "let the proxies connect to each other's port 7447, and check that pods resolve "
+    "names by the cluster's DNS",
     "NoAdvertiseHost": ADDRESS_FIX,
+    "NoZenoh": _BY_POD,
     "NodeLeftOut": f"correct spec.nodeSelector: {_EDIT}",
     "NodeNotReady": "read kubectl get nodes, and kubectl describe node NODE",
     "NotAllowed": f"change the field that the message names ({_EDIT}), or have the value allowed "
     "as the message says",
     "NotWired": _BY_POD,
     "OtherDomain": _BY_POD,
+    "PeerUnreachable": f"do as the message says, or correct spec.peers: {_EDIT}",
     "PolicyRefused": f"change spec.image, or remove spec.image: {_EDIT}",
     "PortConflict": f"set a spec.portWindow without the ports that other programs use: {_EDIT}",
     "PortsExhausted": f"lower spec.ports, or widen spec.portWindow: {_EDIT}",

@@ -8,12 +8,14 @@ import msgspec
 
 from rosproxy.telemetry.text import clean, plural, shorten
 from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.common.zenoh import tcp_endpoint
 from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
     PodFailure,
     ProxyReport,
     RosProxyOnNode,
+    ZenohReport,
 )
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
@@ -21,11 +23,17 @@ from rosproxy_operator.kubernetes.resources.model import (
     Json,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, INJECT, master_uri
+from rosproxy_operator.kubernetes.resources.names import (
+    ADMIN_PORT,
+    INJECT,
+    master_uri,
+    router_of,
+)
 from rosproxy_operator.kubernetes.status.findings import (
     CONFLICT,
     EXHAUSTED,
     NO_MASTER,
+    NO_PEER,
     NO_WAY_IN,
     node_findings,
     proxy_subject,
@@ -37,6 +45,7 @@ PORTS = "PortsAllocated"
 MASTER = "MasterReachable"
 DEGRADED = "Degraded"
 WAY_IN = "PortsReachable"
+PEERS = "PeersReachable"
 MOST_MESSAGE_CHARACTERS = 1024
 """Characters of a message at most."""
 MOST_NODES = 200
@@ -57,6 +66,8 @@ _NO_PODS = "NoPods"
 _KEEPS_PODS_OUT = ("Ambiguous", "HostNetwork", "NodeLeftOut", "NotWired")
 """Reasons of findings about pods that get no proxy."""
 _NO_PROXY = "no proxy runs, so this is not known"
+_OF_ZENOH = ("sessions", "peers", "hubs")
+"""Fields of ``perNode`` about rmw_zenoh."""
 
 
 class Condition(msgspec.Struct, frozen=True):
@@ -94,15 +105,16 @@ def status_of(
     wanted = [state for state in states if state.pods]
     spec = rosproxy.spec
     participant_count = sum(int_at(line, "participants") for line in lines)
-    served = [plural(ros_nodes, "ROS node")] if spec.ros1 else []
+    served = [plural(ros_nodes, "ROS node")] if spec.ros1 or spec.zenoh else []
     if spec.ros2:
         served.append(f"{plural(participant_count, 'participant')} of domain {spec.ros2.number}")
     ready = _ready(rosproxy, wanted, problems, " and ".join(served))
     judged = (
         ready,
-        _allocated(wanted, problems),
+        *([_allocated(wanted, problems)] if not spec.zenoh else []),
         *([_reached(states, problems, former)] if spec.ros1 else []),
-        _way_in(states, problems, former),
+        *([_way_in(states, problems, former)] if not spec.zenoh else []),
+        *([_linked(states, problems, former)] if spec.zenoh and spec.zenoh.peers else []),
         _degraded(problems),
     )
     return {
@@ -110,12 +122,13 @@ def status_of(
         "message": _message(ready, problems),
         **_addressed(rosproxy, cluster_ip, master),
         **({"domain": spec.ros2.number, "participants": participant_count} if spec.ros2 else {}),
+        **({"sessions": sum(int_at(n, "sessions") for n in lines)} if spec.zenoh else {}),
         "nodes": len(wanted),
         "proxies": f"{sum(map(_serving, wanted))}/{len(wanted)}",
         "rosNodes": ros_nodes,
         "topics": _topics(states, former),
-        "addresses": _addresses(wanted),
-        "ports": _ports(states),
+        "addresses": "" if spec.zenoh else _addresses(wanted),
+        "ports": "" if spec.zenoh else _ports(states),
         "livePage": _live_page(wanted),
         "perNode": lines,
         "conditions": _conditions(judged, former, rosproxy.generation, stamp),
@@ -145,6 +158,9 @@ def _addressed(rosproxy: RosProxy, cluster_ip: str, master: str) -> dict[str, ob
         fields = {"master": master, "masterURI": uri}
     if rosproxy.spec.ros2:
         fields["staticPeers"] = cluster_ip or rosproxy.cluster_ip
+    if rosproxy.spec.zenoh:
+        address = cluster_ip or rosproxy.cluster_ip
+        fields["routerEndpoint"] = tcp_endpoint(router_of(address)) if address else ""
     return fields
 
 
@@ -185,7 +201,7 @@ def _line(rosproxy: RosProxy, state: RosProxyOnNode, most_names: int) -> dict[st
     line = {
         "name": state.name,
         "advertiseHost": state.advertise_host,
-        "ports": str(state.range or ""),
+        "ports": "" if rosproxy.spec.zenoh else str(state.range or ""),
         "proxy": proxy.pod.id.name if proxy else "",
         "ready": _serving(state),
         "pods": len(state.pods),
@@ -198,20 +214,33 @@ def _line(rosproxy: RosProxy, state: RosProxyOnNode, most_names: int) -> dict[st
 def _ros(state: RosProxyOnNode, limit: int, former: Json) -> dict[str, object]:
     """The ROS nodes and topics behind a proxy, by the present answer or else the former status."""
     if _has_answered(state.answer):
-        names = sorted({name for group in state.answer.nodes.values() for name in group})
+        zenoh = state.answer.zenoh
+        found = {name for group in state.answer.nodes.values() for name in group}
+        names = sorted({*found, *(zenoh.nodes if zenoh else ())})
         shown = [shorten(clean(name), _MOST_NAME_CHARACTERS) for name in names[:limit]]
         by_address = state.answer.participants
         counted = {"participants": sum(map(len, by_address.values()))} if by_address else {}
         count = len(state.answer.topics)
-        return {"rosNodes": len(names), "names": shown, "topics": count, **counted}
+        sessions = _sessions(zenoh) if zenoh else {}
+        return {"rosNodes": len(names), "names": shown, "topics": count, **counted, **sessions}
     lines = submaps(former, "perNode") if state.proxy is not None else ()
     last = next((line for line in lines if line.get("name") == state.name), {})
     return {
         "rosNodes": int_at(last, "rosNodes"),
         "names": list(last.get("names") or ()),
         "topics": int_at(last, "topics"),
-        **({"participants": int_at(last, "participants")} if "participants" in last else {}),
+        **{key: last[key] for key in ("participants", *_OF_ZENOH) if key in last},
     }
+
+
+def _sessions(zenoh: ZenohReport) -> dict[str, object]:
+    """The sessions of nodes in pods, and how many links are up, of all."""
+    links = {"peers": zenoh.peers, "hubs": zenoh.hubs}
+    counts = {
+        key: f"{sum(not fault for fault in of_kind.values())}/{len(of_kind)}"
+        for key, of_kind in links.items()
+    }
+    return {"sessions": zenoh.sessions, **counts}
 
 
 def _has_answered(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:
@@ -401,6 +430,27 @@ def _way_in(
     lines = [f"{proxy_subject(p)}: {not_proven(s, probe)}" for s, p, probe in open_questions]
     reason = "NotTried" if any(probe is None for _, _, probe in open_questions) else "NotProven"
     return Condition(WAY_IN, "Unknown", reason, ". ".join(lines))
+
+
+def _linked(
+    states: Sequence[RosProxyOnNode], problems: Sequence[ClusterFinding], former: Json
+) -> Condition:
+    """The condition PeersReachable; the former condition if a proxy has not answered yet."""
+    lines = [_one_line(problem) for problem in problems if problem.reason == NO_PEER]
+    if lines:
+        return Condition(PEERS, "False", NO_PEER, ". ".join(lines))
+    proxies = [state for state in states if _may_answer(state)]
+    if not proxies:
+        return Condition(PEERS, "Unknown", "NoProxies", _NO_PROXY)
+    answers = {s.name: s.answer.zenoh for s in proxies if _has_answered(s.answer)}
+    if len(answers) < len(proxies):
+        return _previous(PEERS, former)
+    peers = ((name, zenoh.peers) for name, zenoh in answers.items() if zenoh)
+    down = [f"node {name}: {p}" for name, every in peers for p, fault in every.items() if fault]
+    if down:
+        return Condition(PEERS, "Unknown", "Linking", f"not linked yet: {', '.join(down)}")
+    text = "every proxy is linked with every router of spec.peers"
+    return Condition(PEERS, "True", "Reached", text)
 
 
 def _may_answer(state: RosProxyOnNode) -> bool:

@@ -80,7 +80,7 @@ def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **chan
 
 def site(of: RosProxy, on: ClusterNode, ports: PortRange = RANGE, publish: int = 0) -> ProxySite:
     """A site for a proxy of a RosProxy, with the planner's defaults."""
-    host = on.advertise_host or on.addresses["InternalIP"]
+    host = on.advertise_host or on.addresses.get("InternalIP", "")
     (of,) = with_pod_defaults(ClusterSnapshot(rosproxies=(of,)), SETTINGS.pod).rosproxies
     host = "" if of.spec.zenoh else host
     return ProxySite(of, on, host, ports, replace(of.spec.master, publish=publish))

@@ -6,6 +6,15 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy.access.rules import parse_rules
+from rosproxy.admin.status_document import (
+    ProblemStatus,
+    ProxyStatus,
+    StatusSettings,
+    ZenohLinkStatus,
+    ZenohNodeStatus,
+    ZenohSessionStatus,
+    ZenohStatus,
+)
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.policy import administrators_policy
@@ -15,6 +24,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     CreateService,
     DeleteProxy,
     DeleteService,
+    Emit,
 )
 from rosproxy_operator.kubernetes.planner.bounds import bounds_violation
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
@@ -24,20 +34,24 @@ from rosproxy_operator.kubernetes.planner.pods.wiring import (
 )
 from rosproxy_operator.kubernetes.planner.pods.zenoh_pods import zenoh_findings
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
+from rosproxy_operator.kubernetes.planner.zenoh_hubs import APART_REPORTED_S, hub_name
+from rosproxy_operator.kubernetes.proxies.proxy_report import report
 from rosproxy_operator.kubernetes.resources import names, objects
-from rosproxy_operator.kubernetes.resources.cluster import ProxyService
+from rosproxy_operator.kubernetes.resources.cluster import ProxyReport, ProxyService, ZenohReport
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import (
     Json,
     MasterSpec,
     Pod,
     PodContainer,
+    ProxyPlace,
     Ros2Spec,
     RosProxy,
     ZenohSpec,
 )
 from rosproxy_operator.kubernetes.resources.spec import rosproxy as read
 from rosproxy_operator.kubernetes.settings import Bounds
+from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 from tests.run_options import settings_of
 from tests.unit.operator.kubernetes import objects as some
 from tests.unit.operator.kubernetes.builders_api import rosproxy_obj
@@ -53,6 +67,9 @@ from tests.unit.operator.kubernetes.objects import (
     proxy,
     service,
     site,
+    status,
+    told,
+    written,
 )
 
 DEFAULTS = {
@@ -522,3 +539,154 @@ def test_pods_reach_the_router_and_proxies_reach_the_hub():
     assert [port["port"] for port in hubs["ports"]] == [7447]
     assert hubs["from"] == [{"podSelector": {"matchLabels": names.own_labels("robot")}}]
     assert operators["from"] == []
+
+
+STATUS = ProxyStatus(
+    settings=StatusSettings(ros=("zenoh",)),
+    zenoh=ZenohStatus(
+        links=(
+            ZenohLinkStatus("192.0.2.7:7447", True),
+            ZenohLinkStatus("robot:7447", error="refused"),
+            ZenohLinkStatus("far:7447", error="unresolvable", hub=True),
+        ),
+        sessions=(
+            ZenohSessionStatus(7448, "client", "a", "10.244.1.200:7448", "10.244.1.9:5000"),
+            ZenohSessionStatus(None, "router", "b", "10.244.1.200:5001", "192.0.2.7:7447"),
+        ),
+        nodes=(
+            ZenohNodeStatus("/talker", 0, "10.244.1.9", ("/chatter",), ("/clock",)),
+            ZenohNodeStatus("/robot", 0, "", ("/scan",)),
+        ),
+    ),
+)
+FAULT = "zenoh peer robot:7447: connection refused. Fix: start a router"
+
+
+def test_what_the_operator_keeps_of_a_status():
+    told_status = report(STATUS)
+    assert told_status.zenoh == ZenohReport(
+        nodes=("/talker",),
+        sessions=1,
+        peers={"192.0.2.7:7447": "", "robot:7447": "refused"},
+        hubs={"far:7447": "unresolvable"},
+    )
+    assert told_status.topics == {"/chatter", "/clock"}
+    assert told_status.master_up
+    # Nodes of rmw_zenoh are unregistered by no call of the operator.
+    assert not told_status.addresses
+    assert report(ProxyStatus()).zenoh is None
+
+
+def answered(of: RosProxy, *answers: Any, **changes: Any) -> Any:
+    """A cluster with a proxy on each node, which has answered."""
+    nodes = [node(name, addresses={}) for name in ("one", "two", "three")[: len(answers)]]
+    pods = [pod(name=f"on-{n.name}", on=n.name, router_endpoint=ENDPOINT) for n in nodes]
+    proxies = [proxy_of(of, n) for n in nodes]
+    reports = {p.pod.uid: a for p, a in zip(proxies, answers, strict=True)}
+    return seen(of, *nodes, *pods, *proxies, reports=reports, **changes)
+
+
+def conditions(plan: Any) -> dict[str, tuple[str, str]]:
+    return {c["type"]: (c["status"], c["reason"]) for c in status(plan)["conditions"]}
+
+
+def test_the_status_of_a_rosproxy():
+    of = ofz("192.0.2.7:7447", "robot:7447")
+    plan = look(answered(of, report(STATUS)))
+    told_status = status(plan)
+    assert told_status["routerEndpoint"] == ENDPOINT
+    assert (told_status["sessions"], told_status["rosNodes"], told_status["topics"]) == (1, 1, 2)
+    assert (told_status["ports"], told_status["addresses"]) == ("", "")
+    (line,) = told_status["perNode"]
+    assert (line["sessions"], line["peers"], line["hubs"]) == (1, "1/2", "0/1")
+    assert line["names"] == ["/talker"]
+    assert not {"ports", "advertiseHost"} & line.keys()
+    assert conditions(plan) == {
+        "Ready": ("True", "Serving"),
+        "PeersReachable": ("Unknown", "Linking"),
+        "Degraded": ("False", "AsExpected"),
+    }
+    message = told_status["conditions"][0]["message"]
+    assert message == "1 of 1 proxies serve 1 ROS node"
+
+
+def test_a_proxy_that_has_not_answered_changes_no_status():
+    of = ofz("robot:7447")
+    first = answered(of, report(STATUS))
+    known = written(first)
+    assert status_or_none(look(replace(known, reports={}))) is None
+
+
+def status_or_none(plan: Any) -> Any:
+    try:
+        return status(plan)
+    except StopIteration:
+        return None
+
+
+def test_a_peer_that_is_down_is_told_with_an_event():
+    of = ofz("robot:7447")
+    faulty = replace(report(STATUS), problems=(FAULT,))
+    plan = look(answered(of, faulty))
+    assert conditions(plan)["PeersReachable"] == ("False", "PeerUnreachable")
+    assert conditions(plan)["Degraded"] == ("True", "PeerUnreachable")
+    assert conditions(plan)["Ready"] == ("True", "Serving")
+    (text,) = told(plan, "PeerUnreachable")
+    assert text.endswith(FAULT)
+    events = [action for action in plan.actions if isinstance(action, Emit)]
+    assert "PeerUnreachable" in {event.reason for event in events}
+    problem = ProblemStatus(subject="zenoh peer robot:7447", text="connection refused", holds=True)
+    told_status = report(replace(STATUS, problems=(problem,)))
+    assert told_status.problems == ("zenoh peer robot:7447: connection refused",)
+
+
+def test_the_doctor_says_which_peer_is_down():
+    of = ofz("robot:7447")
+    plan = look(answered(of, replace(report(STATUS), problems=(FAULT,))))
+    reported = cluster_findings([{**rosproxy_obj(), "status": dict(status(plan))}])
+    (peers,) = (f for f in reported if f.text.startswith("PeersReachable is False: "))
+    assert FAULT in peers.text
+    assert "spec.peers" in peers.fix
+
+
+def test_peers_that_are_linked():
+    good = ZenohReport(peers={"robot:7447": ""})
+    plan = look(answered(ofz("robot:7447"), ProxyReport(True, True, zenoh=good)))
+    assert conditions(plan)["PeersReachable"] == ("True", "Reached")
+    assert "PeersReachable" not in conditions(look(answered(ofz(), ProxyReport(True, True))))
+
+
+def linked(*nodes_up: str, down: tuple[str, ...] = ()) -> ProxyReport:
+    """The answer of a proxy that is linked with the proxies on some nodes."""
+    hubs = {hub_name(ProxyPlace(ROBOT, on)): "" for on in nodes_up}
+    hubs |= {hub_name(ProxyPlace(ROBOT, on)): "silent" for on in down}
+    return ProxyReport(True, True, zenoh=ZenohReport(hubs=hubs))
+
+
+@pytest.mark.parametrize(
+    ("one", "two", "apart"),
+    [
+        (linked("two"), linked("one"), False),
+        (linked("two"), linked(down=("one",)), False),  # behind NAT, one side sees the address
+        (linked(), linked("one"), False),  # the proxy on one is older than node two
+        (linked(), linked(), False),  # beyond the bound of hubs
+        (linked(down=("two",)), linked(down=("one",)), True),
+        (linked(), linked(down=("one",)), True),
+    ],
+)
+def test_hubs_that_are_apart_are_told_after_a_while(
+    one: ProxyReport, two: ProxyReport, apart: bool
+):
+    cluster = answered(ofz(), one, two)
+    first = look(cluster, now=100.0)
+    assert not told(first, "HubsApart")
+    assert bool(first.state.apart) is apart
+    assert first.next_look_in is not None
+    assert first.next_look_in <= APART_REPORTED_S
+    later = look(cluster, first.state, now=100.0 + APART_REPORTED_S)
+    assert [text[:24] for text in told(later, "HubsApart")] == (
+        ["proxy on node one: the hub "[:24]] if apart else []
+    )
+    healed = look(answered(ofz(), linked("two"), linked("one")), later.state, now=200.0)
+    assert not told(healed, "HubsApart")
+    assert not healed.state.apart

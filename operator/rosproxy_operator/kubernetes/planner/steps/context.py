@@ -10,6 +10,7 @@ from rosproxy_operator.kubernetes.planner.cluster_view import View
 from rosproxy_operator.kubernetes.planner.manifests import TERMINATION_GRACE_S, ProxySite
 from rosproxy_operator.kubernetes.planner.retries import Retries
 from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.planner.zenoh_hubs import hub_name
 from rosproxy_operator.kubernetes.resources.checks import host_problem
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
@@ -22,8 +23,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
-    HUB_PORT,
-    hub_host,
     proxy_id,
     relay_secret_of,
     token_of,
@@ -203,8 +202,8 @@ def hubs_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
     if context.view.rosproxies[place.of].spec.zenoh is None:
         return ()
     others = (other for other in context.view.places.get(place.of, ()) if other != place)
-    hosts = sorted(hub_host(o.of, o.node) for o in others if o.node in context.observed.nodes)
-    return tuple(f"{host}:{HUB_PORT}" for host in hosts[:MOST_ZENOH_HUBS])
+    hubs = sorted(hub_name(o) for o in others if o.node in context.observed.nodes)
+    return tuple(hubs[:MOST_ZENOH_HUBS])
 
 
 def peers(context: ClusterContext) -> dict[str, tuple[str, ...]]:

@@ -1,0 +1,74 @@
+"""Finds proxies for rmw_zenoh that are not linked with each other.
+
+Each hub dials the hubs of the other nodes. A session may be visible to a single side: behind NAT,
+the hub that was dialed does not see the address of the other hub. So two proxies are linked if one
+of the two says so.
+"""
+
+from collections.abc import Iterator, Mapping
+from itertools import combinations
+
+from rosproxy.telemetry.text import listed
+from rosproxy_operator.kubernetes.planner.cluster_view import View, group_by_key
+from rosproxy_operator.kubernetes.resources.cluster import ZenohReport
+from rosproxy_operator.kubernetes.resources.model import ClusterFinding, ProxyPlace, RosProxy
+from rosproxy_operator.kubernetes.resources.names import HUB_PORT, hub_host
+from rosproxy_operator.kubernetes.status.findings import finding
+
+APART_REPORTED_S = 30.0
+"""Seconds until proxies that are not linked are reported. DNS may keep "no such name" as long."""
+Apart = Mapping[tuple[ProxyPlace, str], float]
+"""The time since when a proxy is not linked with the proxy on another node."""
+
+
+def hub_name(place: ProxyPlace) -> str:
+    """Return the hub of a place as ``host:port``, as the hubs of other nodes dial it."""
+    return f"{hub_host(place.of, place.node)}:{HUB_PORT}"
+
+
+def hubs_apart(view: View, former: Apart, now: float) -> dict[tuple[ProxyPlace, str], float]:
+    """Return the pairs of ready proxies without a link, and the time since when."""
+    reports = [*_reports(view)]
+    by_rosproxy = group_by_key((place.of, (place, report)) for place, report in reports)
+    return {
+        (one, other.node): former.get((one, other.node), now)
+        for group in by_rosproxy.values()
+        for (one, report), (other, others_report) in combinations(group, 2)
+        if _is_apart(report.hubs.get(hub_name(other)), others_report.hubs.get(hub_name(one)))
+    }
+
+
+def apart_findings(apart: Apart, rosproxy: RosProxy, now: float) -> Iterator[ClusterFinding]:
+    """Yield a finding for each proxy of a RosProxy that is not linked with others."""
+    due = (p for p, since in apart.items() if p[0].of == rosproxy.id and due_in(since, now) <= 0)
+    for place, nodes in sorted(group_by_key(due).items()):
+        text = (
+            f"the hub is not linked with the hubs on node {listed(sorted(nodes))}, so messages "
+            f"between pods of these nodes may not pass. Let the proxies connect to each other at "
+            f"port {HUB_PORT} (NetworkPolicy, firewall), and check that pods resolve "
+            f"{hub_host(place.of, nodes[0])}"
+        )
+        yield finding(rosproxy, "HubsApart", text, subject=f"proxy on node {place.node}")
+
+
+def due_in(since: float, now: float) -> float:
+    """Return the seconds until a missing link is reported."""
+    return since + APART_REPORTED_S - now
+
+
+def _reports(view: View) -> Iterator[tuple[ProxyPlace, ZenohReport]]:
+    """Yield the reports of ready proxies for rmw_zenoh, sorted by place."""
+    for place, proxy in sorted(view.current.items(), key=lambda item: item[0]):
+        report = view.observed.reports.get(proxy.pod.uid)
+        if proxy.ready and report is not None and report.answered and report.zenoh is not None:
+            yield place, report.zenoh
+
+
+def _is_apart(*faults: str | None) -> bool:
+    """Whether a hub dials another hub, and no side has a link.
+
+    Each fault is the error of a link, empty for a link that is up, and None if the side does not
+    dial the other side.
+    """
+    known = [fault for fault in faults if fault is not None]
+    return bool(known) and all(known)
