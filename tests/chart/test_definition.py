@@ -15,6 +15,7 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     ProxyPod,
     ProxyReport,
     RosProxyOnNode,
+    ZenohReport,
 )
 from rosproxy_operator.kubernetes.resources.model import Name, Pod
 from rosproxy_operator.kubernetes.resources.spec import (
@@ -182,7 +183,11 @@ def test_status_is_in_the_definition() -> None:
     )
     stamp = "2026-01-01T00:00:00Z"
     status = status_of(own, states, (), "192.0.2.9", "http://robot:11311", stamp)
-    written = set(paths(status, "status"))
+    zenoh = rosproxy({**body, "spec": {"ros": "zenoh"}})
+    routers = ProxyReport(True, True, zenoh=ZenohReport(("/talker",), 1))
+    of_zenoh = (RosProxyOnNode("n", "", ports, proxy, (pod,), routers),)
+    other_status = status_of(zenoh, of_zenoh, (), "192.0.2.9", "", stamp)
+    written = {*paths(status, "status"), *paths(other_status, "status")}
     assert written <= set(STATUS)
     unused = {"status.perNode[].message", "status.conditions[].observedGeneration"}
     assert set(STATUS) - written <= unused

@@ -104,8 +104,8 @@ class Bounds(msgspec.Struct, frozen=True):
     peers: Annotated[
         tuple[str, ...],
         Option(
-            "ROS 2: hosts that `spec.peers` may name, for example `192.0.2.*`. A pattern "
-            "without letters matches addresses only. Repeatable.",
+            "ROS 2, also with rmw_zenoh: hosts that `spec.peers` may name, for example "
+            "`192.0.2.*`. A pattern without letters matches addresses only. Repeatable.",
             option_values.GLOB,
             name="--allow-peer",
             repeatable=True,
