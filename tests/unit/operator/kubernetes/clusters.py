@@ -49,6 +49,7 @@ CHANGES: tuple[dict[str, Any], ...] = (
     {"ros": 2, "multicast": True, "peers": ["robot"]},
     {"ros": 2, "multicast": None, "domain": 7},
     {"ros": "1,2", "multicast": True},
+    {"ros": "zenoh", "peers": ["robot"]},
     {"ros": 1},
 )
 LABELS = ({names.INJECT: "true"}, {names.INJECT: "robot", "app": "x"}, {names.INJECT: "arm"},
@@ -59,6 +60,12 @@ T = TypeVar("T")
 def mended(spec: Object) -> Object:
     """A spec that the API server accepts, for any version of ROS."""
     ros = str(spec.get("ros", 1))
+    if ros == "zenoh":  # only defaults, as the API server fills in
+        window = {"first": 11412, "last": 29999}
+        absent = dict.fromkeys(
+            ("master", "multicast", "domain", "advertise", "cleanupAfterSeconds")
+        )
+        return spec | absent | {"ports": 32, "portWindow": window}
     if "1" not in ros:
         spec = spec | {"master": None}
     elif not spec["master"]:

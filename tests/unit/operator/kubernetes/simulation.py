@@ -192,6 +192,7 @@ class Cluster:
         if name_of(body) in self.state.services:
             raise Refused("AlreadyExists")
         allocated = {existing["spec"]["clusterIP"] for existing in self.state.services.values()}
+        allocated.discard("None")  # of headless Services
         service = copy.deepcopy(body)
         wanted = service["spec"].setdefault("clusterIP", f"10.96.1.{next(self.numbers) % 250}")
         if wanted in allocated:
@@ -299,7 +300,7 @@ class Cluster:
         pods = [parse.pod(pod) for pod in seen.pods.values()]
         own = [proxy for pod in seen.pods.values() if (proxy := parse.proxy_pod(pod))]
         helpers = [*filter(None, map(parse.helper_pod, seen.pods.values()))]
-        services = filter(None, map(parse.service, seen.services.values()))
+        services = [*filter(None, map(parse.service, seen.services.values()))]
         policies = seen.policies.values()
         of = tuple(parse_rosproxy.rosproxy(rosproxy) for rosproxy in self.state.rosproxies.values())
         masters = {rosproxy.spec.master.service for rosproxy in of if rosproxy.spec.master.service}
@@ -311,7 +312,8 @@ class Cluster:
             proxies=tuple(own),
             lan_relays=tuple(h for h in helpers if h.component == names.LAN_RELAY),
             image_checks=tuple(h for h in helpers if h.component == names.IMAGE_CHECK),
-            services={service.of: service for service in services},
+            services={service.of: service for service in services if not service.names_hubs},
+            hub_services={service.of: service for service in services if service.names_hubs},
             policies={policy.id: policy for policy in filter(None, map(parse.policy, policies))},
             key=self.key,
             masters=dict.fromkeys(masters, resolved),

@@ -161,6 +161,8 @@ class World:
     def is_lawful(self, of: Name, ports: PortRange) -> bool:
         """Whether the RosProxy allows a range."""
         spec = self.cluster.state.rosproxies[of]["spec"]
+        if spec.get("ros") == "zenoh":
+            return ports == names.ROUTERS
         publish = (spec["master"] or {}).get("publish", 0)
         own = {names.MASTER_PORT, names.ADMIN_PORT, publish}
         inside = (
@@ -247,9 +249,11 @@ class World:
         self.check_proxies(plan, {place for place in wanted if place.node not in unready}, unready)
         services = [service for service in state.services.values() if is_own(service)]
         owners = sorted(service["metadata"]["ownerReferences"][0]["uid"] for service in services)
-        assert owners == sorted(rosproxy.uid for rosproxy in rosproxies)
+        uids = sorted(rosproxy.uid for rosproxy in rosproxies)
+        with_hubs = [rosproxy.uid for rosproxy in rosproxies if rosproxy.spec.zenoh]
+        assert owners == sorted([*uids, *with_hubs])
         policies = state.policies.values()
-        assert sorted(p["metadata"]["ownerReferences"][0]["uid"] for p in policies) == owners
+        assert sorted(p["metadata"]["ownerReferences"][0]["uid"] for p in policies) == uids
         for rosproxy in rosproxies:
             stored_policy = objects.policy(state.policies[names.policy_id(rosproxy.id)])
             assert stored_policy is not None
@@ -305,7 +309,8 @@ class World:
                 told = [(problem.reason, problem.of) for problem in plan.problems]
                 assert ("ImageUnusable", place.of) in told
                 continue
-            assert len(proxy.range) == rosproxy["ports"] or self.told(plan, place, "PortsExhausted")
+            has_all = len(proxy.range) == rosproxy["ports"] or proxy.range == names.ROUTERS
+            assert has_all or self.told(plan, place, "PortsExhausted")
             env = {variable["name"]: variable["value"] for variable in container["env"]}
             self.check_versions(place, proxy, env)
             token = names.token_of(self.cluster.key, proxy.pod.id, place.node)
@@ -322,6 +327,8 @@ class World:
         spec = parse_rosproxy.rosproxy(self.cluster.state.rosproxies[place.of]).spec
         assert bool(proxy.pod.host_ports) == spec.ros1
         assert bool(proxy.pod.udp_ports) == (spec.ros2 is not None)
+        assert (proxy.range == names.ROUTERS) == (spec.zenoh is not None)
+        assert (env.get("ROSPROXY_ROS") == "zenoh") == (spec.zenoh is not None)
         secret = names.relay_secret_of(self.cluster.key, proxy.pod.id, place.node)
         expected = secret if "ROSPROXY_ROS2_LAN_RELAY" in env else None
         assert env.get("ROSPROXY_ROS2_LAN_RELAY_SECRET") == expected
