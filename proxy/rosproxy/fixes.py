@@ -123,7 +123,8 @@ FIXES = {
     ),
     "zenoh nodes": Fix(
         "set for the nodes in containers: RMW_IMPLEMENTATION=rmw_zenoh_cpp and "
-        """ZENOH_CONFIG_OVERRIDE='mode="client";connect/endpoints=["tcp/PROXY:{port}"]'""",
+        """ZENOH_CONFIG_OVERRIDE='mode="client";connect/endpoints=["tcp/PROXY:{port}"];"""
+        "connect/timeout_ms=-1'",
         "start nodes with RMW_IMPLEMENTATION=rmw_zenoh_cpp in a container with the label "
         "rosproxy.enable=true. Unset ZENOH_SESSION_CONFIG_URI there",
         _INJECTED.format(nodes="nodes with RMW_IMPLEMENTATION=rmw_zenoh_cpp"),

@@ -15,6 +15,7 @@ OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
 SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"
 MOST_ENDPOINTS = 32
 """The most endpoints that the operator reads from a variable."""
+_WAIT = "connect/timeout_ms=-1"
 _ENDPOINT = re.compile(r"[\"']([a-z]+)/([^\"'/?#;]{1,300})[^\"']*[\"']")
 _ROUTER = re.compile(r"(^|[\s/;&])(rmw_)?zenohd($|[\s;&])")
 
@@ -27,8 +28,13 @@ class Endpoint(NamedTuple):
 
 
 def client_override(router: HostPort) -> str:
-    """Return the value of ZENOH_CONFIG_OVERRIDE that makes nodes clients of a router."""
-    return f'mode="client";connect/endpoints=["{tcp_endpoint(router)}"]'
+    """Return the value of ZENOH_CONFIG_OVERRIDE that makes nodes clients of a router.
+
+    The nodes wait until they reach the router. With rmw_zenoh's own time-out for clients, which is
+    0, a node ends if no router answers at its start (DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5,
+    ``connect``).
+    """
+    return f'mode="client";connect/endpoints=["{tcp_endpoint(router)}"];{_WAIT}'
 
 
 def tcp_endpoint(router: HostPort) -> str:
@@ -44,7 +50,10 @@ def with_client_override(override: str, router: HostPort) -> str:
     keys = {pair.partition("=")[0].strip() for pair in override.split(";")}
     if any(key in ("mode", "connect") or key.startswith("connect/endpoints") for key in keys):
         return ""
-    return ";".join(filter(None, [override.strip().rstrip(";"), client_override(router)]))
+    own = client_override(router)
+    if any(key.startswith("connect/timeout_ms") for key in keys):
+        own = own.removesuffix(f";{_WAIT}")
+    return ";".join(filter(None, [override.strip().rstrip(";"), own]))
 
 
 def is_client(override: str) -> bool:

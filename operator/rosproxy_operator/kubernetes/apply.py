@@ -59,6 +59,8 @@ ADDRESS_RETRY_PAUSES_S = (0.2, 0.5, 1.0)
 Pods know only this address. The API server reports a Service as deleted before the address is free.
 """
 
+_HEADLESS = "None"
+"""The clusterIP of a Service without an address."""
 _PATHS = {"Pod": "pods", "Service": "services", "NetworkPolicy": POLICIES}
 """The plurals in the API's paths, for the kinds that the operator creates and deletes."""
 Count = Callable[[Action, str], None]
@@ -343,7 +345,7 @@ def _create(
     except ApiConflict:
         _check_ours(api, kind, body)
     except ApiInvalid as error:
-        if "clusterIP" not in body["spec"]:
+        if body["spec"].get("clusterIP", _HEADLESS) == _HEADLESS:
             raise
         if pauses:
             time.sleep(pauses[0])

@@ -587,7 +587,8 @@ def test_with_the_rules_the_sysctl_goes() -> None:
 def test_where_it_can_not_be_set_a_client_is_the_fix() -> None:
     state = observed(node(), **the_proxy())
     (group,) = (g for g in look(state).groups if g.subject)
-    override = f'mode="client";connect/endpoints=["tcp/{proxy_name(ZENOH)}:7448"]'
+    endpoint = f"tcp/{proxy_name(ZENOH)}:7448"
+    override = f'mode="client";connect/endpoints=["{endpoint}"];connect/timeout_ms=-1'
     assert group.fix.endswith(f"or set ZENOH_CONFIG_OVERRIDE='{override}'")
 
 

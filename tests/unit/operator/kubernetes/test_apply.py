@@ -154,6 +154,13 @@ async def test_a_lost_service_gets_its_address_or_another(
     assert carry.applier.failures == {OF: {}}
 
 
+async def test_a_headless_service_gets_no_address(server: ApiServer, carry: Carried) -> None:
+    server.address_refusals["None"] = 1000
+    await carry.out(CreateService(OF, body("Service", "hubs", clusterIP="None")))
+    assert server.all("services") == []
+    assert carry.applier.failures[OF].keys() == {Name(NAMESPACE, "hubs")}
+
+
 async def test_nothing_is_deleted_but_what_was_seen(server: ApiServer, carry: Carried) -> None:
     server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     old = proxy_obj()
