@@ -72,11 +72,12 @@ _NOT_OF_ZENOH = {
     "advertise": "advertise",
     "cleanupAfterSeconds": "cleanup_after",
 }
-"""Fields that proxies for rmw_zenoh do not have, each with the field of `RosProxySpec`. The API
-server fills in the defaults, so a default does not count as given."""
+"""Fields that have no effect on proxies for rmw_zenoh, each with the field of `RosProxySpec`.
+
+The API server fills in the defaults. So a default does not count as given.
+"""
+# Above the ports of roscore (11311) and rosserial (11411), and below the NodePorts (from 30000).
 _WINDOW = PortRange(11412, 29999)
-# The window lies above the ports of roscore (11311) and rosserial (11411), and below the NodePorts
-# (from 30000).
 _POLICY_MODE = {"Enforce": PolicyMode.ENFORCE, "Audit": PolicyMode.AUDIT}
 _ACTION = {"Allow": RuleAction.ALLOW, "Deny": RuleAction.DENY}
 RULE_KINDS = {
@@ -219,10 +220,8 @@ def _check_zenoh(field: Field, spec: RosProxySpec) -> None:
     unused = [f for f, n in _NOT_OF_ZENOH.items() if getattr(spec, n) != getattr(default, n)]
     wishes = ((w.field, name) for name, w in WISHES.items())
     unused += [f for f, name in wishes if getattr(spec.proxy, name) != getattr(OWN_SPEC, name)]
-    for path in unused:
-        for key in path.split("."):
-            field = field[key]
-        raise field.error("has no effect with spec.ros: zenoh", "Remove the field")
+    if unused:
+        raise _at(field, unused[0]).error("has no effect with spec.ros: zenoh", "Remove the field")
     try:
         check_layers(spec.policy)
     except ValueError as error:
@@ -293,10 +292,16 @@ def _proxy_spec(field: Field) -> ProxySpec:
     return spec
 
 
+def _at(field: Field, path: str) -> Field:
+    """Return the field at a path such as ``policy.slaveControl``."""
+    for key in path.split("."):
+        field = field[key]
+    return field
+
+
 def _wish(field: Field, name: str) -> Any:
     """Return the value for a field of `ProxySpec`. In the CRD, words begin with a capital."""
-    for key in WISHES[name].field.split("."):
-        field = field[key]
+    field = _at(field, WISHES[name].field)
     allowed = {word.capitalize(): word for word in words(name)}
     default = str(getattr(OWN_SPEC, name)).capitalize()
     return field.one_of(allowed, default) if allowed else field.boolean()
