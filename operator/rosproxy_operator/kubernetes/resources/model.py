@@ -193,6 +193,8 @@ class ClusterNode(msgspec.Struct, frozen=True):
     misspelt: tuple[str, ...] = ()
 
 
+REFERENCE = "$("
+"""The beginning of a reference to another variable, in the value of a variable."""
 VALUE_AT_RUNTIME = "$()"
 """Stands for a value that is unknown until the container runs."""
 

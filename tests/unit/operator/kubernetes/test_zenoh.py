@@ -476,6 +476,7 @@ def test_a_pod_that_is_wired_has_no_finding():
         ({OVERRIDE: 'mode="client"'}, "NotWired", "past the proxy"),
         ({OVERRIDE: f'connect/endpoints=["{ENDPOINT}"]'}, "NotWired", "passes no messages between"),
         ({}, "NotWired", "has no variable ZENOH_CONFIG_OVERRIDE with the address of the proxy"),
+        ({OVERRIDE: 'namespace="r1"'}, "NotWired", "has no variable ZENOH_CONFIG_OVERRIDE with"),
     ],
 )
 def test_faults_of_pods(env: dict[str, str], reason: str, text: str):
@@ -505,6 +506,12 @@ def test_a_pod_with_a_former_address_is_told():
 def test_pods_to_recreate(env: dict[str, str], endpoint: str, expected: bool):
     own = pod(containers=(PodContainer("", env),), router_endpoint=endpoint)
     assert needs_recreation(own, ofz(), ADDRESS) is expected
+
+
+def test_a_container_of_a_later_webhook_is_no_reason_to_recreate_a_pod():
+    containers = (PodContainer("", {OVERRIDE: AS_CLIENT}), PodContainer())
+    own = pod(containers=containers, router_endpoint=ENDPOINT)
+    assert not needs_recreation(own, ofz(), ADDRESS)
 
 
 def test_the_service_gets_the_address_to_which_pods_are_wired():

@@ -22,6 +22,7 @@ from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.cluster import WebhookState
 from rosproxy_operator.kubernetes.resources.model import (
+    REFERENCE,
     VALUE_AT_RUNTIME,
     ClusterFinding,
     Json,
@@ -178,9 +179,12 @@ def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
         and all(_names_master(uri, masters) for uri in pod.own_masters)
         and (pod.wired_master_uri != master_uri(cluster_ip) or _is_of_former(pod, rosproxy))
     )
-    lacks_router = rosproxy.spec.zenoh is not None and any(
-        wired_override(c.variables, router_of(cluster_ip), pod.router_endpoint)
-        for c in pod.containers
+    # A container without the endpoint in a wired pod comes from a later webhook.
+    router = router_of(cluster_ip)
+    lacks_router = (
+        rosproxy.spec.zenoh is not None
+        and pod.router_endpoint != tcp_endpoint(router)
+        and any(wired_override(c.variables, router, pod.router_endpoint) for c in pod.containers)
     )
     peers = {c.variables["ROS_STATIC_PEERS"] for c in pod.containers if has_peers(c)}
     lacks_peers = (
@@ -198,14 +202,19 @@ def wired_override(variables: Mapping[str, str], router: HostPort, former: str) 
     before. The result is empty if the container stays as it is: the container uses DDS, its own
     value names an endpoint or a mode, or its own value is only known at run time.
     """
-    rmw = variables.get("RMW_IMPLEMENTATION", "")
     own = variables.get(OVERRIDE, "")
-    if (rmw and is_dds(rmw) and VALUE_AT_RUNTIME[:2] not in rmw) or VALUE_AT_RUNTIME[:2] in own:
+    if uses_dds(variables) or REFERENCE in own:
         return ""
     endpoint = tcp_endpoint(router)
     if former and former != endpoint and f'"{former}"' in own:
         return own.replace(f'"{former}"', f'"{endpoint}"')
     return with_client_override(own, router)
+
+
+def uses_dds(variables: Mapping[str, str]) -> bool:
+    """Whether a container's own variables say that its ROS 2 nodes use DDS."""
+    rmw = variables.get("RMW_IMPLEMENTATION", "")
+    return bool(rmw) and is_dds(rmw) and REFERENCE not in rmw
 
 
 def has_peers(container: PodContainer) -> bool:

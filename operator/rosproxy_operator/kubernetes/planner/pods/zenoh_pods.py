@@ -7,7 +7,6 @@ does not see variables that the image sets.
 from collections.abc import Iterator
 
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, is_client, tcp_endpoint
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
     UNKNOWN_WEBHOOK,
@@ -15,10 +14,12 @@ from rosproxy_operator.kubernetes.planner.pods.wiring import (
     is_of_service,
     missing_variable_text,
     recreate_command,
+    uses_dds,
+    wired_override,
 )
 from rosproxy_operator.kubernetes.resources.cluster import WebhookState
 from rosproxy_operator.kubernetes.resources.model import (
-    VALUE_AT_RUNTIME,
+    REFERENCE,
     ClusterFinding,
     Pod,
     PodContainer,
@@ -26,9 +27,6 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.names import ROUTERS, router_of
 from rosproxy_operator.kubernetes.status.findings import pod_finding
-
-_UNKNOWN = VALUE_AT_RUNTIME[:2]
-"""The begin of a reference to another variable, whose value the operator does not see."""
 
 
 def zenoh_findings(
@@ -47,31 +45,33 @@ def zenoh_findings(
 
 def _wiring_problem(pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState) -> str:
     """The fault of the override that the webhook sets; empty if there is no fault."""
-    endpoint = tcp_endpoint(router_of(address))
+    router = router_of(address)
+    endpoint = tcp_endpoint(router)
     if pod.router_endpoint and pod.router_endpoint != endpoint:
         return (
             f"was wired to {clean(pod.router_endpoint)[:200]} ({OVERRIDE}), but the proxy is at "
             f"{endpoint} now. Run {recreate_command(pod)}"
         )
-    may_use_zenoh = [c for c in pod.containers if not _uses_dds(c)]
-    if pod.router_endpoint or any(OVERRIDE in c.variables for c in may_use_zenoh):
+    if pod.router_endpoint:
         return ""
-    if pod.containers and not may_use_zenoh:
-        return ""
-    return missing_variable_text(OVERRIDE, pod, rosproxy, webhook)
+    lacking = (wired_override(c.variables, router, endpoint) for c in pod.containers)
+    if not pod.containers or any(lacking):
+        return missing_variable_text(OVERRIDE, pod, rosproxy, webhook)
+    return ""
 
 
 def _problems(
     container: PodContainer, pod: Pod, rosproxy: RosProxy, address: str
 ) -> Iterator[tuple[str, str]]:
     """Yield the reason and the text of each fault of a container."""
-    if _uses_dds(container):
+    if uses_dds(container.variables):
         rmw = clean(container.variables["RMW_IMPLEMENTATION"])[:200]
         text = f"variable RMW_IMPLEMENTATION={rmw} is DDS, and RosProxy {rosproxy.id.name} is for "
         yield "NoZenoh", f"{text}rmw_zenoh. Use rmw_zenoh_cpp, or a RosProxy with spec.ros: 2"
         return
-    override = container.variables.get(OVERRIDE)
-    if override is None or _UNKNOWN in override:
+    override = container.variables.get(OVERRIDE, "")
+    extended = wired_override(container.variables, router_of(address), pod.router_endpoint)
+    if extended or REFERENCE in override:
         return
     if not _leads_to_proxy(override, rosproxy, address, pod.router_endpoint):
         text = f"variable {OVERRIDE} of the template connects the nodes past the proxy"
@@ -81,11 +81,6 @@ def _problems(
         text = f"variable {OVERRIDE} of the template makes the nodes peers of the proxy's router, "
         text += "which passes no messages between two peers"
         yield "NotWired", f"{text}. {edit_fix('Add mode=client to the variable', pod)}"
-
-
-def _uses_dds(container: PodContainer) -> bool:
-    rmw = container.variables.get("RMW_IMPLEMENTATION", "")
-    return bool(rmw) and is_dds(rmw) and _UNKNOWN not in rmw
 
 
 def _leads_to_proxy(override: str, rosproxy: RosProxy, address: str, wired: str) -> bool:
