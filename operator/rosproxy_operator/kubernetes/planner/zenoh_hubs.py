@@ -12,18 +12,13 @@ from rosproxy.telemetry.text import listed
 from rosproxy_operator.kubernetes.planner.cluster_view import View, group_by_key
 from rosproxy_operator.kubernetes.resources.cluster import ZenohReport
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, ProxyPlace, RosProxy
-from rosproxy_operator.kubernetes.resources.names import HUB_PORT, hub_host
+from rosproxy_operator.kubernetes.resources.names import HUB_PORT, hub_address
 from rosproxy_operator.kubernetes.status.findings import finding
 
 APART_REPORTED_S = 30.0
 """Seconds until proxies that are not linked are reported. DNS may keep "no such name" as long."""
 Apart = Mapping[tuple[ProxyPlace, str], float]
 """The time since when a proxy is not linked with the proxy on another node."""
-
-
-def hub_name(place: ProxyPlace) -> str:
-    """Return the hub of a place as ``host:port``, as the hubs of other nodes dial it."""
-    return f"{hub_host(place.of, place.node)}:{HUB_PORT}"
 
 
 def hubs_apart(view: View, former: Apart, now: float) -> dict[tuple[ProxyPlace, str], float]:
@@ -34,7 +29,7 @@ def hubs_apart(view: View, former: Apart, now: float) -> dict[tuple[ProxyPlace, 
         (one, other.node): former.get((one, other.node), now)
         for group in by_rosproxy.values()
         for (one, report), (other, others_report) in combinations(group, 2)
-        if _is_apart(report.hubs.get(hub_name(other)), others_report.hubs.get(hub_name(one)))
+        if _is_apart(_fault(report, other), _fault(others_report, one))
     }
 
 
@@ -46,7 +41,7 @@ def apart_findings(apart: Apart, rosproxy: RosProxy, now: float) -> Iterator[Clu
             f"the hub is not linked with the hubs on node {listed(sorted(nodes))}, so messages "
             f"between pods of these nodes may not pass. Let the proxies connect to each other at "
             f"port {HUB_PORT} (NetworkPolicy, firewall), and check that pods resolve "
-            f"{hub_host(place.of, nodes[0])}"
+            f"{hub_address(place.of, nodes[0]).host}"
         )
         yield finding(rosproxy, "HubsApart", text, subject=f"proxy on node {place.node}")
 
@@ -62,6 +57,10 @@ def _reports(view: View) -> Iterator[tuple[ProxyPlace, ZenohReport]]:
         report = view.observed.reports.get(proxy.pod.uid)
         if proxy.ready and report is not None and report.answered and report.zenoh is not None:
             yield place, report.zenoh
+
+
+def _fault(report: ZenohReport, other: ProxyPlace) -> str | None:
+    return report.hubs.get(str(hub_address(other.of, other.node)))
 
 
 def _is_apart(*faults: str | None) -> bool:

@@ -145,13 +145,14 @@ def hubs_service_id(rosproxy: Name) -> Name:
     return Name(rosproxy.namespace, f"{_HUBS_PREFIX}{rosproxy.name}")
 
 
-def hub_host(rosproxy: Name, node: str) -> str:
-    """Return the name by which the hubs of other nodes reach the hub on a node.
+def hub_address(rosproxy: Name, node: str) -> HostPort:
+    """Return the name and port at which the hubs of other nodes reach the hub on a node.
 
     The name stays the same when the proxy's pod is recreated with another address.
     """
     hubs = hubs_service_id(rosproxy)
-    return f"{proxy_id(rosproxy, node).name}.{hubs.name}.{hubs.namespace}.svc"
+    host = f"{proxy_id(rosproxy, node).name}.{hubs.name}.{hubs.namespace}.svc"
+    return HostPort(host, HUB_PORT)
 
 
 def policy_id(rosproxy: Name) -> Name:

@@ -26,6 +26,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.names import (
     ADMIN_PORT,
     INJECT,
+    hub_address,
     master_uri,
     router_of,
 )
@@ -66,8 +67,8 @@ _NO_PODS = "NoPods"
 _KEEPS_PODS_OUT = ("Ambiguous", "HostNetwork", "NodeLeftOut", "NotWired")
 """Reasons of findings about pods that get no proxy."""
 _NO_PROXY = "no proxy runs, so this is not known"
-_OF_ZENOH = ("sessions", "peers", "hubs")
-"""Fields of ``perNode`` about rmw_zenoh."""
+_OF_ZENOH = ("sessions", "peers")
+"""Fields of ``perNode`` about rmw_zenoh that only the proxy of the node knows."""
 
 
 class Condition(msgspec.Struct, frozen=True):
@@ -100,7 +101,7 @@ def status_of(
     former = rosproxy.status
     shown = _shown_nodes(states)
     most_names = min(MOST_NAMES, MOST_NAMES_OF_ALL // max(len(shown), 1))
-    lines = [_line(rosproxy, state, most_names) for state in shown]
+    lines = [_line(rosproxy, state, states, most_names) for state in shown]
     ros_nodes = sum(int_at(line, "rosNodes") for line in lines)
     wanted = [state for state in states if state.pods]
     spec = rosproxy.spec
@@ -194,8 +195,13 @@ def _shown_nodes(states: Sequence[RosProxyOnNode]) -> list[RosProxyOnNode]:
     return sorted(ranked[:MOST_NODES], key=lambda state: state.name)
 
 
-def _line(rosproxy: RosProxy, state: RosProxyOnNode, most_names: int) -> dict[str, object]:
-    """The entry of ``perNode`` for a node, with ``most_names`` names of ROS nodes at most."""
+def _line(
+    rosproxy: RosProxy, state: RosProxyOnNode, states: Sequence[RosProxyOnNode], most_names: int
+) -> dict[str, object]:
+    """The entry of ``perNode`` for a node, with ``most_names`` names of ROS nodes at most.
+
+    ``states``: the states of all nodes.
+    """
     proxy = state.proxy
     problem = next(iter(node_findings(rosproxy, state)), None)
     line = {
@@ -206,6 +212,7 @@ def _line(rosproxy: RosProxy, state: RosProxyOnNode, most_names: int) -> dict[st
         "ready": _serving(state),
         "pods": len(state.pods),
         **_ros(state, most_names, rosproxy.status),
+        **({"hubs": _hubs(rosproxy, state, states)} if rosproxy.spec.zenoh and proxy else {}),
         "message": bounded(_one_line(problem), _MOST_LINE_MESSAGE_CHARACTERS) if problem else "",
     }
     return {key: value for key, value in line.items() if value != ""}
@@ -234,13 +241,26 @@ def _ros(state: RosProxyOnNode, limit: int, former: Json) -> dict[str, object]:
 
 
 def _sessions(zenoh: ZenohReport) -> dict[str, object]:
-    """The sessions of nodes in pods, and how many links are up, of all."""
-    links = {"peers": zenoh.peers, "hubs": zenoh.hubs}
-    counts = {
-        key: f"{sum(not fault for fault in of_kind.values())}/{len(of_kind)}"
-        for key, of_kind in links.items()
-    }
-    return {"sessions": zenoh.sessions, **counts}
+    """The sessions of nodes in pods, and how many links to routers outside are up, of all."""
+    up = sum(not fault for fault in zenoh.peers.values())
+    return {"sessions": zenoh.sessions, "peers": f"{up}/{len(zenoh.peers)}"}
+
+
+def _hubs(of: RosProxy, state: RosProxyOnNode, states: Sequence[RosProxyOnNode]) -> str:
+    """How many proxies on other nodes the proxy of a node is linked with, of all.
+
+    A single side sees the link if the other side is older, or behind NAT.
+    """
+    others = [s for s in states if s.proxy is not None and s.name != state.name]
+    linked = sum(_sees(of, state, other) or _sees(of, other, state) for other in others)
+    return f"{linked}/{len(others)}"
+
+
+def _sees(of: RosProxy, state: RosProxyOnNode, other: RosProxyOnNode) -> bool:
+    """Whether the proxy of a node sees a link with the proxy on another node."""
+    if not _has_answered(state.answer) or state.answer.zenoh is None:
+        return False
+    return state.answer.zenoh.hubs.get(str(hub_address(of.id, other.name))) == ""
 
 
 def _has_answered(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:

@@ -34,7 +34,7 @@ from rosproxy_operator.kubernetes.planner.pods.wiring import (
 )
 from rosproxy_operator.kubernetes.planner.pods.zenoh_pods import zenoh_findings
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
-from rosproxy_operator.kubernetes.planner.zenoh_hubs import APART_REPORTED_S, hub_name
+from rosproxy_operator.kubernetes.planner.zenoh_hubs import APART_REPORTED_S
 from rosproxy_operator.kubernetes.proxies.proxy_report import report
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import ProxyReport, ProxyService, ZenohReport
@@ -44,7 +44,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     MasterSpec,
     Pod,
     PodContainer,
-    ProxyPlace,
     Ros2Spec,
     RosProxy,
     ZenohSpec,
@@ -237,7 +236,7 @@ def test_the_pod_has_the_name_that_other_hubs_dial():
     body = manifests.proxy_pod(site(of, node(), names.ROUTERS), SETTINGS)
     hubs = manifests.hubs_service(of)
     host = f"{body['spec']['hostname']}.{body['spec']['subdomain']}"
-    assert names.hub_host(of.id, "one") == f"{host}.ros.svc"
+    assert names.hub_address(of.id, "one") == HostPort(f"{host}.ros.svc", 7447)
     assert body["spec"]["subdomain"] == hubs["metadata"]["name"]
     assert (hubs["spec"]["clusterIP"], hubs["spec"]["publishNotReadyAddresses"]) == ("None", True)
     assert hubs["spec"]["selector"].items() <= body["metadata"]["labels"].items()
@@ -273,8 +272,8 @@ def test_proxies_of_other_nodes_are_hubs():
     made = [action for action in done(plan) if isinstance(action, CreateProxy)]
     hubs = {some.node_of(action): env_of(action.body)["ROSPROXY_ZENOH_HUBS"] for action in made}
     assert hubs == {
-        "one": f"{names.hub_host(of.id, 'two')}:7447",
-        "two": f"{names.hub_host(of.id, 'one')}:7447",
+        "one": str(names.hub_address(of.id, "two")),
+        "two": str(names.hub_address(of.id, "one")),
     }
 
 
@@ -606,7 +605,7 @@ def test_the_status_of_a_rosproxy():
     assert (told_status["sessions"], told_status["rosNodes"], told_status["topics"]) == (1, 1, 2)
     assert (told_status["ports"], told_status["addresses"]) == ("", "")
     (line,) = told_status["perNode"]
-    assert (line["sessions"], line["peers"], line["hubs"]) == (1, "1/2", "0/1")
+    assert (line["sessions"], line["peers"], line["hubs"]) == (1, "1/2", "0/0")
     assert line["names"] == ["/talker"]
     assert not {"ports", "advertiseHost"} & line.keys()
     assert conditions(plan) == {
@@ -666,8 +665,8 @@ def test_peers_that_are_linked():
 
 def linked(*nodes_up: str, down: tuple[str, ...] = ()) -> ProxyReport:
     """The answer of a proxy that is linked with the proxies on some nodes."""
-    hubs = {hub_name(ProxyPlace(ROBOT, on)): "" for on in nodes_up}
-    hubs |= {hub_name(ProxyPlace(ROBOT, on)): "silent" for on in down}
+    hubs = {str(names.hub_address(ROBOT, on)): "" for on in nodes_up}
+    hubs |= {str(names.hub_address(ROBOT, on)): "silent" for on in down}
     return ProxyReport(True, True, zenoh=ZenohReport(hubs=hubs))
 
 
@@ -695,6 +694,9 @@ def test_hubs_that_are_apart_are_told_after_a_while(
     assert [text[:24] for text in told(later, "HubsApart")] == (
         ["proxy on node one: the hub "[:24]] if apart else []
     )
+    counts = [line["hubs"] for line in status(later)["perNode"]]
+    is_linked = one.zenoh != two.zenoh and not apart
+    assert counts == (["1/1"] * 2 if is_linked else ["0/1"] * 2)
     healed = look(answered(ofz(), linked("two"), linked("one")), later.state, now=200.0)
     assert not told(healed, "HubsApart")
     assert not healed.state.apart

@@ -10,7 +10,6 @@ from rosproxy_operator.kubernetes.planner.cluster_view import View
 from rosproxy_operator.kubernetes.planner.manifests import TERMINATION_GRACE_S, ProxySite
 from rosproxy_operator.kubernetes.planner.retries import Retries
 from rosproxy_operator.kubernetes.planner.state import ClusterState
-from rosproxy_operator.kubernetes.planner.zenoh_hubs import hub_name
 from rosproxy_operator.kubernetes.resources.checks import host_problem
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
@@ -23,6 +22,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
+    hub_address,
     proxy_id,
     relay_secret_of,
     token_of,
@@ -202,7 +202,8 @@ def hubs_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
     if context.view.rosproxies[place.of].spec.zenoh is None:
         return ()
     others = (other for other in context.view.places.get(place.of, ()) if other != place)
-    hubs = sorted(hub_name(o) for o in others if o.node in context.observed.nodes)
+    known = (other for other in others if other.node in context.observed.nodes)
+    hubs = sorted(str(hub_address(other.of, other.node)) for other in known)
     return tuple(hubs[:MOST_ZENOH_HUBS])
 
 
