@@ -81,7 +81,7 @@ class ProxySite(msgspec.Struct, frozen=True):
     a Service. If ``address`` is empty, the proxy resolves the host name. If ``publish`` is 0, the
     proxy does not publish the master. ``peers`` has the ROS 2 peers: the peers that the RosProxy
     names, and the proxies on other nodes. ``relay_secret`` is the shared secret of the proxy and
-    the LAN relay. ``hubs`` has the proxies for rmw_zenoh on other nodes.
+    the LAN relay. ``hubs`` has the proxies for rmw_zenoh on other nodes, for a new proxy only.
     """
 
     rosproxy: RosProxy

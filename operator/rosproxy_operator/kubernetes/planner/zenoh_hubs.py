@@ -6,7 +6,6 @@ of the two says so.
 """
 
 from collections.abc import Iterator, Mapping
-from itertools import combinations
 
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.kubernetes.planner.cluster_view import View, group_by_key
@@ -23,14 +22,19 @@ Apart = Mapping[tuple[ProxyPlace, str], float]
 
 def hubs_apart(view: View, former: Apart, now: float) -> dict[tuple[ProxyPlace, str], float]:
     """Return the pairs of ready proxies without a link, and the time since when."""
-    reports = [*_reports(view)]
-    by_rosproxy = group_by_key((place.of, (place, report)) for place, report in reports)
-    return {
-        (one, other.node): former.get((one, other.node), now)
-        for group in by_rosproxy.values()
-        for (one, report), (other, others_report) in combinations(group, 2)
-        if _is_apart(_fault(report, other), _fault(others_report, one))
-    }
+    reports = dict(_reports(view))
+    addresses = {place: str(hub_address(place.of, place.node)) for place in reports}
+    places = {address: place for place, address in addresses.items()}
+    apart = set[tuple[ProxyPlace, str]]()
+    for place, report in reports.items():
+        for address in (address for address, fault in report.hubs.items() if fault):
+            other = places.get(address)
+            if other is None or other.of != place.of:
+                continue
+            if reports[other].hubs.get(addresses[place]) != "":  # that side has no link either
+                one, two = sorted((place, other))
+                apart.add((one, two.node))
+    return {pair: former.get(pair, now) for pair in apart}
 
 
 def apart_findings(apart: Apart, rosproxy: RosProxy, now: float) -> Iterator[ClusterFinding]:
@@ -52,22 +56,8 @@ def due_in(since: float, now: float) -> float:
 
 
 def _reports(view: View) -> Iterator[tuple[ProxyPlace, ZenohReport]]:
-    """Yield the reports of ready proxies for rmw_zenoh, sorted by place."""
-    for place, proxy in sorted(view.current.items(), key=lambda item: item[0]):
+    """Yield the reports of ready proxies for rmw_zenoh."""
+    for place, proxy in view.current.items():
         report = view.observed.reports.get(proxy.pod.uid)
         if proxy.ready and report is not None and report.answered and report.zenoh is not None:
             yield place, report.zenoh
-
-
-def _fault(report: ZenohReport, other: ProxyPlace) -> str | None:
-    return report.hubs.get(str(hub_address(other.of, other.node)))
-
-
-def _is_apart(*faults: str | None) -> bool:
-    """Whether a hub dials another hub, and no side has a link.
-
-    Each fault is the error of a link, empty for a link that is up, and None if the side does not
-    dial the other side.
-    """
-    known = [fault for fault in faults if fault is not None]
-    return bool(known) and all(known)

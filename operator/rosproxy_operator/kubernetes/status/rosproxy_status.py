@@ -1,7 +1,7 @@
 """The status of a RosProxy, with its conditions (``metav1.Condition``)."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeGuard
 
 import msgspec
@@ -101,7 +101,8 @@ def status_of(
     former = rosproxy.status
     shown = _shown_nodes(states)
     most_names = min(MOST_NAMES, MOST_NAMES_OF_ALL // max(len(shown), 1))
-    lines = [_line(rosproxy, state, states, most_names) for state in shown]
+    linked = _linked_nodes(rosproxy, states) if rosproxy.spec.zenoh else {}
+    lines = [_line(rosproxy, state, linked, most_names) for state in shown]
     ros_nodes = sum(int_at(line, "rosNodes") for line in lines)
     wanted = [state for state in states if state.pods]
     spec = rosproxy.spec
@@ -196,13 +197,14 @@ def _shown_nodes(states: Sequence[RosProxyOnNode]) -> list[RosProxyOnNode]:
 
 
 def _line(
-    rosproxy: RosProxy, state: RosProxyOnNode, states: Sequence[RosProxyOnNode], most_names: int
+    rosproxy: RosProxy, state: RosProxyOnNode, linked: Mapping[str, set[str]], most_names: int
 ) -> dict[str, object]:
     """The entry of ``perNode`` for a node, with ``most_names`` names of ROS nodes at most.
 
-    ``states``: the states of all nodes.
+    ``linked``: see `_linked_nodes`.
     """
     proxy = state.proxy
+    hubs = f"{len(linked[state.name])}/{len(linked) - 1}" if state.name in linked else ""
     problem = next(iter(node_findings(rosproxy, state)), None)
     line = {
         "name": state.name,
@@ -212,7 +214,7 @@ def _line(
         "ready": _serving(state),
         "pods": len(state.pods),
         **_ros(state, most_names, rosproxy.status),
-        **({"hubs": _hubs(rosproxy, state, states)} if rosproxy.spec.zenoh and proxy else {}),
+        "hubs": hubs,
         "message": bounded(_one_line(problem), _MOST_LINE_MESSAGE_CHARACTERS) if problem else "",
     }
     return {key: value for key, value in line.items() if value != ""}
@@ -246,21 +248,21 @@ def _sessions(zenoh: ZenohReport) -> dict[str, object]:
     return {"sessions": zenoh.sessions, "peers": f"{up}/{len(zenoh.peers)}"}
 
 
-def _hubs(of: RosProxy, state: RosProxyOnNode, states: Sequence[RosProxyOnNode]) -> str:
-    """How many proxies on other nodes the proxy of a node is linked with, of all.
+def _linked_nodes(of: RosProxy, states: Sequence[RosProxyOnNode]) -> Mapping[str, set[str]]:
+    """By node with a proxy for rmw_zenoh: the nodes whose proxies are linked with this proxy.
 
     A single side sees the link if the other side is older, or behind NAT.
     """
-    others = [s for s in states if s.proxy is not None and s.name != state.name]
-    linked = sum(_sees(of, state, other) or _sees(of, other, state) for other in others)
-    return f"{linked}/{len(others)}"
-
-
-def _sees(of: RosProxy, state: RosProxyOnNode, other: RosProxyOnNode) -> bool:
-    """Whether the proxy of a node sees a link with the proxy on another node."""
-    if not _has_answered(state.answer) or state.answer.zenoh is None:
-        return False
-    return state.answer.zenoh.hubs.get(str(hub_address(of.id, other.name))) == ""
+    nodes = {str(hub_address(of.id, s.name)): s.name for s in states if s.proxy is not None}
+    linked = {node: set[str]() for node in nodes.values()}
+    for state in states:
+        if state.proxy is None or not _has_answered(state.answer) or state.answer.zenoh is None:
+            continue
+        up = (hub for hub, fault in state.answer.zenoh.hubs.items() if not fault)
+        for other in {nodes[hub] for hub in up if hub in nodes} - {state.name}:
+            linked[state.name].add(other)
+            linked[other].add(state.name)
+    return linked
 
 
 def _has_answered(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:

@@ -170,7 +170,6 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
         token_hash,
         peers_of(context, place),
         relay_secret_of(context.observed.key, name, node.name),
-        hubs_of(context, place),
     )
 
 

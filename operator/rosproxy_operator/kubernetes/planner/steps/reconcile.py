@@ -11,6 +11,8 @@ action that had no effect.
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
+from msgspec.structs import replace
+
 from rosproxy.net.addresses import is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy_operator.common.port_ranges import REFUSED_RANGE_KEPT_S
@@ -27,7 +29,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
 from rosproxy_operator.kubernetes.planner.cluster_view import serves
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.planner.retries import Task
-from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, site_of
+from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, hubs_of, site_of
 from rosproxy_operator.kubernetes.planner.steps.image_check import (
     ImageState,
     check_image,
@@ -217,6 +219,7 @@ def _reconcile_wanted(
         # A pod that was deleted by force may still hold its hostPorts: see `TORN_DOWN_WITHIN_S`.
         context.retries.look_again_in(seconds)
     elif context.retries.is_due(_creation_task(place)):
+        site = replace(site, hubs=hubs_of(context, place))
         yield CreateProxy(place.of, manifests.proxy_pod(site, context.settings))
 
 
