@@ -4,7 +4,6 @@ import itertools
 import re
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -22,27 +21,10 @@ from tests.docker.inside import ENABLE, Container, Inside, inside, unique
 from tests.docker.machines import Machine, machine
 from tests.docker.nodes import Log
 from tests.docker.redirects import rules
+from tests.docker.zenoh import NODE, Node
 
 NUMBER = 92
-NODE = ("python", "/nodes/node.py")
 _numbers = itertools.count(1)
-
-
-@dataclass(frozen=True)
-class Node:
-    """A session with the defaults of rmw_zenoh. ``container``: None for a node on the robot."""
-
-    name: str
-    log: Log
-    container: Container | None = None
-
-    def wait_for(self, text: str, count: int = 5, seconds: float = 60) -> None:
-        """Wait until the node has printed ``count`` more lines that begin with ``text``."""
-        before = self.count(text)
-        wait_until(lambda: self.count(text) >= before + count, seconds, self.log.read)
-
-    def count(self, text: str) -> int:
-        return len(re.findall(f"^{re.escape(text)}", self.log.read(), re.MULTILINE))
 
 
 class Sides:

@@ -95,7 +95,8 @@ def _is_known(namespace: str) -> bool:
     Otherwise a pod that connects earlier would hang for two minutes. On a busy machine the webhook
     does not always wait long enough.
     """
-    services = api.objects("services", namespace, PROXY_OF)
+    listed = api.objects("services", namespace, PROXY_OF)
+    services = [service for service in listed if service["spec"]["clusterIP"] != "None"]
     rules = [inside(node, "iptables-save") for node in NODES]
     return bool(services) and all(
         service["spec"]["clusterIP"] in text for service in services for text in rules

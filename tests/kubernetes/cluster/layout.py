@@ -20,6 +20,7 @@ ROBOT = "rosproxy-cluster-robot"
 POD_NETWORK = "10.244.0.0/16"
 SERVICE_NETWORK = "10.96.0.0/16"
 API_SERVICE = "10.96.0.1"
+CLUSTER_DOMAIN = "cluster.local"
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,14 @@ from tests.docker.engine import run, wait_until
 from tests.kubernetes.cluster import cgroups, mounts
 from tests.kubernetes.cluster.certificates import certificate_file, key_file
 from tests.kubernetes.cluster.control_plane import kubectl
-from tests.kubernetes.cluster.layout import BIN, POD_NETWORK, STATE, Node
+from tests.kubernetes.cluster.layout import (
+    BIN,
+    CLUSTER_DOMAIN,
+    GATEWAY,
+    POD_NETWORK,
+    STATE,
+    Node,
+)
 from tests.kubernetes.cluster.network import plug_in_node, unplug_node
 from tests.kubernetes.cluster.programs import Program, command_line, kill, processes
 
@@ -183,6 +190,10 @@ def _kubelet_configuration(node: Node) -> dict[str, object]:
         "podLogsDir": f"{node.directory}/pod-logs",
         "volumePluginDir": f"{node.directory}/volume-plugins",
         "resolvConf": "",  # no name server is in reach: names must fail at once
+        # A test may run a name server there (`names.cluster_dns`). Without one, the control plane's
+        # machine refuses each query at once.
+        "clusterDNS": [GATEWAY],
+        "clusterDomain": CLUSTER_DOMAIN,
         "oomScoreAdj": 0,
         "nodeStatusUpdateFrequency": "2s",
         "nodeLeaseDurationSeconds": 8,
