@@ -5,7 +5,7 @@ import socket
 import struct
 from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from itertools import chain, pairwise, repeat
+from itertools import chain, count, pairwise, repeat
 
 import pytest
 
@@ -19,6 +19,7 @@ from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S, SETTLING_PERIOD
 from rosproxy.ros2.ports.stand_ins import stand_in_port
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
+from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.domain_server import ADMISSION_TIMEOUT_S, DomainServer
 from rosproxy.ros2.sources.fair_queue import DiscoveryQueue
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing
@@ -180,6 +181,8 @@ async def test_participants_that_have_waited_are_admitted_in_turn() -> None:
     server = DomainServer(
         settings_of(64), PROXY, times.__next__, lambda address: address == INSIDE, lambda: None
     )
+    # Each look at the clock is a second later, so a round admits a single participant.
+    server._scheduler = DiscoveryScheduler(count().__next__)
     server.start()
     prefixes = [bytes([1, 15, number]) + bytes(9) for number in range(20)]
     for number, prefix in enumerate(prefixes):
