@@ -42,7 +42,8 @@ KIND_INTERVAL_S = 1.0
 USUAL_CHARACTERS = 200
 """For each 200 characters, a message counts one more time."""
 MOST_BUCKETS = 1024
-"""Buckets of kinds and subjects. A further bucket replaces the one that was unused for longest."""
+"""Buckets of kinds, and as many buckets of subjects. A further bucket of a kind replaces the bucket
+of a kind that was unused for longest. So made-up subjects replace no bucket of a kind."""
 
 _NAMES = {"levelname": "level", "name": "logger", "exc_info": "error"}
 
@@ -69,7 +70,8 @@ class LogRateLimit(logging.Filter):
         super().__init__()
         self._clock = clock
         self._lock = threading.Lock()  # the threads of relays log, too
-        self._buckets: dict[Hashable, _Bucket] = {}
+        self._kinds: dict[Hashable, _Bucket] = {}
+        self._subjects: dict[Hashable, _Bucket] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether to write a record. Sets ``left_out`` if records before it were left out."""
@@ -79,18 +81,22 @@ class LogRateLimit(logging.Filter):
         weight = 1 + min(len(record.getMessage()), LONGEST) // USUAL_CHARACTERS
         with self._lock:
             if record.levelno >= logging.WARNING:
-                bucket = self._bucket((*kind, _subject(record)), SUBJECT_BURST, SUBJECT_INTERVAL_S)
+                key = *kind, _subject(record)
+                bucket = self._bucket(self._subjects, key, SUBJECT_BURST, SUBJECT_INTERVAL_S)
                 if not _take(bucket, record, weight):
                     return False
-            return _take(self._bucket(kind, KIND_BURST, KIND_INTERVAL_S), record, weight)
+            bucket = self._bucket(self._kinds, kind, KIND_BURST, KIND_INTERVAL_S)
+            return _take(bucket, record, weight)
 
-    def _bucket(self, key: Hashable, burst: int, interval: float) -> _Bucket:
+    def _bucket(
+        self, buckets: dict[Hashable, _Bucket], key: Hashable, burst: int, interval: float
+    ) -> _Bucket:
         """The bucket of a key, refilled: one message for each ``interval`` (s), up to ``burst``."""
         now = self._clock()
-        bucket = self._buckets.pop(key, None) or _Bucket(burst, now)
-        if len(self._buckets) >= MOST_BUCKETS:
-            del self._buckets[next(iter(self._buckets))]
-        self._buckets[key] = bucket  # at the end: the first bucket was unused for longest
+        bucket = buckets.pop(key, None) or _Bucket(burst, now)
+        if len(buckets) >= MOST_BUCKETS:
+            del buckets[next(iter(buckets))]
+        buckets[key] = bucket  # at the end: the first bucket was unused for longest
         bucket.remaining = min(bucket.remaining + (now - bucket.since) / interval, burst)
         bucket.since = now
         return bucket

@@ -167,6 +167,18 @@ def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int
     assert later.__dict__["left_out"] == more
 
 
+def test_names_made_up_for_one_kind_free_no_other_kind(clock: Clock) -> None:
+    """Each subject had a bucket among those of the kinds, and so pushed these out."""
+    floods = LogRateLimit(clock)
+    count = 0
+    for block in range(6):
+        kind = "%s is gone" if block % 2 else "%s is new"
+        count += len(
+            written(floods, (record(kind, f"/{block}/{n}") for n in range(2 * KIND_BURST)))
+        )
+    assert count == 2 * KIND_BURST
+
+
 def test_the_count_of_a_subject_survives_if_the_bound_of_the_kind_leaves_out_the_next(
     clock: Clock,
 ) -> None:
