@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from rosproxy.ros1.clients.master_client import MasterError, read_value
+from rosproxy.ros1.protocol.bus_stats import IN, MOST_CONNECTIONS, read_bus_stats
 
 STATS = [[["/chatter", [[1, 48, 48, 3, 0]]]], []]
 
@@ -31,3 +32,9 @@ def test_anything_else_is_no_answer(value: object) -> None:
 def test_other_methods_need_a_triple() -> None:
     with pytest.raises(MasterError):
         read_value("getBusInfo", reply(STATS))
+
+
+def test_several_rows_of_a_topic_share_the_bound_of_connections() -> None:
+    """The growth compares each new connection with each connection that has ended."""
+    rows = [["/chatter", [[first + n, 48, 3] for n in range(200)]] for first in (0, 200, 400)]
+    assert len(read_bus_stats([[], rows])[IN, "/chatter"]) == MOST_CONNECTIONS

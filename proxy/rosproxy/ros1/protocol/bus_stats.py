@@ -17,7 +17,8 @@ OUT = "o"
 IN = "i"
 """Directions, as in ``getBusInfo``: of a publisher's connections, and of a subscriber's."""
 MOST_CONNECTIONS = 256
-"""The highest number of connections to read for a topic; `/rosout` of a large system has 200."""
+"""The highest number of connections to read for a topic, of all its rows together; `/rosout` of a
+large system has 200."""
 LEAST_INTEGER = -(2**31)
 GREATEST_INTEGER = 2**31 - 1
 """The bounds of an integer of XML-RPC."""
@@ -39,7 +40,7 @@ def read_bus_stats(stats: Any) -> BusStats:
             match row:
                 case [str(topic), *_, list(connections)]:
                     counts = by_topic.setdefault((direction, topic), {})
-                    for connection in islice(connections, MOST_CONNECTIONS):
+                    for connection in islice(connections, MOST_CONNECTIONS - len(counts)):
                         _add(counts, connection, direction)
     return by_topic
 
