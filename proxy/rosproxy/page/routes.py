@@ -10,7 +10,6 @@ allows only files of the proxy, so a browser does not run such a script.
 import asyncio
 import contextlib
 import hashlib
-import json
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from functools import cache
@@ -20,6 +19,7 @@ from urllib.parse import parse_qs
 from aiohttp import web
 
 from rosproxy.admin.replies import send_shared, unavailable, write_pieces
+from rosproxy.admin.status_bounds import encode
 from rosproxy.net.addresses import plain_address
 from rosproxy.net.fair_slots import NoSlot
 from rosproxy.net.http_client import TooLong, read_bounded
@@ -68,7 +68,7 @@ class Page:
     def __init__(self, feed: Feed, visitors: Visitors) -> None:
         self.feed = feed
         self.visitors = visitors
-        self._encoded: tuple[Json | None, Json, bytes] | None = None
+        self._encoded: tuple[Json, Json, bytes] | None = None
         self._whole: tuple[Json, bytes] | None = None
 
     @property
@@ -170,9 +170,9 @@ class Page:
             former = newest or former
 
     def _encode(self, document: Json) -> bytes:
-        """A document as JSON, encoded only once for all programs."""
+        """A document as JSON, encoded only once for all programs and all new watchers."""
         if self._whole is None or self._whole[0] is not document:
-            self._whole = document, json.dumps(document, separators=(",", ":")).encode()
+            self._whole = document, encode(document)
         return self._whole[1]
 
     def _event(self, former: Json | None, newest: Json) -> bytes:
@@ -180,12 +180,12 @@ class Page:
 
         Encoded only once for all watchers with the same ``former``, as most have.
         """
+        if former is None:
+            return b"event: all\ndata: %b\n\n" % self._encode(newest)
         cached = self._encoded
         if cached is None or cached[0] is not former or cached[1] is not newest:
-            update = newest if former is None else changes(former, newest)
-            kind = "all" if former is None else "change"
-            data = json.dumps(update, separators=(",", ":"))
-            self._encoded = cached = (former, newest, f"event: {kind}\ndata: {data}\n\n".encode())
+            data = encode(changes(former, newest))
+            self._encoded = cached = (former, newest, b"event: change\ndata: %b\n\n" % data)
         return cached[2]
 
 
