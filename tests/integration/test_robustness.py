@@ -1,9 +1,11 @@
 """Hostile and clumsy HTTP and XML-RPC, the same on the master port and on a node's port."""
 
+import gc
 import gzip
 import socket
 import struct
 import threading
+import weakref
 import xmlrpc.client
 from dataclasses import dataclass
 from itertools import product
@@ -13,10 +15,12 @@ import pytest
 
 from examples.demo.fake_http import Address
 from rosproxy.net.addresses import HostPort
+from rosproxy.net.http_server import HttpConnection
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS
 from rosproxy.ros1.protocol.xmlrpc.limits import lease_call, master_call
-from tests.integration.net import HOST, NODE, connect, exchange, post, rpc, xml
+from rosproxy.ros1.servers.xmlrpc_server import XmlRpcServer
+from tests.integration.net import HOST, NODE, connect, exchange, post, rpc, until, xml
 
 BOTH_LOOPS = True
 XML = b"<?xml version='1.0'?>"
@@ -90,6 +94,25 @@ async def test_a_header_that_never_ends_costs_a_time_out(door, monkeypatch):
         assert await mute.outcome() == "closed"
         await kept.send(post(CALL))
         assert (await kept.reply()).value == [1, "", door.pid]
+
+
+async def test_connections_that_have_ended_take_no_memory(door, monkeypatch):
+    """The timer for the first header kept each connection for another half a minute."""
+    made = list[weakref.ref[HttpConnection]]()
+    accept = XmlRpcServer.connection_made
+
+    def note(server, connection):
+        made.append(weakref.ref(connection))
+        accept(server, connection)
+
+    monkeypatch.setattr(XmlRpcServer, "connection_made", note)
+    for request in (b"POST", post(CALL)):
+        async with connect(door.address) as wire:
+            await wire.send(request)
+            await until(lambda: made, "the proxy serves the connection")
+            wire.reset()
+        await until(lambda: gc.collect() >= 0 and not any(r() for r in made), "it is forgotten")
+        made.clear()
 
 
 async def test_several_requests_on_one_connection(door):

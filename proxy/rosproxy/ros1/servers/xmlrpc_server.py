@@ -153,7 +153,8 @@ class XmlRpcServer(HttpServer):
         self._time_limits = TimeLimits()
         self._by_port: defaultdict[int, set[HttpConnection]] = defaultdict(set)
         self._mute: dict[HttpConnection, Callable[[], None]] = {}
-        """Connections without a first request, each with the function that ends the gate's wait."""
+        """Connections without a first request, each with the function that ends the gate's wait and
+        the timer."""
 
     async def dispatch(
         self,
@@ -201,8 +202,14 @@ class XmlRpcServer(HttpServer):
         source = connection.source.host
         self._by_port[port].add(connection)
         self._context.gate.enter(source, port)  # the acceptor counts until `dispatch` has ended
-        self._mute[connection] = self._context.gate.note_waiting(source, connection.force_close)
-        asyncio.get_running_loop().call_later(HEADER_TIMEOUT_S, self._close_mute, connection)
+        spoke = self._context.gate.note_waiting(source, connection.force_close)
+        timer = asyncio.get_running_loop().call_later(HEADER_TIMEOUT_S, connection.force_close)
+
+        def end_wait() -> None:
+            spoke()
+            timer.cancel()  # a timer would keep the connection in memory after its end
+
+        self._mute[connection] = end_wait
 
     def connection_lost(self, connection: HttpConnection) -> None:
         """Forget a connection."""
@@ -212,11 +219,6 @@ class XmlRpcServer(HttpServer):
         if connection in self._by_port[port]:
             self._by_port[port].discard(connection)
             self._context.gate.leave(connection.source.host, port)
-
-    def _close_mute(self, connection: HttpConnection) -> None:
-        if connection in self._mute:
-            self._mute.pop(connection)()
-            connection.force_close()
 
     async def answer(self, request: HttpRequest) -> None:
         """Answer a request. Raises ConnectionError."""
