@@ -74,7 +74,7 @@ class HiddenAnswers:
         endpoint = self._registry.by_caller.get(caller_id)
         if endpoint is None or endpoint.health.cleaned:
             return None
-        if not all(r.hidden for r in endpoint.registrations.values() if r.caller_id == caller_id):
+        if not all(registration.hidden for registration in endpoint.registrations_of(caller_id)):
             return None
         uri = self._addressing.import_slave(self._addressing.advertised_uri(endpoint), caller)
         return LocalAnswer(1, "node api", uri)
@@ -139,7 +139,7 @@ class HiddenAnswers:
 
     def _publishers_inside(self, topic: str) -> list[Endpoint]:
         """All nodes inside that publish a topic."""
-        return _living(endpoint for endpoint in self._registry if endpoint.publishes(topic))
+        return _living(self._registry.holders(Kind.PUBLISHER, topic).values())
 
 
 def _living(endpoints: Iterable[Endpoint]) -> list[Endpoint]:

@@ -82,7 +82,7 @@ class Registration:
 class Endpoint:
     """An inside slave URI, and the port at which outside reaches the node.
 
-    An endpoint is plain state. `Registry` keeps the indexes, ``callers`` (the number of
+    An endpoint is plain state. `Registry` keeps the indexes, ``callers`` (the keys of the
     registrations by node name) and ``characters`` (the length of all registrations).
 
     - ``uri``: the slave URI from the node. ``node``: the host and port of this URI.
@@ -108,7 +108,7 @@ class Endpoint:
     location: NodeLocation
     port: int
     registrations: dict[tuple[Kind, str, str], Registration] = field(default_factory=dict)
-    callers: dict[str, int] = field(default_factory=dict)
+    callers: dict[str, dict[tuple[Kind, str, str], None]] = field(default_factory=dict)
     characters: int = 0
     topic_ports: dict[str, int] = field(default_factory=dict)
     service_ports: dict[int, None] = field(default_factory=dict)
@@ -322,6 +322,10 @@ class Endpoint:
     def fast_connections(self) -> int:
         """The number of connections that the kernel forwards now."""
         return sum(self.fast_peers.values())
+
+    def registrations_of(self, caller_id: str) -> list[Registration]:
+        """The registrations of a node name."""
+        return [self.registrations[key] for key in self.callers.get(caller_id, ())]
 
     @property
     def reason_full(self) -> str | None:

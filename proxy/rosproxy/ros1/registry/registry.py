@@ -49,6 +49,8 @@ class Registry:
         self.by_slave: dict[HostPort, Endpoint] = {}
         self.by_caller: dict[str, Endpoint] = {}
         self.services: dict[str, tuple[Endpoint, Registration]] = {}
+        self._holders: dict[tuple[Kind, str], dict[str, Endpoint]] = {}
+        """The endpoints of all registrations, by kind and name, then by caller."""
         self._hidden: dict[tuple[Kind, str], dict[str, Endpoint]] = {}
         """The endpoints of hidden registrations, by kind and name, then by caller."""
         self.changes = self.lease_changes = 0
@@ -203,7 +205,7 @@ class Registry:
         self.changes += 1
         former = endpoint.registrations.get(registration.key)
         if registration.characters > LONGEST_REGISTRATION or (
-            endpoint.reason_full and former is None
+            former is None and endpoint.reason_full
         ):
             return
         owner = self.by_caller.get(registration.caller_id)
@@ -217,13 +219,12 @@ class Registry:
             service = parse_service_uri(registration.service_api or "")
             if service is not None and endpoint.note_service_port(service.port):
                 self.lease_changes += 1
-        if registration.key not in endpoint.registrations:
-            endpoint.callers[registration.caller_id] = (
-                endpoint.callers.get(registration.caller_id, 0) + 1
-            )
+        key = registration.key
+        endpoint.callers.setdefault(registration.caller_id, {})[key] = None
         endpoint.characters += registration.characters - (former.characters if former else 0)
-        endpoint.registrations[registration.key] = registration
-        self._index_hidden(endpoint, registration)
+        endpoint.registrations[key] = registration
+        _index(self._holders, endpoint, registration, True)
+        _index(self._hidden, endpoint, registration, registration.hidden)
         self.by_caller[registration.caller_id] = endpoint
         endpoint.idle_since = None
 
@@ -235,7 +236,7 @@ class Registry:
 
     def drop_caller(self, endpoint: Endpoint, caller_id: str) -> None:
         """Record that a node has no registration at an endpoint any more."""
-        for key in [key for key in endpoint.registrations if key[2] == caller_id]:
+        for key in list(endpoint.callers.get(caller_id, ())):
             self._drop(endpoint, key)
 
     def by_node(self, node: HostPort) -> list[Endpoint]:
@@ -268,9 +269,13 @@ class Registry:
 
     def subscriptions(self, topic: str) -> list[EndpointRegistration]:
         """The subscriptions of all nodes inside to a topic."""
-        return [
-            (e, r) for e, r in self.registrations() if r.kind is Kind.SUBSCRIBER and r.name == topic
-        ]
+        kind = Kind.SUBSCRIBER
+        holders = self.holders(kind, topic)
+        return [(e, e.registrations[kind, topic, caller_id]) for caller_id, e in holders.items()]
+
+    def holders(self, kind: Kind, name: str) -> Mapping[str, Endpoint]:
+        """The endpoints of all registrations of a kind and name, by caller."""
+        return self._holders.get((kind, name), _NO_HOLDERS)
 
     @property
     def has_hidden(self) -> bool:
@@ -355,29 +360,36 @@ class Registry:
         if not endpoints:
             del self._by_node[endpoint.node]
 
-    def _index_hidden(self, endpoint: Endpoint, registration: Registration) -> None:
-        """Update the index of hidden registrations for a registration."""
-        endpoints = self._hidden.setdefault((registration.kind, registration.name), {})
-        if registration.hidden:
-            endpoints[registration.caller_id] = endpoint
-        elif endpoints.get(registration.caller_id) is endpoint:
-            del endpoints[registration.caller_id]
-        if not endpoints:
-            del self._hidden[registration.kind, registration.name]
-
     def _drop(self, endpoint: Endpoint, key: tuple[Kind, str, str]) -> None:
         registration = endpoint.registrations.pop(key, None)
         if registration is None:
             return
         self.changes += 1
         endpoint.characters -= registration.characters
-        self._index_hidden(endpoint, replace(registration, hidden=False))
+        for index in (self._holders, self._hidden):
+            _index(index, endpoint, registration, False)
         kind, name, caller_id = key
         if kind is Kind.SERVICE:
             self.services.pop(name, None)
         elif kind is Kind.PUBLISHER:
             endpoint.topic_ports.pop(name, None)  # a node that is back may have another port
-        endpoint.callers[caller_id] -= 1
+        del endpoint.callers[caller_id][key]
         if not endpoint.callers[caller_id]:
             del endpoint.callers[caller_id], self.by_caller[caller_id]
             endpoint.note_former_caller(caller_id)
+
+
+def _index(
+    index: dict[tuple[Kind, str], dict[str, Endpoint]],
+    endpoint: Endpoint,
+    registration: Registration,
+    is_in: bool,
+) -> None:
+    """Put a registration into an index by kind, name and caller, or take it out."""
+    endpoints = index.setdefault((registration.kind, registration.name), {})
+    if is_in:
+        endpoints[registration.caller_id] = endpoint
+    elif endpoints.get(registration.caller_id) is endpoint:
+        del endpoints[registration.caller_id]
+    if not endpoints:
+        del index[registration.kind, registration.name]

@@ -359,7 +359,7 @@ class Registrar:
                 endpoint.settles_at = self._context.now() + UPDATE_ARRIVAL_S
             else:
                 service = addressing.advertised_service(endpoint)
-                shown = [r for r in _registrations_of(endpoint, name) if not r.hidden]
+                shown = [r for r in endpoint.registrations_of(name) if not r.hidden]
                 calls += [decisions.unregister_call(r, uri, service) for r in shown]
         await self._context.upstream.multicall(calls)
         freed, known_uris = await self._free_direct(direct)
@@ -368,7 +368,7 @@ class Registrar:
             if registration.key not in endpoint.registrations:
                 registry.register(endpoint, replace(registration, since=self._context.now()))
         names = {name: e for name, (e, _) in former.items() if name not in known_uris}
-        return [(e, r) for name, e in names.items() for r in _registrations_of(e, name)]
+        return [(e, r) for name, e in names.items() for r in e.registrations_of(name)]
 
     async def _free_direct(self, former: FormerUris) -> tuple[list[Registration], dict[str, str]]:
         """Take back all registrations of names that the master has by the nodes' own URIs.
@@ -410,10 +410,6 @@ class Registrar:
         )
         log.warning("%s: %s", name, problem)
         self._context.problems.add(name, problem)
-
-
-def _registrations_of(endpoint: Endpoint, name: str) -> list[Registration]:
-    return [r for r in endpoint.registrations.values() if r.caller_id == name]
 
 
 def _log(endpoint: Endpoint, text: str, *values: object) -> None:

@@ -1,6 +1,5 @@
 """The registry's tables agree with each other after any sequence of operations."""
 
-from collections import Counter
 from typing import Any
 
 from hypothesis import settings
@@ -199,7 +198,16 @@ class Registries(RuleBasedStateMachine):
                 assert service[0] is endpoint
         assert set(self.registry.by_caller) == {key[2] for key in self.expected}
         for endpoint in self.registry:
-            assert endpoint.callers == Counter(key[2] for key in endpoint.registrations)
+            by_caller = {key: caller for caller, keys in endpoint.callers.items() for key in keys}
+            assert by_caller == {key: key[2] for key in endpoint.registrations}
+            assert all(endpoint.callers.values())
+        holders = {
+            (kind, name, caller_id): endpoint
+            for (kind, name), by_name in self.registry._holders.items()
+            for caller_id, endpoint in by_name.items()
+        }
+        assert holders == self.expected
+        assert all(self.registry._holders.values())
         services = {key[1] for key in self.expected if key[0] is Kind.SERVICE}
         assert set(self.registry.services) == services
 
