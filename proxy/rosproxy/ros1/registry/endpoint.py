@@ -15,6 +15,9 @@ thousand nodes has a few thousand, most nodes have ten."""
 MOST_CHARACTERS = 2_000_000
 """The highest number of characters of all registered names and types of an endpoint. 10,000 topics
 of a large system have 1,000,000."""
+MOST_CALLERS = 64
+"""The highest number of node names of an endpoint. Most endpoints have a single name. The policy
+judges a topic for each name of an endpoint."""
 LONGEST_REGISTRATION = 8192
 """Most characters of a registration: three names and a URI. The topic name has the namespace."""
 MOST_SERVICE_PORTS = 16
@@ -327,12 +330,12 @@ class Endpoint:
         """The registrations of a node name."""
         return [self.registrations[key] for key in self.callers.get(caller_id, ())]
 
-    @property
-    def reason_full(self) -> str | None:
-        """Why the endpoint accepts no more registrations; None if there is room."""
+    def reason_full(self, caller_id: str) -> str | None:
+        """Why the endpoint accepts no more registrations of a node name; None if there is room."""
         for count, most, label in (
             (len(self.registrations), MOST_REGISTRATIONS, "registrations"),
             (self.characters, MOST_CHARACTERS, "characters of registered names"),
+            (len(self.callers.keys() - {caller_id}), MOST_CALLERS, "node names"),
         ):
             if count >= most:
                 return f"the node at {self.uri} has {count} {label}, at most {most} are accepted"

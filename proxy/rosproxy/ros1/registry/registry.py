@@ -205,7 +205,7 @@ class Registry:
         self.changes += 1
         former = endpoint.registrations.get(registration.key)
         if registration.characters > LONGEST_REGISTRATION or (
-            former is None and endpoint.reason_full
+            former is None and endpoint.reason_full(registration.caller_id)
         ):
             return
         owner = self.by_caller.get(registration.caller_id)

@@ -11,6 +11,7 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import (
     LONGEST_REGISTRATION,
+    MOST_CALLERS,
     MOST_CHARACTERS,
     MOST_REGISTRATIONS,
     Endpoint,
@@ -441,12 +442,12 @@ def test_an_endpoint_has_so_many_registrations_at_most() -> None:
     for number in range(MOST_REGISTRATIONS + 10):
         register(registry, endpoint, PUB, f"/t{number}")
     assert len(endpoint.registrations_of("/node")) == MOST_REGISTRATIONS
-    assert "10000 registrations, at most 10000" in (endpoint.reason_full or "")
+    assert "10000 registrations, at most 10000" in (endpoint.reason_full("/node") or "")
     registration = Registration(PUB, "/t0", "/node", "std_msgs/String")
     registry.register(endpoint, registration)
     assert endpoint.registrations[registration.key] is registration
     registry.unregister(PUB, "/t0", "/node")
-    assert endpoint.reason_full is None
+    assert endpoint.reason_full("/node") is None
 
 
 def test_an_endpoint_has_so_many_characters_of_names_at_most() -> None:
@@ -455,9 +456,20 @@ def test_an_endpoint_has_so_many_characters_of_names_at_most() -> None:
     for number in range(2 * MOST_CHARACTERS // 1000):
         register(registry, endpoint, SRV, f"/{number}".ljust(1000, "x"), "/node")
     assert MOST_CHARACTERS <= endpoint.characters < MOST_CHARACTERS + 1100
-    assert "characters of registered names" in (endpoint.reason_full or "")
+    assert "characters of registered names" in (endpoint.reason_full("/node") or "")
     registry.drop_caller(endpoint, "/node")
-    assert (endpoint.characters, endpoint.reason_full) == (0, None)
+    assert (endpoint.characters, endpoint.reason_full("/node")) == (0, None)
+
+
+def test_an_endpoint_has_so_many_node_names_at_most() -> None:
+    """The policy judges a topic for each name: 2 s for 10,000 names and 100 rules."""
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    for number in range(MOST_CALLERS + 10):
+        register(registry, endpoint, PUB, "/t", f"/n{number}")
+    assert endpoint.caller_ids == sorted(f"/n{number}" for number in range(MOST_CALLERS))
+    assert "64 node names, at most 64" in (endpoint.reason_full("/another") or "")
+    assert endpoint.reason_full("/n0") is None
 
 
 def test_a_registration_that_is_too_long_is_not_kept() -> None:
@@ -473,8 +485,8 @@ def test_an_endpoint_of_many_nodes_has_a_short_label() -> None:
     endpoint = node(registry, 5)
     for number in range(1000):
         register(registry, endpoint, PUB, "/t", f"/n{number}")
-    assert endpoint.label == "/n0, /n1, /n10 and 997 more (http://10.0.0.5:40001/)"
-    assert endpoint.log_fields["node"] == "/n0, /n1, /n10 and 997 more"
+    assert endpoint.label == "/n0, /n1, /n10 and 61 more (http://10.0.0.5:40001/)"
+    assert endpoint.log_fields["node"] == "/n0, /n1, /n10 and 61 more"
 
 
 def failing(
