@@ -121,13 +121,11 @@ class HiddenAnswers:
         """A table of names with their nodes, including hidden registrations."""
         if not isinstance(table, list):
             return table
-        rows = {row[0]: [*row[1]] for row in table if _is_row(row)}
+        rows = {row[0]: dict.fromkeys(row[1]) for row in table if _is_row(row)}
         for _, registration in self._registry.hidden_registrations():
             if registration.kind is kind:
-                nodes = rows.setdefault(registration.name, [])
-                if registration.caller_id not in nodes:
-                    nodes.append(registration.caller_id)
-        return [[name, nodes] for name, nodes in rows.items()]
+                rows.setdefault(registration.name, {})[registration.caller_id] = None
+        return [[name, [*nodes]] for name, nodes in rows.items()]
 
     def _types(self, kinds: Sequence[Kind]) -> dict[str, str]:
         """The types of hidden topics; ``*`` if no node has given a type."""
@@ -150,6 +148,6 @@ def _living(endpoints: Iterable[Endpoint]) -> list[Endpoint]:
 
 def _is_row(row: Any) -> bool:
     match row:
-        case [str(_), [*_]]:
-            return True
+        case [str(_), [*nodes]]:
+            return all(isinstance(node, str) for node in nodes)
     return False

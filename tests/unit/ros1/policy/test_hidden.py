@@ -165,6 +165,34 @@ def test_the_graph_is_completed_once() -> None:
     assert hidden.complete_graph(Call("getPublishedTopics", []), []) == [["/t", "T"]]
 
 
+class Compared(str):
+    """A name that counts comparisons with other names."""
+
+    compared = 0
+
+    def __eq__(self, other: object) -> bool:
+        Compared.compared += 1
+        return str.__eq__(self, other)
+
+    __hash__ = str.__hash__
+
+
+def test_the_graph_compares_no_hidden_name_with_all_others() -> None:
+    """The graph with 10,000 hidden publishers of a topic took 1.8 s."""
+    addressing = make(("/shown", Kind.PUBLISHER, "/t", False))
+    (endpoint,) = addressing.registry
+    names = [Compared(f"/n{number}") for number in range(60)]
+    for name in names:
+        addressing.registry.register(
+            endpoint, Registration(Kind.PUBLISHER, "/t", name, hidden=True)
+        )
+    Compared.compared = 0
+    state: list[list[object]] = [[["/t", ["/shown"]]], [], []]
+    graph = hidden_in(addressing).complete_graph(Call("getSystemState", []), state)
+    assert graph == [[["/t", ["/shown", *map(str, names)]]], [], []]
+    assert Compared.compared < 5 * len(names)
+
+
 @given(st.recursive(st.text() | st.integers(), st.lists))
 def test_a_malformed_graph_is_left_as_it_is_or_completed(said: object) -> None:
     hidden = hidden_in(make(("/a", Kind.PUBLISHER, "/t", True)))
