@@ -6,6 +6,9 @@ uvloop spends a turn of the event loop on each cancelled timer: a twentieth of t
 import asyncio
 import math
 
+LOOK_INTERVAL_S = 0.1
+"""Shortest time between two looks at all limits, in seconds. A limit may end that much later."""
+
 
 class TimeLimits:
     """The limits in force, and the timer for the limit that may run out first."""
@@ -29,7 +32,8 @@ class TimeLimits:
             self.running.discard(limit)
             limit.run_out()
         if self.running:
-            self.look_at(min(limit.end for limit in self.running), loop)
+            first_end = min(limit.end for limit in self.running)
+            self.look_at(max(first_end, now + LOOK_INTERVAL_S), loop)
 
 
 class TimeLimit:
