@@ -1,5 +1,6 @@
 """Nodes that registered around the proxy: adopted without being shut down, whatever happens."""
 
+import asyncio
 import json
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
@@ -11,6 +12,8 @@ from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.clients.master_client import MasterClient, Unreachable
 from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.upkeep.registrar import Registrar
 from tests.integration.admin_calls import post, update
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
@@ -326,6 +329,31 @@ async def test_a_late_shutdown_is_not_passed_on(
     assert not shutdowns(node)
     await until(lambda: "/lost" in all_of(master), "the missing topic is registered")
     assert not proxy.endpoint(node).has_registered_directly
+
+
+async def test_many_shutdowns_of_a_stranger_are_one_task(
+    make_proxy: MakeProxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each call left a task that asked the node, and the tasks waited for each other."""
+    proxy = await make_proxy(**PATIENT)
+    await node.publish(proxy.master)
+    asked = list[Endpoint]()
+    may_answer = asyncio.Event()
+
+    async def reconcile(_: Registrar, endpoint: Endpoint) -> None:
+        asked.append(endpoint)
+        await may_answer.wait()
+
+    monkeypatch.setattr(Registrar, "reconcile", reconcile)
+    reason = f"[{node.name}] Reason: new node registered with same name"
+    for _ in range(20):
+        assert await rpc(proxy.uri(node), "shutdown", "/master", reason) == [1, "", 0]
+    waiting = [t for t in asyncio.all_tasks() if t.get_name().startswith("taking over")]
+    assert len(waiting) == 2
+    may_answer.set()
+    await asyncio.gather(*waiting)
+    assert asked == [proxy.endpoint(node)] * 2
+    assert not shutdowns(node)
 
 
 async def test_a_shutdown_that_is_meant_is_passed_on(

@@ -30,7 +30,7 @@ from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.upkeep.decisions import adoption as decisions
 from rosproxy.ros1.upkeep.decisions.adoption import Container, DirectNode
 from rosproxy.ros1.upkeep.decisions.registration import is_known_as
-from rosproxy.ros1.upkeep.registrar import FormerUris, Registrar
+from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.verifier import Verifier
 
 log = logging.getLogger(__name__)
@@ -51,6 +51,8 @@ class Adopter:
     _admission: NodeAdmission
     _registrar: Registrar
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    _to_reclaim: dict[Endpoint, dict[str, tuple[Endpoint, str]]] = field(default_factory=dict)
+    """What `_reclaim` takes next, by endpoint: the former URIs by node name."""
 
     async def adopt(self, arrived: Sequence[Container]) -> int:
         """Adopt the nodes of containers that have arrived; return the number of names.
@@ -124,16 +126,18 @@ class Adopter:
         # advertised URI, and there is nothing to reclaim. If the master has no URI, the proxy is
         # already registering the node anew, so reclaim what the node's own URI still has.
         former = {} if uri == advertised else {name: (endpoint, uri or endpoint.uri)}
-        self._context.tasks.spawn(self._reclaim(endpoint, former), f"taking over {endpoint.uri}")
+        # Any client outside may make such calls, so the calls for an endpoint share a task.
+        if endpoint not in self._to_reclaim:
+            self._to_reclaim[endpoint] = {}
+            self._context.tasks.spawn(self._reclaim(endpoint), f"taking over {endpoint.uri}")
+        self._to_reclaim[endpoint] |= former
         return True
 
-    async def _reclaim(self, endpoint: Endpoint, former: FormerUris) -> None:
-        """Reclaim the names in ``former``, and repair the effects of direct calls.
-
-        ``former`` may be empty. Failures are logged only.
-        """
+    async def _reclaim(self, endpoint: Endpoint) -> None:
+        """Reclaim names of an endpoint, and repair the effects of direct calls. Log failures."""
         try:
             async with self._lock:
+                former = self._to_reclaim.pop(endpoint)
                 await self._registrar.reclaim(former)
                 await self._registrar.reconcile(endpoint)
         except (Unreachable, MasterError) as error:
