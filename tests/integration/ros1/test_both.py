@@ -13,6 +13,7 @@ from examples.demo.fake_node import FakeNode
 from rosproxy.forwarding.datagrams import bind
 from rosproxy.net.addresses import is_address, is_loopback
 from rosproxy.ros1.protocol.tcpros import encode_header
+from rosproxy.ros1.registry.endpoint import Endpoint
 from tests.integration.admin_calls import tell
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
@@ -348,6 +349,29 @@ async def test_who_asks_for_many_takes_no_udpros_from_others(
             await rpc(at, "requestTopic", "/listener", "/chatter", [offer], source=source)
     peers = [row["peer"] for row in proxy.app.status()["udpros"]]
     assert sorted(peers) == [MASTER] * 3 + [OUTSIDE]
+
+
+async def test_a_call_with_many_offers_has_a_single_relay(proxy: Proxy, node: FakeNode) -> None:
+    """Each of 500 offers in a call opened a relay, in one turn of the event loop."""
+    await node.publish(proxy.master)
+    offers = [udp_offer("/chatter", OUTSIDE, port) for port in range(40000, 40010)]
+    asked = [*offers, ["TCPROS"]]
+    await rpc(proxy.lease(node), "requestTopic", "/l", "/chatter", asked, source=OUTSIDE)
+    (relayed, other) = offers_heard(node)
+    (row,) = proxy.app.status()["udpros"]
+    assert (relayed[3], other) == (row["port"], ["TCPROS"])
+
+
+async def test_a_search_for_ended_subscriptions_sorts_no_names(
+    proxy: Proxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To sort 10,000 names for each of 256 relays took 0.25 s, every half minute."""
+    await node.publish(proxy.master)
+    offer = udp_offer("/chatter", OUTSIDE, 40000)
+    await rpc(proxy.lease(node), "requestTopic", "/l", "/chatter", [offer], source=OUTSIDE)
+    monkeypatch.setattr(Endpoint, "names", lambda *_: pytest.fail("all names are sorted"))
+    proxy.ros1.stand_ins.udpros.sweep()
+    assert len(proxy.ros1.stand_ins.udpros) == 1
 
 
 async def test_who_is_gone_was_not_cut_by_a_policy(

@@ -121,7 +121,7 @@ class UdprosRelays:
 
         def is_registered() -> bool:
             is_current = self._context.registry.by_port.get(endpoint.port) is endpoint
-            return is_current and topic in endpoint.names(Kind.PUBLISHER)
+            return is_current and endpoint.publishes(topic)
 
         def is_allowed() -> bool:
             return not self._policy.check_outside("topic", topic, endpoint, source, caller_id)
@@ -273,12 +273,18 @@ async def _rewritten(
     condition: _RelayCondition,
     redirect: Callable[[HostPort], Awaitable[HostPort | None]],
 ) -> bytes:
-    """The call with each offer redirected. An offer without a relay is removed."""
+    """The call with the first valid offer redirected. An offer without a relay is removed.
+
+    So are all further offers: subscribers offer UDPROS once, and a call has room for hundreds.
+    """
     topic = call.string(1) or ""
     edits = list[Edit]()
+    is_redirected = False
     for offer in read_offers(call):
         target = None
-        if offer.receiver and offer.topic == topic and condition.holds():
+        is_valid = offer.topic == topic and not is_redirected
+        if offer.receiver and is_valid and condition.holds():
+            is_redirected = True
             target = await redirect(offer.receiver)
         edits += redirect_offer(offer, target)
     return xmlrpc.apply(body, edits)
