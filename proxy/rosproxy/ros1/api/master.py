@@ -203,7 +203,9 @@ class MasterApi:
         if may_be_long and (text := too_long_to_register(call)):
             return self._refuse("long_name", call, caller, text)
         admission = await self._admission.admit(call, caller)
-        if isinstance(admission, Endpoint) and (text := admission.reason_full(caller_id_of(call))):
+        if not isinstance(admission, Endpoint):
+            return admission
+        if text := self._context.registry.reason_full(admission, caller_id_of(call)):
             return self._refuse("too_many_names", call, caller, text)
         return admission
 

@@ -24,6 +24,11 @@ from rosproxy.ros1.registry.endpoint import (
 MOST_ADMISSIONS = 16
 """Remembered pairs of host:port and source for an endpoint. A node gives one host, from a single
 address, or from a few on a machine with several networks."""
+MOST_REGISTRATIONS_OF_SOURCE = 50_000
+"""The highest number of registrations of all endpoints of a source. A thousand nodes of a machine
+have twenty registrations each. Each takes 400 bytes and the names."""
+MOST_CHARACTERS_OF_SOURCE = 10_000_000
+"""The highest number of characters of all names and types that a source has registered."""
 UNPROVEN_DIVISOR = 4
 """Nodes of one source that have never answered may hold the range divided by this number. A healthy
 node answers within milliseconds after its first registration."""
@@ -53,6 +58,10 @@ class Registry:
         """The endpoints of all registrations, by kind and name, then by caller."""
         self._hidden: dict[tuple[Kind, str], dict[str, Endpoint]] = {}
         """The endpoints of hidden registrations, by kind and name, then by caller."""
+        self._registrations_of = Counter[str]()
+        """The number of registrations, by source of the endpoint."""
+        self._characters_of = Counter[str]()
+        """The number of characters of the registrations, by source of the endpoint."""
         self.changes = self.lease_changes = 0
         self._by_node: dict[HostPort, dict[int, Endpoint]] = {}
         self._admitted: dict[tuple[HostPort, str], Endpoint] = {}
@@ -194,6 +203,17 @@ class Registry:
         """The highest number of endpoints of one source that have never answered."""
         return max(1, len(self.pool.range) // UNPROVEN_DIVISOR)
 
+    def reason_full(self, endpoint: Endpoint, caller_id: str) -> str | None:
+        """Why an endpoint accepts no more registrations of a node name; None if there is room."""
+        source = endpoint.source
+        for count, most, label in (
+            (self._registrations_of[source], MOST_REGISTRATIONS_OF_SOURCE, "registrations"),
+            (self._characters_of[source], MOST_CHARACTERS_OF_SOURCE, "characters of names"),
+        ):
+            if count >= most:
+                return f"the nodes of {source} have {count} {label}, at most {most} are accepted"
+        return endpoint.reason_full(caller_id)
+
     def register(self, endpoint: Endpoint, registration: Registration) -> None:
         """Record what the master has accepted.
 
@@ -205,7 +225,7 @@ class Registry:
         self.changes += 1
         former = endpoint.registrations.get(registration.key)
         if registration.characters > LONGEST_REGISTRATION or (
-            former is None and endpoint.reason_full(registration.caller_id)
+            former is None and self.reason_full(endpoint, registration.caller_id)
         ):
             return
         owner = self.by_caller.get(registration.caller_id)
@@ -221,7 +241,9 @@ class Registry:
                 self.lease_changes += 1
         key = registration.key
         endpoint.callers.setdefault(registration.caller_id, {})[key] = None
-        endpoint.characters += registration.characters - (former.characters if former else 0)
+        if former:
+            self._count(endpoint, former, -1)
+        self._count(endpoint, registration, 1)
         endpoint.registrations[key] = registration
         _index(self._holders, endpoint, registration, True)
         _index(self._hidden, endpoint, registration, registration.hidden)
@@ -360,12 +382,21 @@ class Registry:
         if not endpoints:
             del self._by_node[endpoint.node]
 
+    def _count(self, endpoint: Endpoint, registration: Registration, step: int) -> None:
+        """Count a registration that begins (``step`` 1) or ends (-1)."""
+        source = endpoint.source
+        endpoint.characters += step * registration.characters
+        self._characters_of[source] += step * registration.characters
+        self._registrations_of[source] += step
+        if not self._registrations_of[source]:
+            del self._registrations_of[source], self._characters_of[source]
+
     def _drop(self, endpoint: Endpoint, key: tuple[Kind, str, str]) -> None:
         registration = endpoint.registrations.pop(key, None)
         if registration is None:
             return
         self.changes += 1
-        endpoint.characters -= registration.characters
+        self._count(endpoint, registration, -1)
         for index in (self._holders, self._hidden):
             _index(index, endpoint, registration, False)
         kind, name, caller_id = key

@@ -461,6 +461,36 @@ def test_an_endpoint_has_so_many_characters_of_names_at_most() -> None:
     assert (endpoint.characters, endpoint.reason_full("/node")) == (0, None)
 
 
+@pytest.mark.parametrize(
+    ("bound", "most", "label"),
+    [
+        ("MOST_REGISTRATIONS_OF_SOURCE", 4, "4 registrations"),
+        ("MOST_CHARACTERS_OF_SOURCE", 43, "56 characters of names"),
+    ],
+)
+def test_a_source_has_so_many_registrations_at_most(
+    monkeypatch: pytest.MonkeyPatch, bound: str, most: int, label: str
+) -> None:
+    """A container with a node at each of 100 ports filled the memory of its proxy."""
+    monkeypatch.setattr(f"rosproxy.ros1.registry.registry.{bound}", most)
+    registry = make_registry()
+    first, second = (node(registry, 5, port) for port in (40001, 40002))
+    other = node(registry, 6)
+    for number in range(3):
+        for endpoint in (first, second, other):
+            register(registry, endpoint, PUB, f"/t{number}", f"/node{endpoint.port}")
+    assert (len(first.registrations), len(second.registrations)) == (2, 2)
+    assert len(other.registrations) == 3
+    assert label in (registry.reason_full(second, "/n") or "")
+    assert registry.reason_full(other, "/n") is None
+    register(registry, first, PUB, "/t0", f"/node{first.port}")
+    registry.remove(second)
+    assert registry.reason_full(first, "/n") is None
+    registry.remove(first)
+    registry.remove(other)
+    assert not registry._registrations_of + registry._characters_of
+
+
 def test_an_endpoint_has_so_many_node_names_at_most() -> None:
     """The policy judges a topic for each name: 2 s for 10,000 names and 100 rules."""
     registry = make_registry()
