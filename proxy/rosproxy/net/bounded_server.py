@@ -17,11 +17,18 @@ By default the kernel buffers up to 4 MB, even for a reader that takes nothing.
 IDLE_TIMEOUT_S = 75.0
 """Seconds in which the first request, and after a reply the next request, must arrive."""
 
+MOST_IN_ALL = 512
+"""Connections from all addresses together. A machine may have any number of addresses."""
+
 Answer = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 
 
 class BoundedServer(web.Server):
-    """Answers requests on at most ``most`` connections from each address."""
+    """Answers requests on at most ``most`` connections from each address, and MOST_IN_ALL in all.
+
+    For a further connection, the oldest connection of the address ends, or the oldest connection of
+    the address with the most connections.
+    """
 
     def __init__(self, answer: Answer, most: int) -> None:
         # Compressed bodies stay compressed: a small body could expand to a very large body.
@@ -29,24 +36,44 @@ class BoundedServer(web.Server):
             answer, access_log=None, keepalive_timeout=IDLE_TIMEOUT_S, auto_decompress=False
         )
         self.most = most
+        self._by_source: dict[object, dict[web.RequestHandler, None]] = {}
+        """The connections of each source, oldest first."""
 
     def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
-        """Accept a connection; if the source has too many, end the oldest of the source."""
+        """Accept a connection; if there are too many, end another."""
         sock = transport.get_extra_info("socket")
         end_if_stalled(sock)
         with contextlib.suppress(OSError):
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         source = _source(handler)
-        same_source = [c for c in self.connections if _source(c) == source]
-        open_connections = [c for c in same_source if c.transport is not None]
-        # `connections` has closed connections until the next round of the event loop.
-        if len(open_connections) >= self.most:
-            oldest = open_connections[0]
-            # After a mere close the kernel would keep bytes that the reader has not taken.
-            if oldest.transport is not None:
-                oldest.transport.abort()
-            oldest.force_close()
+        if len(self._by_source.get(source, ())) >= self.most:
+            self._end_oldest(source)
+        elif sum(map(len, self._by_source.values())) >= MOST_IN_ALL:
+            self._end_oldest(max(self._by_source, key=lambda s: len(self._by_source[s])))
+        self._by_source.setdefault(source, {})[handler] = None
         super().connection_made(handler, transport)
+
+    def connection_lost(
+        self, handler: web.RequestHandler, exc: BaseException | None = None
+    ) -> None:
+        """Forget a connection."""
+        self._forget(handler)
+        super().connection_lost(handler, exc)
+
+    def _end_oldest(self, source: object) -> None:
+        oldest = next(iter(self._by_source[source]))
+        self._forget(oldest)
+        # After a mere close the kernel would keep bytes that the reader has not taken.
+        if oldest.transport is not None:
+            oldest.transport.abort()
+        oldest.force_close()
+
+    def _forget(self, handler: web.RequestHandler) -> None:
+        source = _source(handler)
+        same_source = self._by_source.get(source, {})
+        same_source.pop(handler, None)
+        if not same_source:
+            self._by_source.pop(source, None)
 
 
 def _source(handler: web.RequestHandler) -> object:

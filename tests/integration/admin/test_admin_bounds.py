@@ -231,3 +231,23 @@ async def test_the_proxys_own_commands_may_use_any_name_of_the_proxy(
     client = AdminClient(f"http://robot.example:{port}")
     status = await asyncio.to_thread(client.status)
     assert status.instance == proxy.app.runtime.instance
+
+
+async def test_many_addresses_have_so_many_connections_in_all(
+    proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each address had its own bound, and addresses are many."""
+    monkeypatch.setattr("rosproxy.net.bounded_server.MOST_IN_ALL", 4)
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    async with AsyncExitStack() as stack:
+        wires = []
+        for number in (1, 2, 2, 3, 4, 5):
+            source = f"127.0.5.{number}"
+            wires.append(await stack.enter_async_context(connect(address, source)))
+            await wires[-1].send(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+            assert (await wires[-1].reply()).status == 200
+        # The address with two loses one, and then the address that came first.
+        assert [await wire.outcome() for wire in (wires[1], wires[0])] == ["closed", "closed"]
+        for wire in wires[2:]:
+            await wire.send(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+            assert (await wire.reply()).status == 200
