@@ -11,9 +11,11 @@ from examples.demo.fake_http import host_and_port, value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.forwarding.datagrams import bind
-from rosproxy.net.addresses import is_address, is_loopback
+from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.tcpros import encode_header
 from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.rewriting.addressing import Caller
+from rosproxy.ros1.stand_ins.outside_nodes import RETRY_TIMEOUT_S, Outside
 from tests.integration.admin_calls import tell
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
@@ -264,6 +266,27 @@ async def test_nothing_leads_to_loopback(
     told = (await rpc(proxy.master, "lookupNode", "/tool", "/evil", source=NODE))[2]
     assert await knock(host_and_port(told), post(xml("getPid", "/tool")), NODE) == "reset"
     listening.close()
+
+
+async def test_a_node_waits_for_no_row_of_silent_nodes_that_refused_before(
+    proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """1,000 such nodes, 32 at a time, kept a registration waiting for half a minute."""
+    ports = proxy.ros1.stand_ins
+    uris = [f"http://{MASTER}:{port}/" for port in range(40000, 40005)]
+    tried = list[str]()
+
+    async def refuses(_: Outside, uri: str, target: HostPort) -> bool:
+        tried.append(uri)
+        await asyncio.sleep(RETRY_TIMEOUT_S)
+        return False
+
+    monkeypatch.setattr(Outside, "refuses", refuses)
+    monkeypatch.setattr(ports, "_retry_slots", asyncio.Semaphore(1))
+    ports._refused.update(dict.fromkeys(uris))
+    await ports.listen_for(uris, Caller(NODE, PROXY))
+    assert 0 < len(tried) < 3
+    assert stand_ins(proxy).keys() == {*uris}
 
 
 # UDPROS

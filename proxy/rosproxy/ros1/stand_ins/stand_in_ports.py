@@ -16,11 +16,12 @@ connections that the kernel does not forward.
 """
 
 import asyncio
+import contextlib
 import logging
 import socket
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -40,7 +41,7 @@ from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros_server import TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
-from rosproxy.ros1.stand_ins.outside_nodes import Outside, OutsideNode
+from rosproxy.ros1.stand_ins.outside_nodes import RETRY_TIMEOUT_S, Outside, OutsideNode
 from rosproxy.ros1.stand_ins.publisher_lookup import PublisherLookup
 from rosproxy.ros1.stand_ins.udpros_relays import UdprosRelays
 
@@ -93,11 +94,7 @@ class StandInPorts:
         targets = await self._targets(uris)
         if not targets:
             return
-        retried = self._refused.keys() & targets.keys()
-        refusals = await asyncio.gather(*(self._refuses(uri, targets[uri]) for uri in retried))
-        for uri, refuses in zip(retried, refusals, strict=True):
-            if not refuses:
-                self._refused.pop(uri, None)
+        await self._retry({uri: targets[uri] for uri in self._refused.keys() & targets.keys()})
         for number, (uri, target) in enumerate(targets.items(), start=1):
             if number % PORTS_PER_TURN == 0:
                 await asyncio.sleep(0)
@@ -331,9 +328,24 @@ class StandInPorts:
         if len(self._refused) > stand_ins.MOST_STAND_INS:
             del self._refused[next(iter(self._refused))]
 
-    async def _refuses(self, uri: str, target: HostPort) -> bool:
-        async with self._retry_slots:
-            return await self._outside.refuses(uri, target)
+    async def _retry(self, targets: Mapping[str, HostPort]) -> None:
+        """Try nodes that have refused before. Nodes that refuse again stay refused.
+
+        A node inside waits for this, at most RETRY_TIMEOUT_S.
+        """
+        refusing = set[str]()
+
+        async def try_node(uri: str, target: HostPort) -> None:
+            async with self._retry_slots:
+                if await self._outside.refuses(uri, target):
+                    refusing.add(uri)
+
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(RETRY_TIMEOUT_S), asyncio.TaskGroup() as tries:
+                for uri, target in targets.items():
+                    tries.create_task(try_node(uri, target))
+        for uri in targets.keys() - refusing:
+            self._refused.pop(uri, None)
 
     def _connections(self) -> Counter[int]:
         counts = Counter(relay.port for relay in self._tcpros.relays if relay.inside_asks)
