@@ -127,13 +127,17 @@ class Registrar:
             await self.resettle(unsettled)
         if state is None:
             return
-        endpoints = {r: e for e in alive for r in e.registrations.values()}
-        missing = decisions.lost_registrations(list(endpoints), state, started)
+        missing = list[EndpointRegistration]()
+        for endpoint in alive:
+            recorded = list(endpoint.registrations.values())
+            lost = decisions.lost_registrations(recorded, state, started)
+            missing += [(endpoint, registration) for registration in lost]
+            await asyncio.sleep(0)  # a node may have thousands of registrations
         if missing:
             log.warning(
                 "the master has lost %d registrations; the proxy makes them again", len(missing)
             )
-            await self.register([(endpoints[r], r) for r in missing])
+            await self.register(missing)
         elif our_state[0] == registry.changes:  # no node registered while the master was asked
             self._complete_state = digest, *our_state
 

@@ -193,14 +193,15 @@ def unregistered_topics(endpoint: Endpoint, info: NodeInfo) -> list[Registration
 def lost_registrations(
     recorded: Sequence[Registration], state: Mapping[str, list[Registration]], before: float
 ) -> list[Registration]:
-    """The registrations of the registry (``recorded``) that the master no longer has.
+    """The registrations of an endpoint (``recorded``) that the master no longer has.
 
     ``before`` is the time at which the master was asked: later registrations do not count. The
     state of the master has no parameter subscriptions. These count as lost if the master has lost
     the whole node.
     """
     recorded = [r for r in recorded if not r.hidden]
-    keys = {r.key for of_node in state.values() for r in of_node}
+    names = {r.caller_id for r in recorded}
+    keys = {r.key for name in names for r in state.get(name, ())}
     params = [r for r in recorded if r.kind is Kind.PARAM]
     gone = [
         r for r in recorded if r.since < before and r.key not in keys and r.kind is not Kind.PARAM
