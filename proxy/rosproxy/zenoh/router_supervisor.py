@@ -13,7 +13,7 @@ import logging
 import signal
 import sys
 from asyncio.subprocess import PIPE, Process
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import TypeVar
 
 from rosproxy.net.tasks import Tasks
@@ -55,7 +55,7 @@ class RouterSupervisor:
     def __init__(
         self,
         tasks: Tasks,
-        take_report: Callable[[Report], None],
+        take_report: Callable[[Report], Awaitable[None]],
     ) -> None:
         self._tasks = tasks
         self._revision = 1
@@ -159,7 +159,7 @@ class RouterSupervisor:
             if report.error:
                 return brief(report.error, LONGEST_LOG_LINE)
             timeout = REPORT_TIMEOUT_S
-            self._take_report(report)
+            await self._take_report(report)
             self.failure = ""
             self._confirmed = max(self._confirmed, report.revision)
             self._first_outcome.set()

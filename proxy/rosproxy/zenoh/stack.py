@@ -27,6 +27,7 @@ from rosproxy.zenoh.link_probe import try_link
 from rosproxy.zenoh.links import Link
 from rosproxy.zenoh.policy.access_control import access_control
 from rosproxy.zenoh.policy.name_sets import check_layers
+from rosproxy.zenoh.protocol.liveliness import graph_of
 from rosproxy.zenoh.protocol.report import Report
 from rosproxy.zenoh.router_configs import RouterPlan
 from rosproxy.zenoh.router_policy import RouterPolicy
@@ -169,8 +170,11 @@ class Zenoh:
         policy = with_hidden(status.policy, *self._policy.hidden())
         return replace(status, zenoh=self.state.status(), policy=policy)
 
-    def _take_report(self, report: Report) -> None:
-        self.state.take(report)
+    async def _take_report(self, report: Report) -> None:
+        tokens = report.tokens
+        # In a thread, because many tokens would hold up all other traffic of the proxy.
+        graph = None if tokens is None else await asyncio.to_thread(graph_of, tokens)
+        self.state.take(report, graph)
         for link in self.state.links:
             if self.state.is_up(link) and link.note(None, self._runtime.now()):
                 log.info("zenoh link up: %s", link.peer)

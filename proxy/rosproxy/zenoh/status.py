@@ -16,7 +16,7 @@ from rosproxy.admin.status_document import (
 )
 from rosproxy.settings import Settings
 from rosproxy.zenoh.links import Link, is_linked
-from rosproxy.zenoh.protocol.liveliness import ZenohNode, nodes_of, parse_token
+from rosproxy.zenoh.protocol.liveliness import TokenGraph, ZenohNode
 from rosproxy.zenoh.protocol.report import (
     Ends,
     Report,
@@ -56,8 +56,11 @@ class ZenohState(Collector):
         peers = dict.fromkeys(settings.zenoh_peer, False)
         self.links = [Link(peer, now(), is_hub) for peer, is_hub in (peers | hubs).items()]
 
-    def take(self, report: Report) -> None:
-        """Replace the sessions by those of a report, and also the nodes if the tokens changed."""
+    def take(self, report: Report, graph: TokenGraph | None) -> None:
+        """Replace the sessions by those of a report, and the nodes by those of its tokens.
+
+        ``graph``: what the tokens announce; None if the tokens have not changed.
+        """
         self._sessions = tuple(self._sessions_of(report.routers))
         self._hub_routers = tuple(
             ends
@@ -65,11 +68,9 @@ class ZenohState(Collector):
             if port is None and session.whatami == "router"
             for ends in all_ends_of(session)
         )
-        if report.tokens is not None:
-            entities = [parse_token(key) for key in report.tokens]
-            known = [entity for entity in entities if entity]
-            self._nodes = nodes_of(known)
-            self._left_out = report.tokens_left_out + len(entities) - len(known)
+        if graph is not None:
+            self._nodes = graph.nodes
+            self._left_out = report.tokens_left_out + graph.left_out
 
     def is_up(self, link: Link) -> bool:
         """Whether the routers run, and the hub has a session with the peer of a link."""

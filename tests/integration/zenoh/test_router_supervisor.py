@@ -47,8 +47,11 @@ class Kept:
 
     def __init__(self, tasks: Tasks, program: str) -> None:
         self.reports: list[Report] = []
-        self.supervisor = RouterSupervisor(tasks, self.reports.append)
+        self.supervisor = RouterSupervisor(tasks, self._take)
         self.supervisor.program = (sys.executable, "-c", program)
+
+    async def _take(self, report: Report) -> None:
+        self.reports.append(report)
 
     @property
     def pid(self) -> int:

@@ -5,7 +5,8 @@ A small program stands in for the process of the routers, which needs the zenoh 
 
 import json
 import sys
-from collections.abc import AsyncIterator, Callable
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from rosproxy.net import sockets
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
 from rosproxy.zenoh import stack
+from rosproxy.zenoh.protocol.report import Report
 from rosproxy.zenoh.stack import Zenoh
 from tests.integration.net import until
 from tests.run_options import parse_settings
@@ -228,3 +230,20 @@ async def test_the_directory_goes_with_the_proxy(make: Make, tmp_path: Path, lin
     assert directory.stat().st_mode & 0o077 == 0
     await zenoh.stop()
     assert not directory.exists()
+
+
+async def test_tokens_are_read_while_the_event_loop_serves_others(make: Make) -> None:
+    """To read 8,192 tokens takes 0.2 s, and a session can change a token each second."""
+    zenoh = make()
+    readers = list[int]()
+
+    class Tokens(tuple[str, ...]):
+        def __iter__(self) -> Iterator[str]:
+            readers.append(threading.get_ident())
+            return super().__iter__()
+
+    zenoh.supervisor.failure = ""
+    await zenoh._take_report(Report(tokens=Tokens(["@ros2_lv/0/bb/0/0/NN/%/%/robot"])))
+    assert [node.name for node in zenoh.state.status().nodes] == ["/robot"]
+    assert readers
+    assert threading.get_ident() not in readers

@@ -6,6 +6,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.admin.status_document import ZenohSessionStatus
+from rosproxy.zenoh.protocol.liveliness import graph_of
 from rosproxy.zenoh.protocol.report import Report, RouterReport, RouterSession, SessionConnection
 from rosproxy.zenoh.router_policy import InsideName
 from rosproxy.zenoh.status import ZenohState
@@ -64,7 +65,7 @@ def make_state(process: FakeProcess) -> ZenohState:
     state = ZenohState(parse_settings(options), process, lambda: 10.0)
     for link in state.links:
         link.addresses = (link.peer.host,)
-    state.take(REPORT)
+    state.take(REPORT, graph_of(TOKENS))
     return state
 
 
@@ -97,9 +98,9 @@ def test_names_of_nodes_inside_have_port_and_address() -> None:
 
 def test_tokens_stay_until_a_report_has_others() -> None:
     state = make_state(FakeProcess())
-    state.take(Report(REPORT.routers))
+    state.take(Report(REPORT.routers), None)
     assert len(state.status().nodes) == 2
-    state.take(Report(REPORT.routers, ()))
+    state.take(Report(REPORT.routers, ()), graph_of(()))
     assert not state.status().nodes
 
 
@@ -133,7 +134,7 @@ def test_every_connection_of_a_session_counts() -> None:
     first = SessionConnection("tcp/172.18.0.2:7447", "tcp/10.0.0.9:50003")
     second = SessionConnection("tcp/172.18.0.2:50004", "tcp/192.0.2.8:7447")
     hub = RouterSession("04", "router", (first, second))
-    state.take(Report((*REPORT.routers[:2], RouterReport("03", (hub,)))))
+    state.take(Report((*REPORT.routers[:2], RouterReport("03", (hub,)))), None)
     assert [state.is_up(link) for link in state.links] == [False, True]
 
 

@@ -9,7 +9,7 @@ In names, ``%`` stands for ``/``.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import Enum
 from typing import NamedTuple
 
@@ -93,6 +93,19 @@ def parse_token(key: str) -> Entity | None:
     node = f"{namespace.rstrip('/')}/{_ros_name(parts[8])}"
     name = "" if kind is EntityKind.NODE else _ros_name(parts[9])
     return Entity(int(domain), session, int(node_id), kind, node, name)
+
+
+class TokenGraph(NamedTuple):
+    """The nodes that tokens announce. ``left_out``: tokens that are not of rmw_zenoh."""
+
+    nodes: tuple[ZenohNode, ...]
+    left_out: int
+
+
+def graph_of(tokens: Sequence[str]) -> TokenGraph:
+    """The nodes of tokens. For MOST_TOKENS this takes 0.2 s."""
+    entities = list(filter(None, map(parse_token, tokens)))
+    return TokenGraph(nodes_of(entities), len(tokens) - len(entities))
 
 
 def nodes_of(entities: Iterable[Entity]) -> tuple[ZenohNode, ...]:
