@@ -79,9 +79,12 @@ class ProxySite(msgspec.Struct, frozen=True):
 
     ``master`` is the real master for the proxy's settings. The ``uri`` is set even if the master is
     a Service. If ``address`` is empty, the proxy resolves the host name. If ``publish`` is 0, the
-    proxy does not publish the master. ``peers`` has the ROS 2 peers: the peers that the RosProxy
-    names, and the proxies on other nodes. ``relay_secret`` is the shared secret of the proxy and
-    the LAN relay. ``hubs`` has the proxies for rmw_zenoh on other nodes, for a new proxy only.
+    proxy does not publish the master. ``relay_secret`` is the shared secret of the proxy and the
+    LAN relay.
+
+    Only the site of a new proxy has ``peers`` and ``hubs``. ``peers`` has the ROS 2 peers: the
+    peers that the RosProxy names, and the proxies on other nodes. ``hubs`` has the proxies for
+    rmw_zenoh on other nodes.
     """
 
     rosproxy: RosProxy

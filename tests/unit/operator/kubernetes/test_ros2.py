@@ -190,6 +190,29 @@ def test_proxies_of_several_nodes_are_each_others_peers():
     assert {briefing.peers for briefing in plan.briefings.values()} == set(expected_peers)
 
 
+def test_a_proxy_has_no_peer_at_its_own_address_unless_others_have_the_address_too():
+    of = of2(Ros2Spec(peers=("192.0.2.1:11400",)))
+    hosts = {
+        "named": "192.0.2.1",
+        "shared": "192.0.2.2",
+        "sharing": "192.0.2.2",
+        "other": "192.0.2.3",
+        "ipv6": "2001:db8::4",
+    }
+    nodes = [node(name, addresses={"InternalIP": host}) for name, host in hosts.items()]
+    pods = [pod(name=f"pod-{name}", on=name) for name in hosts]
+
+    plan = look(observed(of, service(of), *nodes, *pods))
+
+    made = [action for action in plan.actions if isinstance(action, CreateProxy)]
+    peers = {some.node_of(a): settings_of(env_of(a.body)).ros2_peer for a in made}
+    own = {name: HostPort(host, 11400) for name, host in hosts.items()}
+    common = (own["named"], own["shared"])
+    everyone = (*common, own["other"])
+    with_all = dict.fromkeys(("named", "shared", "sharing"), everyone)
+    assert peers == {**with_all, "other": common}
+
+
 def test_ports_of_udp_are_kept_clear_of_others():
     of = of2()
     tcp = pod(name="tcp", ports=())

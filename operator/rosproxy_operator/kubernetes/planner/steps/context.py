@@ -1,5 +1,8 @@
 """The input of the steps of a plan, and the site of a proxy: what the proxy needs on a node."""
 
+from collections import Counter
+from collections.abc import Iterator
+
 import msgspec
 from msgspec.structs import replace
 
@@ -45,7 +48,8 @@ CNI plug-in portmap deletes conntrack entries when a pod starts, and not when a 
 class ClusterContext(msgspec.Struct, frozen=True):
     """The input of the steps of all RosProxies.
 
-    ``now`` is in seconds of the operator's monotonic clock. ``sites`` is a cache of `site_of`.
+    ``now`` is in seconds of the operator's monotonic clock. ``sites`` is a cache of `site_of`, and
+    ``others`` of `_others_of`.
     """
 
     view: View
@@ -55,6 +59,7 @@ class ClusterContext(msgspec.Struct, frozen=True):
     retries: Retries
     now: float
     sites: dict[ProxyPlace, ProxySite | Obstacle] = {}
+    others: dict[ProxyPlace, tuple[str, ...]] = {}
 
     @property
     def observed(self) -> ClusterSnapshot:
@@ -161,16 +166,8 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
     ports = context.ranges.given[place]
     published = replace(master, publish=publish)
     token_hash = hash_token(token) if token else ""
-    return ProxySite(
-        rosproxy,
-        node,
-        host,
-        ports,
-        published,
-        token_hash,
-        peers_of(context, place),
-        relay_secret_of(context.observed.key, name, node.name),
-    )
+    relay_secret = relay_secret_of(context.observed.key, name, node.name)
+    return ProxySite(rosproxy, node, host, ports, published, token_hash, relay_secret=relay_secret)
 
 
 def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
@@ -179,18 +176,7 @@ def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
     A proxy on another node is a peer at the first port of that proxy's range. A proxy with an IPv6
     advertised host is no peer, because proxies use only IPv4 for ROS 2.
     """
-    rosproxy = context.view.rosproxies[place.of]
-    nodes = context.observed.nodes
-    if rosproxy.spec.ros2 is None:
-        return ()
-    peers = set(rosproxy.spec.ros2.peers)
-    for other_place in context.view.places.get(place.of, ()):
-        ports = context.ranges.given.get(other_place)
-        if other_place != place and ports is not None and other_place.node in nodes:
-            host, problem = advertise_host(rosproxy, nodes[other_place.node])
-            if not problem and ":" not in host:
-                peers.add(f"{host}:{ports.first}")
-    return tuple(sorted(peers))
+    return _others_of(context, place) if context.view.rosproxies[place.of].spec.ros2 else ()
 
 
 def hubs_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
@@ -198,12 +184,8 @@ def hubs_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
 
     A hub beyond the bound is dialed by no hub, and dials the hubs within the bound itself.
     """
-    if context.view.rosproxies[place.of].spec.zenoh is None:
-        return ()
-    others = (other for other in context.view.places.get(place.of, ()) if other != place)
-    known = (other for other in others if other.node in context.observed.nodes)
-    hubs = sorted(str(hub_address(other.of, other.node)) for other in known)
-    return tuple(hubs[:MOST_ZENOH_HUBS])
+    is_hub = context.view.rosproxies[place.of].spec.zenoh is not None
+    return _others_of(context, place)[:MOST_ZENOH_HUBS] if is_hub else ()
 
 
 def peers(context: ClusterContext) -> dict[str, tuple[str, ...]]:
@@ -213,3 +195,42 @@ def peers(context: ClusterContext) -> dict[str, tuple[str, ...]]:
         for place, proxy in context.view.current.items()
         if context.view.rosproxies[place.of].spec.ros2
     }
+
+
+def _others_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
+    """The peers of the RosProxy, and the addresses of the RosProxy's other proxies; sorted."""
+    if place not in context.others:
+        context.others.update(_others(context, context.view.rosproxies[place.of]))
+    return context.others[place]
+
+
+def _others(
+    context: ClusterContext, rosproxy: RosProxy
+) -> Iterator[tuple[ProxyPlace, tuple[str, ...]]]:
+    """Yield the addresses for each place of a RosProxy: see `_others_of`.
+
+    All lists together grow with the square of the nodes. So each list is a copy of one sorted list,
+    without the proxy's own address.
+    """
+    places = context.view.places[rosproxy.id]
+    addresses = {place: _address_of(context, rosproxy, place) for place in places}
+    named = rosproxy.spec.ros2.peers if rosproxy.spec.ros2 else ()
+    counts = Counter(filter(None, (*named, *addresses.values())))
+    everyone = tuple(sorted(counts))
+    # An address that the RosProxy names, or that another proxy has as well, stays.
+    positions = {address: at for at, address in enumerate(everyone) if counts[address] == 1}
+    for place, address in addresses.items():
+        at = positions.get(address, len(everyone))
+        yield place, everyone[:at] + everyone[at + 1 :]
+
+
+def _address_of(context: ClusterContext, rosproxy: RosProxy, place: ProxyPlace) -> str:
+    """The address at which other proxies of the RosProxy reach a proxy; empty without one."""
+    node = context.observed.nodes.get(place.node)
+    if node is None:
+        return ""
+    if rosproxy.spec.zenoh:
+        return str(hub_address(place.of, place.node))
+    ports = context.ranges.given.get(place)
+    host, _ = advertise_host(rosproxy, node)
+    return f"{host}:{ports.first}" if ports and host and ":" not in host else ""

@@ -29,7 +29,12 @@ from rosproxy_operator.kubernetes.planner.actions import (
 from rosproxy_operator.kubernetes.planner.cluster_view import serves
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.planner.retries import Task
-from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, hubs_of, site_of
+from rosproxy_operator.kubernetes.planner.steps.context import (
+    ClusterContext,
+    hubs_of,
+    peers_of,
+    site_of,
+)
 from rosproxy_operator.kubernetes.planner.steps.image_check import (
     ImageState,
     check_image,
@@ -219,7 +224,7 @@ def _reconcile_wanted(
         # A pod that was deleted by force may still hold its hostPorts: see `TORN_DOWN_WITHIN_S`.
         context.retries.look_again_in(seconds)
     elif context.retries.is_due(_creation_task(place)):
-        site = replace(site, hubs=hubs_of(context, place))
+        site = replace(site, peers=peers_of(context, place), hubs=hubs_of(context, place))
         yield CreateProxy(place.of, manifests.proxy_pod(site, context.settings))
 
 
