@@ -9,7 +9,7 @@ action that had no effect.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from msgspec.structs import replace
 
@@ -26,7 +26,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     DeleteService,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.cluster_view import serves
+from rosproxy_operator.kubernetes.planner.cluster_view import place_of, serves
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.context import (
@@ -129,7 +129,10 @@ def reconcile_proxies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
     """
     places = context.view.places.get(rosproxy.id, ())
     creatable = [place for place in places if _is_creatable(context, place)]
-    working = {place for place in creatable if _works(context, place, creatable)}
+    existing = [*filter(None, map(context.view.current.get, creatable))]
+    # If no proxy is ready, readiness does not count: the master may be down.
+    has_ready = any(proxy.ready for proxy in existing)
+    working = {place_of(proxy) for proxy in existing if _works(context, proxy, has_ready)}
     down = [p for p in creatable if p not in working and not _lacks_ports(context, p)]
     in_check = [place for place in working if _image_check_is_open(context, place)]
     room = rosproxy.spec.max_unavailable.of(len(creatable)) - len(down) - len(in_check)
@@ -166,22 +169,18 @@ def _is_creatable(context: ClusterContext, place: ProxyPlace) -> bool:
     return place in context.view.wanted and not isinstance(site_of(context, place), Obstacle)
 
 
-def _works(context: ClusterContext, place: ProxyPlace, places: Iterable[ProxyPlace]) -> bool:
-    """Whether a proxy serves and is ready.
+def _works(context: ClusterContext, proxy: ProxyPod, must_be_ready: bool) -> bool:
+    """Whether a proxy serves, and is ready if it must be.
 
     After a change of the image, the answer is False until the container restarts, for
     `IMAGE_CHANGE_RESTART_S` seconds at most.
-
-    If no proxy of ``places`` is ready, readiness does not count: the master may be down.
     """
-    current = context.view.current.get(place)
-    if current is None or not serves(current) or current.stuck is not None:
+    if not serves(proxy) or proxy.stuck is not None:
         return False
     # After a change of the image, a pod stays ready until the kubelet ends the former container.
-    if context.retries.is_recent(_image_task(current, current.image), IMAGE_CHANGE_RESTART_S):
+    if context.retries.is_recent(_image_task(proxy, proxy.image), IMAGE_CHANGE_RESTART_S):
         return False
-    every = filter(None, map(context.view.current.get, places))
-    return current.ready or not any(proxy.ready for proxy in every)
+    return proxy.ready or not must_be_ready
 
 
 def _reconcile_proxy(
