@@ -241,7 +241,7 @@ class _Node(msgspec.Struct):
 
     def _non_proxy_pods(self, place: ProxyPlace) -> list[Pod]:
         """Return the node's pods that are not proxies, with the LAN relays of other RosProxies."""
-        lan_relays = (r for r in self.view.observed.lan_relays if r.node == self.node)
+        lan_relays = self.view.lan_relays_by_node.get(self.node, ())
         # The LAN relay of the same RosProxy holds the last port of the range (`steps.lan_relay`).
         others = (lan_relay.pod for lan_relay in lan_relays if lan_relay.of != place.of)
         return [*self.view.other_pods_by_node.get(self.node, ()), *others]

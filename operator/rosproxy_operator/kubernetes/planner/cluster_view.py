@@ -14,6 +14,7 @@ from rosproxy.telemetry.text import listed
 from rosproxy_operator.kubernetes.planner.pods.selection import on_node, select_rosproxy, selects
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
+    HelperPod,
     PodFailure,
     ProxyPod,
 )
@@ -40,6 +41,7 @@ class View(msgspec.Struct, frozen=True):
     - ``orphans``: the proxies of RosProxies that are gone or being deleted. The proxies of an
       unusable RosProxy are no orphans.
     - ``proxies_by_node``: by intended node, all proxies whose pods have not ended.
+    - ``lan_relays_by_node`` and ``image_checks_by_node``: by intended node, these pods.
     - ``wanted``: the places where pods want a proxy, with these pods.
     - ``places``: by RosProxy, the places where a proxy is wanted or exists, sorted.
     - ``selected_pods``: by RosProxy, the pods that the RosProxy takes, on any node.
@@ -55,6 +57,8 @@ class View(msgspec.Struct, frozen=True):
     current: Mapping[ProxyPlace, ProxyPod]
     orphans: tuple[ProxyPod, ...]
     proxies_by_node: Mapping[str, tuple[ProxyPod, ...]]
+    lan_relays_by_node: Mapping[str, tuple[HelperPod, ...]]
+    image_checks_by_node: Mapping[str, tuple[HelperPod, ...]]
     wanted: Mapping[ProxyPlace, tuple[Pod, ...]]
     places: Mapping[Name, tuple[ProxyPlace, ...]]
     selected_pods: Mapping[Name, tuple[Pod, ...]]
@@ -108,6 +112,8 @@ def view(observed: ClusterSnapshot) -> View:
         },
         orphans=tuple(p for p in orphans if p.owner not in unusable),
         proxies_by_node=group_by_key((p.node, p) for p in observed.proxies if not p.pod.ended),
+        lan_relays_by_node=group_by_key((relay.node, relay) for relay in observed.lan_relays),
+        image_checks_by_node=group_by_key((check.node, check) for check in observed.image_checks),
         wanted=wanted,
         places=group_by_key((place.of, place) for place in sorted({*wanted, *proxies})),
         selected_pods=selected_pods,

@@ -18,7 +18,7 @@ from rosproxy_operator.kubernetes.planner.manifests import (
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, site_of
-from rosproxy_operator.kubernetes.resources.cluster import HelperPod, ProxyPod
+from rosproxy_operator.kubernetes.resources.cluster import HelperPod
 from rosproxy_operator.kubernetes.resources.model import Json, ProxyPlace, RosProxy
 from rosproxy_operator.kubernetes.resources.names import IMAGE_CHECK, image_check_id
 from rosproxy_operator.kubernetes.settings import ClusterSettings
@@ -48,10 +48,10 @@ def image_check_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     return helper_pod(site, id, settings, container, {"restartPolicy": "Never"})
 
 
-def image_state(context: ClusterContext, proxy: ProxyPod, site: ProxySite) -> ImageState:
+def image_state(context: ClusterContext, site: ProxySite) -> ImageState:
     """The result of the check of a proxy's next image, on the proxy's node."""
     expected = fingerprint_of(image_check_pod(site, context.settings))
-    check = next((c for c in _checks(context, site.rosproxy) if c.node == proxy.node), None)
+    check = _check_at(context, site)
     if check is None or check.fingerprint != expected or check.pod.deleting:
         return ImageState.UNCHECKED
     if check.pod.phase == "Succeeded":
@@ -65,14 +65,16 @@ def check_image(context: ClusterContext, site: ProxySite) -> Iterator[Action]:
     rosproxy_id = site.rosproxy.id
     id = image_check_id(rosproxy_id, site.node.name)
     # A check of another image has the same name. `remove_image_checks` deletes that check first.
-    is_there = any(c.node == site.node.name for c in _checks(context, site.rosproxy))
+    is_there = _check_at(context, site) is not None
     if not is_there and context.retries.is_due(Task(rosproxy_id, "create", id)):
         yield CreateHelper(rosproxy_id, image_check_pod(site, context.settings), IMAGE_CHECK)
 
 
 def remove_image_checks(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
     """Yield the actions that delete image checks that no proxy of the RosProxy needs any more."""
-    for check in _checks(context, rosproxy):
+    for check in context.observed.image_checks:
+        if check.owner != rosproxy.uid:
+            continue
         task = Task(check.of, "delete", check.pod.id, check.pod.uid)
         if check.pod.deleting or _is_needed(context, rosproxy, check):
             continue
@@ -91,5 +93,7 @@ def _is_needed(context: ClusterContext, rosproxy: RosProxy, check: HelperPod) ->
     return is_next and check.fingerprint == fingerprint_of(image_check_pod(site, context.settings))
 
 
-def _checks(context: ClusterContext, rosproxy: RosProxy) -> Iterator[HelperPod]:
-    return (c for c in context.observed.image_checks if c.owner == rosproxy.uid)
+def _check_at(context: ClusterContext, site: ProxySite) -> HelperPod | None:
+    """The check that exists for a proxy, of its next image or of another image."""
+    checks = context.view.image_checks_by_node.get(site.node.name, ())
+    return next((c for c in checks if c.owner == site.rosproxy.uid), None)

@@ -152,7 +152,7 @@ def _image_check_is_open(context: ClusterContext, place: ProxyPlace) -> bool:
         return False
     if current.image == manifests.image_of(site.rosproxy, context.settings):
         return False
-    return image_state(context, current, site) in (ImageState.CHECKING, ImageState.UNUSABLE)
+    return image_state(context, site) in (ImageState.CHECKING, ImageState.UNUSABLE)
 
 
 def _lacks_ports(context: ClusterContext, place: ProxyPlace) -> bool:
@@ -240,7 +240,7 @@ def _reconcile_existing(
     elif proxy.fingerprint == fingerprint and proxy.image == image:
         return
     elif serves(proxy) and proxy.stuck is None and proxy.image != image:
-        state = image_state(context, proxy, site)
+        state = image_state(context, site)
         if state is ImageState.USABLE:
             yield from _replace_or_set_image(context, proxy, site, may_stop)
         elif state is ImageState.UNCHECKED and may_stop:
