@@ -5,6 +5,7 @@ import logging
 import secrets
 import time
 from collections.abc import Collection, Mapping, Sequence
+from functools import lru_cache
 from itertools import chain
 from typing import Any
 
@@ -61,6 +62,8 @@ POLICY_INTERVAL_S = 0.5
 """Seconds between checks of the policy for changes."""
 RATE_INTERVAL_S = 2.0
 """Seconds between updates of the rates."""
+MOST_ROUTES = 4096
+"""Addresses for which the proxy remembers its own address on the way there."""
 
 
 class Ros2:
@@ -71,6 +74,8 @@ class Ros2:
         self._settings = runtime.settings
         self.servers: list[DomainServer] = []
         self._hosts: tuple[str, ...] = ()
+        # A lookup takes 20 us, and an announcement goes to hundreds of participants inside.
+        self._address_towards = lru_cache(MOST_ROUTES)(address_towards)
         ports = runtime.settings.ports.listen
         self._kernel_ports = kernel_ports = KernelPorts(PortPool(ports))
         table = KernelTable(DatagramTable(ports), Tools())
@@ -124,7 +129,7 @@ class Ros2:
                 number=number,
                 hosts=self._hosts,
                 ports=ports,
-                proxy_address_for=address_towards,
+                proxy_address_for=self._address_towards,
                 note=self._runtime.refusals.note,
                 settled=self._runtime.refusals.settle,
                 judge=self._is_allowed,
@@ -359,6 +364,7 @@ class Ros2:
             server.set_peers(addresses_of_all)
 
     def _look_at_networks(self) -> None:
+        self._address_towards.cache_clear()
         own_networks = {network: address_into(network) for network in interface_networks()}
         self.networks = self._settings.inside_networks or networks_inside(own_networks, self._hosts)
         own_addresses = {address_into(network) for network in self.networks}

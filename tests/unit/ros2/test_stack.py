@@ -112,6 +112,27 @@ async def test_names_are_looked_up_again_and_hold_while_no_name_server_answers(
     assert ros2._is_inside("192.0.2.9")
 
 
+async def test_the_way_to_an_address_is_looked_up_once_between_two_looks_at_the_networks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An announcement goes to 512 participants inside, and took 10 ms for the lookups alone."""
+    looked_up = list[str]()
+
+    def address_towards(address: str) -> str:
+        looked_up.append(address)
+        return "172.30.0.2"
+
+    monkeypatch.setattr(stack, "address_towards", address_towards)
+    told: dict[str, Any] = {"ros": ("2",), "advertise_host": "127.0.0.1"}
+    told |= {"port_range": "45000-45015", "inside_network": ("172.30.0.0/24",)}
+    ros2 = Ros2(Runtime(parse_settings(told)))
+    for _ in range(2):
+        ros2._look_at_networks()
+        for _ in range(3):
+            assert ros2._address_towards("172.30.0.5") == "172.30.0.2"
+    assert looked_up.count("172.30.0.5") == 2
+
+
 async def test_a_peer_on_loopback_may_be_inside_as_well() -> None:
     """In a trial on a single machine both sides may have the same address."""
     told: dict[str, Any] = {"ros": ("2",), "advertise_host": "127.0.0.1"}

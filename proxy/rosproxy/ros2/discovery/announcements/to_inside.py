@@ -124,12 +124,13 @@ class AnnouncementsToInside:
         participant outside, a dispose message precedes the announcement.
         """
         sent = list[Outgoing]()
+        outsiders = list(filter(self.outside.may_be_announced, outside))
         by_near = dict[str, list[InsideParticipant]]()
-        for insider in inside:
+        for insider in inside if outsiders else ():
             if insider.metatraffic and not insider.is_separated:
                 near = self.settings.proxy_address_for(insider.address)
                 by_near.setdefault(near, []).append(insider)
-        for outsider in filter(self.outside.may_be_announced, outside):
+        for outsider in outsiders:
             for near, receivers in by_near.items():
                 datagram = self._announcement(outsider, near)
                 for insider in receivers:
