@@ -124,6 +124,7 @@ class Disposal:
     def forget_inside(self, insider: InsideParticipant) -> None:
         """Forget a participant inside without a dispose message."""
         self.inside.forget(insider)
+        self.rediscovery.forget_inside(insider)
         self.proxy_participants.forget(insider.prefix)
         self.fragments.forget(insider.prefix)
 

@@ -381,8 +381,8 @@ class Domain:
         sent = list[Outgoing]()
         self.former_ports.forget({insider.address for insider in self.inside.by_prefix.values()})
         for insider in list(self.inside.by_prefix.values()):
+            self.disposal.forget_inside(insider)  # before the work that remains to be done
             sent += self.rediscovery.separate(insider)
-            self.disposal.forget_inside(insider)
         return sent + self.rediscovery.next_datagrams(now)
 
     def standing(self, source: str) -> Standing:

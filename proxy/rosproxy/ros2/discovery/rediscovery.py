@@ -22,7 +22,6 @@ So the proxy makes a few dispose messages and announcements at a time (`next_dat
 addresses inside take turns.
 """
 
-from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
@@ -58,9 +57,9 @@ class Rediscovery:
     outside: OutsideParticipants
     to_inside: AnnouncementsToInside
     lan_relay_heard: bool = False
-    _waiting: dict[str, deque[Iterator[list[Outgoing]]]] = field(default_factory=dict)
-    """Work for participants inside, by their address. A step of an iterator makes the datagrams of
-    a pair of participants."""
+    _waiting: dict[str, dict[bytes, Iterator[list[Outgoing]]]] = field(default_factory=dict)
+    """Work for participants inside, by their address and prefix. A step of an iterator makes the
+    datagrams of a pair of participants."""
     _review: Iterator[InsideParticipant | None] = field(default_factory=lambda: iter(()))
     _has_verdicts: bool = False
     _now: float = 0.0
@@ -130,6 +129,13 @@ class Rediscovery:
         if insider.dispose_message_times is not None and prefix in insider.dispose_message_times:
             insider.dispose_message_times[prefix] = inf
 
+    def forget_inside(self, insider: InsideParticipant) -> None:
+        """Drop the work for a participant inside."""
+        waiting = self._waiting.get(insider.address, {})
+        waiting.pop(insider.prefix, None)
+        if not waiting:
+            self._waiting.pop(insider.address, None)
+
     def forget(self, insiders: Iterable[InsideParticipant], prefix: bytes) -> None:
         """Forget the times of dispose messages for a participant outside that has gone."""
         for insider in insiders:
@@ -147,15 +153,17 @@ class Rediscovery:
         """The datagrams for the next pair of participants, at the address whose turn it is."""
         address = next(iter(self._waiting))
         waiting = self._waiting.pop(address)
-        sent = next(waiting[0], None)
+        prefix, steps = next(iter(waiting.items()))
+        sent = next(steps, None)
         if sent is None:
-            waiting.popleft()
+            del waiting[prefix]
         if waiting:
             self._waiting[address] = waiting  # at the end: the other addresses have turns first
         return sent or []
 
     def _put(self, insider: InsideParticipant, steps: Iterator[list[Outgoing]]) -> None:
-        self._waiting.setdefault(insider.address, deque()).append(steps)
+        self.forget_inside(insider)  # a participant may change its ports again and again
+        self._waiting.setdefault(insider.address, {})[insider.prefix] = steps
 
     def _dispose_messages(
         self, insider: InsideParticipant, outsiders: Iterable[OutsideParticipant]

@@ -5,13 +5,16 @@ from itertools import chain
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortMap, PortRange
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.rediscovery import (
     MOST_PAIRS_PER_PART,
     MOST_VERDICTS_PER_PART,
     SEPARATION_S,
 )
-from rosproxy.ros2.domain_settings import Outgoing
+from rosproxy.ros2.domain_settings import MOST_MAPPINGS, Outgoing
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (
@@ -20,12 +23,14 @@ from tests.unit.ros2.discovery.domains import (
     OTHER,
     ROBOT,
     A,
+    dispose_message,
     finished,
     make_domain,
     meet,
     sedp,
     spdp,
 )
+from tests.unit.ros2.protocol.messages import data, message, payload
 
 OUTSIDE_COUNT = 100
 INSIDE_COUNT = 20
@@ -149,3 +154,39 @@ def test_a_participant_that_has_gone_is_not_parted() -> None:
     policy.allows = True
     domain.end_participants_at({INSIDE})
     assert not told(finished(domain, []), ended=True)[INSIDE]
+
+
+def with_ports(prefix: bytes, first: int) -> bytes:
+    """An announcement with as many locators as a participant may have ports."""
+    locators = [
+        (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, first + number), "<"))
+        for number in range(MOST_MAPPINGS)
+    ]
+    return message(data(payload(locators)), prefix=prefix)
+
+
+def test_no_more_work_waits_than_there_are_participants() -> None:
+    """Each change of ports added work for all outside: with 40 participants, 120 pieces a second.
+
+    Work for participants that had gone remained as well.
+    """
+    domain = crowd(Policy())
+    domain.rediscovery.lan_relay_heard = True  # else separations wait for the relay
+    for half_seconds in range(1, 21):
+        now = NOW + half_seconds / 2
+        for prefix in (inside(0), inside(1), inside(100 + half_seconds)):
+            for first in (8000, 9000):
+                domain.heard_inside(with_ports(prefix, first + half_seconds * 20), INSIDE, now)
+        domain.continue_pending(now)
+        domain.heard_inside(dispose_message(inside(100 + half_seconds)), INSIDE, now)
+    (waiting,) = domain.rediscovery._waiting.values()
+    assert set(waiting) == {inside(0), inside(1)}
+
+
+def test_a_participant_that_changes_its_ports_again_lets_others_go_first() -> None:
+    domain = crowd(Policy())
+    for prefix in (inside(0), inside(1)):
+        domain.rediscovery.separate(domain.inside.by_prefix[prefix])
+    domain.rediscovery.separate(domain.inside.by_prefix[inside(0)])
+    (waiting,) = domain.rediscovery._waiting.values()
+    assert list(waiting) == [inside(1), inside(0)]
