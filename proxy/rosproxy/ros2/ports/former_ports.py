@@ -10,7 +10,7 @@ wait lasts at least until outside has had `SETTLING_PERIOD_S` to send to former 
 from collections import Counter
 from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Self
+from typing import NamedTuple, Self
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import (
@@ -23,22 +23,34 @@ from rosproxy.ros2.ports.locator_ports import LocatorPorts
 from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.announced_participant import first_metatraffic
-from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 ANSWER_TIMEOUT_S = 5.0
 """Seconds that a participant has to name its former ports."""
 
 
+class WaitingParticipant(NamedTuple):
+    """A participant inside that waits, with the source of the announcement, and the announcement.
+
+    The announcement is kept as it came: when it is read, it takes up to 30 times as much memory.
+    ``metatraffic`` is the locator for questions, and ``since`` the start of the wait.
+    """
+
+    source: str
+    datagram: bytes
+    metatraffic: HostPort | None
+    since: float
+
+
 @dataclass(slots=True)
 class FormerPorts:
     """The participants inside that wait, and their ports from before the start.
 
-    ``waiting`` has by prefix: the source of the announcement, the announcement, and the start of
-    the wait. At an address, as many participants may wait as may be served. ``recorded`` has ports
-    by prefix, until the participant has gone: the operator has recorded these for participants that
-    knew the proxy at another address, or with another range. ``displaced`` are the last
-    participants that the proxy has ended, and that may be alive.
+    ``waiting`` is by prefix. At an address, as many participants may wait as may be served.
+    ``recorded`` has ports by prefix, until the participant has gone: the operator has recorded
+    these for participants that knew the proxy at another address, or with another range.
+    ``displaced`` are the last participants that the proxy has ended, and that may be alive.
 
     Fast DDS accepts no new locators of a known participant (PDPListener.cpp,
     PDPSimple::updateInfoMatchesEDP). So all participants outside must rediscover the ``recorded``
@@ -49,7 +61,7 @@ class FormerPorts:
     ports: LocatorPorts
     port_store: PortStore
     proofs: AddressProofs
-    waiting: dict[bytes, tuple[str, DiscoveryMessage, float]] = field(default_factory=dict)
+    waiting: dict[bytes, WaitingParticipant] = field(default_factory=dict)
     recorded: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
     displaced: dict[bytes, None] = field(default_factory=dict)
     _counts: Counter[str] = field(default_factory=Counter)
@@ -78,7 +90,7 @@ class FormerPorts:
 
     def is_waiting(self, prefix: bytes, source: str) -> bool:
         """Whether a participant at an address waits."""
-        return prefix in self.waiting and self.waiting[prefix][0] == source
+        return prefix in self.waiting and self.waiting[prefix].source == source
 
     def wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Hold an announcement until ports may be given. Return questions for the former ports.
@@ -87,9 +99,12 @@ class FormerPorts:
         """
         if not self._make_room(message.prefix, source):
             return []  # the participant announces itself again, and there may be room then
-        self.waiting[message.prefix] = source, message, now
+        spdp = message.of_participant
+        target = first_metatraffic(spdp, message.datagram, source) if spdp else None
+        waiting = WaitingParticipant(source, message.datagram, target, now)
+        self.waiting[message.prefix] = waiting
         self._counts[source] += 1
-        return self._questions(message, source, now)
+        return self._questions(message.prefix, waiting, now)
 
     def _make_room(self, prefix: bytes, source: str) -> bool:
         """Return whether a further participant may wait at an address.
@@ -118,9 +133,9 @@ class FormerPorts:
         """The questions to waiting participants whose answers are still due."""
         return [
             question
-            for source, message, since in self.waiting.values()
-            if not self._is_question_closed(message.prefix, since, now)
-            for question in self._questions(message, source, now)
+            for prefix, waiting in self.waiting.items()
+            if not self._is_question_closed(prefix, waiting.since, now)
+            for question in self._questions(prefix, waiting, now)
         ]
 
     def ready(self, now: float) -> list[bytes]:
@@ -138,9 +153,9 @@ class FormerPorts:
         """
         if prefix not in self.waiting:
             return None
-        source, message, _ = self.waiting.pop(prefix)
-        self._counts -= Counter((source,))
-        return source, message
+        waiting = self.waiting.pop(prefix)
+        self._counts -= Counter((waiting.source,))
+        return waiting.source, read_discovery(waiting.datagram)
 
     def forget(self, addresses: Collection[str]) -> None:
         """Forget the waiting participants at addresses that are gone, with their claims."""
@@ -243,7 +258,7 @@ class FormerPorts:
         return [p for p in ordered if keepers.get((p.address, p.metatraffic), p) is p]
 
     def _forget_waiting(self, prefix: bytes) -> None:
-        self._counts -= Counter((self.waiting.pop(prefix)[0],))
+        self._counts -= Counter((self.waiting.pop(prefix).source,))
         self.forget_participant(prefix)
 
     def _is_question_closed(self, prefix: bytes, since: float, now: float) -> bool:
@@ -254,13 +269,12 @@ class FormerPorts:
             or now - since >= ANSWER_TIMEOUT_S
         )
 
-    def _questions(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        spdp = message.of_participant
-        target = first_metatraffic(spdp, message.datagram, source) if spdp else None
-        if target is None:
+    def _questions(self, prefix: bytes, waiting: WaitingParticipant, now: float) -> list[Outgoing]:
+        if waiting.metatraffic is None:
             return []
-        questions = self.port_store.questions(message.prefix, self._reply_target(source), now)
-        return [Outgoing(target, datagram) for datagram in questions]
+        reached_at = self._reply_target(waiting.source)
+        questions = self.port_store.questions(prefix, reached_at, now)
+        return [Outgoing(waiting.metatraffic, datagram) for datagram in questions]
 
     def _reply_target(self, address: str) -> HostPort:
         """The address and port at which a participant inside reaches the port store."""

@@ -280,10 +280,10 @@ class DomainServer:
         for prefix in former_ports.ready(now):
             if prefix in admitting:
                 continue
-            source, message, _ = former_ports.waiting[prefix]
+            source, datagram, *_ = former_ports.waiting[prefix]
             standing = self.domain.standing(source)
             admit = partial(self._admit, prefix)
-            if self._scheduler.put(source, standing, len(message.datagram), admit):
+            if self._scheduler.put(source, standing, len(datagram), admit):
                 admitting[prefix] = now
 
     def _admit(self, prefix: bytes) -> list[Outgoing]:

@@ -439,6 +439,18 @@ def test_one_outside_whose_announcement_is_bad_keeps_none_inside_apart() -> None
     assert not any(insider.is_separated for insider in domain.inside.by_prefix.values())
 
 
+def test_what_waits_is_kept_as_it_came() -> None:
+    """An announcement of 6 kB took 270 kB after reading it, and 512 of them 138 MB."""
+    domain = make_domain()
+    padding = [(Pid.PAD, b"")] * 500
+    locator = (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, 7410), "<"))
+    datagram = message(*[data(payload([locator, *padding]))] * 3, prefix=EVIL)
+    assert domain.heard_inside(datagram, INSIDE, 0.1)
+    (waiting,) = domain.former_ports.waiting.values()
+    assert {type(value) for value in waiting} == {str, bytes, HostPort, float}
+    assert waiting.datagram == datagram
+
+
 def test_one_that_waits_and_is_malformed_keeps_no_others_waiting(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
