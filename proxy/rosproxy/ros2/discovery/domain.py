@@ -345,9 +345,12 @@ class Domain:
             return []  # the participant has ended meanwhile
         source, message = waited
         try:
-            return self._serve_inside(message, source, now)
+            sent = self._serve_inside(message, source, now)
         except RtpsError as error:
-            return self._drop("malformed", source, str(error))
+            sent = self._drop("malformed", source, str(error))
+        if prefix not in self.inside.by_prefix:
+            self.former_ports.forget_answers(prefix)
+        return sent
 
     def apply_policy(self, now: float) -> list[Outgoing]:
         """Start the rediscovery of the participants for which the policy now decides otherwise."""

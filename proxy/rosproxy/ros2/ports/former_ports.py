@@ -232,6 +232,15 @@ class FormerPorts:
         self.port_store.forget(prefix)
         self.ports.forget_claims(prefix)
 
+    def forget_answers(self, prefix: bytes) -> None:
+        """Forget the answers of a participant that has waited, and that gets no place.
+
+        The proxy asks again after the next announcement.
+        """
+        self.port_store.forget(prefix)
+        if prefix not in self.recorded:
+            self.ports.forget_claims(prefix)
+
     def reminders(self, participant: InsideParticipant, now: float) -> list[Outgoing]:
         """The datagrams with which a participant keeps its present ports."""
         if participant.metatraffic is None:

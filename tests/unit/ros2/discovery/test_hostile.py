@@ -42,6 +42,7 @@ from tests.unit.ros2.discovery.domains import (
     B,
     carried,
     dispose_message,
+    kept_answer,
     make_domain,
     meet,
     prove,
@@ -437,6 +438,25 @@ def test_one_outside_whose_announcement_is_bad_keeps_none_inside_apart() -> None
     domain.outside.by_prefix[B].announcement = b"no RTPS message"
     settle(domain, NOW + SEPARATION_S)
     assert not any(insider.is_separated for insider in domain.inside.by_prefix.values())
+
+
+def test_answers_of_participants_that_get_no_place_are_forgotten() -> None:
+    """If few ports were free, a container could fill the memory with answers of made-up ones."""
+    domain = make_domain()
+    others = [bytes([1, 15, 7, number, *bytes(8)]) for number in range(6)]
+    prove(domain, OTHER, prefixes=others)
+    for number, prefix in enumerate(others):
+        domain.heard_inside(spdp(prefix, OTHER, 7000 + 2 * number), OTHER, NOW)
+    for number in range(100):
+        prefix = bytes([1, 15, 8, number, *bytes(8)])
+        domain.heard_inside(spdp(prefix, INSIDE), INSIDE, NOW)
+        domain.heard_inside(kept_answer(domain, prefix, 99), INSIDE, NOW)
+        settle(domain, NOW)
+    assert domain.inside.by_prefix.keys() == set(others)
+    store = domain.proxy_participants.port_store
+    assert not store._answers
+    assert store._counts.keys() <= set(others)
+    assert not domain.ports._ports_claimed
 
 
 def test_what_waits_is_kept_as_it_came() -> None:
