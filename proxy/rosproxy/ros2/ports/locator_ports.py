@@ -18,7 +18,7 @@ tell which. If a participant with a proof comes later, it gets its port back fro
 without a proof.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
@@ -90,34 +90,29 @@ _KEPT_OR_STATED = range(_Claim.KEPT_AND_NAMED, _Claim.NAMED)
 
 @dataclass(slots=True)
 class _FormerUsers:
-    """The participants that are named at a port, by the kind of source."""
+    """The participants that are named at a port, by the kind of source.
+
+    ``users`` are those that the best kind of source names; empty if these are more than
+    `MOST_NAMED`. ``prefixes`` are the GUID prefixes of ``users``.
+    """
 
     users_by: dict[NamedBy, set[_User]] = field(default_factory=dict)
+    users: set[_User] = field(default_factory=set)
+    prefixes: set[bytes] = field(default_factory=set)
 
     def note(self, user: _User, by: NamedBy) -> None:
         """Note a named participant, up to `MOST_NAMED` and one more."""
         users = self.users_by.setdefault(by, set())
-        if len(users) <= MOST_NAMED:
+        if len(users) <= MOST_NAMED and user not in users:
             users.add(user)
+            best_users = self.users_by[self.best]
+            self.users = best_users if len(best_users) <= MOST_NAMED else set()
+            self.prefixes = {prefix for prefix, _ in self.users}
 
     @property
     def best(self) -> NamedBy:
         """The best kind of source that has named a participant."""
         return max(self.users_by, default=NamedBy.OTHERS)
-
-    @property
-    def users(self) -> Collection[_User]:
-        """The participants that the best kind of source names.
-
-        Empty if these are more than `MOST_NAMED`.
-        """
-        users = self.users_by.get(self.best, set())
-        return users if len(users) <= MOST_NAMED else ()
-
-    @property
-    def prefixes(self) -> set[bytes]:
-        """The GUID prefixes of `users`."""
-        return {prefix for prefix, _ in self.users}
 
 
 _NO_USERS = _FormerUsers()

@@ -278,3 +278,13 @@ def test_a_name_that_may_be_forged_makes_a_word_no_better_and_voids_one_without_
     pool.note_former_user(45008, owner, DATA, PROVEN, 0.5)
     assert pool.take(liar, locator(1), DATA, SETTLING_PERIOD_S, 45008) != 45008
     assert pool.take(owner, locator(1), DATA, SETTLING_PERIOD_S, 45008) == 45008
+
+
+def test_no_set_of_names_is_made_while_a_port_is_chosen() -> None:
+    """Strangers may name eight participants at each port: a port of 4,096 then took 45 ms."""
+    pool = ports()
+    for number in range(8):
+        pool.note_former_user(45007, number.to_bytes(12, "big"), DATA, OTHERS, 0.5)
+    named = pool._former_users[45007]
+    assert named.prefixes is named.prefixes
+    assert len(named.users) == len(named.prefixes) == 8
