@@ -5,7 +5,8 @@ no other locator. So no announcement makes the proxy a way to another host. Outs
 in place of the locators. `rosproxy.ros2.ports.locator_ports` chooses the port.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
@@ -47,7 +48,9 @@ class PortMappings:
     by_port: dict[int, Holder] = field(default_factory=dict)
     shortages: dict[bytes, PortShortage] = field(default_factory=dict)
     changes: int = 0
-    _by_address: dict[str, dict[int, Holder]] = field(default_factory=dict)
+    _by_locator: dict[HostPort, dict[int, Holder]] = field(default_factory=dict)
+    """The mappings to each locator, by port: participants at an address may share a locator."""
+    _count_by_address: Counter[str] = field(default_factory=Counter)
 
     def must_answer_first(self, prefix: bytes, address: str) -> bool:
         """Whether a participant gets a port only after an answer, because few ports are free."""
@@ -81,7 +84,7 @@ class PortMappings:
             return None
         if kind is TrafficKind.METATRAFFIC and mapping.kind is not kind:
             mapping.kind = kind  # Cyclone DDS has one locator for both kinds
-            self.mark_read(participant.address)
+            self.mark_read([locator])
         host = self.settings.host_for(locator.host)
         return HostPort(host, self.settings.ports.advertised(mapping.port))
 
@@ -89,15 +92,16 @@ class PortMappings:
         """Add a mapping of a participant."""
         participant.mappings[mapping.target] = mapping
         self.by_port[mapping.port] = participant, mapping
-        self._by_address.setdefault(participant.address, {})[mapping.port] = participant, mapping
-        self.mark_read(participant.address)
+        self._by_locator.setdefault(mapping.target, {})[mapping.port] = participant, mapping
+        self._count_by_address[participant.address] += 1
+        self.mark_read([mapping.target])
 
     def end(self, participant: InsideParticipant) -> None:
         """End all mappings of a participant that has gone."""
         for mapping in participant.mappings.values():
             self._take_back(participant.address, mapping)
         self.shortages.pop(participant.prefix, None)
-        self.mark_read(participant.address)
+        self.mark_read(participant.mappings)
 
     def make_room(
         self, participant: InsideParticipant, spdp: Announcement, datagram: bytes
@@ -110,20 +114,22 @@ class PortMappings:
         address = participant.address
         named = {locator for _, locator in spdp.reached_at(datagram) if locator.host == address}
         if len(named) <= MOST_MAPPINGS < len(named | participant.mappings.keys()):
-            for locator in participant.mappings.keys() - named:
+            unnamed = participant.mappings.keys() - named
+            for locator in unnamed:
                 self._take_back(address, participant.mappings.pop(locator))
             self.shortages.pop(participant.prefix, None)
-            self.mark_read(address)
+            self.mark_read(unnamed)
 
-    def mark_read(self, address: str) -> None:
-        """Mark the mappings to locators at which a participant at an address reads discovery.
+    def mark_read(self, locators: Iterable[HostPort]) -> None:
+        """Mark the mappings to those of these locators at which a participant reads discovery.
 
         A participant may announce the locator of another participant at the same address.
         """
-        holders = self._by_address.get(address, {}).values()
-        read = {mapping.target for p, mapping in holders if p.reads_discovery_at(mapping)}
-        for _, mapping in holders:
-            mapping.is_read = mapping.target in read
+        for locator in locators:
+            holders = self._by_locator.get(locator, {}).values()
+            is_read = any(p.reads_discovery_at(mapping) for p, mapping in holders)
+            for _, mapping in holders:
+                mapping.is_read = is_read
         self.changes += 1
 
     def _map(
@@ -174,7 +180,7 @@ class PortMappings:
         participants get the same ports again, in whichever order they come.
         """
         size = len(self.settings.ports.listen)
-        return len(self._by_address.get(address, ())) >= size - size // PART_FOR_OTHERS
+        return self._count_by_address[address] >= size - size // PART_FOR_OTHERS
 
     def _is_own(self, locator: HostPort) -> bool:
         """Whether a locator is a port of the range.
@@ -195,7 +201,11 @@ class PortMappings:
 
     def _take_back(self, address: str, mapping: PortMapping) -> None:
         del self.by_port[mapping.port]
-        del self._by_address[address][mapping.port]
-        if not self._by_address[address]:
-            del self._by_address[address]
+        holders = self._by_locator[mapping.target]
+        del holders[mapping.port]
+        if not holders:
+            del self._by_locator[mapping.target]
+        self._count_by_address[address] -= 1
+        if not self._count_by_address[address]:
+            del self._count_by_address[address]
         self.ports.give_back(mapping.port)

@@ -266,9 +266,12 @@ class Neighbours(RuleBasedStateMachine):
             assert participant.mappings[mapping.target] is mapping
             assert (mapping.port, mapping.target.host) == (port, participant.address)
             assert not pool.is_free(port)
-        by_address = self.domain.mappings._by_address
-        assert {port: pair for at in by_address.values() for port, pair in at.items()} == by_port
-        assert all(by_address.values())
+        by_locator = self.domain.mappings._by_locator
+        assert {port: pair for at in by_locator.values() for port, pair in at.items()} == by_port
+        assert all(by_locator.values())
+        assert self.domain.mappings._count_by_address == Counter(
+            participant.address for participant, _ in by_port.values()
+        )
         assert inside.count_by_address == Counter(
             participant.address for participant in inside.by_prefix.values()
         )

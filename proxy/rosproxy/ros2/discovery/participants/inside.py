@@ -64,7 +64,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             self.settings.settled(source)
         self.mappings.make_room(participant, spdp, datagram)
         if participant.note_vendor(source_vendor(datagram)):
-            self.mappings.mark_read(source)
+            self.mappings.mark_read(participant.mappings)
         participant.until = now + lease_duration(spdp, datagram)
         participant.next_number = spdp.sample.sequence + 1
         participant.metatraffic = first_metatraffic(spdp, datagram, source)
