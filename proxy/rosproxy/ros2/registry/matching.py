@@ -15,7 +15,7 @@ comparison of another address's pairs.
 
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
-from itertools import islice, product, repeat
+from itertools import islice, repeat
 from typing import TypeVar
 
 import msgspec
@@ -34,7 +34,6 @@ _OPPOSITE = {
     EndpointKind.READER: EndpointKind.WRITER,
     EndpointKind.WRITER: EndpointKind.READER,
 }
-_WILDCARDS = {"*", "?", "["}
 _XCDR = 0
 _REPRESENTATIONS = {0: "XCDR", 1: "XML", 2: "XCDR2"}
 
@@ -144,24 +143,26 @@ def _type(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
 
 
 def _partition(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
-    """The mismatch if there is no common partition. The default partition has an empty name."""
+    """The mismatch if there is no common partition. The default partition has an empty name.
+
+    Some names are patterns, and implementations interpret patterns differently. So a pattern and a
+    name that is none may match. Two patterns match only if both are the same (DDS 1.4, 2.2.3.13).
+    """
     offered = writer.qos.partitions
     requested = reader.qos.partitions
     if offered is None or requested is None:
         return None
-    if any(_may_be_same_partition(*pair) for pair in product(offered or ("",), requested or ("",))):
+    offered = offered or ("",)
+    requested = requested or ("",)
+    kinds = {_is_pattern(name) for name in (*offered, *requested)}
+    if len(kinds) > 1 or not set(offered).isdisjoint(requested):
         return None
     return Mismatch("partition", " ".join(offered) or "none", " ".join(requested) or "none")
 
 
-def _may_be_same_partition(offered: str, requested: str) -> bool:
-    """Whether two names of partitions match or may match. One of the names may be a pattern.
-
-    Implementations interpret patterns differently. Two patterns match only if both are the same
-    (DDS 1.4, 2.2.3.13).
-    """
-    wild = [bool(_WILDCARDS & {*name}) for name in (offered, requested)]
-    return offered == requested or wild[0] != wild[1]
+def _is_pattern(partition: str) -> bool:
+    """Whether the name of a partition may be a pattern."""
+    return "*" in partition or "?" in partition or "[" in partition
 
 
 def _reliability(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
