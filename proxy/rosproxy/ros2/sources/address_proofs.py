@@ -14,6 +14,7 @@ itself: a question names the participant (INFO_DST), and no other participant an
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from hashlib import blake2b
+from itertools import islice
 from typing import Any
 
 from rosproxy.net.addresses import HostPort
@@ -43,6 +44,9 @@ MOST_ADDRESSES = 4096
 goes."""
 ANSWER_KEPT_S = 30.0
 """Seconds for which the answer of a participant counts after the participant has gone."""
+MOST_EXPIRED_PER_CALL = 64
+"""Addresses whose answers `AddressProofs.expire` looks at in one call. The addresses take turns. So
+with 4,096 addresses, an answer is forgotten up to half a minute sooner or later."""
 MOST_ANSWERS_PER_ADDRESS = 128
 """Participants at an address whose answers count. Beyond this number, the oldest answer goes."""
 LONGEST_ANSWER_BYTES = 256
@@ -140,14 +144,15 @@ class AddressProofs:
         self._expire_answers(now, present)
 
     def _expire_answers(self, now: float, present: Iterable[ParticipantTable[Any]]) -> None:
-        for address, answered in list(self._answered.items()):
+        for address in list(islice(self._answered, MOST_EXPIRED_PER_CALL)):
+            answered = self._answered.pop(address)
             for prefix, until in list(answered.items()):
                 if any(table.find(prefix, address) for table in present):
                     answered[prefix] = now + ANSWER_KEPT_S
                 elif until < now:
                     del answered[prefix]
-            if not answered:
-                del self._answered[address]
+            if answered:
+                self._answered[address] = answered  # behind the others
 
     def _renew(self, address: str, now: float) -> None:
         """Let an address count as proven for `PROOF_KEPT_S` from now."""
