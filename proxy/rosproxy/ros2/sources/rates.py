@@ -24,7 +24,8 @@ start together cause 10,000, and then some 1,200 a second."""
 BYTES_PER_UNIT = 256
 """Bytes of a datagram for each unit of the charge. An announcement costs two or three units."""
 MOST_SOURCES = 4096
-"""Sources with an allowance. Beyond this number, the oldest allowance is forgotten."""
+"""Sources with an allowance. Beyond this number, the oldest allowance is forgotten, first those of
+unproven sources."""
 
 
 class Standing(IntEnum):
@@ -66,7 +67,8 @@ class DiscoveryRates:
     """The allowance of each source, and a common allowance of all unproven sources of a side.
 
     A forger may use any number of sources, but these share one allowance. ``unproven_per_second``
-    and ``unproven_burst`` are its rate and size.
+    and ``unproven_burst`` are its rate and size. Such a source is forgotten before a proven one:
+    otherwise a proven source could have its used allowance forgotten, and so get a new one.
     """
 
     per_second: float = PER_SECOND
@@ -74,6 +76,8 @@ class DiscoveryRates:
     unproven_per_second: float = PER_SECOND
     unproven_burst: float = BURST
     _by_source: dict[str, _Allowance] = field(default_factory=dict)
+    _unproven: dict[str, None] = field(default_factory=dict)
+    """The sources that were unproven at the last datagram, the oldest first."""
     _of_unproven: dict[Standing, _Allowance] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -96,7 +100,9 @@ class DiscoveryRates:
         if own.refill(self.per_second, self.burst, now) < 1.0:
             return False
         own.remaining -= cost(size)
+        self._unproven.pop(source, None)
         if shared:
+            self._unproven[source] = None
             shared.remaining -= cost(size)
         return True
 
@@ -114,6 +120,8 @@ class DiscoveryRates:
         allowance = self._by_source.get(source)
         if allowance is None:
             if len(self._by_source) >= MOST_SOURCES:
-                del self._by_source[next(iter(self._by_source))]
+                oldest = next(iter(self._unproven or self._by_source))
+                del self._by_source[oldest]
+                self._unproven.pop(oldest, None)
             allowance = self._by_source[source] = _Allowance(self.burst, now)
         return allowance

@@ -73,3 +73,15 @@ def test_forged_sources_have_one_allowance_together() -> None:
     assert not rates.take("evil", 100, 0.1, Standing.OUTSIDE)
     assert rates.take("robot", 100, 0.1)
     assert rates.take("node", 100, 0.1, Standing.INSIDE)
+
+
+def test_forged_sources_give_no_new_allowance_to_a_proven_one() -> None:
+    """A container that made up 4,096 sources got a new burst twice a second."""
+    rates = DiscoveryRates()
+    assert rates.take("container", 100, 0.0)
+    rates.charge("container", int(BURST))
+    taken = [rates.take(str(n), 100, 0.0, Standing.INSIDE) for n in range(2 * MOST_SOURCES)]
+    assert all(taken)
+    assert not rates.take("container", 100, 0.0)
+    assert rates._by_source.keys() == {"container", *rates._unproven}
+    assert len(rates._by_source) == MOST_SOURCES
