@@ -3,7 +3,7 @@
 import asyncio
 import socket
 import struct
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, count, pairwise, repeat
 
@@ -17,7 +17,7 @@ from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink, Outgoing
 from rosproxy.ros2.ports.former_ports import ANSWER_TIMEOUT_S
 from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S, SETTLING_PERIOD_S
 from rosproxy.ros2.ports.stand_ins import stand_in_port
-from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.protocol.rtps import FAST_DDS, HEADER_BYTES, VERSION, source_prefix
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.domain_server import ADMISSION_TIMEOUT_S, DomainServer
@@ -231,7 +231,7 @@ async def test_of_heartbeats_that_wait_only_the_last_one_of_a_stream_is_read(
     """Fast DDS repeats heartbeats 25 times a second, which would fill the queue of a slow proxy."""
     read = list[bytes]()
 
-    def take(datagram: bytes, _source: str, _now: float) -> list[Outgoing]:
+    def take(datagram: bytes, _source: str, _now: float, _: int) -> list[Outgoing]:
         read.append(datagram)
         return []
 
@@ -247,3 +247,37 @@ async def test_of_heartbeats_that_wait_only_the_last_one_of_a_stream_is_read(
         server._take_in(sock, take, lambda *_: True)
         await until(lambda: not server._scheduler.is_behind, "all is read")
     assert read == [heartbeat(5), heartbeat(1, BuiltinWriter.SUBSCRIPTIONS)]
+
+
+def of_many(prefixes: Sequence[bytes]) -> bytes:
+    """A datagram in which several participants announce themselves to a participant."""
+    parts = list[bytes]()
+    for number, prefix in enumerate(prefixes):
+        parts.append(submessage(0x0C, 0, bytes(4) + VERSION + FAST_DDS + prefix))
+        parts += [] if number else [submessage(0x0E, 0, B)]
+        parts.append(spdp(prefix, INSIDE, 9000 + 2 * number)[HEADER_BYTES:])
+    return message(*parts, prefix=A)
+
+
+async def test_the_participants_in_a_datagram_are_read_in_turn(server: DomainServer) -> None:
+    """The proxy announced 48 of these to all of the other side in one step of 0.25 s."""
+    server._scheduler = DiscoveryScheduler(count().__next__)
+    prefixes = [bytes([1, 15, number]) + bytes(9) for number in range(60)]
+    datagram = of_many(prefixes)
+    read = list[bytes]()
+    received = 0
+
+    def take(part: bytes, source: str, now: float, size: int) -> list[Outgoing]:
+        nonlocal received
+        received += size
+        read.append(source_prefix(part))
+        return []
+
+    server._read_in_turn(take, datagram, INSIDE, None)
+    counts = [len(read)]
+    while len(read) < len(prefixes):
+        await asyncio.sleep(0)
+        counts.append(len(read))
+    assert read == prefixes
+    assert max(after - before for before, after in pairwise([0, *counts])) == 1
+    assert received == len(datagram)  # although the messages repeat the destination

@@ -176,11 +176,14 @@ class Domain:
         self._charge(source, sent)
         return sent
 
-    def heard_outside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+    def heard_outside(
+        self, datagram: bytes, source: str, now: float, received: int | None = None
+    ) -> list[Outgoing]:
         """Handle a datagram at the discovery port.
 
         Participants outside announce themselves there, directly or through the LAN relay. Known
-        participants send their answers to the discovery participant there.
+        participants send their answers to the discovery participant there. ``received`` is the
+        number of bytes that came, if not all of the datagram.
         """
         relay = self.settings.relay
         # No datagram of the LAN relay starts with RTPS. Such a datagram is from another program at
@@ -193,7 +196,8 @@ class Domain:
             source
         ):
             return []
-        return self._heard_at_discovery(datagram, source, False, now)
+        received = len(datagram) if received is None else received
+        return self._heard_at_discovery(datagram, source, False, received, now)
 
     def source_of(self, datagram: bytes, source: str) -> str:
         """The original source of a datagram: the LAN relay may have passed the datagram on."""
@@ -222,20 +226,20 @@ class Domain:
             # With IPv6 the relay may receive from the inside network (groups.py,
             # _IP_MULTICAST_ALL). So the announcement of a participant inside is no fault.
             return [] if is_known else self._drop("claimed_address", source, fault)
-        return self._heard_at_discovery(announcement, source, True, now)
+        return self._heard_at_discovery(announcement, source, True, len(announcement), now)
 
     def _heard_at_discovery(
-        self, datagram: bytes, source: str, by_relay: bool, now: float
+        self, datagram: bytes, source: str, by_relay: bool, received: int, now: float
     ) -> list[Outgoing]:
         is_answer = self.proofs.is_first_answer(source, datagram)
         if not is_answer and not self._take_allowance(datagram, source, now):
             return []
         sent = list[Outgoing]()
         try:
-            for message, received in credited_messages(datagram):
+            for message, credited in credited_messages(datagram, received):
                 if by_relay and message.of_participant is None:
                     raise RtpsError("the LAN relay may pass on only announcements of participants")
-                sent += self._heard_outside(message, source, by_relay, received, now)
+                sent += self._heard_outside(message, source, by_relay, credited, now)
         except RtpsError as error:
             sent += self._drop("malformed", source, str(error))
         self._charge(source, sent)
@@ -277,8 +281,10 @@ class Domain:
         may_be_read = any(outsider.reads_discovery_at(mapping) for outsider, mapping in users)
         return may_be_read and may_be_discovery(datagram)
 
-    def at_range_port(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
-        """Handle a datagram from outside at a port of the range."""
+    def at_range_port(
+        self, port: int, datagram: bytes, source: str, now: float, received: int | None = None
+    ) -> list[Outgoing]:
+        """Handle a datagram from outside at a port of the range; see `heard_outside`."""
         mapped = self.mappings.by_port.get(port)
         try:
             if mapped is None:  # the port may belong to a participant from before the start
@@ -297,7 +303,10 @@ class Domain:
             if is_read:
                 if not self._take_allowance(datagram, source, now):
                     return []
-                passed, back = self._read_at_range_port(port, source, insider, datagram, now)
+                received = len(datagram) if received is None else received
+                passed, back = self._read_at_range_port(
+                    port, source, insider, datagram, received, now
+                )
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
         return [self._passed(mapping, d, True, is_user_data=not is_read) for d in passed] + back
@@ -696,16 +705,22 @@ class Domain:
         return self.former_ports.reminders(insider, now)
 
     def _read_at_range_port(
-        self, port: int, source: str, insider: InsideParticipant, datagram: bytes, now: float
+        self,
+        port: int,
+        source: str,
+        insider: InsideParticipant,
+        datagram: bytes,
+        received: int,
+        now: float,
     ) -> _Passing:
         """Handle discovery from outside at a port of the range. Raises RtpsError."""
         passed = list[bytes]()
         back = list[Outgoing]()
-        for message, received in credited_messages(datagram):
+        for message, credited in credited_messages(datagram, received):
             if is_question_of_proxy(message):
                 back += self.proxy_participants.answer_to_proxy(insider.prefix, message, source)
                 continue
-            forwarded, replies = self._imported(port, source, insider, now, message, received)
+            forwarded, replies = self._imported(port, source, insider, now, message, credited)
             passed += forwarded
             back += replies
         return passed, back

@@ -79,11 +79,6 @@ parameters in 600 bytes, so a datagram of 64 KiB has 2,700."""
 MOST_LOCATORS_OF_ALL = 1024
 """Locators of all announcements in a datagram. Fast DDS announces five for a reader or writer."""
 
-MOST_ANNOUNCED_PARTICIPANTS = 48
-"""Participants that announce themselves in one datagram. The proxy announces each to all
-participants of the other side. Cyclone DDS sends at most 14,720 bytes (MaxMessageSize), 400 for
-each participant."""
-
 
 class BuiltinWriter(IntEnum):
     """The builtin writers that discovery uses."""
@@ -201,30 +196,20 @@ def read_discovery(datagram: bytes) -> DiscoveryMessage:
 
 def read_messages(datagram: bytes) -> Iterator[DiscoveryMessage]:
     """Yield the message of each participant in a datagram. Raises RtpsError."""
-    announced_count = 0
-    for message in map(read_discovery, by_source(datagram)):
-        announced_count += message.of_participant is not None
-        if announced_count > MOST_ANNOUNCED_PARTICIPANTS:
-            text = (
-                f"the datagram has more than {MOST_ANNOUNCED_PARTICIPANTS} announcements of "
-                "participants"
-            )
-            raise RtpsError(text)
-        yield message
+    yield from map(read_discovery, by_source(datagram))
 
 
-def credited_messages(datagram: bytes) -> Iterator[tuple[DiscoveryMessage, int]]:
+def credited_messages(datagram: bytes, received: int) -> Iterator[tuple[DiscoveryMessage, int]]:
     """Yield the message of each participant, and the count of received bytes for the message.
 
     The messages together may be longer than the datagram (`by_source`). The sum of the counts is at
-    most the length of the datagram. So a datagram of several messages earns no additional
-    credit. Raises RtpsError.
+    most ``received``. So a datagram of several messages earns no additional credit. Raises
+    RtpsError.
     """
-    remaining = len(datagram)
     for message in read_messages(datagram):
-        received = min(len(message.datagram), remaining)
-        remaining -= received
-        yield message, received
+        credited = min(len(message.datagram), received)
+        received -= credited
+        yield message, credited
 
 
 def rewritten(

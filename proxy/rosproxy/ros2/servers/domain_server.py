@@ -45,7 +45,7 @@ from rosproxy.ros2.domain_settings import (
 from rosproxy.ros2.protocol.addressing import heartbeat_stream
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.relay_envelope import address_lists
-from rosproxy.ros2.protocol.rtps import PREFIX_BYTES, RtpsError
+from rosproxy.ros2.protocol.rtps import PREFIX_BYTES, RtpsError, by_source
 from rosproxy.ros2.rewriting.discovery import read_messages
 from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
@@ -64,8 +64,9 @@ QUEUED_PER_PASSED = 8
 
 If sockets queued fewer, the kernel would drop datagrams, without fairness to the sources."""
 
-Take = Callable[[bytes, str, float], list[Outgoing]]
-"""Handles a datagram with its source and the time, and returns the datagrams to send."""
+Take = Callable[[bytes, str, float, int], list[Outgoing]]
+"""Handles a datagram with its source, the time, and the number of received bytes. Returns the
+datagrams to send."""
 MustQueue = Callable[[bytes, str], bool]
 """Whether a datagram from a source is discovery that has to wait in the queue."""
 
@@ -354,12 +355,14 @@ class DomainServer:
         is_own = self._secret and datagram == self._secret
         return not is_own and self.domain.must_queue_discovery(datagram, source)
 
-    def _heard_at_well_known(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+    def _heard_at_well_known(
+        self, datagram: bytes, source: str, now: float, _: int
+    ) -> list[Outgoing]:
         if not self._is_let_in(datagram, source, now):
             return []
         return self.domain.heard_inside(datagram, source, now)
 
-    def _heard_in_group(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+    def _heard_in_group(self, datagram: bytes, source: str, now: float, _: int) -> list[Outgoing]:
         if not self._is_let_in(datagram, source, now):
             return []
         sent = self.domain.heard_inside(datagram, source, now)
@@ -394,11 +397,18 @@ class DomainServer:
         relay = self.domain.settings.relay
         return relay is not None and source == relay.address.host
 
-    def _at_discovery(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+    def _at_discovery(
+        self, datagram: bytes, source: str, now: float, received: int
+    ) -> list[Outgoing]:
         if self._secret and datagram == self._secret:
             self._heard.set()
             return []
-        return self.domain.heard_outside(datagram, source, now)
+        return self.domain.heard_outside(datagram, source, now, received)
+
+    def _at_stand_in(
+        self, port: int, datagram: bytes, source: str, now: float, _: int
+    ) -> list[Outgoing]:
+        return self.domain.at_stand_in(port, datagram, source, now)
 
     def _take_in(self, sock: socket.socket, take: Take, must_queue: MustQueue) -> None:
         """Receive the datagrams at a socket: queue discovery, and pass all others at once.
@@ -423,7 +433,7 @@ class DomainServer:
                     self._read_in_turn(take, datagram, source, key)
                 else:
                     weight = 1.0
-                    self._carry_out(take, datagram, source)
+                    self._carry_out(take, datagram, source, len(datagram))
                 spent += weight
                 spent_bytes += weight * len(datagram)
 
@@ -441,20 +451,29 @@ class DomainServer:
         """Replace the waiting datagram with a key by a later one. Return False if none waits."""
         if key is None:
             return False
-        return self._scheduler.replace(key, partial(self._carry_out, take, datagram, source))
+        read = partial(self._carry_out, take, datagram, source, len(datagram))
+        return self._scheduler.replace(key, read)
 
     def _read_in_turn(self, take: Take, datagram: bytes, source: str, key: Hashable) -> None:
-        """Queue a datagram of discovery, or handle the datagram at once if no datagram waits."""
+        """Queue a datagram of discovery, or handle the datagram at once if no datagram waits.
+
+        The messages of several participants in a datagram wait one by one: each announcement may go
+        to hundreds of participants.
+        """
         heard_at = self.domain.source_of(datagram, source)
         standing = self.domain.standing(heard_at)
-        read = partial(self._carry_out, take, datagram, source)
-        if not self._scheduler.read(heard_at, standing, len(datagram), read, key):
-            text = "the queue of discovery that the proxy has not read yet is full"
-            self.domain.refused("rate", heard_at, text)
+        left = len(datagram)
+        for message in _messages(datagram):
+            received = min(len(message), left)  # together, the messages may be longer
+            left -= received
+            read = partial(self._carry_out, take, message, source, received)
+            if not self._scheduler.read(heard_at, standing, len(message), read, key):
+                text = "the queue of discovery that the proxy has not read yet is full"
+                self.domain.refused("rate", heard_at, text)
 
-    def _carry_out(self, take: Take, datagram: bytes, source: str) -> list[Outgoing]:
+    def _carry_out(self, take: Take, datagram: bytes, source: str, received: int) -> list[Outgoing]:
         """Handle a datagram. Send and return the resulting datagrams."""
-        outgoing = take(datagram, source, self._now())
+        outgoing = take(datagram, source, self._now(), received)
         self._report_changes()
         self._open_and_send(outgoing)
         return outgoing
@@ -520,10 +539,18 @@ class DomainServer:
                 closed.append(port)
                 continue
             self._stand_ins[port] = sock
-            take = partial(self.domain.at_stand_in, port)
+            take = partial(self._at_stand_in, port)
             must_queue = partial(self.domain.must_queue_at_stand_in, port)
             self._loop.add_reader(sock, self._take_in, sock, take, must_queue)
         return closed
+
+
+def _messages(datagram: bytes) -> list[bytes]:
+    """The message of each participant in a datagram. `Domain` refuses a malformed datagram."""
+    try:
+        return by_source(datagram)
+    except RtpsError:
+        return [datagram]
 
 
 def _families(bind: str) -> list[socket.AddressFamily]:

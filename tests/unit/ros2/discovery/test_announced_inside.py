@@ -11,8 +11,8 @@ from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.protocol.rtps import FAST_DDS, HEADER_BYTES, VERSION, source_prefix
-from rosproxy.ros2.rewriting.discovery import MOST_ANNOUNCED_PARTICIPANTS, read_discovery
+from rosproxy.ros2.protocol.rtps import HEADER_BYTES, source_prefix
+from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NEAR,
@@ -60,16 +60,6 @@ def count_calls(monkeypatch: pytest.MonkeyPatch, name: str) -> Counter[str]:
 
     monkeypatch.setattr(to_inside, name, counted)
     return calls
-
-
-def speaking(count: int) -> bytes:
-    """A datagram in which so many participants announce themselves."""
-    parts = list[bytes]()
-    for number in range(count):
-        source = bytes(4) + VERSION + FAST_DDS + named(number)
-        parts.append(submessage(0x0C, 0, source))
-        parts.append(spdp(named(number), ROBOT, 9000 + number)[HEADER_BYTES:])
-    return message(*parts, prefix=B)
 
 
 def test_an_announcement_is_rewritten_once_for_all_inside(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,14 +121,3 @@ def test_inside_is_told_what_a_participant_announces_of_itself_alone() -> None:
     assert len(told) == HEADER_BYTES + len(stamp) + len(announced)
     assert told[HEADER_BYTES : HEADER_BYTES + len(stamp)] == stamp
     assert read_discovery(told).of_participant is not None
-
-
-def test_so_many_participants_announce_themselves_in_a_datagram() -> None:
-    """The proxy announces each to all participants inside, in the same round of the event loop."""
-    domain = make_domain()
-    domain.heard_outside(speaking(MOST_ANNOUNCED_PARTICIPANTS), ROBOT, NOW)
-    assert domain.refused.count == 0
-    assert len(domain.outside.by_prefix) == MOST_ANNOUNCED_PARTICIPANTS
-    domain.heard_outside(speaking(MOST_ANNOUNCED_PARTICIPANTS + 10), ROBOT, NOW)
-    assert domain.refused.count == 1
-    assert len(domain.outside.by_prefix) == MOST_ANNOUNCED_PARTICIPANTS
