@@ -295,10 +295,9 @@ class DomainServer:
         return outgoing
 
     def _release(self) -> None:
-        """Handle the held announcements of addresses that are admitted now."""
-        now = self._now()
-        for source, datagram in self._selected.released(now):
-            self._open_and_send(self.domain.heard_inside(datagram, source, now))
+        """Read the held announcements of addresses that are admitted now."""
+        for source, datagram in self._selected.released(self._now()):
+            self._read_in_turn(self._heard_at_well_known, datagram, source, None)
 
     def _announce_to(self, addresses: Iterable[str]) -> None:
         """Announce the discovery participant by unicast to addresses that may not get multicast.
