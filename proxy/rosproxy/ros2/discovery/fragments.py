@@ -192,7 +192,8 @@ class FragmentStore:
             if gathered and is_repeated and key not in missing_by_key:
                 count = -(-gathered.total // gathered.size)
                 missing = [n for n in range(1, count + 1) if n not in gathered.fragments]
-                missing_by_key[key] = sample, missing
+                if missing:
+                    missing_by_key[key] = sample, missing
         return list(missing_by_key.values())
 
     def rewritten(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> list[bytes]:
@@ -204,11 +205,7 @@ class FragmentStore:
             raise RtpsError(f"the datagram has more than {MOST_FRAGMENTS} fragments")
         # This rewrites the whole announcements of the datagram; `_filled` rewrites the fragments.
         arrived = _WaitingDatagram(port, message.fragments, rewrite(message))
-        completed = {
-            _key(port, sample)
-            for sample, frags in message.fragments
-            if self._gather(port, message, sample, frags, rewrite)
-        }
+        completed = self._gather_all(port, message, rewrite)
         released = [self._filled(datagram) for datagram in self._released(completed)]
         if self._is_whole(arrived):  # also if the fragments repeat whole announcements
             return [*released, self._filled(arrived)]
@@ -245,32 +242,39 @@ class FragmentStore:
                 del self._waiting_by_key[key]
         return datagram
 
+    def _gather_all(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> set[_Key]:
+        """Gather the fragments of a message, and return the announcements that are whole now.
+
+        All announcements that a message completes count as one announcement, because the proxy
+        reads all of them in one step. Raises RtpsError.
+        """
+        completed = set[_Key]()
+        size = 0
+        for sample, frags in message.fragments:
+            gathered = self._gather(port, message, sample, frags)
+            if gathered is not None:
+                size += gathered.total
+                if size > LONGEST_ANNOUNCEMENT_BYTES:
+                    text = f"more than {LONGEST_ANNOUNCEMENT_BYTES} bytes"
+                    raise RtpsError(f"the datagram completes announcements of {text}")
+                _complete(gathered, message, sample, rewrite)
+                completed.add(_key(port, sample))
+        return completed
+
     def _gather(
-        self,
-        port: int,
-        message: DiscoveryMessage,
-        sample: Sample,
-        frags: Fragments,
-        rewrite: Rewrite,
-    ) -> bool:
-        """Gather the fragments of a DATA_FRAG. Return whether these complete the sample.
+        self, port: int, message: DiscoveryMessage, sample: Sample, frags: Fragments
+    ) -> _PendingSample | None:
+        """Gather the fragments of a DATA_FRAG. Return the sample if all its fragments have come.
 
         Raises RtpsError.
         """
         gathered = self._gathered(port, sample, frags)
         payloads = dict(_payloads(message.datagram, sample, frags))
         if gathered.whole is not None:
-            return False
+            return None
         gathered.fragments.update(payloads)
-        if len(gathered.fragments) < -(-frags.total // frags.size):
-            return False
-        payload = b"".join(gathered.fragments[number] for number in sorted(gathered.fragments))
-        edited = rewrite(read_discovery(_as_data(message.datagram, sample, payload)))
-        # `rewrite` has turned a hidden announcement into a GAP (`withheld`).
-        hidden = edited[HEADER_BYTES] == SubmessageId.GAP
-        gathered.whole = b"" if hidden else edited[_PAYLOAD_AT:]
-        gathered.fragments.clear()
-        return True
+        is_complete = len(gathered.fragments) == -(-frags.total // frags.size)
+        return gathered if is_complete else None
 
     def _gathered(self, port: int, sample: Sample, frags: Fragments) -> _PendingSample:
         """The gathered fragments of a sample.
@@ -317,6 +321,18 @@ class FragmentStore:
 
 def _key(port: int, sample: Sample) -> _Key:
     return port, sample.prefix, sample.writer, sample.sequence
+
+
+def _complete(
+    gathered: _PendingSample, message: DiscoveryMessage, sample: Sample, rewrite: Rewrite
+) -> None:
+    """Rewrite an announcement of which all fragments have come. Raises RtpsError."""
+    payload = b"".join(gathered.fragments[number] for number in sorted(gathered.fragments))
+    edited = rewrite(read_discovery(_as_data(message.datagram, sample, payload)))
+    # `rewrite` has turned a hidden announcement into a GAP (`withheld`).
+    hidden = edited[HEADER_BYTES] == SubmessageId.GAP
+    gathered.whole = b"" if hidden else edited[_PAYLOAD_AT:]
+    gathered.fragments.clear()
 
 
 def _payloads(datagram: bytes, sample: Sample, frags: Fragments) -> Iterator[tuple[int, bytes]]:
