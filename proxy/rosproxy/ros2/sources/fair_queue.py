@@ -141,13 +141,17 @@ class FairQueue(Generic[Item]):
     def _make_room(self, waiting: Waiting[Item]) -> bool:
         """Return whether an item fits. If necessary, drop the last items of the largest source.
 
-        Only an item of a source with fewer bytes makes the largest source lose items.
+        Only an item of a source with less than a fair share makes the largest source lose items.
         """
         source = waiting.source
         if source not in self._waiting and len(self._waiting) >= self.most_sources:
             return False
         size = self._sizes.get(source, 0) + waiting.size
         if size > self.most_bytes_per_source:
+            return False
+        # In an overload most items end here, before the search for the largest source.
+        is_full = self._size + waiting.size > self.most_bytes
+        if is_full and size * len(self._waiting) > self.most_bytes:
             return False
         while self._size + waiting.size > self.most_bytes:
             largest = max(self._sizes, key=self._sizes.__getitem__)

@@ -1,10 +1,13 @@
 """The queue of discovery: the next datagram, and lost datagrams."""
 
 from collections import Counter
+from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.ros2.sources import fair_queue
 from rosproxy.ros2.sources.fair_queue import (
     MOST_PROVEN_SOURCES,
     OVERHEAD_BYTES,
@@ -209,3 +212,23 @@ def test_a_standing_pays_for_what_its_datagrams_lead_to() -> None:
         if source == "announces":
             queue.charge(source, 9 * OVERHEAD_BYTES)
     assert Counter(sources) == {"announces": 2, "other": 20}
+
+
+def test_a_full_queue_looks_for_the_largest_source_only_for_a_smaller_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The search among 2,048 sources took 0.1 ms for each datagram that had no room."""
+    searches = list[str]()
+
+    def searched(*sizes: Any, **options: Any) -> Any:
+        searches.extend(["largest"] if options else [])
+        return max(*sizes, **options)
+
+    queue = FairQueue[int](8, most_bytes=24 * OVERHEAD_BYTES)
+    for number in range(24):
+        assert queue.put(str(number % 7), number, 0)
+    monkeypatch.setattr(fair_queue, "max", searched, raising=False)
+    assert not any(queue.put(str(number), 0, 0) for number in range(7))
+    assert not searches
+    assert queue.put("a smaller one", 0, 0)
+    assert searches == ["largest"]
