@@ -235,6 +235,8 @@ class Ros2State(Collector):
 def _first_endpoints(participant: Participant, most: int) -> list[DdsEndpoint]:
     """At most ``most`` readers and writers; readers that name a node (`_node_of`) come first."""
     endpoints = participant.endpoints.values()
+    if not most:
+        return []
     if most < len(endpoints):
         return list(islice(sorted(endpoints, key=lambda e: _node_of(e) is None), most))
     return list(endpoints)

@@ -16,9 +16,15 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.registry.participants import COMES_IN_WITHIN_S, Participant, PortMapping
+from rosproxy.ros2.registry.participants import (
+    COMES_IN_WITHIN_S,
+    DdsEndpoint,
+    EndpointKind,
+    Participant,
+    PortMapping,
+)
 from rosproxy.ros2.servers.domain_server import DomainServer
-from rosproxy.ros2.status import Ros2State
+from rosproxy.ros2.status import Ros2State, _first_endpoints
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
@@ -214,3 +220,11 @@ def test_outside_comes_in_or_may_still_do_so() -> None:
     domain.at_range_port(port, spdp(B, ROBOT), ROBOT, NOW + COMES_IN_WITHIN_S)
     (outside,) = told(domain).outside
     assert outside.proven
+
+
+def test_without_names_no_reader_or_writer_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check of the domains, every 5 s, sorted all readers and writers to list none."""
+    monkeypatch.setattr("rosproxy.ros2.status._node_of", None)
+    endpoint = DdsEndpoint(EndpointKind.READER, "rt/chatter", "std_msgs::msg::dds_::String_")
+    participant = Participant(A, INSIDE, b"\x01\x0f", 0.0, endpoints={b"only": endpoint})
+    assert _first_endpoints(participant, 0) == []
