@@ -121,6 +121,8 @@ class DomainSettings:
     participants_at: Callable[[str], int] = lambda _: 0
     gateways: frozenset[str] = frozenset()
     settled: Settled = lambda _: None
+    _peer_hosts: frozenset[str] = frozenset()
+    _peer_hosts_of: tuple[HostPort, ...] = ()
 
     @property
     def host(self) -> str:
@@ -176,4 +178,7 @@ class DomainSettings:
 
     def is_peer(self, address: str) -> bool:
         """Whether an address is that of a peer."""
-        return any(peer.host == address for peer in self.peers)
+        if self._peer_hosts_of is not self.peers:
+            self._peer_hosts_of = self.peers
+            self._peer_hosts = frozenset(peer.host for peer in self.peers)
+        return address in self._peer_hosts

@@ -417,6 +417,7 @@ class ParticipantTable(Generic[AnyParticipant]):
     by_prefix: dict[bytes, AnyParticipant] = field(default_factory=dict)
     count_by_address: Counter[str] = field(default_factory=Counter)
     notes: EndpointNotes = field(default_factory=EndpointNotes)
+    _by_address: dict[str, dict[bytes, AnyParticipant]] = field(default_factory=dict)
 
     def find(self, prefix: bytes, source: str) -> AnyParticipant | None:
         """The participant with a prefix; None if there is none at this source address."""
@@ -425,9 +426,7 @@ class ParticipantTable(Generic[AnyParticipant]):
 
     def at(self, address: str) -> list[AnyParticipant]:
         """The participants at an address."""
-        if address not in self.count_by_address:
-            return []
-        return [p for p in self.by_prefix.values() if p.address == address]
+        return list(self._by_address.get(address, {}).values())
 
     def former_processes(self, prefix: bytes, address: str) -> list[AnyParticipant]:
         """The participants of former processes at the port that a participant has now.
@@ -451,11 +450,14 @@ class ParticipantTable(Generic[AnyParticipant]):
         """Add a participant."""
         self.by_prefix[participant.prefix] = participant
         self.count_by_address[participant.address] += 1
+        self._by_address.setdefault(participant.address, {})[participant.prefix] = participant
 
     def remove(self, participant: AnyParticipant) -> None:
         """Remove a participant, with its readers and writers."""
         del self.by_prefix[participant.prefix]
+        del self._by_address[participant.address][participant.prefix]
         self.notes.forget(participant)
         self.count_by_address[participant.address] -= 1
         if not self.count_by_address[participant.address]:
             del self.count_by_address[participant.address]
+            del self._by_address[participant.address]

@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Iterator
 from sys import getsizeof
+from typing import NoReturn
 
 import pytest
 
@@ -24,6 +25,7 @@ from rosproxy.ros2.registry.participants import (
     DdsEndpoint,
     EndpointKind,
     EndpointNotes,
+    OutsideParticipant,
     Participant,
     PortMapping,
 )
@@ -519,3 +521,41 @@ def test_of_strangers_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     for port in domain.mappings.by_port:
         domain.at_range_port(port, message(prefix=B), STRANGER, NOW)
     assert STRANGER not in domain.rates._by_source
+
+
+class Unwalked(dict[bytes, OutsideParticipant]):
+    """A table that no caller may walk through."""
+
+    def values(self) -> NoReturn:
+        raise AssertionError
+
+
+def test_the_participants_at_an_address_are_found_without_the_others() -> None:
+    """An answer, and an announcement for each peer, walked through up to 1,792 participants."""
+    domain = make_domain()
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    domain.outside.by_prefix = Unwalked(domain.outside.by_prefix)
+    assert domain.outside.at(ROBOT) == [domain.outside.by_prefix[B]]
+    assert domain.outside.at(STRANGER) == []
+    domain.heard_outside(dispose_message(B), ROBOT, NOW)
+    assert domain.outside.at(ROBOT) == []
+
+
+class Counted(tuple[HostPort, ...]):
+    """Peers that count how often a caller walks through them."""
+
+    walks = 0
+
+    def __iter__(self) -> Iterator[HostPort]:
+        Counted.walks += 1
+        return super().__iter__()
+
+
+def test_whether_an_address_is_a_peers_is_known_without_the_other_peers() -> None:
+    """With 256 peers each check took 16 us, and a datagram needs six."""
+    settings = make_domain().settings
+    for peers in ((ROBOT, OTHER), (STRANGER,)):
+        settings.peers = Counted(HostPort(peer, 0) for peer in peers)
+        for address in (ROBOT, OTHER, STRANGER):
+            assert settings.is_peer(address) is (address in peers)
+    assert Counted.walks == 2

@@ -113,6 +113,6 @@ class AnnouncementsToOutside:
 
     def _known_targets(self, host: str, count: int) -> list[HostPort]:
         """The next well-known ports of a host, and the locators of its known participants."""
-        met = (p.metatraffic for p in self.outside.by_prefix.values() if p.address == host)
+        met = (participant.metatraffic for participant in self.outside.at(host))
         next_ports = self.settings.well_known(host, min(count + NEXT_PORTS, MOST_TRIED))
         return list(dict.fromkeys([*next_ports, *filter(None, met)]))
