@@ -1,5 +1,6 @@
 """A problem of the kernel plane lasts until the kernel forwards."""
 
+import logging
 import time
 from collections.abc import Mapping
 from types import MappingProxyType, SimpleNamespace
@@ -8,9 +9,11 @@ from typing import Any, cast
 import pytest
 
 from rosproxy.forwarding.kernel import plane
+from rosproxy.forwarding.kernel.decisions import Changes
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.forwarding.kernel.syncer import LOST_TABLE_RETRY_S, Clock
+from rosproxy.forwarding.kernel.syncer import LINES_PERIOD_S, LOST_TABLE_RETRY_S, MOST_LINES, Clock
 from rosproxy.forwarding.kernel.tools import ToolError
+from rosproxy.net.addresses import HostPort
 from rosproxy.telemetry.problems import Problems
 from tests.run_options import parse_settings
 
@@ -88,3 +91,19 @@ async def test_a_lost_table_is_a_problem_until_the_table_is_regained(
     now = LOST_TABLE_RETRY_S + 1
     await kernel.look()
     assert problems.all() == []
+
+
+def test_the_log_names_so_many_changed_forwards_and_no_more(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A participant may change its ports again and again, and each port was a line."""
+    now = 0.0
+    syncer = kernel_plane(monkeypatch, Problems(), clock=lambda: now).syncer
+    caplog.set_level(logging.INFO)
+    for port in range(MOST_LINES):
+        syncer._log(Changes({port: HostPort("172.30.0.5", 7411)}, {}))
+        syncer._log(Changes({}, {port: HostPort("172.30.0.5", 7412)}))
+    assert len(caplog.records) == MOST_LINES
+    now = LINES_PERIOD_S
+    syncer._log(Changes({}, {11400: HostPort("172.30.0.5", 7413)}))
+    assert len(caplog.records) == MOST_LINES + 1

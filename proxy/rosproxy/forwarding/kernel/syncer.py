@@ -41,6 +41,11 @@ LOST_TABLE_RETRY_S = 30.0
 
 FORWARD_TIMEOUT_S = 1.0
 """Most seconds for which the requestTopic of a subscriber waits for the forward."""
+MOST_LINES = 200
+"""Changed forwards that the log names in `LINES_PERIOD_S`. A node may change its ports again and
+again."""
+LINES_PERIOD_S = 60.0
+"""Seconds after which the log names changed forwards again."""
 ROUTE_AGE_S = 60.0
 """Seconds after which the routes to nodes are read again."""
 
@@ -81,6 +86,8 @@ class ForwardSyncer:
         self._retry_at = float("inf")
         self._routes_until = 0.0
         self._logged: dict[LeaseHolder, str] = {}
+        self._lines = 0
+        self._lines_since = clock()
         self.traffic = "topics" if table.has_connections else "datagrams"
         self.subject = SUBJECT if table.has_connections else f"{SUBJECT} for UDP"
         self.why_not: str | None = "the proxy has not started yet"
@@ -293,7 +300,15 @@ class ForwardSyncer:
         return wanted
 
     def _log(self, change: Changes) -> None:
-        for port in {**change.removed, **change.added}:
+        if self._clock() - self._lines_since >= LINES_PERIOD_S:
+            self._lines = 0
+            self._lines_since = self._clock()
+        changed = [*{**change.removed, **change.added}]
+        logged = changed[: MOST_LINES - self._lines]
+        self._lines += len(logged)
+        if len(logged) < len(changed):
+            log.debug("%d more forwards have changed", len(changed) - len(logged))
+        for port in logged:
             endpoint = self._accounts.owners.get(port)
             target = change.added.get(port)
             name = endpoint.label if endpoint else "a node that has ended"
