@@ -1,5 +1,6 @@
 """A problem of the kernel plane lasts until the kernel forwards."""
 
+import asyncio
 import logging
 import time
 from collections.abc import Mapping
@@ -11,7 +12,13 @@ import pytest
 from rosproxy.forwarding.kernel import plane
 from rosproxy.forwarding.kernel.decisions import Changes
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.forwarding.kernel.syncer import LINES_PERIOD_S, LOST_TABLE_RETRY_S, MOST_LINES, Clock
+from rosproxy.forwarding.kernel.syncer import (
+    DATAGRAM_PAUSE_S,
+    LINES_PERIOD_S,
+    LOST_TABLE_RETRY_S,
+    MOST_LINES,
+    Clock,
+)
 from rosproxy.forwarding.kernel.tools import ToolError
 from rosproxy.net.addresses import HostPort
 from rosproxy.telemetry.problems import Problems
@@ -107,3 +114,25 @@ def test_the_log_names_so_many_changed_forwards_and_no_more(
     now = LINES_PERIOD_S
     syncer._log(Changes({}, {11400: HostPort("172.30.0.5", 7413)}))
     assert len(caplog.records) == MOST_LINES + 1
+
+
+@pytest.mark.parametrize(("has_connections", "pauses"), [(True, []), (False, [DATAGRAM_PAUSE_S])])
+async def test_ports_for_datagrams_are_not_compared_all_the_time(
+    monkeypatch: pytest.MonkeyPatch, has_connections: bool, pauses: list[float]
+) -> None:
+    """A comparison of 875 ports takes 18 ms, and each announcement may change ports.
+
+    A subscriber of ROS 1 waits for its forward, so there is no pause.
+    """
+    monkeypatch.setattr(FailingTable, "has_connections", has_connections)
+    kernel = kernel_plane(monkeypatch, Problems())
+    await kernel.start()
+    slept = list[float]()
+
+    async def sleep(seconds: float) -> None:
+        slept.append(seconds)
+
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    kernel.syncer.note_change()
+    await kernel.syncer.run_once()
+    assert slept == pauses

@@ -41,6 +41,9 @@ LOST_TABLE_RETRY_S = 30.0
 
 FORWARD_TIMEOUT_S = 1.0
 """Most seconds for which the requestTopic of a subscriber waits for the forward."""
+DATAGRAM_PAUSE_S = 0.1
+"""Seconds after a comparison of all ports for datagrams in which no further comparison begins. A
+participant may change its ports with each announcement. Meanwhile user space passes datagrams."""
 MOST_LINES = 200
 """Changed forwards that the log names in `LINES_PERIOD_S`. A node may change its ports again and
 again."""
@@ -139,6 +142,8 @@ class ForwardSyncer:
         """Wait for a change, and bring the kernel's forwards up to date."""
         await self._wake.wait()
         await self._sync()
+        if not self._table.has_connections:
+            await asyncio.sleep(DATAGRAM_PAUSE_S)
 
     def may_forward(self, endpoint: LeaseHolder) -> bool:
         """Whether the kernel could forward the topics of an endpoint through a fast port."""
