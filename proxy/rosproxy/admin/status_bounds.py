@@ -80,7 +80,8 @@ def left_out(status: ProxyStatus) -> int:
         counts += [domain.left_out, domain.mismatches_left_out]
         counts += [participant.left_out for participant in (*domain.inside, *domain.outside)]
     zenoh = status.zenoh or ZenohStatus()
-    counts += [zenoh.left_out, *(node.left_out for node in zenoh.nodes)]
+    counts += [zenoh.left_out, zenoh.mismatches_left_out]
+    counts += [node.left_out for node in zenoh.nodes]
     return sum(counts)
 
 
@@ -182,6 +183,7 @@ def _visit_tables(status: ProxyStatus, visit: VisitTable) -> ProxyStatus:
         visit,
         sessions=lambda session: _host(f"//{session.remote}"),
         nodes=lambda node: node.address,
+        mismatches=_owners_of_zenoh_mismatches(status.zenoh),
     )
     return _with_tables(
         msgspec.structs.replace(status, policy=policy, domains=domains, zenoh=zenoh),
@@ -208,6 +210,12 @@ def _with_tables(parent: Parent, visit: VisitTable, **owners: Callable[[Row], st
 def _owners_of_mismatches(domain: DomainStatus) -> Callable[[Row], str]:
     """A function from a mismatch to the address of the participant inside; empty if unknown."""
     addresses = {participant.guid_prefix: participant.address for participant in domain.inside}
+    return lambda mismatch: addresses.get(mismatch.writer, addresses.get(mismatch.reader, ""))
+
+
+def _owners_of_zenoh_mismatches(zenoh: ZenohStatus) -> Callable[[Row], str]:
+    """A function from a mismatch to the address of the node inside; empty if unknown."""
+    addresses = {node.key: node.address for node in zenoh.nodes if node.port is not None}
     return lambda mismatch: addresses.get(mismatch.writer, addresses.get(mismatch.reader, ""))
 
 

@@ -320,8 +320,9 @@ class ParticipantStatus(msgspec.Struct, frozen=True):
 class MismatchStatus(msgspec.Struct, frozen=True):
     """A topic or service (``kind``) whose reader and writer on the two sides do not match.
 
-    ``policy``: the first QoS policy, or the type, that differs. ``offered``: the value of the
-    writer. ``requested``: the value of the reader. ``writer`` and ``reader`` are GUID prefixes.
+    ``policy``: the first QoS policy, the type, or the type hash, that differs. ``offered``: the
+    value of the writer. ``requested``: the value of the reader. ``writer`` and ``reader`` are GUID
+    prefixes, or keys of nodes of rmw_zenoh (`ZenohStatus`).
     """
 
     kind: str = ""
@@ -388,7 +389,12 @@ class ZenohSessionStatus(msgspec.Struct, frozen=True):
 
 
 class ZenohNodeStatus(msgspec.Struct, frozen=True):
-    """A node of rmw_zenoh; ``address`` is empty if the node is beyond a router outside."""
+    """A node of rmw_zenoh; ``address`` is empty if the node is beyond a router outside.
+
+    ``port`` and ``mode`` are those of the node's session with a router of the proxy. ``port``: the
+    port for containers; None: the node is outside. ``calls``: the services of which the node has a
+    client. ``key`` is the same at all proxies, since several nodes may have the same name.
+    """
 
     name: str = ""
     domain: Count = 0
@@ -397,12 +403,20 @@ class ZenohNodeStatus(msgspec.Struct, frozen=True):
     subscribes: Names = ()
     services: Names = ()
     left_out: Count = 0
+    calls: Names = ()
+    types: tuple[NamedTypeStatus, ...] = ()
+    port: Count | None = None
+    mode: str = ""
+    key: str = ""
 
 
 class ZenohStatus(msgspec.Struct, frozen=True):
     """The routers for rmw_zenoh: ports for containers, and the port ``listen`` for outside.
 
     ``failure``: why the routers do not run. ``restarts``: how often the child process has ended.
+    ``mismatches`` are pairs of nodes with a node inside: ``writer`` is the key of the node that
+    publishes or serves, ``reader`` of the node that subscribes or calls. ``not_compared``: pairs of
+    nodes that the proxy has not compared.
     """
 
     ports: str = ""
@@ -413,6 +427,9 @@ class ZenohStatus(msgspec.Struct, frozen=True):
     sessions: tuple[ZenohSessionStatus, ...] = ()
     nodes: tuple[ZenohNodeStatus, ...] = ()
     left_out: Count = 0
+    mismatches: tuple[MismatchStatus, ...] = ()
+    mismatches_left_out: Count = 0
+    not_compared: Count = 0
 
 
 class ProxyStatus(msgspec.Struct, frozen=True):

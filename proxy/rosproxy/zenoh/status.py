@@ -4,11 +4,15 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Protocol
 
+from msgspec.structs import replace
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from rosproxy.access.rules import RuleKind
+from rosproxy.admin.status_bounds import fair_choice
 from rosproxy.admin.status_document import (
+    MismatchStatus,
+    NamedTypeStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
     ZenohSessionStatus,
@@ -16,6 +20,7 @@ from rosproxy.admin.status_document import (
 )
 from rosproxy.settings import Settings
 from rosproxy.zenoh.links import Link, is_linked
+from rosproxy.zenoh.matching import Comparison, compare
 from rosproxy.zenoh.protocol.liveliness import TokenGraph, ZenohNode
 from rosproxy.zenoh.protocol.report import (
     Ends,
@@ -28,6 +33,8 @@ from rosproxy.zenoh.protocol.report import (
 from rosproxy.zenoh.router_policy import InsideName
 
 MODES = ("client", "peer", "router")
+MOST_LISTED_MISMATCHES = 100
+"""Mismatches that the status lists, with fair shares by the address inside."""
 _PlacedSession = tuple[int | None, RouterSession, Ends]
 """A session with the port of its router, which is None for the hub, and with both ends."""
 
@@ -50,7 +57,9 @@ class ZenohState(Collector):
         self._now = now
         self._sessions: tuple[_PlacedSession, ...] = ()
         self._hub_routers: tuple[Ends, ...] = ()
-        self._nodes: tuple[ZenohNode, ...] = ()
+        self._graph = TokenGraph()
+        self._compared_with: frozenset[str] | None = None
+        self._comparison = Comparison()
         self._left_out = 0
         hubs = dict.fromkeys(settings.zenoh_hub, True)
         peers = dict.fromkeys(settings.zenoh_peer, False)
@@ -69,8 +78,12 @@ class ZenohState(Collector):
             for ends in all_ends_of(session)
         )
         if graph is not None:
-            self._nodes = graph.nodes
+            self._graph = graph
             self._left_out = report.tokens_left_out + graph.left_out
+        inside = frozenset(s.peer for port, s, _ in self._sessions if port is not None)
+        if graph is not None or inside != self._compared_with:
+            self._comparison = compare(self._graph.entities, inside)
+            self._compared_with = inside
 
     def is_up(self, link: Link) -> bool:
         """Whether the routers run, and the hub has a session with the peer of a link."""
@@ -87,7 +100,7 @@ class ZenohState(Collector):
         """The topics and services of the nodes with a session at a port for containers."""
         place_by_zid = {s.peer: (port, ends.remote.host) for port, s, ends in self._sessions}
         names: list[InsideName] = []
-        for node in self._nodes:
+        for node in self._graph.nodes:
             port, address = place_by_zid.get(node.session, (None, ""))
             if port is None:
                 continue
@@ -103,33 +116,39 @@ class ZenohState(Collector):
     def status(self) -> ZenohStatus:
         """The part of the status."""
         failure = self._process.failure
-        sessions = () if failure else self._sessions
-        nodes = () if failure else self._nodes
-        host_by_zid = {session.peer: ends.remote.host for _, session, ends in sessions}
+        if failure:  # all else is of a process that has ended
+            return self._status_of_routers(failure)
+        by_zid = {session.peer: (port, session, ends) for port, session, ends in self._sessions}
+        nodes = tuple(_node_status(node, by_zid.get(node.session)) for node in self._graph.nodes)
+        mismatches = self._comparison.mismatches
+        addresses = {node.key: node.address for node in nodes if node.port is not None}
+
+        def owner(pair: MismatchStatus) -> str:
+            return addresses.get(pair.writer, addresses.get(pair.reader, ""))
+
+        shown = fair_choice(mismatches, owner, MOST_LISTED_MISMATCHES)
+        return replace(
+            self._status_of_routers(failure),
+            sessions=tuple(
+                ZenohSessionStatus(
+                    port, session.whatami, session.peer, str(ends.local), str(ends.remote)
+                )
+                for port, session, ends in self._sessions
+            ),
+            nodes=nodes,
+            left_out=self._left_out,
+            mismatches=tuple(shown),
+            mismatches_left_out=len(mismatches) - len(shown),
+            not_compared=self._comparison.not_compared,
+        )
+
+    def _status_of_routers(self, failure: str) -> ZenohStatus:
         return ZenohStatus(
             ports=str(self._settings.zenoh_ports),
             listen=self._settings.zenoh_listen,
             failure=failure,
             restarts=self._process.restarts,
             links=tuple(map(self._link, self.links)),
-            sessions=tuple(
-                ZenohSessionStatus(
-                    port, session.whatami, session.peer, str(ends.local), str(ends.remote)
-                )
-                for port, session, ends in sessions
-            ),
-            nodes=tuple(
-                ZenohNodeStatus(
-                    node.name,
-                    node.domain,
-                    host_by_zid.get(node.session, ""),
-                    node.publishes,
-                    node.subscribes,
-                    node.services,
-                )
-                for node in nodes
-            ),
-            left_out=0 if failure else self._left_out,
         )
 
     def collect(self) -> Iterable[Metric]:
@@ -184,3 +203,21 @@ class ZenohState(Collector):
             since=round(max(self._now() - link.since, 0.0), 1),
             hub=link.is_hub,
         )
+
+
+def _node_status(node: ZenohNode, placed: _PlacedSession | None) -> ZenohNodeStatus:
+    """A node. ``placed``: the session of the node with a router of the proxy; None: none."""
+    port, session, ends = placed or (None, None, None)
+    return ZenohNodeStatus(
+        node.name,
+        node.domain,
+        ends.remote.host if ends else "",
+        node.publishes,
+        node.subscribes,
+        node.services,
+        calls=node.calls,
+        types=tuple(NamedTypeStatus(name, ros) for name, ros in node.types),
+        port=port,
+        mode=session.whatami if session else "",
+        key=node.key,
+    )

@@ -167,20 +167,26 @@ def test_every_list_is_bounded_and_hides_nothing_of_others(flood: str) -> None:
         {"nodes": (ZenohNodeStatus("/evil", address=EVIL, publishes=MANY),) * 2},
         {"nodes": tuple(ZenohNodeStatus(name, address=EVIL) for name in MANY)},
         {"sessions": (ZenohSessionStatus(zid=LONG, remote=f"{EVIL}:40000"),) * 2000},
+        {"mismatches": (MismatchStatus(offered=LONG, writer="0 bb.0/evil"),) * 2000},
     ],
 )
 def test_what_zenoh_tells_is_bounded(flood: dict[str, Any]) -> None:
     good_node = ZenohNodeStatus("/good", address=GOOD, publishes=("/scan",))
     good_session = ZenohSessionStatus(zid="01", remote=f"{GOOD}:40000")
-    flood = {"nodes": (), "sessions": ()} | flood
+    good_mismatch = MismatchStatus(name="/scan", writer="0 aa.0/good")
+    good_node = replace(good_node, port=7448, key=good_mismatch.writer)
+    flood = {"nodes": (), "sessions": (), "mismatches": ()} | flood
     zenoh = ZenohStatus(
-        nodes=(*flood["nodes"], good_node), sessions=(*flood["sessions"], good_session)
+        nodes=(*flood["nodes"], good_node),
+        sessions=(*flood["sessions"], good_session),
+        mismatches=(*flood["mismatches"], good_mismatch),
     )
     shown = bounded(ProxyStatus(zenoh=zenoh))
     assert 0.5 * MOST_BYTES < len(encode(shown)) <= MOST_BYTES
     assert shown.zenoh is not None
     assert good_node in shown.zenoh.nodes
     assert good_session in shown.zenoh.sessions
+    assert good_mismatch in shown.zenoh.mismatches
     assert left_out(shown) > 0
 
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from prometheus_client import CollectorRegistry, generate_latest
 
 from rosproxy.access.rules import RuleKind
-from rosproxy.admin.status_document import ZenohSessionStatus
+from rosproxy.admin.status_document import NamedTypeStatus, ZenohSessionStatus
 from rosproxy.zenoh.protocol.liveliness import graph_of
 from rosproxy.zenoh.protocol.report import Report, RouterReport, RouterSession, SessionConnection
 from rosproxy.zenoh.router_policy import InsideName
-from rosproxy.zenoh.status import ZenohState
+from rosproxy.zenoh.status import MOST_LISTED_MISMATCHES, ZenohState
 from tests.run_options import parse_settings
 
 NODE_ZID = "aa"
@@ -85,7 +85,33 @@ def test_nodes_here_have_an_address() -> None:
         "172.18.0.3",
         ("/chatter",),
     )
-    assert (robot.name, robot.address) == ("/robot", "")
+    assert (talker.port, talker.mode, talker.key) == (7448, "peer", f"0 {NODE_ZID}.0/talker")
+    assert talker.types == (NamedTypeStatus("/chatter", "T_"),)
+    assert (robot.name, robot.address, robot.port, robot.mode) == ("/robot", "", None, "")
+
+
+def test_nodes_that_do_not_match_are_pairs_with_a_node_inside() -> None:
+    state = make_state(FakeProcess())
+    reader = "@ros2_lv/0/bb/0/10/MS/%/%/robot/%chatter/Other_/H/::,10:,:,:,,"
+    state.take(Report(REPORT.routers), graph_of((*TOKENS, reader)))
+    (pair,) = state.status().mismatches
+    assert (pair.name, pair.policy, pair.offered, pair.requested) == (
+        *("/chatter", "type", "T_", "Other_"),
+    )
+    assert (pair.writer, pair.reader) == (f"0 {NODE_ZID}.0/talker", "0 bb.0/robot")
+    state.take(Report((RouterReport("01"), *REPORT.routers[1:])), None)
+    assert not state.status().mismatches, "the talker has no session here any more"
+
+
+def test_the_list_of_mismatches_is_bounded() -> None:
+    state = make_state(FakeProcess())
+    readers = [
+        f"@ros2_lv/0/bb/{number}/10/MS/%/%/robot/%chatter/Other_/H/::,10:,:,:,,"
+        for number in range(MOST_LISTED_MISMATCHES + 3)
+    ]
+    state.take(Report(REPORT.routers), graph_of((*TOKENS, *readers)))
+    status = state.status()
+    assert (len(status.mismatches), status.mismatches_left_out) == (MOST_LISTED_MISMATCHES, 3)
 
 
 def test_names_of_nodes_inside_have_port_and_address() -> None:

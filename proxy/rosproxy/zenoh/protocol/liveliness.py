@@ -23,6 +23,13 @@ MOST_TOKENS = 8192
 1,000."""
 _NODE_PARTS = 9
 _TOPIC_OR_SERVICE_PARTS = 13
+_TYPE_PART = 10
+_HASH_PART = 11
+_QOS_PART = 12
+_TRANSIENT_LOCAL = "1"
+"""The durability in the QoS of a token, ``reliability:durability:...``. A default is an empty text:
+since March 2025 the default of rmw_zenoh is volatile, before it was transient local (rmw_zenoh
+#521)."""
 _NUMBER = re.compile(r"[0-9]{1,9}")
 _SESSION = re.compile(r"[0-9a-f]{1,32}")
 
@@ -50,7 +57,8 @@ class Entity(NamedTuple):
     """A node, or a publisher, subscription, service or service client of a node.
 
     ``session`` is the zenoh ID of the session that has the node. ``node`` is the full name of the
-    node. ``name`` is the full name of the topic or service, and empty for a node.
+    node. ``name`` is the full name of the topic or service, and empty for a node. ``type`` and
+    ``type_hash`` are as in the keys of the data: nodes exchange data only if both are the same.
     """
 
     domain: int
@@ -59,12 +67,20 @@ class Entity(NamedTuple):
     kind: EntityKind
     node: str
     name: str = ""
+    type: str = ""
+    type_hash: str = ""
+    is_transient_local: bool = False
+
+    @property
+    def node_key(self) -> str:
+        """The key of the node (`ZenohNode.key`)."""
+        return _node_key(self.domain, self.session, self.node_id, self.node)
 
 
 class ZenohNode(NamedTuple):
     """A ROS node with its publishers, subscriptions, services and service clients.
 
-    The full names of topics and services are sorted.
+    The full names of topics and services are sorted. ``types`` has each name with its ROS type.
     """
 
     domain: int
@@ -74,6 +90,16 @@ class ZenohNode(NamedTuple):
     subscribes: tuple[str, ...]
     services: tuple[str, ...]
     calls: tuple[str, ...] = ()
+    types: tuple[tuple[str, str], ...] = ()
+    node_id: int = 0
+
+    @property
+    def key(self) -> str:
+        """The key of the node, which is the same at all proxies: ``DOMAIN SESSION.NODE_ID/NAME``.
+
+        Several nodes may have the same name.
+        """
+        return _node_key(self.domain, self.session, self.node_id, self.name)
 
 
 def parse_token(key: str) -> Entity | None:
@@ -91,39 +117,69 @@ def parse_token(key: str) -> Entity | None:
         return None
     namespace = _ros_name(parts[7])
     node = f"{namespace.rstrip('/')}/{_ros_name(parts[8])}"
-    name = "" if kind is EntityKind.NODE else _ros_name(parts[9])
-    return Entity(int(domain), session, int(node_id), kind, node, name)
+    if kind is EntityKind.NODE:
+        return Entity(int(domain), session, int(node_id), kind, node)
+    return Entity(
+        int(domain),
+        session,
+        int(node_id),
+        kind,
+        node,
+        _ros_name(parts[9]),
+        parts[_TYPE_PART],
+        parts[_HASH_PART],
+        is_transient_local=parts[_QOS_PART].split(":")[1:2] == [_TRANSIENT_LOCAL],
+    )
 
 
 class TokenGraph(NamedTuple):
-    """The nodes that tokens announce. ``left_out``: tokens that are not of rmw_zenoh."""
+    """What tokens announce. ``left_out``: tokens that are not of rmw_zenoh."""
 
-    nodes: tuple[ZenohNode, ...]
-    left_out: int
+    entities: tuple[Entity, ...] = ()
+    nodes: tuple[ZenohNode, ...] = ()
+    left_out: int = 0
 
 
 def graph_of(tokens: Sequence[str]) -> TokenGraph:
-    """The nodes of tokens. For MOST_TOKENS this takes 0.2 s."""
-    entities = list(filter(None, map(parse_token, tokens)))
-    return TokenGraph(nodes_of(entities), len(tokens) - len(entities))
+    """What tokens announce. For MOST_TOKENS this takes 0.2 s."""
+    entities = tuple(filter(None, map(parse_token, tokens)))
+    return TokenGraph(entities, nodes_of(entities), len(tokens) - len(entities))
 
 
 def nodes_of(entities: Iterable[Entity]) -> tuple[ZenohNode, ...]:
     """The nodes of entities, sorted by domain and name."""
-    by_node: dict[tuple[int, str, str, int], dict[EntityKind, set[str]]] = {}
+    by_node: dict[tuple[int, str, str, int], list[Entity]] = {}
     for entity in entities:
         key = (entity.domain, entity.node, entity.session, entity.node_id)
-        names = by_node.setdefault(key, {kind: set() for kind in EntityKind})
+        by_node.setdefault(key, []).append(entity)
+    return tuple(_node_of(by_node[key]) for key in sorted(by_node))
+
+
+def _node_of(entities: Sequence[Entity]) -> ZenohNode:
+    """The node to which all the entities belong."""
+    first = entities[0]
+    names: dict[EntityKind, set[str]] = {kind: set() for kind in EntityKind}
+    for entity in entities:
         names[entity.kind].add(entity.name)
-    return tuple(
-        ZenohNode(
-            domain,
-            session,
-            node,
-            *(tuple(sorted(names[kind])) for kind in _KINDS_OF_NAMES),
-        )
-        for (domain, node, session, _), names in sorted(by_node.items(), key=lambda item: item[0])
+    types = {(entity.name, ros_type(entity.type)) for entity in entities if entity.name}
+    return ZenohNode(
+        first.domain,
+        first.session,
+        first.node,
+        *(tuple(sorted(names[kind])) for kind in _KINDS_OF_NAMES),
+        types=tuple(sorted(types)),
+        node_id=first.node_id,
     )
+
+
+def ros_type(key_type: str) -> str:
+    """The ROS type for the type in a key: std_msgs/msg/String for std_msgs::msg::dds_::String_."""
+    package, separator, name = key_type.partition("::dds_::")
+    return f"{package.replace('::', '/')}/{name.removesuffix('_')}" if separator else key_type
+
+
+def _node_key(domain: int, session: str, node_id: int, node: str) -> str:
+    return f"{domain} {session}.{node_id}{node}"
 
 
 def _ros_name(mangled: str) -> str:

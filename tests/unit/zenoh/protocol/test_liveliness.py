@@ -13,6 +13,7 @@ from rosproxy.zenoh.protocol.liveliness import (
     ZenohNode,
     nodes_of,
     parse_token,
+    ros_type,
 )
 
 ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
@@ -26,8 +27,9 @@ NAMES = st.lists(NAME, min_size=1, max_size=3).map(lambda parts: "/" + "/".join(
 
 def test_a_node_and_its_publisher() -> None:
     assert parse_token(NODE) == Entity(0, ZID, 0, EntityKind.NODE, "/talker")
-    publisher = Entity(0, ZID, 0, EntityKind.PUBLISHER, "/talker", "/chatter")
+    publisher = Entity(0, ZID, 0, EntityKind.PUBLISHER, "/talker", "/chatter", STRING, HASH)
     assert parse_token(PUBLISHER) == publisher
+    assert publisher.node_key == f"0 {ZID}.0/talker"
 
 
 @given(
@@ -46,7 +48,29 @@ def test_what_rmw_zenoh_writes_is_read(
     key = (
         f"@ros2_lv/{domain}/{session}/3/4/{kind.value}/%/{mangled}/{node}/{named}/T_/H/::,1:,:,:,,"
     )
-    assert parse_token(key) == Entity(domain, session, 3, kind, f"{namespace}/{node}", topic)
+    entity = Entity(domain, session, 3, kind, f"{namespace}/{node}", topic, "T_", "H")
+    assert parse_token(key) == entity
+
+
+@pytest.mark.parametrize(
+    ("qos", "is_latched"), [("1:1:1,10", True), (":1:,", True), (":2:,1", False), ("x", False)]
+)
+def test_the_durability_of_a_token(qos: str, is_latched: bool) -> None:
+    entity = parse_token(PUBLISHER.replace("::,10", qos))
+    assert entity is not None
+    assert entity.is_transient_local is is_latched
+
+
+@pytest.mark.parametrize(
+    ("key_type", "ros"),
+    [
+        (STRING, "std_msgs/msg/String"),
+        ("example_interfaces::srv::dds_::AddTwoInts_", "example_interfaces/srv/AddTwoInts"),
+        ("custom", "custom"),
+    ],
+)
+def test_a_type_in_a_key_has_a_ros_type(key_type: str, ros: str) -> None:
+    assert ros_type(key_type) == ros
 
 
 @given(st.one_of(st.text(), st.lists(st.text(max_size=8), min_size=8, max_size=14).map("/".join)))
@@ -82,6 +106,9 @@ def test_entities_become_nodes() -> None:
     keys.append(NODE.replace("/0/", "/5/", 1))
     entities = [entity for key in keys if (entity := parse_token(key))]
     assert nodes_of(reversed(entities)) == (
-        ZenohNode(0, ZID, "/talker", ("/chatter",), ("/chatter",), (), ("/chatter",)),
+        ZenohNode(
+            *(0, ZID, "/talker", ("/chatter",), ("/chatter",), (), ("/chatter",)),
+            types=(("/chatter", "std_msgs/msg/String"),),
+        ),
         ZenohNode(5, ZID, "/talker", (), (), ()),
     )
