@@ -2,8 +2,11 @@
 
 from typing import Any
 
+from msgspec.structs import replace
+
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.admin.status_document import (
+    MismatchStatus,
     ProxyStatus,
     StatusSettings,
     ZenohLinkStatus,
@@ -77,3 +80,48 @@ def test_names_that_the_user_asks_for() -> None:
         "/robot: connected from outside",
         "/nothing: no node has this name, and no node has a topic or service of this name",
     ]
+
+
+TALKER = ZenohNodeStatus("/talker", 0, "172.18.0.3", ("/chatter",), port=7448, key="0 a.0/talker")
+LISTENER = ZenohNodeStatus("/listener", subscribes=("/chatter",), key="0 b.0/listener")
+MET = replace(GOOD, nodes=(TALKER, LISTENER))
+
+
+def test_nodes_that_do_not_match_are_an_error_without_a_question() -> None:
+    pair = MismatchStatus(
+        *("topic", "/chatter", "type", "std_msgs/msg/String", "std_msgs/msg/Int32"),
+        *(TALKER.key, LISTENER.key),
+    )
+    told = findings(replace(MET, mismatches=(pair,)))
+    assert (told[-1].severity, told[-1].subject) == (Severity.ERROR, "topic /chatter")
+    assert told[-1].text == (
+        "type differs: the publisher /talker (172.18.0.3) offers std_msgs/msg/String, the "
+        "subscription /listener (outside) requests std_msgs/msg/Int32"
+    )
+    asked = findings(replace(MET, mismatches=(pair,)), "/chatter")
+    assert asked.count(told[-1]) == 1
+
+
+def test_a_question_tells_the_other_domain() -> None:
+    elsewhere = replace(LISTENER, domain=7)
+    told = findings(replace(MET, nodes=(TALKER, elsewhere)), "/chatter")[-1]
+    assert told.severity is Severity.WARNING
+    assert told.text == (
+        "no subscription is known in domain 0, but: /listener (outside) in domain 7"
+    )
+    assert "ROS_DOMAIN_ID" in told.fix
+    assert not findings(replace(MET, nodes=(TALKER, elsewhere)))[2:], "only if the user asks"
+
+
+def test_a_service_without_a_server_is_a_note() -> None:
+    client = ZenohNodeStatus("/client", calls=("/add",))
+    told = texts(replace(GOOD, nodes=(*GOOD.nodes, client)), "/add")
+    assert told[-1] == "/add: served by /talker (172.18.0.3); called by /client (outside)"
+    told = texts(replace(GOOD, nodes=(client,)), "/add")
+    assert told[-1] == "/add: called by /client (outside), and served by no node"
+
+
+def test_a_graph_with_gaps_is_a_warning() -> None:
+    told = findings(replace(MET, left_out=3, not_compared=2))[2:]
+    assert [finding.severity for finding in told] == [Severity.WARNING] * 2
+    assert "left out of the status: 3." in told[0].text

@@ -1,5 +1,7 @@
 """Nodes that do not match: by type, by type hash, or by durability."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,12 +16,12 @@ INSIDE = "aa"
 OUTSIDE = "bb"
 
 
-def publisher(node: str = "/talker", session: str = INSIDE, **changes: object) -> Entity:
+def publisher(node: str = "/talker", session: str = INSIDE, **changes: Any) -> Entity:
     made = Entity(0, session, 1, EntityKind.PUBLISHER, node, "/chatter", STRING, "H1")
     return made._replace(**changes)
 
 
-def subscription(node: str = "/listener", session: str = OUTSIDE, **changes: object) -> Entity:
+def subscription(node: str = "/listener", session: str = OUTSIDE, **changes: Any) -> Entity:
     return publisher(node, session, **{"kind": EntityKind.SUBSCRIPTION, **changes})
 
 
@@ -40,7 +42,7 @@ def test_nodes_with_the_same_key_match() -> None:
     ],
 )
 def test_what_differs_is_named(
-    changes: dict[str, object], policy: str, offered: str, requested: str
+    changes: dict[str, Any], policy: str, offered: str, requested: str
 ) -> None:
     assert found(publisher(), subscription(**changes)) == (
         MismatchStatus(

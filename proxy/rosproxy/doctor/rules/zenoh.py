@@ -2,13 +2,22 @@
 
 from collections.abc import Iterator
 
-from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok, warning
-from rosproxy.admin.status_document import ZenohNodeStatus, ZenohStatus
+from rosproxy.admin.doctor_finding import (
+    UNKNOWN_NAME,
+    DoctorFinding,
+    Severity,
+    error,
+    note,
+    ok,
+    warning,
+)
+from rosproxy.admin.status_document import ZenohStatus
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.fixes import how_to
 from rosproxy.telemetry.text import listed, plural
-from rosproxy.zenoh.findings import ROUTERS, faults
+from rosproxy.zenoh.findings import ROUTERS, faults, incomplete, mismatch_findings, place
 from rosproxy.zenoh.links import LinkFault
+from rosproxy.zenoh.pairs import Graph, troubles
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
@@ -16,15 +25,21 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     zenoh = facts.proxy.zenoh
     if zenoh is None:
         return
-    yield from faults(zenoh)
+    lasting = [*faults(zenoh)]
+    yield from lasting
     if zenoh.failure:
         return
     yield from _outside(zenoh)
     yield from _nodes(zenoh)
+    mismatches = [f for _, f in mismatch_findings(zenoh) if f.severity > Severity.OK]
+    yield from mismatches
+    yield from incomplete(zenoh)
+    graph = Graph(zenoh, facts.proxy.policy)
     is_alone = not facts.proxy.settings.for_ros1 and not facts.proxy.domains
     for name in facts.names:
         about_name = [*_about(zenoh, name)]
         yield from about_name
+        yield from (f for f in troubles(graph, name) if f not in (*lasting, *mismatches))
         if not about_name and is_alone:
             text = "no node has this name, and no node has a topic or service of this name"
             fix = f"compare with the names in the status: {how_to('status')}"
@@ -60,9 +75,10 @@ def _about(zenoh: ZenohStatus, name: str) -> Iterator[DoctorFinding]:
     for node in zenoh.nodes:
         if node.name == name:
             yield ok("node", name, f"connected from {node.address or 'outside'}")
-    publishers = [_place(node) for node in zenoh.nodes if name in node.publishes]
-    subscribers = [_place(node) for node in zenoh.nodes if name in node.subscribes]
-    servers = [_place(node) for node in zenoh.nodes if name in node.services]
+    publishers = [place(node) for node in zenoh.nodes if name in node.publishes]
+    subscribers = [place(node) for node in zenoh.nodes if name in node.subscribes]
+    servers = [place(node) for node in zenoh.nodes if name in node.services]
+    clients = [place(node) for node in zenoh.nodes if name in node.calls]
     if publishers or subscribers:
         text = f"published by {listed(publishers) or 'no node'}; "
         text += f"subscribed to by {listed(subscribers) or 'no node'}"
@@ -71,8 +87,8 @@ def _about(zenoh: ZenohStatus, name: str) -> Iterator[DoctorFinding]:
         else:
             yield note("topic", name, text, "check the name; check that the other program runs")
     if servers:
-        yield ok("service", name, f"served by {listed(servers)}")
-
-
-def _place(node: ZenohNodeStatus) -> str:
-    return f"{node.name} ({node.address or 'outside'})"
+        called = f"; called by {listed(clients)}" if clients else ""
+        yield ok("service", name, f"served by {listed(servers)}{called}")
+    elif clients:
+        text = f"called by {listed(clients)}, and served by no node"
+        yield note("service", name, text, "check the name; check that the other program runs")

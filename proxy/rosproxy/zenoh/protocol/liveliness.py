@@ -161,14 +161,20 @@ def _node_of(entities: Sequence[Entity]) -> ZenohNode:
     names: dict[EntityKind, set[str]] = {kind: set() for kind in EntityKind}
     for entity in entities:
         names[entity.kind].add(entity.name)
+    publishes, subscribes, services, calls = (
+        tuple(sorted(names[kind])) for kind in _KINDS_OF_NAMES
+    )
     types = {(entity.name, ros_type(entity.type)) for entity in entities if entity.name}
     return ZenohNode(
         first.domain,
         first.session,
         first.node,
-        *(tuple(sorted(names[kind])) for kind in _KINDS_OF_NAMES),
-        types=tuple(sorted(types)),
-        node_id=first.node_id,
+        publishes,
+        subscribes,
+        services,
+        calls,
+        tuple(sorted(types)),
+        first.node_id,
     )
 
 
