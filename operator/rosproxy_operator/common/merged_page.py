@@ -3,7 +3,8 @@
 Each proxy has its own nodes inside. All proxies of a master have the same nodes outside, so the
 merged page shows each node and each link once. A node outside one proxy may be inside another. A
 master on loopback is a different master on each host. A participant of ROS 2 has the same key at
-all proxies: the domain and the unique GUID prefix. If a proxy does not answer, the page shows the
+all proxies: the domain and the unique GUID prefix. The same holds for a node of rmw_zenoh, whose
+key has the domain and the zenoh ID of its session. If a proxy does not answer, the page shows the
 proxy as a node with the reason.
 
 An attacker may control a proxy. So each proxy gets a fair share of the nodes, links and findings.
@@ -46,11 +47,14 @@ from rosproxy.page.page_document import (
     shown_text,
     within_bounds,
 )
+from rosproxy.page.zenoh_graph import HUB, NODE, ROUTER
 
 Json = dict[str, Any]
 PROXY = "proxy"
 PARTICIPANT = "participant"
 """Kinds of nodes on the page (`PageNode.kind`)."""
+_SHARED_KINDS = frozenset({PARTICIPANT, NODE, ROUTER, HUB})
+"""Kinds of nodes with the same key at all proxies."""
 _LONG_TEXT_FIELDS = ("text", "fix", "detail")
 _MOST_LEFT_OUT = 10**9
 Row = TypeVar("Row", PageNode, PageLink, PageFinding, PageProxy)
@@ -211,7 +215,8 @@ def _outside_key(name: str, document: Document, key: str, node: PageNode, others
     is put in front. So a proxy can't forge a key of another proxy.
     """
     outside_key = key
-    if node.kind != PARTICIPANT:
+    # A router at a loopback address is a different router on each host.
+    if node.kind not in _SHARED_KINDS or (node.kind == ROUTER and node.lane == HOST):
         master = document.proxy.master or name
         address = parse_authority(master)
         host = f"{document.proxy.host} " if address and is_loopback(address.host) else ""

@@ -165,7 +165,7 @@ def _measures_of(
     data comes from one participant.
     """
     ports = _user_data_ports(participant)
-    services = sum(not _is_quiet_service(name) for name in participant.services)
+    services = sum(not is_quiet_ros2_service(name) for name in participant.services)
     acknowledged = published if any(locator.plane == KERNEL for locator in ports) else 0
     shared = len(group) + services + acknowledged
     datagrams = sum(locator.user_datagram_rate for locator in ports)
@@ -182,7 +182,7 @@ def _measures_of(
     }
 
 
-def _is_quiet_service(name: str) -> bool:
+def is_quiet_ros2_service(name: str) -> bool:
     """Whether every node of ROS 2 has such a service."""
     return is_quiet_service(name) or name.endswith(_QUIET_ENDINGS)
 
@@ -283,7 +283,7 @@ def _links(domain: DomainStatus, problems: dict[str, DomainProblem]) -> Iterator
                     "service",
                     shown_name(service),
                     _key(domain, participant.guid_prefix),
-                    quiet=_is_quiet_service(service),
+                    quiet=is_quiet_ros2_service(service),
                 ),
                 problems.get(participant.guid_prefix),
             )

@@ -14,7 +14,7 @@ from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error
 from rosproxy.admin.status_document import EndpointStatus, ProxyStatus, StandInStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, SystemState
 from rosproxy.net.addresses import is_loopback
-from rosproxy.page import domain_graph
+from rosproxy.page import domain_graph, zenoh_graph
 from rosproxy.page.judgement import JudgedFacts, inside_nodes, without_ended
 from rosproxy.page.measures import Key, Measures
 from rosproxy.page.page_document import (
@@ -74,14 +74,16 @@ def graph_document(
     present = tuple(endpoint for endpoint in status.nodes if not endpoint.has_ended)
     status = msgspec.structs.replace(status, nodes=present)
     nodes, links = domain_graph.graph(status, measures, now, epoch)
-    left_out = 0
+    zenoh_nodes, zenoh_links, left_out = zenoh_graph.graph(status, now, epoch)
     if status.settings.for_ros1:
         nodes |= _Ros1Graph(status, judged).nodes()
         ros1 = _Ros1Links(status, judged, measures, now, epoch)
         links += ros1.all()
-        left_out = ros1.left_out
+        left_out += ros1.left_out
     findings = [*own_findings, *judged.rest, *domain_graph.findings(status)]
-    nodes = {PROXY: _proxy_node(status), **nodes}
+    findings += zenoh_graph.findings(status, (*zenoh_nodes.values(), *zenoh_links))
+    nodes = {PROXY: _proxy_node(status), **nodes, **zenoh_nodes}
+    links += zenoh_links
     return document(_about(status), nodes, links, findings, left_out)
 
 
@@ -101,9 +103,19 @@ def _about(status: ProxyStatus) -> Json:
 
 
 def _proxy_node(status: ProxyStatus) -> PageNode:
-    ports = f"{status.ports.advertise}, {status.ports.used} used, {status.ports.free} free"
+    ports = []
+    if status.ports.advertise:  # rmw_zenoh alone has no range
+        ports.append(
+            f"{status.ports.advertise}, {status.ports.used} used, {status.ports.free} free"
+        )
+    if status.zenoh:
+        ports.append(f"{status.zenoh.ports} for containers of rmw_zenoh")
     return PageNode(
-        HOST, "proxy", "rosproxy", address=shown_name(status.settings.advertise_host), ports=ports
+        HOST,
+        "proxy",
+        "rosproxy",
+        address=shown_name(status.settings.advertise_host),
+        ports="; ".join(ports),
     )
 
 

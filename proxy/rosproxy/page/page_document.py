@@ -1,8 +1,8 @@
 """The JSON document of the live page: nodes, links between nodes, and findings.
 
-Proxies make this document for ROS 1 and ROS 2, and both operators make the same document for
-several proxies. Nodes choose the names in the document. `shown_name` and `shown_text` shorten these
-names, but do not escape HTML: show these names only as text.
+Proxies make this document for ROS 1, ROS 2 and rmw_zenoh, and both operators make the same document
+for several proxies. Nodes choose the names in the document. `shown_name` and `shown_text` shorten
+these names, but do not escape HTML: show these names only as text.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -45,13 +45,13 @@ Row = TypeVar("Row", bound=msgspec.Struct)
 
 
 class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A node, participant, master or proxy in its lane.
+    """A node, participant, master, router or proxy in its lane.
 
     ``label``: the text to show if the key is not a name. ``detail``: the text to show if a user
     selects the node. ``place``: the name of the container or pod, if known. ``text`` and ``fix``:
     the problem and what to do. ``ports``: the ports of the proxy for this node. ``rate``: forwarded
     bytes a second, if the rates of the links are not known. ``proxy``: the proxy of the node, on an
-    operator's page.
+    operator's page. ``since``: the Unix time in seconds since which a router is linked or not.
     """
 
     lane: str
@@ -66,17 +66,18 @@ class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
     proxy: str = ""
     detail: str = ""
     place: str = ""
+    since: float | None = None
 
 
 class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
     """A topic from a publisher to a subscriber, or a service or parameter of a node.
 
-    ``target``: empty if only one end is known. ``carried``: kernel, splice, copy or UDPROS; direct
-    if the link does not pass the proxy; empty if unknown. ``port``: the port of the proxy.
-    ``rate``: bytes a second. ``hz``: messages a second. ``since``: the Unix time in seconds of the
-    last message, if nothing flows. None means unknown. ``flows``: messages pass now. ``quiet``: the
-    page hides the link by default. ``proxy``: the key of the proxy with the ``port``, on an
-    operator's page.
+    ``target``: empty if only one end is known. ``carried``: kernel, splice, copy, UDPROS, or router
+    (of rmw_zenoh); direct if the link does not pass the proxy; empty if unknown. ``port``: the port
+    of the proxy. ``rate``: bytes a second. ``hz``: messages a second. ``since``: the Unix time in
+    seconds of the last message, if nothing flows. None means unknown. ``flows``: messages pass now.
+    ``quiet``: the page hides the link by default. ``proxy``: the key of the proxy with the
+    ``port``, on an operator's page. ``type``: the ROS type; empty if unknown.
 
     ``datagrams``: user data of ROS 2 in datagrams per second. If ``shared`` is 2 or more, the
     measures are a sum over this number of links to the same participant, services of the
@@ -100,6 +101,7 @@ class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
     proxy: str = ""
     datagrams: float | None = None
     shared: int = 0
+    type: str = ""
 
     @property
     def key(self) -> str:

@@ -89,7 +89,9 @@ class Graph:
     def size(self, names: _Names) -> int:
         """The most pairs that `pairs` yields."""
         sources, targets = self.by_name[names]
-        return len(sources) * len(targets) + len(sources) + len(targets)
+        inside = [sum(map(is_inside, side)) for side in (sources, targets)]
+        outside = [len(sources) - inside[0], len(targets) - inside[1]]
+        return len(sources) * len(targets) - outside[0] * outside[1] + sum(inside)
 
     def pairs(self, names: _Names) -> Iterator[Pair]:
         """Yield the pairs of a topic or service with a node inside.
@@ -98,16 +100,15 @@ class Graph:
         """
         kind, _, name = names
         sources, targets = self.by_name[names]
+        targets_inside = [*filter(is_inside, targets)]
         for source in sources:
-            ends = [target for target in targets if target is not source]
-            for target in ends:
-                if is_inside(source) or is_inside(target):
-                    yield Pair(kind, name, source, target)
+            ends = [t for t in (targets if is_inside(source) else targets_inside) if t != source]
+            yield from (Pair(kind, name, source, target) for target in ends)
             if not ends and is_inside(source):
                 yield Pair(kind, name, source, None)
         if kind == TOPIC:
-            for target in targets:
-                if is_inside(target) and not any(source is not target for source in sources):
+            for target in targets_inside:
+                if all(source == target for source in sources):
                     yield Pair(kind, name, None, target)
 
     def judge(self, pair: Pair) -> DoctorFinding:

@@ -293,3 +293,48 @@ def test_no_proxy_tells_of_links_between_nodes_of_others() -> None:
 def test_what_is_left_out_is_a_number_that_can_be(left_out: int) -> None:
     document = merged({"one": shown("a", left_out=left_out)}, "1.0", LOGS)
     assert 0 <= document["left_out"] <= 10**9
+
+
+def zenoh(name: str, *nodes: dict[str, Any], links: dict[str, Any] | None = None) -> Document:
+    """A proxy for rmw_zenoh, with nodes by key."""
+    rows = {str(node.pop("key")): {"kind": "zenoh node", **node} for node in nodes}
+    rows["rosproxy"] = {"lane": "host", "kind": "proxy", "label": "rosproxy"}
+    document = {"proxy": {"host": name}, "nodes": rows, "links": links or {}}
+    return read_document(json.dumps(document))
+
+
+def test_a_node_of_rmw_zenoh_is_the_same_at_all_proxies() -> None:
+    inside = {"lane": "container", "label": "/talker", "address": "10.244.1.9"}
+    outside = {"lane": "robot", "label": "/talker"}
+    listener = {"key": "0 b.0/listener", "lane": "container", "label": "/listener"}
+    talker = "0 a.0/talker"
+    link = {
+        "kind": "topic",
+        "name": "/chatter",
+        "source": talker,
+        "target": listener["key"],
+        "state": "ok",
+        "port": 7448,
+    }
+    documents = {
+        "one": zenoh("h1", {"key": talker, **inside}),
+        "two": zenoh("h2", {"key": talker, **outside}, listener, links={"x": link}),
+    }
+    document = merged(documents, "1.0", LOGS, {"10.244.1.9": "talker-pod"})
+    assert {key for key in document["nodes"] if "/talker" in key} == {f"one {talker}"}
+    assert document["nodes"][f"one {talker}"]["place"] == "talker-pod"
+    (shown_link,) = document["links"].values()
+    assert shown_link["source"] == f"one {talker}"
+
+
+def test_a_router_is_the_same_at_all_proxies_unless_it_is_on_loopback() -> None:
+    router = {"key": "router robot:7447", "kind": "router", "lane": "robot"}
+    here = {"key": "router 127.0.0.1:7447", "kind": "router", "lane": "host"}
+    away = {**router, "state": "broken", "text": "no answer"}
+    documents = {
+        "one": zenoh("h1", dict(router), dict(here)),
+        "two": zenoh("h2", dict(away), dict(here)),
+    }
+    nodes = merged(documents, "1.0", LOGS)["nodes"]
+    assert nodes["router robot:7447"]["state"] == "broken", "the worst state counts"
+    assert len([key for key in nodes if "127.0.0.1" in key]) == 2

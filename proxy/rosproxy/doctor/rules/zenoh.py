@@ -34,7 +34,7 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     mismatches = [f for _, f in mismatch_findings(zenoh) if f.severity > Severity.OK]
     yield from mismatches
     yield from incomplete(zenoh)
-    graph = Graph(zenoh, facts.proxy.policy)
+    graph = Graph(zenoh if facts.names else ZenohStatus(), facts.proxy.policy)
     is_alone = not facts.proxy.settings.for_ros1 and not facts.proxy.domains
     for name in facts.names:
         about_name = [*_about(zenoh, name)]

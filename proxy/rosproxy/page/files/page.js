@@ -404,12 +404,14 @@ function details(on) {
     const node = state.nodes.get(id) || {};
     const ports = node.ports ? `ports ${node.ports}` : "";
     const rate = node.rate === undefined ? "" : `${megabytes(node)} MB/s through it`;
-    parts.push(["h3", on.title ? "" : labelOf(id, node)], ["p", node.detail || ""], ["p", [node.place, node.address, ports, rate].filter(Boolean).join(" · ")],
+    const period = node.since === undefined ? "" : ` for ${duration(now - node.since)}`;
+    parts.push(["h3", on.title ? "" : labelOf(id, node)], ["p", `${node.detail || ""}${period}`], ["p", [node.place, node.address, ports, rate].filter(Boolean).join(" · ")],
       ["p", node.text || ""], ["code", node.fix || ""]);
   }
   const links = [...on.links.values()];
   for (const { link, from, to } of links.slice(0, MOST_CHOSEN)) {
-    parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name} from ${from}${to ? ` to ${to}` : ""}, ${frequency(link) || "– Hz"}, ` +
+    const type = link.type ? ` (${link.type})` : "";
+    parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name}${type} from ${from}${to ? ` to ${to}` : ""}, ${frequency(link) || "– Hz"}, ` +
       `${megabytes(link)} MB/s, last message ${age(link, now)}, carried by ${link.carried || "–"}, port ${link.port || "–"}`],
     ["p", link.text || ""], ["code", link.text && !cause ? link.fix || "" : ""]);
   }

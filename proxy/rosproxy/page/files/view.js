@@ -16,8 +16,8 @@ export function namespaceOf(label) {
   return parts[0] === "" && parts.length > 2 ? `/${parts[1]}` : "";
 }
 
-// What a filter finds of a node: names, the host, the container or pod, and the proxy, master or
-// domain in the key.
+// What a filter finds of a node: names, the host, the container or pod, the domain, and the proxy or
+// master in the key.
 function wordsOf(id, node = {}) {
   const domain = node.kind === "participant" ? ` domain ${id.split(" ").at(-2)}` : "";
   return [labelOf(id, node), id, hostOf(node.address), node.place, node.detail].filter(Boolean).join(" ") + domain;
@@ -31,7 +31,7 @@ export function visibleLinks(links, nodes, { quiet, filter }) {
     if (link.quiet && !quiet && link.state !== "broken") continue;
     const ids = [link.source, link.target || ""];
     const ends = ids.map((end) => labelOf(end, nodes.get(end)));
-    if (wanted && ![link.name, ...ids.map((end) => wordsOf(end, nodes.get(end)))].some((text) => text.toLowerCase().includes(wanted))) continue;
+    if (wanted && ![link.name, link.type || "", ...ids.map((end) => wordsOf(end, nodes.get(end)))].some((text) => text.toLowerCase().includes(wanted))) continue;
     found.push({ id, link, from: ends[0], to: ends[1] });
   }
   const order = (one) => RANK[one.link.state || "unknown"] >= 2 ? RANK[one.link.state] : 0;
