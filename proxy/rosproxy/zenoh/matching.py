@@ -19,7 +19,7 @@ TYPE = "type"
 TYPE_HASH = "type hash"
 DURABILITY = "durability"
 """Values of `MismatchStatus.policy`. With DURABILITY, later messages pass nevertheless."""
-MOST_COMPARED_PAIRS = 20_000
+MOST_COMPARED_PAIRS = 10_000
 """Pairs of nodes in one comparison, which takes at most 0.1 s."""
 MOST_LISTED_VALUES = 3
 """Types or type hashes of one node that a mismatch lists."""
