@@ -180,7 +180,7 @@ ROS1_CLIENTS = Layer(
 )
 ROS2_NODES = Layer("ros2", MARKED, (ROS2,), (JAZZY,), 2, debian_root_obstacle)
 ZENOH_NODES = Layer("zenoh", setup=(ZENOH,), workers=2, obstacle=debian_root_obstacle)
-BROWSER = Layer("browser", setup=(ROS, NODES, ROS2, CHROMIUM), obstacle=debian_root_obstacle)
+BROWSER = Layer("browser", setup=(ROS, NODES, ROS2, ZENOH, CHROMIUM), obstacle=debian_root_obstacle)
 DOCKER_ENGINE = Layer(
     "docker",
     MARKED,

@@ -12,6 +12,7 @@ from tests.ros.forks import Forks
 from tests.ros.lab import Lab
 from tests.ros.topology import SHARED, Place, Topology, remove_leftovers
 from tests.ros2.lab import Lab as Ros2Lab
+from tests.zenoh.lab import Lab as ZenohLab
 
 
 @pytest.hookimpl(wrapper=True)
@@ -21,7 +22,7 @@ def pytest_runtest_makereport(
     """Add the output of the proxy and the nodes to the report of a failed test."""
     result = yield
     lab = getattr(item, "funcargs", {}).get("lab")
-    if result.failed and isinstance(lab, Lab | Ros2Lab):
+    if result.failed and isinstance(lab, Lab | Ros2Lab | ZenohLab):
         result.sections += lab.transcripts()
     return result
 

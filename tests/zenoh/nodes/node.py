@@ -1,9 +1,10 @@
 """A replacement for a node of rmw_zenoh: session, keys and liveliness tokens.
 
 `python node.py KIND NAME TOPIC`, where KIND is pub, shout, sub, latch, late, serve, call, probe
-or graph. Prints a line for each event, and runs until killed.
+or graph. Prints a line for each event, and runs until killed. NODE_TYPE: another type, as in keys.
 """
 
+import os
 import sys
 import threading
 import time
@@ -14,7 +15,7 @@ from sessions import NODE, open_session
 from zenoh import ext
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
-TYPE = "std_msgs::msg::dds_::String_"
+TYPE = os.environ.get("NODE_TYPE", "std_msgs::msg::dds_::String_")
 PERIOD_S = 0.1
 
 
