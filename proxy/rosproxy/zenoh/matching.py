@@ -9,7 +9,8 @@ Each session declares its own tokens. Without a mismatch, two nodes still may no
 """
 
 from collections.abc import Collection, Iterable, Iterator
-from itertools import product
+from itertools import chain, islice, product
+from math import prod
 from typing import NamedTuple
 
 from rosproxy.admin.status_document import MismatchStatus
@@ -19,8 +20,11 @@ TYPE = "type"
 TYPE_HASH = "type hash"
 DURABILITY = "durability"
 """Values of `MismatchStatus.policy`. With DURABILITY, later messages pass nevertheless."""
-MOST_COMPARED_PAIRS = 10_000
-"""Pairs of nodes in one comparison, which takes at most 0.1 s."""
+MOST_COMPARISONS = 10_000
+"""Pairs of different entities in one comparison, which takes at most 0.1 s. Nodes with the same
+entities count once."""
+MOST_MISMATCHES_OF_NAME = 100
+"""Pairs of nodes of a topic or service that a comparison returns. All others are counted."""
 MOST_LISTED_VALUES = 3
 """Types or type hashes of one node that a mismatch lists."""
 _SIDES = {
@@ -39,37 +43,66 @@ class _Variant(NamedTuple):
     is_transient_local: bool
 
 
-_Node = tuple[str, str]
-"""The session and the key of a node."""
+class _Node(NamedTuple):
+    """The session and the key of a node."""
+
+    session: str
+    key: str
+
+
 _Side = dict[_Node, set[_Variant]]
 """The nodes that publish or serve a name, or those that subscribe or call."""
+_Groups = dict[frozenset[_Variant], list[_Node]]
+"""The nodes of a side. Nodes with the same variants are together."""
 
 
 class Comparison(NamedTuple):
-    """The pairs of nodes that do not match, and how many pairs are not compared."""
+    """The pairs of nodes that do not match.
+
+    ``late`` are pairs that differ in durability alone: only messages from before the subscription
+    are missing. ``left_out``: further mismatches. ``not_compared``: pairs of nodes.
+    """
 
     mismatches: tuple[MismatchStatus, ...] = ()
+    late: tuple[MismatchStatus, ...] = ()
+    left_out: int = 0
     not_compared: int = 0
+
+
+class _OfName(NamedTuple):
+    """The mismatches of a topic or service, as in `Comparison`."""
+
+    mismatches: list[MismatchStatus]
+    late: list[MismatchStatus]
+    left_out: int
 
 
 def compare(entities: Iterable[Entity], inside: Collection[str]) -> Comparison:
     """Compare the nodes of each topic and service. ``inside`` has the sessions of nodes inside.
 
-    Pairs without a node inside are left out. If the pairs are too many, the names with the most
-    pairs are not compared.
+    Pairs without a node inside are left out. If there are too many different entities, the names
+    with the most are not compared.
     """
-    by_name = {name: sides for name, sides in _by_name(entities).items() if _may_differ(sides)}
-    mismatches: list[MismatchStatus] = []
+    by_name = {
+        names: (_grouped(writers), _grouped(readers))
+        for names, (writers, readers) in _by_name(entities).items()
+    }
+    found: list[_OfName] = []
     compared = 0
     not_compared = 0
-    for kind, domain, name in sorted(by_name, key=lambda key: (_size(by_name[key]), key)):
-        sides = by_name[kind, domain, name]
-        if compared + _size(sides) > MOST_COMPARED_PAIRS:
-            not_compared += _size(sides)
+    for names in sorted(by_name, key=lambda names: (_size(by_name[names]), names)):
+        sides = by_name[names]
+        if compared + _size(sides) > MOST_COMPARISONS:
+            not_compared += prod(sum(map(len, side.values())) for side in sides)
             continue
         compared += _size(sides)
-        mismatches += _mismatches(kind, name, sides, inside)
-    return Comparison(tuple(mismatches), not_compared)
+        found.append(_of_name(names[0], names[2], sides, inside))
+    return Comparison(
+        tuple(pair for of_name in found for pair in of_name.mismatches),
+        tuple(pair for of_name in found for pair in of_name.late),
+        sum(of_name.left_out for of_name in found),
+        not_compared,
+    )
 
 
 def _by_name(entities: Iterable[Entity]) -> dict[tuple[str, int, str], tuple[_Side, _Side]]:
@@ -80,27 +113,52 @@ def _by_name(entities: Iterable[Entity]) -> dict[tuple[str, int, str], tuple[_Si
             kind, side = _SIDES[entity.kind]
             sides = by_name.setdefault((kind, entity.domain, entity.name), ({}, {}))
             variant = _Variant(entity.type, entity.type_hash, entity.is_transient_local)
-            sides[side].setdefault((entity.session, entity.node_key), set()).add(variant)
+            node = _Node(entity.session, entity.node_key)
+            sides[side].setdefault(node, set()).add(variant)
     return by_name
 
 
-def _may_differ(sides: tuple[_Side, _Side]) -> bool:
-    """Whether there are both sides, and not all entities are the same."""
-    return all(sides) and len(set().union(*sides[0].values(), *sides[1].values())) > 1
+def _grouped(side: _Side) -> _Groups:
+    groups: _Groups = {}
+    for node, variants in side.items():
+        groups.setdefault(frozenset(variants), []).append(node)
+    return groups
 
 
-def _size(sides: tuple[_Side, _Side]) -> int:
+def _size(sides: tuple[_Groups, _Groups]) -> int:
     return len(sides[0]) * len(sides[1])
 
 
-def _mismatches(
-    kind: str, name: str, sides: tuple[_Side, _Side], inside: Collection[str]
-) -> Iterator[MismatchStatus]:
-    for writer, reader in product(*sides):
-        if writer[0] in inside or reader[0] in inside:
-            found = _mismatch(sides[0][writer], sides[1][reader], is_topic=kind == "topic")
-            if found:
-                yield MismatchStatus(kind, name, *found, writer[1], reader[1])
+def _of_name(
+    kind: str, name: str, sides: tuple[_Groups, _Groups], inside: Collection[str]
+) -> _OfName:
+    mismatches: list[MismatchStatus] = []
+    late: list[MismatchStatus] = []
+    left_out = 0
+    for offered, requested in product(*sides):
+        differs = _mismatch(offered, requested, is_topic=kind == "topic")
+        if differs is None:
+            continue
+        rows = late if differs[0] == DURABILITY else mismatches
+        count, pairs = _with_inside(sides[0][offered], sides[1][requested], inside)
+        room = MOST_MISMATCHES_OF_NAME - len(rows)
+        rows += (
+            MismatchStatus(kind, name, *differs, writer.key, reader.key)
+            for writer, reader in islice(pairs, room)
+        )
+        left_out += max(count - room, 0) if rows is mismatches else 0
+    return _OfName(mismatches, late, left_out)
+
+
+def _with_inside(
+    writers: Collection[_Node], readers: Collection[_Node], inside: Collection[str]
+) -> tuple[int, Iterator[tuple[_Node, _Node]]]:
+    """The number of pairs with a node inside, and these pairs."""
+    writers_inside = [node for node in writers if node.session in inside]
+    readers_inside = [node for node in readers if node.session in inside]
+    others = [node for node in writers if node.session not in inside]
+    count = len(writers_inside) * len(readers) + len(others) * len(readers_inside)
+    return count, chain(product(writers_inside, readers), product(others, readers_inside))
 
 
 def _mismatch(

@@ -34,7 +34,8 @@ from rosproxy.zenoh.router_policy import InsideName
 
 MODES = ("client", "peer", "router")
 MOST_LISTED_MISMATCHES = 100
-"""Mismatches that the status lists, with fair shares by the address inside."""
+"""Mismatches that the status lists, with fair shares by the address inside. As many pairs that
+differ in durability alone are listed, too; further ones are not counted."""
 _PlacedSession = tuple[int | None, RouterSession, Ends]
 """A session with the port of its router, which is None for the hub, and with both ends."""
 
@@ -120,13 +121,14 @@ class ZenohState(Collector):
             return self._status_of_routers(failure)
         by_zid = {session.peer: (port, session, ends) for port, session, ends in self._sessions}
         nodes = tuple(_node_status(node, by_zid.get(node.session)) for node in self._graph.nodes)
-        mismatches = self._comparison.mismatches
         addresses = {node.key: node.address for node in nodes if node.port is not None}
 
         def owner(pair: MismatchStatus) -> str:
             return addresses.get(pair.writer, addresses.get(pair.reader, ""))
 
+        mismatches = self._comparison.mismatches
         shown = fair_choice(mismatches, owner, MOST_LISTED_MISMATCHES)
+        late = fair_choice(self._comparison.late, owner, MOST_LISTED_MISMATCHES)
         return replace(
             self._status_of_routers(failure),
             sessions=tuple(
@@ -137,8 +139,8 @@ class ZenohState(Collector):
             ),
             nodes=nodes,
             left_out=self._left_out,
-            mismatches=tuple(shown),
-            mismatches_left_out=len(mismatches) - len(shown),
+            mismatches=(*shown, *late),
+            mismatches_left_out=self._comparison.left_out + len(mismatches) - len(shown),
             not_compared=self._comparison.not_compared,
         )
 

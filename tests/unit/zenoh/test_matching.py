@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import MismatchStatus
-from rosproxy.zenoh.matching import MOST_COMPARED_PAIRS, Comparison, compare
+from rosproxy.zenoh.matching import MOST_COMPARISONS, MOST_MISMATCHES_OF_NAME, Comparison, compare
 from rosproxy.zenoh.protocol.liveliness import Entity, EntityKind
 
 STRING = "std_msgs::msg::dds_::String_"
@@ -26,7 +26,9 @@ def subscription(node: str = "/listener", session: str = OUTSIDE, **changes: Any
 
 
 def found(*entities: Entity) -> tuple[MismatchStatus, ...]:
-    return compare(entities, {INSIDE}).mismatches
+    comparison = compare(entities, {INSIDE})
+    assert not comparison.not_compared
+    return comparison.mismatches + comparison.late
 
 
 def test_nodes_with_the_same_key_match() -> None:
@@ -82,12 +84,29 @@ def test_other_domains_and_pairs_outside_are_not_compared() -> None:
     assert found(publisher(session=OUTSIDE), subscription(session=INSIDE, type=NUMBER))
 
 
-def test_a_name_with_too_many_pairs_hides_no_other_name() -> None:
-    flood = [publisher(f"/p{n}", OUTSIDE, name="/flood") for n in range(200)]
-    flood += [subscription(f"/s{n}", INSIDE, name="/flood", type=NUMBER) for n in range(200)]
+def test_nodes_with_the_same_entities_are_compared_once() -> None:
+    many = [publisher(f"/p{n}") for n in range(300)]
+    many += [subscription(f"/s{n}", is_transient_local=n == 0) for n in range(300)]
+    comparison = compare((*many, subscription(type=NUMBER)), {INSIDE})
+    assert len(comparison.mismatches) == len(comparison.late) == MOST_MISMATCHES_OF_NAME
+    assert comparison.left_out == 300 - MOST_MISMATCHES_OF_NAME, "late pairs are not counted"
+    assert not comparison.not_compared
+
+
+def test_a_name_with_too_many_entities_hides_no_other_name() -> None:
+    flood = [publisher(f"/p{n}", OUTSIDE, name="/flood", type=f"p{n}") for n in range(101)]
+    flood += [subscription(f"/s{n}", INSIDE, name="/flood", type=f"s{n}") for n in range(101)]
     comparison = compare((*flood, publisher(), subscription(type=NUMBER)), {INSIDE})
     assert [pair.name for pair in comparison.mismatches] == ["/chatter"]
-    assert comparison.not_compared == 200 * 200 > MOST_COMPARED_PAIRS
+    assert comparison.not_compared == 101 * 101 > MOST_COMPARISONS
+
+
+def test_the_mismatches_of_a_name_are_counted() -> None:
+    flood = [publisher(f"/p{n}", name="/flood") for n in range(4000)]
+    flood += [subscription(f"/s{n}", INSIDE, name="/flood", type=NUMBER) for n in range(4000)]
+    comparison = compare((*flood, publisher(), subscription(type=NUMBER)), {INSIDE})
+    assert len(comparison.mismatches) == MOST_MISMATCHES_OF_NAME + 1
+    assert comparison.left_out == 4000 * 4000 - MOST_MISMATCHES_OF_NAME
 
 
 def test_a_flood_of_types_is_shortened() -> None:
@@ -118,7 +137,7 @@ def test_nodes_that_share_a_key_differ_in_durability_alone(entities: list[Entity
     }
     comparison = compare(entities, {INSIDE})
     assert not comparison.not_compared
-    for pair in comparison.mismatches:
+    for pair in (*comparison.mismatches, *comparison.late):
         sides = [
             {
                 (entity.type, entity.type_hash)
@@ -129,3 +148,28 @@ def test_nodes_that_share_a_key_differ_in_durability_alone(entities: list[Entity
         ]
         assert all(sides)
         assert sides[0].isdisjoint(sides[1]) is (pair.policy != "durability")
+    assert all(pair.policy == "durability" for pair in comparison.late)
+
+
+@given(st.lists(ENTITIES, max_size=12))
+def test_every_pair_that_shares_no_key_is_found(entities: list[Entity]) -> None:
+    """The simple way: compare each publisher with each subscription."""
+    by_node: dict[tuple[str, str], set[tuple[str, str]]] = {}
+    for entity in entities:
+        if entity.name == "/x" and entity.domain == 0:
+            key = (entity.kind.value, entity.node_key)
+            by_node.setdefault(key, set()).add((entity.type, entity.type_hash))
+    expected = {
+        (writer, reader)
+        for (kind, writer), offered in by_node.items()
+        for (other, reader), requested in by_node.items()
+        if (kind, other) == ("MP", "MS")
+        and offered.isdisjoint(requested)
+        and f"0 {INSIDE}." in (writer[:5], reader[:5])
+    }
+    told = {
+        (pair.writer, pair.reader)
+        for pair in compare(entities, {INSIDE}).mismatches
+        if pair.kind == "topic" and pair.name == "/x" and pair.writer.startswith("0")
+    }
+    assert told == expected
