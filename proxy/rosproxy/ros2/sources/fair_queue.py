@@ -207,8 +207,12 @@ class DiscoveryQueue(Generic[Item]):
         """Add a datagram; see `FairQueue.put`."""
         if not self._queues[standing]:
             busy = [self._used[other] for other, queue in self._queues.items() if queue]
-            # Silence saves nothing, as in `FairQueue`.
-            self._used[standing] = max(self._used[standing], min(busy, default=0))
+            if busy:
+                # Silence saves nothing, as in `FairQueue`.
+                self._used[standing] = max(self._used[standing], min(busy))
+            else:
+                # No standing had to wait for what another one has used alone.
+                self._used = dict.fromkeys(Standing, 0)
         return self._queues[standing].put(source, item, size, key)
 
     def replace(self, key: Hashable, item: Item) -> bool:

@@ -232,3 +232,17 @@ def test_a_full_queue_looks_for_the_largest_source_only_for_a_smaller_one(
     assert not searches
     assert queue.put("a smaller one", 0, 0)
     assert searches == ["largest"]
+
+
+def test_a_standing_owes_nothing_for_what_was_read_while_no_other_waited() -> None:
+    """After a busy day, forged sources alone were read for minutes, and proven sources waited."""
+    queue = DiscoveryQueue[int]()
+    for number in range(100):
+        queue.put("busy", Standing.PROVEN, number, 0)
+        queue.pop()
+        queue.charge("busy", 1000 * OVERHEAD_BYTES)
+    for number in range(10):
+        queue.put("forged", Standing.OUTSIDE, number, 0)
+        queue.put("busy", Standing.PROVEN, number, 0)
+    sources = [waiting.source for _ in range(10) if (waiting := queue.pop())]
+    assert Counter(sources) == {"busy": 5, "forged": 5}
