@@ -66,11 +66,11 @@ class FairQueue(Generic[Item]):
     _waiting: dict[str, deque[Waiting[Item]]] = field(default_factory=dict)
     _replaceable: dict[Hashable, Waiting[Item]] = field(default_factory=dict)
     _sizes: dict[str, int] = field(default_factory=dict)
-    _order: list[tuple[int, int, str]] = field(default_factory=list)
+    _order: list[tuple[float, int, str]] = field(default_factory=list)
     _arrivals: int = 0
-    _next: dict[str, int] = field(default_factory=dict)
+    _next: dict[str, float] = field(default_factory=dict)
     _silent: OrderedDict[str, None] = field(default_factory=OrderedDict)
-    _now: int = 0
+    _now: float = 0.0
     _size: int = 0
 
     def __bool__(self) -> bool:
@@ -90,7 +90,7 @@ class FairQueue(Generic[Item]):
         if source not in self._waiting:
             self._waiting[source] = deque()
             self._silent.pop(source, None)
-            self._next[source] = max(self._now, self._next.get(source, 0))
+            self._next[source] = max(self._now, self._next.get(source, 0.0))
             self._line_up(source)
         self._waiting[source].append(waiting)
         self._count(source, waiting.size)
@@ -119,7 +119,8 @@ class FairQueue(Generic[Item]):
         """Add bytes to the used share of a source."""
         if source in self._next:
             self._next[source] += size
-            self._now += size // max(len(self._waiting), 1)
+            # In fractions: more sources may wait than a datagram has bytes.
+            self._now += size / max(len(self._waiting), 1)
 
     def _line_up(self, source: str) -> None:
         """Give a source its place in the order. Of equal shares, the first to arrive goes first."""

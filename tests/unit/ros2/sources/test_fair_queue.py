@@ -119,6 +119,22 @@ def test_new_sources_that_come_all_the_time_delay_none_that_comes_back() -> None
     assert counts["newcomer"] >= 18
 
 
+def test_new_sources_delay_none_that_comes_back_although_a_crowd_waits() -> None:
+    """With more waiting sources than bytes in a datagram, the line of shares stood still."""
+    count = 2 * OVERHEAD_BYTES
+    queue = FairQueue[int](most_sources=count)
+    for number in range(count - 1):
+        queue.put(f"new {number}", number, 0)
+    queue.put("comes back", 0, 0)
+    counts = Counter[str]()
+    for number in range(10 * count):
+        (source,) = taken(queue, 1)
+        kind = source.partition(" ")[0]
+        counts[kind] += 1
+        queue.put(source if kind == "comes" else f"new {count + number}", number, 0)
+    assert 9 <= counts["comes"] <= 11
+
+
 def test_made_up_sources_are_not_remembered() -> None:
     """The queue remembered all of them, and searched all at each datagram: 1.6 ms with 16,000."""
     queue = FairQueue[int](most_sources=10)
