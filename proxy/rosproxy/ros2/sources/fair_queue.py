@@ -28,6 +28,9 @@ MOST_PROVEN_SOURCES = 2048
 datagrams in a second."""
 MOST_UNPROVEN_SOURCES = 256
 """Sources that may wait, for each of the two other standings."""
+MOST_SEARCHED = 256
+"""Waiting sources among which each datagram may search the largest. With 256 sources a search takes
+0.02 ms."""
 OVERHEAD_BYTES = 256
 """Bytes that are added to the length of each datagram."""
 
@@ -142,7 +145,8 @@ class FairQueue(Generic[Item]):
     def _make_room(self, waiting: Waiting[Item]) -> bool:
         """Return whether an item fits. If necessary, drop the last items of the largest source.
 
-        Only an item of a source with less than a fair share makes the largest source lose items.
+        Only an item of a smaller source makes the largest source lose items. If more than
+        `MOST_SEARCHED` sources wait, the smaller source must also have less than a fair share.
         """
         source = waiting.source
         if source not in self._waiting and len(self._waiting) >= self.most_sources:
@@ -150,9 +154,10 @@ class FairQueue(Generic[Item]):
         size = self._sizes.get(source, 0) + waiting.size
         if size > self.most_bytes_per_source:
             return False
-        # In an overload most items end here, before the search for the largest source.
+        # In an overload with many sources, most items end here, before the search.
         is_full = self._size + waiting.size > self.most_bytes
-        if is_full and size * len(self._waiting) > self.most_bytes:
+        exceeds_share = size * len(self._waiting) > self.most_bytes
+        if is_full and exceeds_share and len(self._waiting) > MOST_SEARCHED:
             return False
         while self._size + waiting.size > self.most_bytes:
             largest = max(self._sizes, key=self._sizes.__getitem__)

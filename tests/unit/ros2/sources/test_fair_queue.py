@@ -230,6 +230,17 @@ def test_a_standing_pays_for_what_its_datagrams_lead_to() -> None:
     assert Counter(sources) == {"announces": 2, "other": 20}
 
 
+def test_of_few_sources_always_the_largest_loses() -> None:
+    """A node lost half of its discovery, because others at their bound had filled the queue."""
+    queue = FairQueue[int](100, most_bytes=400 * OVERHEAD_BYTES)
+    for number in range(80):
+        assert queue.put(f"little {number}", number, 0)
+    for number in range(160):
+        assert queue.put("much", number, 0)
+        assert queue.put("as much", number, 0)
+    assert all(queue.put("node", number, 0) for number in range(50))
+
+
 def test_a_full_queue_looks_for_the_largest_source_only_for_a_smaller_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -240,6 +251,7 @@ def test_a_full_queue_looks_for_the_largest_source_only_for_a_smaller_one(
         searches.extend(["largest"] if options else [])
         return max(*sizes, **options)
 
+    monkeypatch.setattr(fair_queue, "MOST_SEARCHED", 6)
     queue = FairQueue[int](8, most_bytes=24 * OVERHEAD_BYTES)
     for number in range(24):
         assert queue.put(str(number % 7), number, 0)
