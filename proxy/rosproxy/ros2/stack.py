@@ -5,7 +5,6 @@ import logging
 import secrets
 import time
 from collections.abc import Collection, Mapping, Sequence
-from functools import lru_cache
 from itertools import chain
 from typing import Any
 
@@ -74,8 +73,7 @@ class Ros2:
         self._settings = runtime.settings
         self.servers: list[DomainServer] = []
         self._hosts: tuple[str, ...] = ()
-        # A lookup takes 20 us, and an announcement goes to hundreds of participants inside.
-        self._address_towards = lru_cache(MOST_ROUTES)(address_towards)
+        self._routes: dict[str, str] = {}
         ports = runtime.settings.ports.listen
         self._kernel_ports = kernel_ports = KernelPorts(PortPool(ports))
         table = KernelTable(DatagramTable(ports), Tools())
@@ -257,6 +255,20 @@ class Ros2:
             for index in range(count)
         ]
 
+    def _address_towards(self, address: str) -> str:
+        """The proxy's own address on the way to an address, as of the last look at the networks.
+
+        A lookup takes 20 us, and an announcement goes to hundreds of participants inside.
+        """
+        own_address = self._routes.get(address)
+        if own_address is None:
+            own_address = address_towards(address)
+            # Without a route, look again: the proxy may join the network at any time, and Fast DDS
+            # accepts no new locators of a known participant.
+            if len(self._routes) < MOST_ROUTES and not addresses.is_loopback(own_address):
+                self._routes[address] = own_address
+        return own_address
+
     def _is_inside(self, address: str) -> bool:
         is_peer = address in self._peer_addresses
         return not is_peer and addresses.is_inside(address, self.networks)
@@ -364,7 +376,7 @@ class Ros2:
             server.set_peers(addresses_of_all)
 
     def _look_at_networks(self) -> None:
-        self._address_towards.cache_clear()
+        self._routes.clear()
         own_networks = {network: address_into(network) for network in interface_networks()}
         self.networks = self._settings.inside_networks or networks_inside(own_networks, self._hosts)
         own_addresses = {address_into(network) for network in self.networks}

@@ -133,6 +133,17 @@ async def test_the_way_to_an_address_is_looked_up_once_between_two_looks_at_the_
     assert looked_up.count("172.30.0.5") == 2
 
 
+async def test_an_address_without_a_way_is_looked_up_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The proxy announced loopback to participants of a network that it had just joined again."""
+    found = iter(["127.0.0.1", "172.30.0.2"])
+    told: dict[str, Any] = {"ros": ("2",), "advertise_host": "127.0.0.1"}
+    told |= {"port_range": "45000-45015", "inside_network": ("172.30.0.0/24",)}
+    monkeypatch.setattr(stack, "address_towards", lambda _: next(found))
+    ros2 = Ros2(Runtime(parse_settings(told)))
+    assert ros2._address_towards("172.30.0.5") == "127.0.0.1"
+    assert [ros2._address_towards("172.30.0.5") for _ in range(2)] == ["172.30.0.2"] * 2
+
+
 async def test_a_peer_on_loopback_may_be_inside_as_well() -> None:
     """In a trial on a single machine both sides may have the same address."""
     told: dict[str, Any] = {"ros": ("2",), "advertise_host": "127.0.0.1"}
