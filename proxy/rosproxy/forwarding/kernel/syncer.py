@@ -43,7 +43,8 @@ FORWARD_TIMEOUT_S = 1.0
 """Most seconds for which the requestTopic of a subscriber waits for the forward."""
 DATAGRAM_PAUSE_S = 0.1
 """Seconds after a comparison of all ports for datagrams in which no further comparison begins. A
-participant may change its ports with each announcement. Meanwhile user space passes datagrams."""
+participant may change its ports with each announcement. Meanwhile user space passes the datagrams
+at a new port, and the kernel still forwards a port that has changed to the former locator."""
 MOST_LINES = 200
 """Changed forwards that the log names in `LINES_PERIOD_S`. A node may change its ports again and
 again."""
