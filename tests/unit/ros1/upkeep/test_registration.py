@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import pytest
 
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.registry.endpoint import Registration
+from rosproxy.ros1.registry.endpoint import MOST_CALLERS, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.upkeep.decisions import registration as decisions
 from tests.unit.builders import (
@@ -151,6 +151,24 @@ def test_what_a_process_that_is_gone_has_left_behind(
         endpoint, said(published, subscribed), before=10.0
     )
     assert [registration.key for registration in left_over] == [row[:3] for row in left]
+
+
+def test_a_node_with_another_name_after_each_start_keeps_room_for_the_next() -> None:
+    """An anonymous node at a fixed port that was killed 64 times could register no more."""
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    names = [f"/n_{number}" for number in range(MOST_CALLERS)]
+    registry = addressing.registry
+    for number, name in enumerate(names):
+        assert registry.reason_full(endpoint, name) is None
+        registry.register(endpoint, Registration(PUB, "/t", name, since=float(number)))
+    assert registry.reason_full(endpoint, "/next")
+    before = float(MOST_CALLERS)
+    left_over = decisions.left_over_registrations(endpoint, said({"/t"}), before)
+    assert [r.caller_id for r in left_over] == names[:1]
+    registry.unregister(PUB, "/t", names[0])
+    assert registry.reason_full(endpoint, "/next") is None
+    assert decisions.left_over_registrations(endpoint, said({"/t"}), before) == []
 
 
 def test_topics_that_a_node_has_and_the_master_does_not_know_of() -> None:

@@ -11,12 +11,18 @@ itself says (`NodeInfo`). A node names its topics, but not its services and para
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 from rosproxy.net.addresses import is_loopback
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS, Kind, method_spec
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
+from rosproxy.ros1.registry.endpoint import (
+    MOST_CALLERS,
+    Endpoint,
+    EndpointRegistration,
+    Registration,
+)
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, NodeInfo
 
 MethodCall = tuple[str, list[Any]]
@@ -128,6 +134,8 @@ def left_over_registrations(
     - All registrations of a node name are left over under two conditions. Another name has
       registered since. And the node names no topic of the first name, apart from /rosout, which
       nearly every node has.
+    - All registrations of the oldest name are left over if the endpoint has MOST_CALLERS names. A
+      node that takes another name with each start, at the same port, has the same topics each time.
 
     Registrations made after ``before`` are never left over.
     """
@@ -139,6 +147,9 @@ def left_over_registrations(
         return is_conclusive and info.holds(registration) is not False
 
     live_names = {r.caller_id for r in registrations if r is newest or may_hold(r)}
+    by_age = sorted(registrations, key=lambda r: r.since, reverse=True)
+    newest_names = dict.fromkeys(r.caller_id for r in by_age if r.caller_id in live_names)
+    live_names = set(islice(newest_names, MOST_CALLERS - 1))
     gone = vanished_topics(endpoint, info, before)
     return [
         r
