@@ -332,13 +332,16 @@ class Endpoint:
 
     def reason_full(self, caller_id: str) -> str | None:
         """Why the endpoint accepts no more registrations of a node name; None if there is room."""
-        for count, most, label in (
-            (len(self.registrations), MOST_REGISTRATIONS, "registrations"),
-            (self.characters, MOST_CHARACTERS, "characters of registered names"),
-            (len(self.callers.keys() - {caller_id}), MOST_CALLERS, "node names"),
+        others = len(self.callers.keys() - {caller_id})
+        divide = "Divide the topics and services among several nodes"
+        for count, most, label, fix in (
+            (len(self.registrations), MOST_REGISTRATIONS, "registrations", divide),
+            (self.characters, MOST_CHARACTERS, "characters of registered names", divide),
+            (others, MOST_CALLERS, "node names", "Start the node with the same name each time"),
         ):
             if count >= most:
-                return f"the node at {self.uri} has {count} {label}, at most {most} are accepted"
+                text = f"the node at {self.uri} has {count} {label}, at most {most} are accepted"
+                return f"{text}. {fix}"
         return None
 
     @property

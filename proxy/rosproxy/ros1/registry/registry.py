@@ -26,7 +26,7 @@ MOST_ADMISSIONS = 16
 address, or from a few on a machine with several networks."""
 MOST_REGISTRATIONS_OF_SOURCE = 50_000
 """The highest number of registrations of all endpoints of a source. A thousand nodes of a machine
-have twenty registrations each. Each takes 400 bytes and the names."""
+have twenty registrations each. Each takes 600 bytes and the names."""
 MOST_CHARACTERS_OF_SOURCE = 10_000_000
 """The highest number of characters of all names and types that a source has registered."""
 UNPROVEN_DIVISOR = 4
@@ -211,7 +211,10 @@ class Registry:
             (self._characters_of[source], MOST_CHARACTERS_OF_SOURCE, "characters of names"),
         ):
             if count >= most:
-                return f"the nodes of {source} have {count} {label}, at most {most} are accepted"
+                return (
+                    f"the nodes of {source} have {count} {label}, at most {most} are accepted. Run "
+                    "some of these nodes at another address, such as in another container"
+                )
         return endpoint.reason_full(caller_id)
 
     def register(self, endpoint: Endpoint, registration: Registration) -> None:

@@ -481,7 +481,9 @@ def test_a_source_has_so_many_registrations_at_most(
             register(registry, endpoint, PUB, f"/t{number}", f"/node{endpoint.port}")
     assert (len(first.registrations), len(second.registrations)) == (2, 2)
     assert len(other.registrations) == 3
-    assert label in (registry.reason_full(second, "/n") or "")
+    reason = registry.reason_full(second, "/n") or ""
+    assert label in reason
+    assert "are accepted. Run some of these nodes at another address" in reason
     assert registry.reason_full(other, "/n") is None
     register(registry, first, PUB, "/t0", f"/node{first.port}")
     registry.remove(second)
@@ -498,7 +500,8 @@ def test_an_endpoint_has_so_many_node_names_at_most() -> None:
     for number in range(MOST_CALLERS + 10):
         register(registry, endpoint, PUB, "/t", f"/n{number}")
     assert endpoint.caller_ids == sorted(f"/n{number}" for number in range(MOST_CALLERS))
-    assert "64 node names, at most 64" in (endpoint.reason_full("/another") or "")
+    reason = endpoint.reason_full("/another") or ""
+    assert "64 node names, at most 64 are accepted. Start the node with the same name" in reason
     assert endpoint.reason_full("/n0") is None
 
 
