@@ -27,15 +27,19 @@ class BoundedServer(web.Server):
     """Answers requests on at most ``most`` connections from each address, and MOST_IN_ALL in all.
 
     For a further connection, the oldest connection of the address ends, or the oldest connection of
-    the address with the most connections.
+    the address with the most connections. If several addresses have the most, connections without a
+    request under way end first: an operator holds a connection, and waits for changes.
     """
 
     def __init__(self, answer: Answer, most: int) -> None:
         # Compressed bodies stay compressed: a small body could expand to a very large body.
         super().__init__(
-            answer, access_log=None, keepalive_timeout=IDLE_TIMEOUT_S, auto_decompress=False
+            self._answer, access_log=None, keepalive_timeout=IDLE_TIMEOUT_S, auto_decompress=False
         )
         self.most = most
+        self._make_reply = answer
+        self._busy = set[web.RequestHandler]()
+        """The connections with a request under way."""
         self._by_source: dict[object, dict[web.RequestHandler, None]] = {}
         """The connections of each source, oldest first."""
 
@@ -47,9 +51,9 @@ class BoundedServer(web.Server):
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         source = _source(handler)
         if len(self._by_source.get(source, ())) >= self.most:
-            self._end_oldest(source)
+            self._end(next(iter(self._by_source[source])))
         elif sum(map(len, self._by_source.values())) >= MOST_IN_ALL:
-            self._end_oldest(max(self._by_source, key=lambda s: len(self._by_source[s])))
+            self._end(self._least_useful())
         self._by_source.setdefault(source, {})[handler] = None
         super().connection_made(handler, transport)
 
@@ -60,13 +64,25 @@ class BoundedServer(web.Server):
         self._forget(handler)
         super().connection_lost(handler, exc)
 
-    def _end_oldest(self, source: object) -> None:
-        oldest = next(iter(self._by_source[source]))
-        self._forget(oldest)
+    async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
+        self._busy.add(request.protocol)
+        try:
+            return await self._make_reply(request)
+        finally:
+            self._busy.discard(request.protocol)
+
+    def _least_useful(self) -> web.RequestHandler:
+        """The connection that ends if there are MOST_IN_ALL."""
+        most = max(map(len, self._by_source.values()))
+        crowd = [c for same in self._by_source.values() if len(same) == most for c in same]
+        return next((c for c in crowd if c not in self._busy), crowd[0])
+
+    def _end(self, handler: web.RequestHandler) -> None:
+        self._forget(handler)
         # After a mere close the kernel would keep bytes that the reader has not taken.
-        if oldest.transport is not None:
-            oldest.transport.abort()
-        oldest.force_close()
+        if handler.transport is not None:
+            handler.transport.abort()
+        handler.force_close()
 
     def _forget(self, handler: web.RequestHandler) -> None:
         source = _source(handler)

@@ -8,6 +8,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
 import pytest
+from aiohttp import web
 from msgspec.structs import replace
 
 from examples.demo.fake_node import FakeNode
@@ -16,6 +17,7 @@ from rosproxy.admin.admin_server import MOST_CONNECTIONS, MOST_REPLIES, MOST_REP
 from rosproxy.admin.replies import PIECE_BYTES, REPLY_TIMEOUT
 from rosproxy.admin.status_bounds import MOST_BYTES
 from rosproxy.admin.status_document import ProblemStatus
+from rosproxy.net.bounded_server import BoundedServer
 from tests.clock import pass_time
 from tests.integration.admin_calls import tell
 from tests.integration.conftest import MakeProxy
@@ -251,3 +253,32 @@ async def test_many_addresses_have_so_many_connections_in_all(
         for wire in wires[2:]:
             await wire.send(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
             assert (await wire.reply()).status == 200
+
+
+async def test_many_addresses_end_no_request_that_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An operator that waits for changes was the first to go: it had connected first."""
+    monkeypatch.setattr("rosproxy.net.bounded_server.MOST_IN_ALL", 4)
+    is_asked = asyncio.Event()
+    is_changed = asyncio.Event()
+
+    async def answer(request: web.BaseRequest) -> web.Response:
+        if request.path == "/changes":
+            is_asked.set()
+            await is_changed.wait()
+        return web.Response()
+
+    runner = web.ServerRunner(BoundedServer(answer, 2))
+    await runner.setup()
+    await web.TCPSite(runner, HOST, 0).start()
+    address = runner.addresses[0][:2]
+    async with AsyncExitStack() as stack:
+        stack.push_async_callback(runner.cleanup)
+        operator = await stack.enter_async_context(connect(address, "127.0.5.1"))
+        await operator.send(b"GET /changes HTTP/1.1\r\nHost: x\r\n\r\n")
+        await is_asked.wait()
+        for number in range(2, 10):
+            wire = await stack.enter_async_context(connect(address, f"127.0.5.{number}"))
+            await wire.send(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
+            assert (await wire.reply()).status == 200
+        is_changed.set()
+        assert (await operator.reply()).status == 200
