@@ -223,8 +223,11 @@ class Registry:
         As at the master, a service has a single provider, and a name that registers with another
         URI loses all its former registrations (rosmaster/registrations.py). A registration beyond a
         bound is left out. The proxy refuses such a registration from a node earlier, so this
-        concerns data from the master or from a node's own lists.
+        concerns data from the master or from a node's own lists. So is a registration at an
+        endpoint that has been removed meanwhile: nothing would take it out again.
         """
+        if self.by_port.get(endpoint.port) is not endpoint:
+            return
         self.changes += 1
         former = endpoint.registrations.get(registration.key)
         if registration.characters > LONGEST_REGISTRATION or (

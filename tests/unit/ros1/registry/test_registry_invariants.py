@@ -1,5 +1,6 @@
 """The registry's tables agree with each other after any sequence of operations."""
 
+from collections import Counter
 from typing import Any
 
 from hypothesis import settings
@@ -101,18 +102,41 @@ class Registries(RuleBasedStateMachine):
             self.registry.remove(endpoint)
             self.expected = {k: e for k, e in self.expected.items() if e is not endpoint}
 
-    @rule(data=st.data(), kind=KINDS, name=NAMES, caller_id=CALLERS)
-    def register(self, data: st.DataObject, kind: Kind, name: str, caller_id: str) -> None:
+    @rule(
+        data=st.data(),
+        kind=KINDS,
+        name=NAMES,
+        caller_id=CALLERS,
+        type_=st.sampled_from(["*", "std_msgs/String"]),
+        hidden=st.booleans(),
+    )
+    def register(
+        self,
+        data: st.DataObject,
+        kind: Kind,
+        name: str,
+        caller_id: str,
+        type_: str,
+        hidden: bool,
+    ) -> None:
         endpoint = self.draw(data)
         if endpoint is None:
             return
-        self.registry.register(endpoint, Registration(kind, name, caller_id))
+        self.registry.register(endpoint, Registration(kind, name, caller_id, type_, hidden=hidden))
         kept = self.expected.items()
         self.expected = {k: e for k, e in kept if k[2] != caller_id or e is endpoint}
         if kind is Kind.SERVICE:
             kept = self.expected.items()
             self.expected = {k: e for k, e in kept if k[:2] != (kind, name)}
         self.expected[kind, name, caller_id] = endpoint
+
+    @rule(data=st.data(), kind=KINDS, name=NAMES, caller_id=CALLERS)
+    def register_too_late(self, data: st.DataObject, kind: Kind, name: str, caller_id: str) -> None:
+        """The lease has ended while the proxy asked the node or the master."""
+        former = list(self.registry._former.values())
+        if former:
+            endpoint = data.draw(st.sampled_from(former))
+            self.registry.register(endpoint, Registration(kind, name, caller_id))
 
     @rule(kind=KINDS, name=NAMES, caller_id=CALLERS)
     def unregister(self, kind: Kind, name: str, caller_id: str) -> None:
@@ -208,6 +232,16 @@ class Registries(RuleBasedStateMachine):
         }
         assert holders == self.expected
         assert all(self.registry._holders.values())
+        hidden = {r.key: e for e, r in self.registry.registrations() if r.hidden}
+        assert {r.key: e for e, r in self.registry.hidden_registrations()} == hidden
+        assert all(self.registry._hidden.values())
+        counts = Counter[str]()
+        characters = Counter[str]()
+        for endpoint, registration in self.registry.registrations():
+            counts[endpoint.source] += 1
+            characters[endpoint.source] += registration.characters
+        assert dict(self.registry._registrations_of) == dict(counts)
+        assert dict(self.registry._characters_of) == dict(characters)
         services = {key[1] for key in self.expected if key[0] is Kind.SERVICE}
         assert set(self.registry.services) == services
 
