@@ -53,16 +53,12 @@ async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding
     running = [proxy for proxy in status["proxies"] if proxy["state"] == "running"]
     # A silent proxy without a problem has just been started.
     asked = [p["name"] for p in running if p["reachable"] or f"proxy {p['name']}" in subjects]
-    findings_by_proxy = await asyncio.gather(*map(ask, asked))
-    served = served_participants(status)
-    return [
-        *host_findings(status),
-        *(
-            finding
-            for finding in without_names_of_others(findings_by_proxy, names)
-            if not _is_of_another_proxy(finding, served)
-        ),
-    ]
+    findings = without_names_of_others(await asyncio.gather(*map(ask, asked)), names)
+    if any(map(_participant_of, findings)):
+        # A proxy may have begun to serve a participant while the doctors ran.
+        served = served_participants(status) | served_participants(await host.now())
+        findings = [f for f in findings if _participant_of(f) not in served]
+    return [*host_findings(status), *findings]
 
 
 def served_participants(status: Json) -> frozenset[str]:
@@ -71,14 +67,14 @@ def served_participants(status: Json) -> frozenset[str]:
     return frozenset(p["guid_prefix"] for p in participants)
 
 
-def _is_of_another_proxy(finding: DoctorFinding, served: frozenset[str]) -> bool:
-    """Whether a finding is about a participant that another proxy of this host serves.
+def _participant_of(finding: DoctorFinding) -> str:
+    """Return the GUID prefix of a participant that another proxy of this host may serve, or empty.
 
     The doctor of a proxy knows no other proxy. So the doctor warns that such a participant is in
     another domain, or announces itself on its own machine only.
     """
     is_about_participant = finding.check in (OTHER_DOMAIN, OWN_MACHINE)
-    return is_about_participant and finding.subject.rpartition(" ")[2] in served
+    return finding.subject.rpartition(" ")[2] if is_about_participant else ""
 
 
 def host_findings(status: Json) -> Iterator[DoctorFinding]:

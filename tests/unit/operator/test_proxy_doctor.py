@@ -165,10 +165,14 @@ def test_a_name_that_no_proxy_knows_is_told_by_each() -> None:
     assert found == [unknown[0], about_another, unknown[1]]
 
 
+@pytest.mark.parametrize("is_new", [False, True])
 def test_a_participant_of_another_domains_proxy_is_not_missed(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, is_new: bool
 ) -> None:
-    """Two proxies on the same network, each for a domain, hear the participants of both."""
+    """Two proxies on the same network, each for a domain, hear the participants of both.
+
+    A proxy may begin to serve a participant (``is_new``) while the doctors run.
+    """
     ours = warning("domain", "01.0f.aa", "is in domain 5, but this proxy serves domain 0")
     lost = warning("domain", "01.0f.bb", "is in domain 9, but this proxy serves domain 0")
     said = json.dumps(as_json([ours, lost])).encode()
@@ -179,17 +183,19 @@ def test_a_participant_of_another_domains_proxy_is_not_missed(
             {"name": "p0", "state": "running", "reachable": True},
             {"name": "p1", "state": "running", "reachable": False},
         ],
-        "containers": [container],
         "actions": [],
         "operator": None,
     }
+    is_served = not is_new
 
     class Host:
         async def now(self) -> object:
-            return status
+            return {**status, "containers": [container] if is_served else []}
 
     class Engine:
         def run(self, *_: str) -> bytes:
+            nonlocal is_served
+            is_served = True
             return said
 
     monkeypatch.setattr(docker_doctor, "DockerClient", Engine)
