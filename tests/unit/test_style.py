@@ -18,6 +18,8 @@ RIDDLES = re.compile(
     re.IGNORECASE,
 )
 """Pronouns in the place of the noun that a reader looks for."""
+PARTS_OF_RIDDLES = re.compile("who|body", re.IGNORECASE)
+"""Every riddle has one of these. Sources without are not parsed."""
 CODE_IN_TEXT = re.compile(r"`[^`]*`")
 
 
@@ -56,6 +58,8 @@ def texts_of_page(page: str) -> Iterator[tuple[int, str]]:
 def riddles(path: Path) -> list[str]:
     """The sentences of a file that hide their noun, each with its place."""
     source = path.read_text()
+    if not PARTS_OF_RIDDLES.search(source):
+        return []
     texts = texts_of_python(source) if path.suffix == ".py" else texts_of_page(source)
     name = path.relative_to(ROOT)
     return [

@@ -58,9 +58,9 @@ class Invariants:
     def own(self, *states: str, role: str = "") -> list[tuple[Box, OwnLabels]]:
         """The operator's containers."""
         return [
-            (box, box.own)
+            (box, own)
             for box in self.engine.boxes
-            if box.own and (not states or box.state in states) and role in ("", box.role)
+            if (not states or box.state in states) and (own := box.own) and role in ("", own.role)
         ]
 
     def boxes(self, *states: str, role: str = "") -> list[Box]:

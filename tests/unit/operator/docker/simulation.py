@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
@@ -71,6 +72,12 @@ class Refused(Failed):
         self.port = port
 
 
+@lru_cache(maxsize=4096)
+def _own(name: str, labels: tuple[tuple[str, str], ...]) -> OwnLabels | None:
+    own = read_own(dict(labels))
+    return own if own and has_own_name(own, name) else None
+
+
 @dataclass
 class Box:
     """A container of the engine. ``networks`` holds ids and names by network.
@@ -100,8 +107,7 @@ class Box:
         """The operator's labels, if the name agrees. The simulation knows no other sign of
         forgery.
         """
-        labels = read_own(self.labels)
-        return labels if labels and has_own_name(labels, self.name) else None
+        return _own(self.name, tuple(self.labels.items()))
 
     @property
     def role(self) -> str:
