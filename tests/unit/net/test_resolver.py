@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import threading
+from collections import OrderedDict
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from rosproxy.net import resolver
 from rosproxy.net.resolver import (
     MOST_FOR_NODES,
-    MOST_FOR_OTHERS,
+    MOST_FOR_SOURCES,
     MOST_LOOKUPS,
     MOST_PER_SOURCE,
     NODES,
@@ -42,6 +43,7 @@ async def server(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[NameServer]:
     monkeypatch.setattr(socket, "getaddrinfo", made.getaddrinfo)
     monkeypatch.setattr(resolver, "RESOLVE_TIMEOUT_S", 0.01)
     monkeypatch.setattr(resolver, "_running", {})
+    monkeypatch.setattr(resolver, "_resolved", OrderedDict())
     yield made
     made.ended.set()
     await all_ended()
@@ -55,8 +57,8 @@ async def find(host: str, source: str = "") -> list[str]:
     return addresses
 
 
-async def hang(source: str, count: int) -> None:
-    names = [f"{source or 'own'}-{n}" for n in range(count)]
+async def hang(source: str, count: int, name: str = "{source}-{number}") -> None:
+    names = [name.format(source=source or "own", number=number) for number in range(count)]
     assert not any(await asyncio.gather(*(resolve(name, source) for name in names)))
 
 
@@ -107,15 +109,61 @@ async def test_hanging_names_of_one_caller_hold_up_nobody_else(server: NameServe
 async def test_hanging_names_of_all_others_leave_look_ups_for_the_proxys_own(
     server: NameServer,
 ) -> None:
-    await hang(NODES, 100)
+    await hang(NODES, 100, "robot.net{number}.test")
     assert len(server.asked) == MOST_FOR_NODES
     for number in range(20):
         await hang(f"10.0.0.{number}", 10)
-    assert len(server.asked) == MOST_FOR_OTHERS
+    assert len(server.asked) == MOST_FOR_NODES + MOST_FOR_SOURCES
     assert await resolve("good", "10.0.1.1") == []
     assert await find("good-master") == ["192.0.2.7"]
     await hang("", 100)
     assert len(server.asked) == MOST_LOOKUPS + 1
+
+
+@pytest.mark.parametrize(
+    "name", ["n{number}.evil.test", "n{number}.a{number}.evil.test", "n{number}"]
+)
+async def test_hanging_names_of_a_domain_leave_look_ups_for_other_domains(
+    server: NameServer, name: str
+) -> None:
+    await hang(NODES, 100, name)
+    assert len(server.asked) == MOST_FOR_NODES // 2
+    assert await resolve(name.format(number="good"), NODES) == []
+    assert await find("good-robot.lan", NODES) == ["192.0.2.7"]
+    assert await find("good-robot.other.test", NODES) == ["192.0.2.7"]
+
+
+async def test_hanging_names_of_many_domains_leave_look_ups_for_names_that_have_resolved(
+    server: NameServer,
+) -> None:
+    assert await find("good-robot", NODES) == ["192.0.2.7"]
+    await hang(NODES, 100, "robot.net{number}.test")
+    assert await resolve("good-other", NODES) == []
+    for _ in range(100):
+        assert await find("good-robot", NODES) == ["192.0.2.7"]
+
+
+async def test_a_name_that_hangs_after_it_has_resolved_counts_as_a_new_name(
+    server: NameServer,
+) -> None:
+    names = [f"robot.net{number}.test" for number in range(MOST_FOR_NODES)]
+    resolver._resolved.update(dict.fromkeys(names))
+    assert not any(await asyncio.gather(*(resolve(name, NODES) for name in names)))
+    assert not resolver._resolved
+    server.ended.set()
+    await all_ended()
+    server.ended.clear()
+    await hang(NODES, MOST_FOR_NODES, "robot.net{number}.test")
+    assert await resolve("good-new", NODES) == []
+
+
+async def test_the_proxy_remembers_a_few_names_that_have_resolved(
+    server: NameServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resolver, "MOST_RESOLVED", 2)
+    for name in ("good1", "good2", "good1", "good3"):
+        await find(name, NODES)
+    assert [*resolver._resolved] == ["good1", "good3"]
 
 
 async def test_look_ups_are_free_again_when_they_have_ended(server: NameServer) -> None:
