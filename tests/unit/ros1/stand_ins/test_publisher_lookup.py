@@ -9,7 +9,7 @@ import pytest
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
-from rosproxy.ros1.stand_ins.publisher_lookup import PublisherLookup
+from rosproxy.ros1.stand_ins.publisher_lookup import LONGEST_PAUSE_S, PublisherLookup
 
 TOPICS = ("/a", "/b", "/c", "/d")
 
@@ -21,12 +21,16 @@ class SlowMaster:
         self.questions: list[set[str]] = []
         self.answers = asyncio.Semaphore(0)
         self.is_down = False
+        self.processor_time = 0.0
+        self.cost = 0.0
 
-    async def read_registrations(self) -> dict[str, list[Registration]]:
+    async def read_changes(self, _: bytes) -> tuple[bytes, dict[str, list[Registration]]]:
         await self.answers.acquire()
+        self.processor_time += self.cost
         if self.is_down:
             raise Unreachable("down")
-        return {f"/of{topic}": [Registration(Kind.PUBLISHER, topic, "/n")] for topic in TOPICS}
+        rows = {f"/of{topic}": [Registration(Kind.PUBLISHER, topic, "/n")] for topic in TOPICS}
+        return b"", rows
 
     async def look_up(self, _: str, names: Iterable[str]) -> dict[str, str]:
         self.questions.append(set(names))
@@ -49,7 +53,7 @@ def master() -> SlowMaster:
 
 @pytest.fixture
 def lookup(master: Any) -> PublisherLookup:
-    return PublisherLookup(master)
+    return PublisherLookup(master, lambda: master.processor_time)
 
 
 async def start(lookup: PublisherLookup, *topics: str) -> list[asyncio.Task[set[str]]]:
@@ -105,3 +109,41 @@ async def test_a_master_that_is_down_knows_no_publishers(
     master.is_down = True
     await answer(master, 2)
     assert await asyncio.gather(*calls) == [set(), set()]
+
+
+@pytest.fixture
+def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The pauses, which take no time in these tests."""
+    made: list[float] = []
+    real_sleep = asyncio.sleep
+
+    async def sleep(seconds: float) -> None:
+        if seconds > 0:
+            made.append(seconds)
+        await real_sleep(0)
+
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    return made
+
+
+async def test_the_proxy_pauses_after_a_costly_question(
+    lookup: PublisherLookup, master: SlowMaster, pauses: list[float]
+) -> None:
+    master.cost = 10.0
+    calls = await start(lookup, "/a", "/b")
+    await answer(master, 1)
+    assert len(pauses) == 1
+    assert pauses[0] <= LONGEST_PAUSE_S
+    calls += await start(lookup, "/c")  # in the pause
+    await answer(master, 2)
+    assert await asyncio.gather(*calls) == [{uri("/a")}, {uri("/b")}, {uri("/c")}]
+
+
+async def test_no_pause_delays_a_first_question(
+    lookup: PublisherLookup, master: SlowMaster, pauses: list[float]
+) -> None:
+    master.cost = 10.0
+    calls = await start(lookup, "/a")
+    await answer(master, 1)
+    assert await asyncio.gather(*calls) == [{uri("/a")}]
+    assert pauses == []
