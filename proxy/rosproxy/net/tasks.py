@@ -1,11 +1,20 @@
-"""Background tasks that never fail silently."""
+"""Background tasks that never fail silently, and long work in turns."""
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Coroutine
-from typing import Any
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable
+from typing import Any, TypeVar
 
 log = logging.getLogger(__name__)
+_T = TypeVar("_T")
+
+
+async def in_turns(items: Iterable[_T], per_turn: int) -> AsyncIterator[_T]:
+    """The items. After each ``per_turn`` items, the event loop does other work."""
+    for number, item in enumerate(items, start=1):
+        yield item
+        if number % per_turn == 0:
+            await asyncio.sleep(0)
 
 
 class Tasks:

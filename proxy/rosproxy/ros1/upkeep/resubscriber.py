@@ -18,10 +18,13 @@ themselves for up to three minutes.
 
 import asyncio
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
+from random import randrange
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net.resolver import NODES, resolve
+from rosproxy.net.tasks import in_turns
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
@@ -48,6 +51,14 @@ probes begin after 60 seconds. Then a reset answers, or no answer comes for 90 s
 """
 RESUBSCRIBE_INTERVAL_S = 1.0
 """Seconds between two checks which looks are due."""
+REGISTRATIONS_PER_TURN = 2000
+"""Registrations, and pairs of these with a publisher, that the proxy looks at before the event loop
+does other work: some milliseconds."""
+PAIRS_PER_TURN = 200
+"""Pairs of a subscriber and a publisher that the proxy compares before the event loop does other
+work: some milliseconds."""
+MOST_PAIRS = 50_000
+"""The highest number of pairs without a connection that a look takes. A later look takes others."""
 MissedPublisher = tuple[str, str, str]
 """A topic, a subscriber's name, and the master's URI of a publisher that is not connected."""
 OutsidePath = tuple[StandIn | None, str]
@@ -133,14 +144,14 @@ class Resubscriber:
         Raises Unreachable, MasterError.
         """
         state = await self._context.upstream.read_registrations()
-        subscriptions = decisions.subscriptions(state, endpoints, self._context.addressing)
-        unrelayed = decisions.without_relay(subscriptions, self._tcpros.topic_connections())
+        unrelayed = await self._unrelayed(state, endpoints)
         if not unrelayed and not self._context.stand_ins.is_bidirectional:
             return set()
         graph = Graph(state, await self._context.upstream.look_up("lookupNode", state))
-        unrelayed = self._through_proxy(graph, unrelayed)
+        unrelayed = await self._through_proxy(graph, unrelayed)
         buses = await self._read_buses(unrelayed) if ask else {}
-        outside_publishers = self._outside_publishers(graph, endpoints)
+        publishers = await _publishers_by_topic(graph)
+        outside_publishers = await self._outside_publishers(publishers, endpoints)
         for endpoint, _, uris in outside_publishers:
             await self._stand_ins.listen_for(uris, self._context.caller_at(endpoint))
         # The plane reads the kernel's connections only every few seconds, so read these now.
@@ -155,9 +166,33 @@ class Resubscriber:
             (s.topic, s.caller_id, self._context.addressing.advertised_uri(s.endpoint))
             for s in decisions.unconnected(unrelayed, buses, addresses)
         ]
-        return await self._send_without(graph, missed + self._missed_outside(outside_publishers))
+        missed += await self._missed_outside(outside_publishers)
+        return await self._send_without(graph.uris, publishers, missed)
 
-    def _through_proxy(
+    async def _unrelayed(
+        self, state: Mapping[str, Sequence[Registration]], endpoints: Iterable[Endpoint]
+    ) -> list[TopicSubscription]:
+        """The subscriptions without a relay, MOST_PAIRS at most.
+
+        Each look begins with another node, so that no node hides the others for good.
+        """
+        relays = self._tcpros.topic_connections()
+        nodes = list(state.items())
+        first = randrange(len(nodes)) if nodes else 0  # noqa: S311 - no secret
+        nodes = nodes[first:] + nodes[:first]
+        unrelayed = list[TopicSubscription]()
+        work = 0
+        for pairs in decisions.subscriptions(nodes, endpoints, self._context.addressing):
+            unrelayed += decisions.without_relay(pairs, relays)
+            if len(unrelayed) >= MOST_PAIRS:
+                break
+            work += 1 + len(pairs)
+            if work >= REGISTRATIONS_PER_TURN:
+                work = 0
+                await asyncio.sleep(0)
+        return unrelayed[:MOST_PAIRS]
+
+    async def _through_proxy(
         self, graph: Graph, unrelayed: Iterable[TopicSubscription]
     ) -> list[TopicSubscription]:
         """The subscriptions of nodes that reach the publisher through the proxy."""
@@ -172,7 +207,7 @@ class Resubscriber:
             inside_uri = addressing.import_slave(addressing.advertised_uri(sub.endpoint), caller)
             return addressing.is_own_uri(inside_uri, caller)
 
-        return [s for s in unrelayed if is_relayed(s)]
+        return [s async for s in in_turns(unrelayed, PAIRS_PER_TURN) if is_relayed(s)]
 
     async def _read_buses(self, subs: Iterable[TopicSubscription]) -> dict[Endpoint, list[BusRow]]:
         """The connections of the publishers, by ``getBusInfo``."""
@@ -206,27 +241,31 @@ class Resubscriber:
         addresses = await asyncio.gather(*(resolve_host(graph.uris[node]) for node in nodes))
         return dict(zip(nodes, addresses, strict=True))
 
-    def _outside_publishers(
-        self, graph: Graph, endpoints: Iterable[Endpoint]
+    async def _outside_publishers(
+        self, publishers: Mapping[str, Sequence[str]], endpoints: Iterable[Endpoint]
     ) -> list[tuple[Endpoint, Registration, list[str]]]:
         """The subscriptions of some endpoints, with the URIs of publishers outside.
 
         The list is empty if nodes inside reach outside without the proxy.
         """
-        both = self._context.stand_ins.is_bidirectional
-        publishers = graph.by_topic(Kind.PUBLISHER)
+        if not self._context.stand_ins.is_bidirectional:
+            return []
         foreign = self._context.addressing.stand_in_target
-        return [
-            (endpoint, r, list(filter(foreign, publishers.get(r.name, ()))))
-            for endpoint in (endpoints if both else ())
-            for r in endpoint.registrations.values()
-            if r.kind is Kind.SUBSCRIBER and not r.hidden
-        ]
+        outside: dict[str, list[str]] = {}
+        subscriptions = []
+        async for endpoint, sub in in_turns(_subscribers(endpoints), PAIRS_PER_TURN):
+            if sub.hidden:
+                continue
+            if sub.name not in outside:
+                uris = in_turns(publishers.get(sub.name, ()), PAIRS_PER_TURN)
+                outside[sub.name] = [uri async for uri in uris if foreign(uri)]
+            subscriptions.append((endpoint, sub, outside[sub.name]))
+        return subscriptions
 
-    def _missed_outside(
+    async def _missed_outside(
         self, outside_publishers: Iterable[tuple[Endpoint, Registration, list[str]]]
     ) -> list[MissedPublisher]:
-        """The publishers outside that subscribers inside lack a connection to.
+        """The publishers outside that subscribers inside lack a connection to, MOST_PAIRS at most.
 
         The proxy knows connections in the kernel only by address. If a node inside has fewer such
         connections to a node outside than subscriptions, all these subscriptions count as missing.
@@ -234,13 +273,13 @@ class Resubscriber:
         context = self._context
         relays = self._tcpros.topic_connections() | self._stand_ins.udpros.connections()
         unconnected: dict[OutsidePath, list[MissedPublisher]] = {}
-        for endpoint, sub, uris in outside_publishers:
+        pairs = ((e, sub, uri) for e, sub, uris in outside_publishers for uri in uris)
+        async for endpoint, sub, uri in in_turns(islice(pairs, MOST_PAIRS), PAIRS_PER_TURN):
             proxy = context.caller_at(endpoint).proxy
-            for uri in uris:
-                stand_in = context.stand_ins.find(proxy, uri)
-                if stand_in is None or (stand_in.local.port, sub.name, sub.caller_id) not in relays:
-                    publisher = sub.name, sub.caller_id, uri
-                    unconnected.setdefault((stand_in, endpoint.address), []).append(publisher)
+            stand_in = context.stand_ins.find(proxy, uri)
+            if stand_in is None or (stand_in.local.port, sub.name, sub.caller_id) not in relays:
+                publisher = sub.name, sub.caller_id, uri
+                unconnected.setdefault((stand_in, endpoint.address), []).append(publisher)
         return [
             publisher
             for (stand_in, address), missing in unconnected.items()
@@ -248,17 +287,24 @@ class Resubscriber:
             for publisher in missing
         ]
 
-    async def _send_without(self, graph: Graph, missed: Iterable[MissedPublisher]) -> set[str]:
-        """Send subscribers their publishers without the missed publishers; return the topics."""
+    async def _send_without(
+        self,
+        uris: Mapping[str, str],
+        publishers: Mapping[str, Sequence[str]],
+        missed: Iterable[MissedPublisher],
+    ) -> set[str]:
+        """Send subscribers their publishers without the missed publishers; return the topics.
+
+        ``uris``: the slave URIs of the nodes. ``publishers``: those of the publishers by topic.
+        """
         missed_uris: dict[tuple[str, str], set[str]] = {}
         for topic, node, uri in missed:
             missed_uris.setdefault((topic, node), set()).add(uri)
-        publishers = graph.by_topic(Kind.PUBLISHER)
         calls = (
             self._publisher_updates.update(
-                graph.uris[node], topic, [u for u in publishers.get(topic, []) if u not in uris]
+                uris[node], topic, [u for u in publishers.get(topic, []) if u not in missing]
             )
-            for (topic, node), uris in missed_uris.items()
+            for (topic, node), missing in missed_uris.items()
         )
         topics = set()
         for (topic, node), answered in zip(missed_uris, await asyncio.gather(*calls), strict=True):
@@ -268,6 +314,16 @@ class Resubscriber:
                 )
                 topics.add(topic)
         return topics
+
+
+async def _publishers_by_topic(graph: Graph) -> dict[str, list[str]]:
+    """The slave URIs of the publishers, by topic."""
+    publishers: dict[str, list[str]] = {}
+    rows = ((node, r) for node, rows in graph.registrations.items() for r in rows)
+    async for node, registration in in_turns(rows, REGISTRATIONS_PER_TURN):
+        if registration.kind is Kind.PUBLISHER and node in graph.uris:
+            publishers.setdefault(registration.name, []).append(graph.uris[node])
+    return publishers
 
 
 def _subscribers(endpoints: Iterable[Endpoint]) -> list[EndpointRegistration]:

@@ -1,12 +1,13 @@
 """Subscribers without a connection to a publisher inside, by relay, UDPROS or forwarding."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import pytest
 
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.rewriting.addressing import Addressing
 from rosproxy.ros1.upkeep.decisions import resubscription as decisions
 from rosproxy.ros1.upkeep.decisions.resubscription import BusRow, TopicSubscription
 from tests.unit.builders import add_node, add_registration, make_addressing
@@ -32,6 +33,15 @@ def subscribed(endpoint: Endpoint, *names: str, topic: str = "/t") -> list[Topic
     return [TopicSubscription(endpoint, topic, name) for name in names]
 
 
+def found(
+    registrations: Mapping[str, Sequence[Registration]],
+    endpoints: Iterable[Endpoint],
+    addressing: Addressing,
+) -> list[TopicSubscription]:
+    pieces = decisions.subscriptions(registrations.items(), endpoints, addressing)
+    return [subscription for piece in pieces for subscription in piece]
+
+
 def names(subscriptions: Iterable[TopicSubscription]) -> list[str]:
     return [subscription.caller_id for subscription in subscriptions]
 
@@ -49,15 +59,24 @@ def test_subscriptions_are_those_to_topics_that_the_endpoints_publish() -> None:
         "/b": [Registration(PUB, "/t", "/b"), Registration(SUB, "/u", "/b")],
         "/c": [Registration(SRV, "/t", "/c")],
     }
-    assert decisions.subscriptions(registrations, [first, second], addressing) == [
+    assert found(registrations, [first, second], addressing) == [
         TopicSubscription(first, "/t", "/a"),
         TopicSubscription(second, "/t", "/a"),
         TopicSubscription(second, "/u", "/b"),
     ]
-    assert decisions.subscriptions(registrations, [first], addressing) == [
-        TopicSubscription(first, "/t", "/a")
-    ]
-    assert decisions.subscriptions({}, [first], addressing) == []
+    assert found(registrations, [first], addressing) == [TopicSubscription(first, "/t", "/a")]
+    assert found({}, [first], addressing) == []
+
+
+def test_subscriptions_come_in_pieces_of_a_registration() -> None:
+    addressing = make_addressing()
+    endpoints = [add_node(addressing, f"http://10.0.0.6:{4000 + n}/") for n in range(3)]
+    for number, endpoint in enumerate(endpoints):
+        for topic in range(10):
+            add_registration(addressing, endpoint, PUB, f"/t{topic}", f"/publisher{number}")
+    registrations = [("/a", [Registration(SUB, f"/t{topic}", "/a") for topic in range(10)])]
+    pieces = [len(p) for p in decisions.subscriptions(registrations, endpoints, addressing)]
+    assert pieces == [0] * 30 + [3] * 10
 
 
 def test_two_publishers_of_a_topic_in_one_process_are_one() -> None:
@@ -66,9 +85,7 @@ def test_two_publishers_of_a_topic_in_one_process_are_one() -> None:
     for name in ("/one", "/two"):
         add_registration(addressing, endpoint, PUB, "/t", name)
     registrations = {"/a": [Registration(SUB, "/t", "/a")]}
-    assert decisions.subscriptions(registrations, [endpoint], addressing) == [
-        TopicSubscription(endpoint, "/t", "/a")
-    ]
+    assert found(registrations, [endpoint], addressing) == [TopicSubscription(endpoint, "/t", "/a")]
 
 
 @pytest.mark.parametrize(
@@ -92,7 +109,7 @@ def test_neighbours_that_reach_a_publisher_by_its_own_uri_are_left_out(
         "/listener": [add_registration(addressing, listener, SUB, "/t", "/listener")],
         "/speaker": [Registration(SUB, "/t", "/speaker")],
     }
-    subscriptions = decisions.subscriptions(registrations, [speaker], addressing)
+    subscriptions = found(registrations, [speaker], addressing)
     assert subscriptions == subscribed(speaker, "/listener")[:count]
 
 

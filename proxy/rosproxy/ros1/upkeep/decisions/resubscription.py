@@ -10,7 +10,7 @@ master, and removes the subscriptions that have a connection: a relay of the pro
 kernel, or a direct connection without the proxy.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from ipaddress import ip_address
 from typing import Any
 
@@ -37,15 +37,16 @@ class TopicSubscription(msgspec.Struct, frozen=True):
 
 
 def subscriptions(
-    registrations_by_node: Mapping[str, Sequence[Registration]],
+    registrations_by_node: Iterable[tuple[str, Sequence[Registration]]],
     endpoints: Iterable[Endpoint],
     addressing: Addressing,
-) -> list[TopicSubscription]:
+) -> Iterator[list[TopicSubscription]]:
     """Subscriptions to topics of some endpoints, without the subscriptions of neighbours.
 
-    ``registrations_by_node`` has all registrations of the master. A neighbour reaches the publisher
-    by the publisher's own URI. The function leaves neighbours out early, for speed: a thousand
-    nodes that all subscribe to each other make a million pairs.
+    ``registrations_by_node`` has registrations of the master. A neighbour reaches the publisher by
+    the publisher's own URI. The function leaves neighbours out early, for speed: a thousand nodes
+    that all subscribe to each other make a million pairs. The subscriptions come in small pieces,
+    some of them empty, so that the caller can do other work in between.
     """
     topics: dict[str, dict[frozenset[int], list[Endpoint]]] = {}
     for endpoint in endpoints:
@@ -54,22 +55,21 @@ def subscriptions(
         networks = _networks_of(location.address, addressing) if uses_own_uri else frozenset()
         for topic in dict.fromkeys(endpoint.names_at_master(Kind.PUBLISHER)):
             topics.setdefault(topic, {}).setdefault(networks, []).append(endpoint)
-    distant: list[TopicSubscription] = []
-    for node, registrations in registrations_by_node.items():
+            yield []
+    for node, registrations in registrations_by_node:
         subscriber = addressing.registry.by_caller.get(node)
         local = _networks_of(subscriber.location.address, addressing) if subscriber else frozenset()
         for registration in registrations:
             groups = (
                 topics.get(registration.name, {}) if registration.kind is Kind.SUBSCRIBER else {}
             )
-            distant += [
+            yield [
                 TopicSubscription(endpoint, registration.name, node)
                 for networks, group in groups.items()
                 if not networks & local
                 for endpoint in group
                 if endpoint is not subscriber
             ]
-    return distant
 
 
 def without_relay(
@@ -103,8 +103,9 @@ def unconnected(
     whose other end has vanished. The proxy knows connections in the kernel only by host.
     """
     remaining: dict[Endpoint, list[TopicSubscription]] = {}
+    row_sets = {endpoint: frozenset(rows) for endpoint, rows in bus_rows.items()}
     for sub in unrelayed:
-        if (sub.topic, sub.caller_id, "UDPROS") not in bus_rows.get(sub.endpoint, ()):
+        if (sub.topic, sub.caller_id, "UDPROS") not in row_sets.get(sub.endpoint, ()):
             remaining.setdefault(sub.endpoint, []).append(sub)
     return [
         s
