@@ -435,6 +435,26 @@ async def test_ports_in_use_are_kept(
     assert slave(crowd[2])[1] in stand_ins(proxy)
 
 
+async def test_of_a_topic_with_too_many_publishers_the_same_keep_their_ports(
+    proxy: Proxy,
+    crowd: list[FakeNode],
+    node: FakeNode,
+    monkeypatch: pytest.MonkeyPatch,
+    master: FakeMaster,
+) -> None:
+    monkeypatch.setattr("rosproxy.ros1.registry.stand_ins.MOST_STAND_INS", 2)
+    for robot in crowd:
+        await robot.publish(host_and_port(master.uri), "/shared")
+    await node.subscribe(proxy.master, "/shared")
+    ports = set(stand_ins(proxy))
+    assert len(ports) == 2
+    for _ in range(3):
+        await node.subscribe(proxy.master, "/shared")
+        assert set(stand_ins(proxy)) == ports
+    left_out = [robot.uri for robot in crowd if slave(robot)[1] not in ports]
+    assert "all 2 stand-in ports are in use" in problems(proxy)[left_out[0]]
+
+
 async def test_another_address_counts_for_new_connections(proxy: Proxy, robot: FakeNode) -> None:
     await look_up(proxy, robot)
     await look_up_service(proxy)

@@ -21,7 +21,7 @@ import logging
 import socket
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -95,11 +95,16 @@ class StandInPorts:
         if not targets:
             return
         await self._retry({uri: targets[uri] for uri in self._refused.keys() & targets.keys()})
-        for number, (uri, target) in enumerate(targets.items(), start=1):
+        address = self._stand_ins.address(caller.proxy)
+        # The URIs with a port come first: of a list that is too long, the same URIs stay.
+        in_order = sorted(targets, key=lambda uri: not self._stand_ins.find(address, uri))
+        for number, uri in enumerate(in_order, start=1):
             if number % PORTS_PER_TURN == 0:
                 await asyncio.sleep(0)
-            if uri not in self._refused and not self._closed:
-                self._listen(uri, target, self._stand_ins.address(caller.proxy))
+            if uri in self._refused or self._closed:
+                continue
+            if not self._listen(uri, targets[uri], address, targets):
+                break
 
     async def listen_for_announced(self, topic: str, uris: Sequence[str], caller: Caller) -> None:
         """Open ports for the URIs that are publishers at the master, if another program names them.
@@ -208,29 +213,36 @@ class StandInPorts:
                 targets[uri] = target
         return targets
 
-    def _listen(self, uri: str, target: HostPort, address: str) -> None:
-        """Open the port for a URI, or report why that fails."""
-        problems = self._context.problems
+    def _listen(self, uri: str, target: HostPort, address: str, kept: Container[str]) -> bool:
+        """Open the port for a URI, or report why that fails. Return False if there is no room.
+
+        ``kept``: the URIs whose ports the proxy does not close to make room.
+        """
         if stand_in := self._stand_ins.find(address, uri):
             self._stand_ins.note_used(stand_in)
             self._open_fast_port(stand_in)
-            return
-        reason = self._make_room()
-        if reason is None:
+            return True
+        lack = reason = self._make_room(kept)
+        if lack is None:
             for candidate in self._stand_ins.candidates(uri, target, address):
                 reason = self._open(candidate)
                 if reason is None:
-                    problems.solved(uri)
-                    return
-        text = self._stand_ins.advice(
-            target, reason or "", self._context.upstream.master_address or ""
-        )
+                    self._context.problems.solved(uri)
+                    return True
+        self._report_unreachable(uri, target, reason or "")
+        return lack is None
+
+    def _report_unreachable(self, uri: str, target: HostPort, reason: str) -> None:
+        """Report why no port stands in for a URI; log the same report once."""
+        problems = self._context.problems
+        master_address = self._context.upstream.master_address or ""
+        text = self._stand_ins.advice(target, reason, master_address)
         if (uri, text) not in ((p.subject, p.text) for p in problems.all()):
             log.warning("%s: %s", uri, text)
         problems.add(uri, text)
 
-    def _make_room(self) -> str | None:
-        """Close the port unused for longest if there are too many.
+    def _make_room(self, kept: Container[str]) -> str | None:
+        """Close the port unused for longest if there are too many, but no port of ``kept`` URIs.
 
         Returns None if there is room now, otherwise the reason.
         """
@@ -238,12 +250,11 @@ class StandInPorts:
             return None
         counts = self._connections()
         # `by_local` begins with the stand-in that has been unused longest.
-        unused = (s for s in self._stand_ins.by_local.values() if not counts[s.local.port])
-        stand_in = next(unused, None)
-        if stand_in is None:
-            return f"can't be opened: all {stand_ins.MOST_STAND_INS} stand-in ports are in use"
-        self._close(stand_in)
-        return None
+        for stand_in in self._stand_ins.by_local.values():
+            if stand_in.uri not in kept and not counts[stand_in.local.port]:
+                self._close(stand_in)
+                return None
+        return f"can't be opened: all {stand_ins.MOST_STAND_INS} stand-in ports are in use"
 
     def _open(self, stand_in: StandIn) -> str | None:
         """Open a port; return the reason if that fails."""
