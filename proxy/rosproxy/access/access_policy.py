@@ -15,12 +15,11 @@ from rosproxy.access.layers import (
     PolicyMode,
     Verdict,
     check_bounds,
-    decide,
     decide_below,
     may_deny,
     of_kind,
-    strictest,
 )
+from rosproxy.access.rule_index import RuleIndex
 from rosproxy.access.rules import RuleKind
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, Refusals
@@ -30,6 +29,8 @@ OFFER_KINDS = frozenset({RuleKind.PUBLISH, RuleKind.SERVE})
 from outside."""
 PARAMETER_KINDS = frozenset({RuleKind.GET_PARAM, RuleKind.SET_PARAM})
 """The kinds of rules about parameters."""
+MOST_INDEXES = 256
+"""Addresses and kinds of rules whose rules are kept prepared."""
 
 
 class AccessPolicy:
@@ -55,6 +56,8 @@ class AccessPolicy:
         self._operator_wait_over = asyncio.Event()
         self.checks: list[Callable[[Sequence[PolicyLayer]], None]] = []
         self._by_kind: dict[RuleKind, tuple[PolicyLayer, ...]] = {}
+        self._indexes: dict[tuple[RuleKind, str], RuleIndex] = {}
+        """The rules by kind and by address of a node inside, for the latest addresses."""
         self.version = 0
         self.empty = False
         self._note_change()
@@ -95,8 +98,7 @@ class AccessPolicy:
         """
         if self.empty:
             return ALLOWED
-        layers = self._layers_for(kind)
-        return strictest([decide(layers, kind, name, c, address) for c in callers or ("",)])
+        return self._index_for(kind, address).judge(name, callers or ("",))
 
     def ask(
         self,
@@ -150,8 +152,19 @@ class AccessPolicy:
 
     def _note_change(self) -> None:
         self._by_kind.clear()
+        self._indexes.clear()
         self.version += 1
         self.empty = not any(layer.rules for layer in self.layers)
+
+    def _index_for(self, kind: RuleKind, address: str) -> RuleIndex:
+        """The rules of one kind that hold for the nodes inside at an address."""
+        index = self._indexes.get((kind, address))
+        if index is None:
+            if len(self._indexes) >= MOST_INDEXES:
+                self._indexes.clear()
+            index = RuleIndex.of_kind(self._layers_for(kind), kind, address)
+            self._indexes[kind, address] = index
+        return index
 
     def _layers_for(self, kind: RuleKind) -> tuple[PolicyLayer, ...]:
         """The layers that have rules of one kind, with these rules alone."""
