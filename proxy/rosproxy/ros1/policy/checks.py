@@ -8,9 +8,11 @@ several inside networks reach each other through the ports of the proxy.
 import asyncio
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 
 from rosproxy.access.access_policy import OFFER_KINDS, PARAMETER_KINDS, AccessPolicy
 from rosproxy.access.layers import Verdict, strictest
+from rosproxy.access.rule_index import MOST_CALLER_COMPARISONS
 from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
 from rosproxy.ros1.clients.master_client import MasterClient, MasterError, Unreachable
@@ -289,8 +291,12 @@ class Ros1Policy:
         """
         if self.rules.empty:
             return None
-        names_at_source = [n for e in self._registry if e.address == source for n in e.caller_ids]
-        callers = [caller_id] if caller_id in names_at_source else [caller_id, *names_at_source]
+        callers = [caller_id]
+        owner = self._registry.by_caller.get(caller_id)
+        if owner is None or owner.address != source:
+            at_source = (n for e in self._registry if e.address == source for n in e.callers)
+            # More names than the policy compares with rules change no verdict.
+            callers += islice(at_source, MOST_CALLER_COMPARISONS)
         for resolved in topic_names(name, caller_id):
             verdict = self.rules.ask(_USED[kind], resolved, callers, source)
             if not verdict.allowed:
