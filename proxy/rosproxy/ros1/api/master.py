@@ -29,7 +29,7 @@ from rosproxy.ros1.protocol.xmlrpc import fast, passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.limits import Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
-from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting import master_api, master_calls
 from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.rewriting.master_calls import (
@@ -42,6 +42,7 @@ from rosproxy.ros1.rewriting.master_calls import (
     Request,
     caller_id_of,
     refusal,
+    registration_of,
 )
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.long_calls import LongCall
@@ -51,6 +52,9 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 from rosproxy.ros1.upkeep.recovery import Recovery
+
+PendingRegistration = tuple[Endpoint, Registration | None]
+"""The endpoint of a call that registers, and the registration; None if the call names nothing."""
 
 
 @dataclass(slots=True, eq=False)
@@ -162,7 +166,7 @@ class MasterApi:
         """
         self._context.refresh_networks()
         outcomes = list[CallOutcome]()
-        pending = list[Endpoint]()
+        pending = list[PendingRegistration]()
         try:
             # In order, because two calls may register the same new node.
             for call, answer in zip(request.calls, answers, strict=True):
@@ -175,10 +179,14 @@ class MasterApi:
                 await asyncio.sleep(0)  # with many rules, a call may take milliseconds
             yield outcomes
         finally:
-            for endpoint in pending:
+            for endpoint, registration in pending:
                 endpoint.pending -= 1
+                if registration is not None:
+                    self._context.registry.end_promise(endpoint, registration)
 
-    async def _outcome(self, call: Call, request: Request, pending: list[Endpoint]) -> CallOutcome:
+    async def _outcome(
+        self, call: Call, request: Request, pending: list[PendingRegistration]
+    ) -> CallOutcome:
         """The outcome of a call. Makes the endpoint that the call registers pending."""
         caller = request.caller
         policy = self._context.policy
@@ -191,7 +199,10 @@ class MasterApi:
         if isinstance(admission, Endpoint):
             # Pending before the first await. Otherwise the lease could end meanwhile.
             admission.pending += 1
-            pending.append(admission)
+            registration = registration_of(call, self._context.now(), caller.address)
+            if registration is not None:
+                self._context.registry.promise(admission, registration)
+            pending.append((admission, registration))
             await self._adopter.take_over(admission, caller_id_of(call))
         denial = policy.check_registration(call, admission, caller, self._context.now())
         return denial.answer if denial else admission
@@ -205,7 +216,8 @@ class MasterApi:
         admission = await self._admission.admit(call, caller)
         if not isinstance(admission, Endpoint):
             return admission
-        if text := self._context.registry.reason_full(admission, caller_id_of(call)):
+        registration = registration_of(call, self._context.now(), caller.address)
+        if registration and (text := self._context.registry.reason_full(admission, registration)):
             return self._refuse("too_many_names", call, caller, text)
         return admission
 

@@ -1,5 +1,6 @@
 """An endpoint: a node behind the proxy, with location, registrations and port."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -120,6 +121,11 @@ class Endpoint:
     """Names that are no longer registered at this endpoint, oldest first. `Registry` adds names."""
     connections: int = 0
     """Open connections from outside that the proxy relays."""
+    promised: Counter[str] = field(default_factory=Counter)
+    """Registrations that the proxy has admitted and the master has not answered yet, by node name.
+    `Registry` counts these."""
+    promised_characters: int = 0
+    """The number of characters of these registrations."""
     pending: int = 0
     """Calls under way that register something here. The lease does not end meanwhile."""
     idle_since: float | None = None
@@ -330,15 +336,22 @@ class Endpoint:
         """The registrations of a node name."""
         return [self.registrations[key] for key in self.callers.get(caller_id, ())]
 
-    def reason_full(self, caller_id: str) -> str | None:
-        """Why the endpoint accepts no more registrations of a node name; None if there is room."""
-        others = len(self.callers.keys() - {caller_id})
+    def reason_full(self, caller_id: str, is_new: bool = True) -> str | None:
+        """Why the endpoint accepts no more registrations of a node name; None if there is room.
+
+        ``is_new``: the endpoint does not have the registration yet. Registrations that the proxy
+        has admitted count as well.
+        """
+        names = self.callers.keys() | self.promised.keys()
+        registrations = len(self.registrations) + self.promised.total()
+        characters = self.characters + self.promised_characters
         divide = "Divide the topics and services among several nodes"
-        for count, most, label, fix in (
-            (len(self.registrations), MOST_REGISTRATIONS, "registrations", divide),
-            (self.characters, MOST_CHARACTERS, "characters of registered names", divide),
-            (others, MOST_CALLERS, "node names", "Start the node with the same name each time"),
-        ):
+        rows = [(characters, MOST_CHARACTERS, "characters of registered names", divide)]
+        if is_new:
+            same_name = "Start the node with the same name each time"
+            rows.append((registrations, MOST_REGISTRATIONS, "registrations", divide))
+            rows.append((len(names - {caller_id}), MOST_CALLERS, "node names", same_name))
+        for count, most, label, fix in rows:
             if count >= most:
                 text = f"the node at {self.uri} has {count} {label}, at most {most} are accepted"
                 return f"{text}. {fix}"

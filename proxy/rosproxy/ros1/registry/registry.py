@@ -62,6 +62,10 @@ class Registry:
         """The number of registrations, by source of the endpoint."""
         self._characters_of = Counter[str]()
         """The number of characters of the registrations, by source of the endpoint."""
+        self._promised_of = Counter[str]()
+        """The number of promised registrations, by source of the endpoint."""
+        self._promised_characters_of = Counter[str]()
+        """The number of characters of the promised registrations, by source of the endpoint."""
         self.changes = self.lease_changes = 0
         self._by_node: dict[HostPort, dict[int, Endpoint]] = {}
         self._admitted: dict[tuple[HostPort, str], Endpoint] = {}
@@ -203,19 +207,39 @@ class Registry:
         """The highest number of endpoints of one source that have never answered."""
         return max(1, len(self.pool.range) // UNPROVEN_DIVISOR)
 
-    def reason_full(self, endpoint: Endpoint, caller_id: str) -> str | None:
-        """Why an endpoint accepts no more registrations of a node name; None if there is room."""
+    def reason_full(self, endpoint: Endpoint, registration: Registration) -> str | None:
+        """Why an endpoint does not accept a registration; None if there is room.
+
+        A registration that the endpoint has already is accepted, unless its names get longer: a
+        node repeats all its registrations at a master that has restarted.
+        """
+        former = endpoint.registrations.get(registration.key)
+        if former is not None and registration.characters <= former.characters:
+            return None
         source = endpoint.source
-        for count, most, label in (
-            (self._registrations_of[source], MOST_REGISTRATIONS_OF_SOURCE, "registrations"),
-            (self._characters_of[source], MOST_CHARACTERS_OF_SOURCE, "characters of names"),
-        ):
+        registrations = self._registrations_of[source] + self._promised_of[source]
+        characters = self._characters_of[source] + self._promised_characters_of[source]
+        rows = [(characters, MOST_CHARACTERS_OF_SOURCE, "characters of names")]
+        if former is None:
+            rows.append((registrations, MOST_REGISTRATIONS_OF_SOURCE, "registrations"))
+        for count, most, label in rows:
             if count >= most:
                 return (
                     f"the nodes of {source} have {count} {label}, at most {most} are accepted. Run "
                     "some of these nodes at another address, such as in another container"
                 )
-        return endpoint.reason_full(caller_id)
+        return endpoint.reason_full(registration.caller_id, former is None)
+
+    def promise(self, endpoint: Endpoint, registration: Registration) -> None:
+        """Count a registration that is admitted, until `end_promise`.
+
+        Otherwise the calls of a ``system.multicall`` would all find room for the last registration.
+        """
+        self._count_promised(endpoint, registration, 1)
+
+    def end_promise(self, endpoint: Endpoint, registration: Registration) -> None:
+        """Count an admitted registration no more: it is recorded now, or has failed."""
+        self._count_promised(endpoint, registration, -1)
 
     def register(self, endpoint: Endpoint, registration: Registration) -> None:
         """Record what the master has accepted.
@@ -230,8 +254,9 @@ class Registry:
             return
         self.changes += 1
         former = endpoint.registrations.get(registration.key)
+        has_room = former is not None or registration.caller_id in endpoint.promised
         if registration.characters > LONGEST_REGISTRATION or (
-            former is None and self.reason_full(endpoint, registration.caller_id)
+            not has_room and self.reason_full(endpoint, registration)
         ):
             return
         owner = self.by_caller.get(registration.caller_id)
@@ -396,6 +421,18 @@ class Registry:
         self._registrations_of[source] += step
         if not self._registrations_of[source]:
             del self._registrations_of[source], self._characters_of[source]
+
+    def _count_promised(self, endpoint: Endpoint, registration: Registration, step: int) -> None:
+        source = endpoint.source
+        caller_id = registration.caller_id
+        endpoint.promised_characters += step * registration.characters
+        self._promised_characters_of[source] += step * registration.characters
+        for counter, key in ((self._promised_of, source), (endpoint.promised, caller_id)):
+            counter[key] += step
+            if not counter[key]:
+                del counter[key]
+        if source not in self._promised_of:
+            del self._promised_characters_of[source]
 
     def _drop(self, endpoint: Endpoint, key: tuple[Kind, str, str]) -> None:
         registration = endpoint.registrations.pop(key, None)

@@ -481,13 +481,13 @@ def test_a_source_has_so_many_registrations_at_most(
             register(registry, endpoint, PUB, f"/t{number}", f"/node{endpoint.port}")
     assert (len(first.registrations), len(second.registrations)) == (2, 2)
     assert len(other.registrations) == 3
-    reason = registry.reason_full(second, "/n") or ""
+    reason = registry.reason_full(second, Registration(PUB, "/new", "/n")) or ""
     assert label in reason
     assert "are accepted. Run some of these nodes at another address" in reason
-    assert registry.reason_full(other, "/n") is None
+    assert registry.reason_full(other, Registration(PUB, "/new", "/n")) is None
     register(registry, first, PUB, "/t0", f"/node{first.port}")
     registry.remove(second)
-    assert registry.reason_full(first, "/n") is None
+    assert registry.reason_full(first, Registration(PUB, "/new", "/n")) is None
     registry.remove(first)
     registry.remove(other)
     assert not registry._registrations_of + registry._characters_of
@@ -503,6 +503,59 @@ def test_an_endpoint_has_so_many_node_names_at_most() -> None:
     reason = endpoint.reason_full("/another") or ""
     assert "64 node names, at most 64 are accepted. Start the node with the same name" in reason
     assert endpoint.reason_full("/n0") is None
+
+
+def full_endpoint(registry: Registry) -> Endpoint:
+    """An endpoint with two registrations fewer than it may have."""
+    endpoint = node(registry, 5)
+    for number in range(MOST_REGISTRATIONS - 2):
+        register(registry, endpoint, PUB, f"/t{number}")
+    return endpoint
+
+
+def test_a_full_endpoint_accepts_what_it_has_already() -> None:
+    """A node with the highest number of registrations was refused at a master that restarted."""
+    registry = make_registry()
+    endpoint = full_endpoint(registry)
+    for number in range(2):
+        register(registry, endpoint, PUB, f"/more{number}")
+    assert registry.reason_full(endpoint, Registration(PUB, "/t0", "/node")) is None
+    longer = Registration(PUB, "/t0", "/node", "std_msgs/String")
+    assert registry.reason_full(endpoint, longer) is None
+    assert registry.reason_full(endpoint, Registration(SUB, "/t0", "/node"))
+    endpoint.characters = MOST_CHARACTERS
+    assert registry.reason_full(endpoint, longer)
+    assert registry.reason_full(endpoint, Registration(PUB, "/t0", "/node")) is None
+
+
+def test_admitted_registrations_take_room_until_they_are_recorded() -> None:
+    """A system.multicall of 1,000 registrations found room for each of these."""
+    registry = make_registry()
+    endpoint = full_endpoint(registry)
+    admitted = [Registration(PUB, f"/more{number}", "/node") for number in range(2)]
+    for registration in admitted:
+        assert registry.reason_full(endpoint, registration) is None
+        registry.promise(endpoint, registration)
+    assert registry.reason_full(endpoint, Registration(PUB, "/else", "/node"))
+    for registration in admitted:
+        registry.register(endpoint, registration)
+        registry.end_promise(endpoint, registration)
+    assert len(endpoint.registrations) == MOST_REGISTRATIONS
+    assert not endpoint.promised + registry._promised_of + registry._promised_characters_of
+    assert endpoint.promised_characters == 0
+
+
+def test_admitted_registrations_that_fail_leave_their_room() -> None:
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    admitted = [Registration(PUB, "/t", f"/n{number}") for number in range(MOST_CALLERS)]
+    for registration in admitted:
+        assert registry.reason_full(endpoint, registration) is None
+        registry.promise(endpoint, registration)
+    assert registry.reason_full(endpoint, Registration(PUB, "/t", "/next"))
+    for registration in admitted:
+        registry.end_promise(endpoint, registration)
+    assert registry.reason_full(endpoint, Registration(PUB, "/t", "/next")) is None
 
 
 def test_a_registration_that_is_too_long_is_not_kept() -> None:

@@ -160,14 +160,16 @@ def test_a_node_with_another_name_after_each_start_keeps_room_for_the_next() -> 
     names = [f"/n_{number}" for number in range(MOST_CALLERS)]
     registry = addressing.registry
     for number, name in enumerate(names):
-        assert registry.reason_full(endpoint, name) is None
-        registry.register(endpoint, Registration(PUB, "/t", name, since=float(number)))
-    assert registry.reason_full(endpoint, "/next")
+        registration = Registration(PUB, "/t", name, since=float(number))
+        assert registry.reason_full(endpoint, registration) is None
+        registry.register(endpoint, registration)
+    following = Registration(PUB, "/t", "/next")
+    assert registry.reason_full(endpoint, following)
     before = float(MOST_CALLERS)
     left_over = decisions.left_over_registrations(endpoint, said({"/t"}), before)
     assert [r.caller_id for r in left_over] == names[:1]
     registry.unregister(PUB, "/t", names[0])
-    assert registry.reason_full(endpoint, "/next") is None
+    assert registry.reason_full(endpoint, following) is None
     assert decisions.left_over_registrations(endpoint, said({"/t"}), before) == []
 
 
