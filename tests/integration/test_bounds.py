@@ -302,7 +302,7 @@ async def test_a_source_with_too_many_connections_is_refused_and_others_are_not(
         assert await knock(lease, b"") == "reset"
         assert (await exchange(lease, pid(), OTHER_NODE)).value[0] == 1
     assert proxy.metric("refused_total", reason="connections_per_source")
-    await until(lambda: not proxy.ros1.context.gate._by_source[OUTSIDE], "all have gone")
+    await until(lambda: not proxy.ros1.context.gate._by_source.of(OUTSIDE), "all have gone")
     assert (await exchange(lease, pid())).value[0] == 1
 
 

@@ -3,10 +3,12 @@
 import asyncio
 import contextlib
 import socket
+from collections import Counter
 from collections.abc import Awaitable, Callable
 
 from aiohttp import web
 
+from rosproxy.net.addresses import plain_address, subnet
 from rosproxy.net.sockets import end_if_stalled
 
 SEND_BUFFER_BYTES = 64 * 1024
@@ -27,8 +29,9 @@ class BoundedServer(web.Server):
     """Answers requests on at most ``most`` connections from each address, and MOST_IN_ALL in all.
 
     For a further connection, the oldest connection of the address ends, or the oldest connection of
-    the address with the most connections. If several addresses have the most, connections without a
-    request under way end first: an operator holds a connection, and waits for changes.
+    the address with the most connections, in the IPv6 network (/64) with the most. If several
+    addresses have the most, connections without a request under way end first: an operator holds a
+    connection, and waits for changes.
     """
 
     def __init__(self, answer: Answer, most: int) -> None:
@@ -40,7 +43,7 @@ class BoundedServer(web.Server):
         self._make_reply = answer
         self._busy = set[web.RequestHandler]()
         """The connections with a request under way."""
-        self._by_source: dict[object, dict[web.RequestHandler, None]] = {}
+        self._by_source: dict[str, dict[web.RequestHandler, None]] = {}
         """The connections of each source, oldest first."""
 
     def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
@@ -73,8 +76,17 @@ class BoundedServer(web.Server):
 
     def _least_useful(self) -> web.RequestHandler:
         """The connection that ends if there are MOST_IN_ALL."""
-        most = max(map(len, self._by_source.values()))
-        crowd = [c for same in self._by_source.values() if len(same) == most for c in same]
+        networks = Counter[str]()
+        for address, connections in self._by_source.items():
+            networks[subnet(address)] += len(connections)
+        most_of_network = max(networks.values())
+        of_largest = [
+            connections
+            for address, connections in self._by_source.items()
+            if networks[subnet(address)] == most_of_network
+        ]
+        most = max(map(len, of_largest))
+        crowd = [c for connections in of_largest if len(connections) == most for c in connections]
         return next((c for c in crowd if c not in self._busy), crowd[0])
 
     def _end(self, handler: web.RequestHandler) -> None:
@@ -92,6 +104,6 @@ class BoundedServer(web.Server):
             self._by_source.pop(source, None)
 
 
-def _source(handler: web.RequestHandler) -> object:
+def _source(handler: web.RequestHandler) -> str:
     """The source address of a connection."""
-    return handler.peername[0] if handler.peername else None
+    return plain_address(handler.peername[0]) if handler.peername else ""

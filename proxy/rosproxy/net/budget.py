@@ -8,6 +8,8 @@ budget of all others.
 
 from types import TracebackType
 
+from rosproxy.net.source_shares import SourceShares
+
 
 class OverBudget(Exception):
     """The budget refuses an amount; the message names the bound."""
@@ -20,28 +22,23 @@ class Budget:
         self.most = most
         self._share = share
         self._unit = unit
-        self._used_by_source: dict[str, int] = {}
+        self._used_by_source = SourceShares()
         self.used = 0
 
     def take(self, source: str, size: int) -> None:
         """Take an amount for a source. Raises OverBudget, and then takes nothing."""
         if self.used + size > self.most:
             raise OverBudget(f"at most {self.most} {self._unit} are accepted at once; try again")
-        total = self._used_by_source.get(source, 0) + size
-        if total > self._share:
+        if not self._used_by_source.has_room(source, self._share, size):
             text = f"at most {self._share} {self._unit} are accepted at once from {source}"
             raise OverBudget(text)
         self.used += size
-        self._used_by_source[source] = total
+        self._used_by_source.add(source, size)
 
     def give(self, source: str, size: int) -> None:
         """Give back an amount that was taken for a source."""
         self.used -= size
-        remaining = self._used_by_source.get(source, 0) - size
-        if remaining:
-            self._used_by_source[source] = remaining
-        else:
-            self._used_by_source.pop(source, None)
+        self._used_by_source.add(source, -size)
 
 
 class Charge:

@@ -1,8 +1,9 @@
 """Slots for work that is under way, with a bound in all and a bound for each source address."""
 
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from rosproxy.net.source_shares import SourceShares
 
 
 class NoSlot(Exception):
@@ -20,24 +21,21 @@ class FairSlots:
         self.each = each
         self._work = work
         self._advice = advice
-        self._taken: Counter[str] = Counter()
-
-    @property
-    def taken(self) -> int:
+        self._by_source = SourceShares()
+        self.taken = 0
         """How many slots are taken."""
-        return self._taken.total()
 
     @contextmanager
     def slot(self, source: str) -> Iterator[None]:
         """Take a slot for as long as the context lasts. Raises NoSlot."""
-        if self._taken[source] >= self.each:
+        if not self._by_source.has_room(source, self.each):
             raise NoSlot(f"{source}: {self.each} {self._work} already; {self._advice}")
         if self.taken >= self.most:
             raise NoSlot(f"{self.most} {self._work} already; {self._advice}")
-        self._taken[source] += 1
+        self._by_source.add(source)
+        self.taken += 1
         try:
             yield
         finally:
-            self._taken[source] -= 1
-            if not self._taken[source]:
-                del self._taken[source]
+            self._by_source.add(source, -1)
+            self.taken -= 1

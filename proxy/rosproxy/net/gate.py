@@ -13,14 +13,17 @@ from contextlib import contextmanager
 from itertools import count
 
 from rosproxy.fixes import how_to_in_a_sentence
+from rosproxy.net.addresses import subnet
+from rosproxy.net.source_shares import SourceShares
 
 MOST_WAITING = 512
 """Most waiting connections of a source. In ROS 1 the client sends first, at once."""
 LEAST_PER_SOURCE = 64
 """Connections that each source may have, even if there are few file descriptors."""
-FILES_PER_CONNECTION = 4
-"""A source may have a connection for every 4 file descriptors that the process may open. A relay
-takes two file descriptors, and up to four more for large transfers."""
+FILES_PER_CONNECTION = 2
+"""All sources may have a connection for every 2 file descriptors that the process may open, because
+a relay takes two. For large transfers it takes up to four more, and forwards more slowly without.
+A source gets no more than it leaves to others: half of all connections if it is the only one."""
 
 NoteRefusal = Callable[[str, str, str], None]
 """Takes the reason of a refusal in one word, the source, and a text."""
@@ -37,17 +40,18 @@ class Gate:
         self._file_limit = 0
         self._per_port = per_port
         self._note_refusal = note_refusal
-        self._by_source: Counter[str] = Counter()
+        self._by_source = SourceShares()
+        self._most: int | None = None
+        """The highest number of connections of all sources, as far as files bound them."""
+        self._total = 0
         self._by_port: Counter[int] = Counter()
         self._waiting: dict[str, dict[int, Callable[[], None]]] = {}
         self._numbers = count()
 
     def bound(self, files: int) -> None:
-        """Lower the bound of a source if the process may open only this number of ``files``."""
-        most = max(files // FILES_PER_CONNECTION, LEAST_PER_SOURCE)
-        if most < self.per_source:
-            self.per_source = most
-            self._file_limit = files
+        """Lower the bounds if the process may open only this number of ``files``."""
+        self._most = max(files // FILES_PER_CONNECTION, 2 * LEAST_PER_SOURCE)
+        self._file_limit = files
 
     def admits(self, source: str, port: int) -> bool:
         """Whether the acceptor may accept a connection from a source at a port.
@@ -60,27 +64,22 @@ class Gate:
             text += how_to_in_a_sentence("connections to a port")
             self._note_refusal("connections_per_lease", source, text)
             return False
-        if self._by_source[source] < self.per_source:
+        reason = self._reason_full(source)
+        if reason is None:
             return True
-        text = f"the source already has {self.per_source} connections"
-        if self._file_limit:
-            text += f", as many as the {self._file_limit} open files of the proxy allow. "
-            text += how_to_in_a_sentence("open files")
-        else:
-            text += f". {how_to_in_a_sentence('connections of a source')}"
-        self._note_refusal("connections_per_source", source, text)
+        self._note_refusal("connections_per_source", source, reason)
         return self._end_oldest(source)
 
     def enter(self, source: str, port: int) -> None:
         """Count a connection."""
-        self._by_source[source] += 1
+        self._by_source.add(source)
         self._by_port[port] += 1
+        self._total += 1
 
     def leave(self, source: str, port: int) -> None:
         """Stop counting a connection."""
-        self._by_source[source] -= 1
-        if not self._by_source[source]:
-            del self._by_source[source]
+        self._by_source.add(source, -1)
+        self._total -= 1
         self._by_port[port] -= 1
         if not self._by_port[port]:
             del self._by_port[port]
@@ -114,6 +113,22 @@ class Gate:
             yield
         finally:
             spoke()
+
+    def _reason_full(self, source: str) -> str | None:
+        """Why a source may have no more connections; None if it may."""
+        count = self._by_source.of(source)
+        in_network = self._by_source.of_network(source)
+        if not self._by_source.has_room(source, self.per_source):
+            holder = f"network {subnet(source)}" if count < self.per_source else "the source"
+            text = f"{holder} already has {max(count, in_network)} connections"
+            return f"{text}. {how_to_in_a_sentence('connections of a source')}"
+        if self._most is None or in_network < self._most - self._total:
+            return None
+        return (
+            f"the source has {in_network} of the {self._most} connections that the "
+            f"{self._file_limit} open files of the proxy allow, and leaves fewer to others. "
+            + how_to_in_a_sentence("open files")
+        )
 
     def _end_oldest(self, source: str) -> bool:
         """End the oldest waiting connection of a source; False if no connection waits."""

@@ -22,6 +22,7 @@ from concurrent.futures import Future
 from typing import NamedTuple
 
 from rosproxy.net.addresses import is_address, plain_address
+from rosproxy.net.source_shares import SourceShares
 
 log = logging.getLogger(__name__)
 
@@ -115,9 +116,12 @@ def _may_start(lookup: _Lookup) -> bool:
     if lookup.source == NODES:
         part = [r for r in running if r.source == NODES and r.resolved is lookup.resolved]
         return MOST_FOR_NODES - len(part) > sum(r.domain == lookup.domain for r in part)
+    shares = SourceShares()
     of_sources = [r.source for r in running if r.source not in ("", NODES)]
-    of_source = of_sources.count(lookup.source)
-    return len(of_sources) < MOST_FOR_SOURCES and of_source < MOST_PER_SOURCE
+    for source in of_sources:
+        shares.add(source)
+    has_room = shares.has_room(lookup.source, MOST_PER_SOURCE)
+    return has_room and len(of_sources) < MOST_FOR_SOURCES
 
 
 def _domain(host: str) -> str:

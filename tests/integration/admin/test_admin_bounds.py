@@ -255,6 +255,27 @@ async def test_many_addresses_have_so_many_connections_in_all(
             assert (await wire.reply()).status == 200
 
 
+async def test_many_addresses_of_a_network_end_no_connection_of_another_network(
+    proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine may have any number of IPv6 addresses."""
+
+    def network(address: str) -> str:
+        return "127.0.6.0/24" if address.startswith("127.0.6.") else address
+
+    monkeypatch.setattr("rosproxy.net.bounded_server.MOST_IN_ALL", 4)
+    monkeypatch.setattr("rosproxy.net.bounded_server.subnet", network, raising=False)
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    async with AsyncExitStack() as stack:
+        wires = []
+        for source in ("127.0.5.1", *(f"127.0.6.{number}" for number in range(1, 10))):
+            wires.append(await stack.enter_async_context(connect(address, source)))
+            await wires[-1].send(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+            assert (await wires[-1].reply()).status == 200
+        await wires[0].send(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+        assert (await wires[0].reply()).status == 200
+
+
 async def test_many_addresses_end_no_request_that_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     """An operator that waits for changes was the first to go: it had connected first."""
     monkeypatch.setattr("rosproxy.net.bounded_server.MOST_IN_ALL", 4)

@@ -42,3 +42,13 @@ def test_nothing_is_kept_of_a_source_that_holds_nothing() -> None:
         with Charge(budget, f"source {number}") as charge:
             charge.add(1)
     assert not budget._used_by_source
+
+
+def test_the_addresses_of_an_ipv6_network_share() -> None:
+    budget = Budget(100, 50, "bytes")
+    budget.take("2001:db8::1", 50)
+    budget.take("2001:db8::2", 25)
+    for address in ("2001:db8::2", "2001:db8::3"):
+        with pytest.raises(OverBudget):
+            budget.take(address, 1)
+    budget.take("2001:db8:0:1::1", 25)

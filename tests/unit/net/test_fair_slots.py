@@ -1,5 +1,7 @@
 """Slots: a limited number, and never all for a single source."""
 
+from contextlib import ExitStack
+
 import pytest
 
 from rosproxy.net.fair_slots import FairSlots, NoSlot
@@ -25,4 +27,15 @@ def test_what_has_ended_makes_room() -> None:
         with pytest.raises(ValueError, match="a mistake"), slots.slot(NEAR):
             raise ValueError("a mistake")
     assert slots.taken == 0
-    assert not slots._taken
+    assert not slots._by_source
+
+
+def test_the_addresses_of_an_ipv6_network_share() -> None:
+    slots = FairSlots("replies are under way", 8, 4)
+    with ExitStack() as stack:
+        for number in (1, 1, 1, 1, 2, 2):
+            stack.enter_context(slots.slot(f"2001:db8::{number}"))
+        for full in ("2001:db8::1", "2001:db8::2", "2001:db8::3"):
+            with pytest.raises(NoSlot):
+                stack.enter_context(slots.slot(full))
+        stack.enter_context(slots.slot("2001:db8:0:1::1"))

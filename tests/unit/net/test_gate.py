@@ -1,7 +1,11 @@
 """Limits on connections, and the connection that is closed first."""
 
+from itertools import count
+
+import pytest
+
 from rosproxy.net import gate
-from rosproxy.net.gate import LEAST_PER_SOURCE, Gate
+from rosproxy.net.gate import Gate
 
 Told = list[tuple[str, str]]
 
@@ -60,14 +64,41 @@ def test_silent_connections_are_bounded_by_source() -> None:
     assert told == [("silent_connections", "a")] * 2
 
 
-def test_file_descriptors_bound_a_source_as_well() -> None:
-    connection_gate, _ = make_gate(per_source=1000)
-    connection_gate.bound(1_000_000)
-    assert connection_gate.per_source == 1000
-    connection_gate.bound(2000)
-    assert connection_gate.per_source == 500
-    connection_gate.bound(-1)
-    assert connection_gate.per_source == LEAST_PER_SOURCE
+def fill(connection_gate: Gate, source: str) -> int:
+    """Open all connections that a source gets, and return their number."""
+    for number in count():
+        if not connection_gate.admits(source, 1):
+            return number
+        connection_gate.enter(source, 1)
+    raise AssertionError
+
+
+@pytest.mark.parametrize(("files", "number"), [(1_000_000, 1000), (2000, 500), (-1, 64)])
+def test_file_descriptors_bound_a_source_as_well(files: int, number: int) -> None:
+    connection_gate, _ = make_gate(per_source=1000, per_port=10_000)
+    connection_gate.bound(files)
+    assert fill(connection_gate, "a") == number
+
+
+def test_several_sources_leave_file_descriptors_to_others() -> None:
+    """Four addresses had all of them."""
+    connection_gate, told = make_gate(per_source=4096, per_port=10_000)
+    connection_gate.bound(4096)
+    numbers = [fill(connection_gate, f"192.0.2.{number}") for number in range(4)]
+    assert numbers == [1024, 512, 256, 128]
+    assert sum(numbers) * 2 < 4096
+    assert fill(connection_gate, "192.0.2.99") > 0
+    assert {reason for reason, _ in told} == {"connections_per_source"}
+
+
+def test_the_addresses_of_an_ipv6_network_share() -> None:
+    connection_gate, _ = make_gate(per_source=100, per_port=10_000)
+    numbers = [fill(connection_gate, f"2001:db8::{number}") for number in range(1, 9)]
+    assert numbers == [100, 50, 0, 0, 0, 0, 0, 0]
+    assert fill(connection_gate, "2001:db8:0:1::1") == 100
+    connection_gate.bound(700)
+    assert fill(connection_gate, "2001:db8:0:2::1") > 0
+    assert fill(connection_gate, "2001:db8:0:2::2") == 0
 
 
 def test_nothing_is_kept_of_who_has_gone() -> None:
@@ -88,9 +119,8 @@ def test_the_fix_names_what_bounds_a_source() -> None:
     for files, fix in ((100_000, "--max-connections-per-source"), (4 * 100, "open files")):
         connection_gate = Gate(300, 10_000, lambda _reason, _source, text: texts.append(text))
         connection_gate.bound(files)
-        enter(connection_gate, "a", 1, connection_gate.per_source)
-        assert not connection_gate.admits("a", 1)
+        fill(connection_gate, "a")
         assert fix in texts[-1]
     assert texts[0].startswith("the source already has 300 connections. Set a larger --max-")
-    assert texts[1].startswith("the source already has 100 connections, as many as the 400 open ")
+    assert texts[1].startswith("the source has 100 of the 200 connections that the 400 open files ")
     assert "--max-connections" not in texts[1]

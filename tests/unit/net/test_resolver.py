@@ -106,6 +106,15 @@ async def test_hanging_names_of_one_caller_hold_up_nobody_else(server: NameServe
     assert await find("good-master") == ["192.0.2.7"]
 
 
+async def test_hanging_names_of_an_ipv6_network_hold_up_no_other_network(
+    server: NameServer,
+) -> None:
+    for number in range(10):
+        await hang(f"2001:db8::{number}", 10)
+    assert len(server.asked) == MOST_PER_SOURCE * 1.5
+    assert await find("good", "2001:db8:0:1::1") == ["192.0.2.7"]
+
+
 async def test_hanging_names_of_all_others_leave_look_ups_for_the_proxys_own(
     server: NameServer,
 ) -> None:
