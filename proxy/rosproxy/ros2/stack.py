@@ -89,7 +89,13 @@ class Ros2:
         self._addresses_of_peers: dict[HostPort, tuple[HostPort, ...]] = {}
         self._peer_addresses = frozenset[str]()
         self._watch = DomainWatch(
-            Ros2State(self.servers, self._domain_plane, with_names=False), runtime.problems
+            Ros2State(
+                self.servers,
+                self._domain_plane,
+                with_names=False,
+                comparisons=self.state.comparisons,
+            ),
+            runtime.problems,
         )
 
     async def start(self) -> None:
@@ -113,8 +119,14 @@ class Ros2:
             tasks.repeat(server.expire, EXPIRY_INTERVAL_S, "ending participants")
             tasks.repeat(server.announce, ANNOUNCE_INTERVAL_S, "announcing the proxy")
         tasks.repeat(self._refresh, REFRESH_INTERVAL_S, "checking networks and peers")
-        tasks.repeat(self._watch.look, REFRESH_INTERVAL_S, "checking connections of participants")
+        tasks.repeat(
+            self._look_at_domains, REFRESH_INTERVAL_S, "checking connections of participants"
+        )
         tasks.repeat(self._sample_rates, RATE_INTERVAL_S, "sampling rates")
+
+    async def _look_at_domains(self) -> None:
+        await self.state.comparisons.renew([server.domain for server in self.servers])
+        await self._watch.look()
 
     def _start_servers(self) -> None:
         """Start a server for each domain. Raises SettingError."""

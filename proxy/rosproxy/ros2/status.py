@@ -1,7 +1,8 @@
 """The state of ROS 2 in a running proxy: as a part of ``/status``, and as metrics."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+import asyncio
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import TypeVar
 
@@ -14,16 +15,16 @@ from rosproxy.admin import status_document as document
 from rosproxy.admin.common_status import MOST_HIDDEN
 from rosproxy.admin.status_bounds import fair_choice, fair_shares_by_owner
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.ros_names import (
+    is_of_requests,
     is_of_service,
     ros_name,
     ros_node,
-    ros_service,
-    ros_topic,
     ros_type,
 )
-from rosproxy.ros2.registry.matching import MismatchedPair, compare
+from rosproxy.ros2.registry.matching import Comparison, MismatchedPair, comparison_steps
 from rosproxy.ros2.registry.participants import (
     DdsEndpoint,
     EndpointKind,
@@ -43,8 +44,44 @@ A host with fifty nodes has some 1,000. Listing 8,192 takes 30 ms, and the event
 meanwhile."""
 MOST_LISTED_MISMATCHES = 100
 """Mismatches of a domain that are listed, with fair shares by the address inside."""
+MOST_STEPS_AT_ONCE = 4
+"""Steps of a comparison that a status may take, some 10 ms. A host with fifty nodes and a robot
+with as many take more. Then the status has the comparison of the last check."""
 _NO_SHORTAGE = PortShortage()
 _Participant = TypeVar("_Participant", bound=Participant)
+
+
+class Comparisons:
+    """The comparisons of the readers and writers of each domain."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, Comparison] = {}
+
+    def of(self, domain: Domain) -> Comparison:
+        """A comparison that is made now, or that of the last `renew` if it takes too long."""
+        steps = _steps(domain)
+        try:
+            for _ in range(MOST_STEPS_AT_ONCE):
+                next(steps)
+        except StopIteration as end:
+            comparison: Comparison = end.value
+            return comparison
+        return self._last.get(domain.settings.number, Comparison())
+
+    async def renew(self, domains: Iterable[Domain]) -> None:
+        """Compare the readers and writers of domains. The proxy forwards between the steps."""
+        for domain in domains:
+            steps = _steps(domain)
+            try:
+                while True:
+                    next(steps)
+                    await asyncio.sleep(0)
+            except StopIteration as end:
+                self._last[domain.settings.number] = end.value
+
+
+def _steps(domain: Domain) -> Generator[None, None, Comparison]:
+    return comparison_steps(domain.inside.by_prefix.values(), domain.outside.by_prefix.values())
 
 
 @dataclass(eq=False)
@@ -57,6 +94,7 @@ class Ros2State(Collector):
     _servers: Sequence[DomainServer]
     _plane: DomainPlane
     with_names: bool = True
+    comparisons: Comparisons = field(default_factory=Comparisons)
 
     def status(self) -> tuple[document.DomainStatus, ...]:
         """The status of each domain."""
@@ -146,7 +184,7 @@ class Ros2State(Collector):
         domain = server.domain
         settings = server.domain.settings
         discovery = settings.ports.advertised(settings.discovery_port)
-        comparison = compare(domain.inside.by_prefix.values(), domain.outside.by_prefix.values())
+        comparison = self.comparisons.of(domain)
         pairs = comparison.mismatched
         shortages = domain.mappings.shortages
         shown_pairs = fair_choice(pairs, _address_inside, MOST_LISTED_MISMATCHES)
@@ -205,13 +243,18 @@ class Ros2State(Collector):
 
     def _status_of(self, participant: Participant, most: int) -> document.ParticipantStatus:
         endpoints = _first_endpoints(participant, most)
-        writers = {endpoint.topic for endpoint in endpoints if endpoint.kind is EndpointKind.WRITER}
-        readers = {endpoint.topic for endpoint in endpoints if endpoint.kind is EndpointKind.READER}
-        publishes = sorted(filter(None, map(ros_topic, writers)))
-        subscribes = sorted(filter(None, map(ros_topic, readers)))
-        services = sorted(filter(None, map(ros_service, readers)))
-        types = {ros_name(endpoint.topic): ros_type(endpoint.type_name) for endpoint in endpoints}
-        named = types.keys() & {*publishes, *subscribes, *services}
+        publishes = set[str]()
+        subscribes = set[str]()
+        services = set[str]()
+        types: dict[str, str] = {}
+        for endpoint in endpoints:
+            name = ros_name(endpoint.topic)
+            types[name] = ros_type(endpoint.type_name)
+            if not is_of_service(endpoint.topic):
+                (publishes if endpoint.kind is EndpointKind.WRITER else subscribes).add(name)
+            elif endpoint.kind is EndpointKind.READER and is_of_requests(endpoint.topic):
+                services.add(name)
+        named = types.keys() & (publishes | subscribes | services) - {""}
         return document.ParticipantStatus(
             guid_prefix=participant.guid_prefix,
             address=participant.address,
@@ -220,9 +263,9 @@ class Ros2State(Collector):
                 self._plane.locator(participant, mapping)
                 for mapping in participant.mappings.values()
             ),
-            publishes=tuple(publishes),
-            subscribes=tuple(subscribes),
-            services=tuple(services),
+            publishes=tuple(sorted(publishes - {""})),
+            subscribes=tuple(sorted(subscribes - {""})),
+            services=tuple(sorted(services - {""})),
             nodes=tuple(sorted({node for node in map(_node_of, endpoints) if node})),
             left_out=len(participant.endpoints) - len(endpoints) if self.with_names else 0,
             domain=participant.traits.domain,

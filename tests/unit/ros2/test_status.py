@@ -1,5 +1,6 @@
 """The status of a domain: topics, types, and readers and writers that do not match."""
 
+import asyncio
 import struct
 from dataclasses import dataclass
 from typing import cast
@@ -24,7 +25,7 @@ from rosproxy.ros2.registry.participants import (
     PortMapping,
 )
 from rosproxy.ros2.servers.domain_server import DomainServer
-from rosproxy.ros2.status import Ros2State, _first_endpoints
+from rosproxy.ros2.status import MOST_STEPS_AT_ONCE, Ros2State, _first_endpoints
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
@@ -76,10 +77,12 @@ def sedp(prefix: bytes, writer: int, topic: str, kind: str, reliability: int) ->
     return message(data(payload(parameters), writer=writer), prefix=prefix)
 
 
+def state_of(domain: Domain) -> Ros2State:
+    return Ros2State([cast(DomainServer, Served(domain))], cast(DomainPlane, Copied()))
+
+
 def told(domain: Domain) -> DomainStatus:
-    (status,) = Ros2State(
-        [cast(DomainServer, Served(domain))], cast(DomainPlane, Copied())
-    ).status()
+    (status,) = state_of(domain).status()
     return status
 
 
@@ -118,6 +121,23 @@ def test_topics_and_their_types() -> None:
         NamedTypeStatus("/scan", "std_msgs/msg/String"),
     )
     assert told(domain).mismatches == ()
+
+
+async def test_a_long_comparison_is_made_in_steps_and_the_status_has_the_last_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A status took 0.3 s to compare 20,000 pairs. Meanwhile the proxy forwarded nothing."""
+    monkeypatch.setattr("rosproxy.ros2.registry.matching.ITEMS_PER_STEP", 1)
+    domain = make_domain()
+    announce(domain, 2)
+    state = state_of(domain)
+    assert state.status()[0].mismatches == ()
+    renewal = asyncio.create_task(state.comparisons.renew([domain]))
+    for _ in range(MOST_STEPS_AT_ONCE):
+        await asyncio.sleep(0)
+    assert not renewal.done()
+    await renewal
+    assert [pair.policy for pair in state.status()[0].mismatches] == ["reliability"]
 
 
 def test_a_participant_has_the_names_of_all_its_nodes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,8 @@ DDS calls the topic ``/chatter`` ``rt/chatter``. A service has two topics, ``rq/
 namespace, ``dds_``.
 """
 
+from rosproxy.net.addresses import cached
+
 _TOPIC = "rt/"
 _REQUEST = "rq/"
 _REPLY = "rr/"
@@ -62,6 +64,7 @@ def ros_node(dds_topic: str, dds_type: str) -> str | None:
     return service.removesuffix(ending) or None
 
 
+@cached
 def ros_type(dds_type: str) -> str:
     """The ROS type for a DDS type: std_msgs/msg/String for ``std_msgs::msg::dds_::String_``.
 

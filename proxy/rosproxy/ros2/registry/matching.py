@@ -14,7 +14,7 @@ comparison of another address's pairs.
 """
 
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from itertools import islice, repeat
 from typing import TypeVar
 
@@ -30,6 +30,8 @@ has some tens. The addresses of the side take turns."""
 MOST_COMPARED_PAIRS = 20_000
 """Pairs in one comparison. The addresses inside take turns, and so do the readers and writers of an
 address. The endpoints outside of each pair follow in the order of the turns outside."""
+ITEMS_PER_STEP = 500
+"""Endpoints or pairs in a step of a comparison: some milliseconds."""
 _OPPOSITE = {
     EndpointKind.READER: EndpointKind.WRITER,
     EndpointKind.WRITER: EndpointKind.READER,
@@ -76,30 +78,47 @@ def compare(inside: Iterable[Participant], outside: Iterable[Participant]) -> Co
     Two participants may have several pairs of the same topic or service that do not match by the
     same policy. Then the result has only the first of these pairs.
     """
-    insiders, not_looked_at_inside = _endpoints(inside)
-    outsiders, not_looked_at_outside = _endpoints(outside)
+    steps = comparison_steps(inside, outside)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            comparison: Comparison = end.value
+            return comparison
+
+
+def comparison_steps(
+    inside: Iterable[Participant], outside: Iterable[Participant]
+) -> Generator[None, None, Comparison]:
+    """The comparison of `compare` in steps of some milliseconds.
+
+    The first step reads the two sides, so these may change between the steps.
+    """
+    looks = [_Endpoints(inside), _Endpoints(outside)]
+    insiders = yield from _in_steps(looks[0].owned)
+    outsiders = yield from _in_steps(looks[1].owned)
     by_partner: defaultdict[tuple[str, EndpointKind], list[_Owned]] = defaultdict(list)
-    for owned in outsiders:
+    for number, owned in enumerate(outsiders, start=1):
         _, endpoint = owned
         by_partner[endpoint.topic, _OPPOSITE[endpoint.kind]].append(owned)
+        if number % ITEMS_PER_STEP == 0:
+            yield
     by_address: defaultdict[str, list[Iterator[tuple[_Owned, _Owned]]]] = defaultdict(list)
     count = 0
-    for owned in insiders:
+    for number, owned in enumerate(insiders, start=1):
         participant, endpoint = owned
         partners = by_partner.get((endpoint.topic, endpoint.kind), [])
         by_address[participant.address].append(zip(repeat(owned), partners))
         count += len(partners)
+        if number % ITEMS_PER_STEP == 0:
+            yield
     pairs = _in_turn(map(_in_turn, by_address.values()))
     mismatched: dict[tuple[str, bytes, bytes, str], MismatchedPair] = {}
-    for insider, outsider in islice(pairs, MOST_COMPARED_PAIRS):
-        is_written_inside = insider[1].kind is EndpointKind.WRITER
-        (source, writer), (sink, reader) = (
-            (insider, outsider) if is_written_inside else (outsider, insider)
-        )
-        if reason := mismatch(writer, reader):
-            key = ros_name(writer.topic), insider[0].prefix, outsider[0].prefix, reason.policy
-            mismatched.setdefault(key, MismatchedPair(reason, writer.topic, source, sink))
-    left_out = max(count - MOST_COMPARED_PAIRS, 0) + not_looked_at_inside + not_looked_at_outside
+    for number, pair in enumerate(islice(pairs, MOST_COMPARED_PAIRS), start=1):
+        _note_mismatch(*pair, mismatched)
+        if number % ITEMS_PER_STEP == 0:
+            yield
+    left_out = max(count - MOST_COMPARED_PAIRS, 0) + sum(look.left_out for look in looks)
     return Comparison(list(mismatched.values()), left_out)
 
 
@@ -107,22 +126,45 @@ _Owned = tuple[Participant, DdsEndpoint]
 _Item = TypeVar("_Item")
 
 
-def _endpoints(side: Iterable[Participant]) -> tuple[list[_Owned], int]:
-    """Return the readers and writers of a side in turn, and how many are left out.
+def _note_mismatch(
+    insider: _Owned,
+    outsider: _Owned,
+    mismatched: dict[tuple[str, bytes, bytes, str], MismatchedPair],
+) -> None:
+    """Add a pair to ``mismatched`` if it does not match, and if no such pair is there yet."""
+    is_written_inside = insider[1].kind is EndpointKind.WRITER
+    (source, writer), (sink, reader) = (
+        (insider, outsider) if is_written_inside else (outsider, insider)
+    )
+    if reason := mismatch(writer, reader):
+        key = ros_name(writer.topic), insider[0].prefix, outsider[0].prefix, reason.policy
+        mismatched.setdefault(key, MismatchedPair(reason, writer.topic, source, sink))
 
-    Equal endpoints of a participant count as one.
-    """
-    by_address: defaultdict[str, list[Iterator[_Owned]]] = defaultdict(list)
-    count = 0
-    for participant in side:
-        owned = zip(repeat(participant), participant.endpoints.values())
-        by_address[participant.address].append(owned)
-        count += len(participant.endpoints)
-    in_turn = islice(_in_turn(map(_in_turn, by_address.values())), MOST_COMPARED_ENDPOINTS)
-    different = {
-        (participant.prefix, endpoint): (participant, endpoint) for participant, endpoint in in_turn
-    }
-    return list(different.values()), max(count - MOST_COMPARED_ENDPOINTS, 0)
+
+class _Endpoints:
+    """The readers and writers of a side in turn (``owned``), and how many are left out."""
+
+    def __init__(self, side: Iterable[Participant]) -> None:
+        by_address: defaultdict[str, list[Iterator[_Owned]]] = defaultdict(list)
+        count = 0
+        for participant in side:
+            # A copy: the participant may have others in the next step.
+            owned = zip(repeat(participant), list(participant.endpoints.values()))
+            by_address[participant.address].append(owned)
+            count += len(participant.endpoints)
+        in_turn = _in_turn(map(_in_turn, by_address.values()))
+        self.owned = islice(in_turn, MOST_COMPARED_ENDPOINTS)
+        self.left_out = max(count - MOST_COMPARED_ENDPOINTS, 0)
+
+
+def _in_steps(every: Iterable[_Owned]) -> Generator[None, None, list[_Owned]]:
+    """The readers and writers in steps. Equal endpoints of a participant count as one."""
+    different: dict[tuple[bytes, DdsEndpoint], _Owned] = {}
+    for number, (participant, endpoint) in enumerate(every, start=1):
+        different[participant.prefix, endpoint] = participant, endpoint
+        if number % ITEMS_PER_STEP == 0:
+            yield
+    return list(different.values())
 
 
 def _in_turn(sequences: Iterable[Iterable[_Item]]) -> Iterator[_Item]:

@@ -9,11 +9,13 @@ from msgspec.structs import replace
 from rosproxy.ros2.protocol.qos import Durability, EndpointQos, Liveliness
 from rosproxy.ros2.registry import matching
 from rosproxy.ros2.registry.matching import (
+    ITEMS_PER_STEP,
     MOST_COMPARED_ENDPOINTS,
     MOST_COMPARED_PAIRS,
     Comparison,
     Mismatch,
     compare,
+    comparison_steps,
     mismatch,
 )
 from rosproxy.ros2.registry.participants import DdsEndpoint, EndpointKind, Participant
@@ -211,6 +213,32 @@ def test_so_many_are_compared_and_no_more(monkeypatch: pytest.MonkeyPatch) -> No
     comparison = compare([many(1, 200, writer)], [many(2, 200, reader), many(5, 7, writer)])
     assert len(compared) == MOST_COMPARED_PAIRS
     assert comparison.left_out == 200 * 200 - MOST_COMPARED_PAIRS
+
+
+def test_a_comparison_has_small_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = [0]
+    real = matching.mismatch
+
+    def counting(one: DdsEndpoint, other: DdsEndpoint) -> Mismatch | None:
+        done[-1] += 1
+        return real(one, other)
+
+    monkeypatch.setattr(matching, "mismatch", counting)
+    steps = comparison_steps([many(1, 200, writer)], [many(2, 200, reader)])
+    for _ in steps:
+        done.append(0)  # noqa: PERF401 - `counting` uses the list meanwhile
+    assert sum(done) == MOST_COMPARED_PAIRS
+    assert max(done) == ITEMS_PER_STEP
+
+
+def test_the_sides_may_change_between_the_steps_of_a_comparison() -> None:
+    inside = many(1, 2 * ITEMS_PER_STEP, writer)
+    outside = many(2, ITEMS_PER_STEP, reader)
+    steps = comparison_steps([inside], [outside])
+    next(steps)
+    inside.endpoints.clear()
+    outside.endpoints.clear()
+    assert len([*steps]) > 1
 
 
 def test_readers_and_writers_that_are_not_looked_at_are_counted() -> None:
