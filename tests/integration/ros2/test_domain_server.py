@@ -3,7 +3,7 @@
 import asyncio
 import socket
 import struct
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, count, pairwise, repeat
 
@@ -293,3 +293,24 @@ async def test_announcements_that_were_held_are_read_in_turn(server: DomainServe
     table = server.domain.inside.by_prefix
     assert len(table) <= 1
     await until(lambda: len(table) > 1, "the others are read")
+
+
+async def test_announcements_of_the_proxy_are_sent_in_turns(
+    server: DomainServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """489 participants took 0.06 s and more every three seconds."""
+    monkeypatch.setattr("rosproxy.ros2.servers.domain_server.SENT_PER_TURN", 4, raising=False)
+    sent = [0]
+
+    def send(outgoing: Iterable[Outgoing]) -> None:
+        sent[-1] += len([*outgoing])
+
+    monkeypatch.setattr(server, "_send", send)
+    server.select(f"127.0.8.{number}" for number in range(50))
+    sent[:] = [0]
+    announcing = asyncio.create_task(server.announce())
+    while not announcing.done():
+        await asyncio.sleep(0)
+        sent.append(0)
+    assert sum(sent) > 100
+    assert max(sent) <= 4 + 2 * 3  # beside those of a turn, some by multicast

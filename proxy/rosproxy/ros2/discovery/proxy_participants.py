@@ -6,6 +6,7 @@ has a reader or writer for a topic. Each side discovers these participants direc
 not pass on an announcement of these participants between the sides.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rosproxy.net.addresses import HostPort
@@ -118,10 +119,15 @@ class ProxyParticipants:
             participant.metatraffic, self.port_store.dispose_messages(participant.prefix)
         )
 
-    def port_reminders(self, now: float) -> list[Outgoing]:
-        """The datagrams with which participants inside keep their present ports."""
-        participants = self.former_ports.keepers(self.inside.by_prefix.values())
-        return [sent for p in participants for sent in self.former_ports.reminders(p, now)]
+    def port_reminders(self, now: float) -> Iterator[Outgoing]:
+        """Yield the datagrams with which participants inside keep their present ports.
+
+        The datagrams of a participant are made when the first of these is taken. So the caller can
+        do other work in between, and participants may end meanwhile.
+        """
+        for participant in self.former_ports.keepers(self.inside.by_prefix.values()):
+            if self.inside.by_prefix.get(participant.prefix) is participant:
+                yield from self.former_ports.reminders(participant, now)
 
     def handle_from_inside(
         self, message: DiscoveryMessage, source: str, now: float

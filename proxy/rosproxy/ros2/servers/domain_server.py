@@ -26,6 +26,7 @@ from collections.abc import (
     Collection,
     Hashable,
     Iterable,
+    Iterator,
     Mapping,
     Sequence,
 )
@@ -35,6 +36,7 @@ from rosproxy.forwarding import datagrams
 from rosproxy.forwarding.datagrams import LARGEST_DATAGRAM
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort, plain_address
+from rosproxy.net.tasks import in_turns
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import (
     NEXT_PORTS,
@@ -63,6 +65,10 @@ QUEUED_PER_PASSED = 8
 """Datagrams that a socket may queue in the time in which it passes on one datagram.
 
 If sockets queued fewer, the kernel would drop datagrams, without fairness to the sources."""
+
+SENT_PER_TURN = 64
+"""Own announcements that the proxy sends before the event loop does other work: some
+milliseconds."""
 
 Take = Callable[[bytes, str, float, int], list[Outgoing]]
 """Handles a datagram with its source, the time, and the number of received bytes. Returns the
@@ -227,25 +233,30 @@ class DomainServer:
         self._report_changes()
 
     async def announce(self) -> None:
-        """Announce the discovery participant to all, and send reminders of ports."""
+        """Announce the discovery participant to all, and send reminders of ports.
+
+        Hundreds of participants inside take 0.1 s. So the proxy forwards in between.
+        """
         for address in self._groups.joined:
             self._announce_on(address)
-        settings = self.domain.settings
-        inside = list(self.domain.inside.by_prefix.values())
-        self._send(
-            Outgoing(
-                p.metatraffic,
-                self.domain.proxy_participants.announced_inside(
-                    settings.proxy_address_for(p.address)
-                ),
-            )
-            for p in inside
-            if p.metatraffic
-        )
-        self._announce_to(self._selected.selected or ())
-        self._send(self.domain.proxy_participants.announced_outside())
-        self._send(self.domain.proxy_participants.port_reminders(self._now()))
+        await self._send_in_turns(self._announcements_to_inside())
+        await self._send_in_turns(self._announcements_at(self._selected.selected or ()))
+        await self._send_in_turns(self.domain.proxy_participants.announced_outside())
+        await self._send_in_turns(self.domain.proxy_participants.port_reminders(self._now()))
         self._tell_relay()
+
+    def _announcements_to_inside(self) -> Iterator[Outgoing]:
+        """Yield the announcements of the discovery participant to the participants inside."""
+        settings = self.domain.settings
+        for participant in list(self.domain.inside.by_prefix.values()):
+            if participant.metatraffic:
+                near = settings.proxy_address_for(participant.address)
+                announced = self.domain.proxy_participants.announced_inside(near)
+                yield Outgoing(participant.metatraffic, announced)
+
+    async def _send_in_turns(self, outgoing: Iterable[Outgoing]) -> None:
+        async for out in in_turns(outgoing, SENT_PER_TURN):
+            self._send([out])
 
     def close(self) -> None:
         """Close all sockets."""
@@ -300,7 +311,10 @@ class DomainServer:
             self._read_in_turn(self._heard_at_well_known, datagram, source, None)
 
     def _announce_to(self, addresses: Iterable[str]) -> None:
-        """Announce the discovery participant by unicast to addresses that may not get multicast.
+        self._send(self._announcements_at(addresses))
+
+    def _announcements_at(self, addresses: Iterable[str]) -> Iterator[Outgoing]:
+        """Yield unicast announcements to addresses that may not get multicast.
 
         Docker's internal networks pass no multicast if the host filters bridged packets
         (br_netfilter).
@@ -317,7 +331,8 @@ class DomainServer:
             targets = settings.well_known(
                 address, count + NEXT_PORTS if count else PARTICIPANTS_TRIED
             )
-            self._send(Outgoing(target, announcement) for target in targets)
+            for target in targets:
+                yield Outgoing(target, announcement)
 
     def _announce_on(self, near: str) -> None:
         self._multicast(near, self.domain.proxy_participants.announced_inside(near))

@@ -392,15 +392,27 @@ def test_a_participant_that_shares_its_locator_keeps_its_ports() -> None:
     assert reminded(domain) == {A, in_other_process}
 
 
+def test_a_participant_that_has_ended_is_not_reminded() -> None:
+    """The proxy forwards between the reminders, so participants may end meanwhile."""
+    domain = make_domain()
+    meet(domain, A)
+    meet(domain, B)
+    reminders = domain.proxy_participants.port_reminders(NOW)
+    assert next(reminders).target == next(reminders).target
+    domain.end_participants_at([INSIDE])
+    assert [*reminders] == []
+    assert not domain.proxy_participants.port_store._counts
+
+
 def test_participants_are_reminded_until_they_keep_their_ports() -> None:
     domain = make_domain()
     meet(domain)
     told, reminder = domain.proxy_participants.port_reminders(NOW)
     assert {told.target, reminder.target} == {HostPort(INSIDE, 7410)}
-    assert domain.proxy_participants.port_reminders(NOW)
+    assert [*domain.proxy_participants.port_reminders(NOW)]
     number = domain.proxy_participants.port_store.number(domain.inside.by_prefix[A].ports)
     domain.heard_inside(kept_answer(domain, A, number), INSIDE, NOW)
-    assert domain.proxy_participants.port_reminders(NOW) == []
+    assert [*domain.proxy_participants.port_reminders(NOW)] == []
 
 
 @given(st.binary(max_size=300), st.sampled_from([INSIDE, ROBOT, STRANGER, LAN_RELAY.host]))

@@ -277,7 +277,7 @@ def test_a_participant_keeps_its_ports_and_their_proof() -> None:
         assert not domain.has_confirmed_ports(domain.inside.by_prefix[A])
         domain.heard_inside(answer, INSIDE, NOW)
     assert domain.has_confirmed_ports(domain.inside.by_prefix[A])
-    assert domain.proxy_participants.port_reminders(NOW) == []
+    assert [*domain.proxy_participants.port_reminders(NOW)] == []
 
 
 def announce_from(domain: Domain, prefix: bytes, source: str, now: float) -> list[Outgoing]:

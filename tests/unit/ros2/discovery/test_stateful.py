@@ -220,8 +220,10 @@ class Neighbours(RuleBasedStateMachine):
     @rule()
     def the_proxy_announces(self) -> None:
         self.check(
-            self.domain.proxy_participants.port_reminders(self.now)
-            + self.domain.proxy_participants.announced_outside()
+            [
+                *self.domain.proxy_participants.port_reminders(self.now),
+                *self.domain.proxy_participants.announced_outside(),
+            ]
         )
 
     @rule(port=st.integers(STAND_INS.first, STAND_INS.last), for_good=st.booleans())
