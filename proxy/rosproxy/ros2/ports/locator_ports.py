@@ -126,6 +126,7 @@ class LocatorPorts:
         self._started = started
         self._former_users: dict[int, _FormerUsers] = {}
         self._forwarded: dict[int, HostPort] = {}
+        self._forwarded_to: dict[HostPort, list[int]] = {}
         self._claims: dict[int, dict[bytes, bool]] = {}
         """The participants that claim each port, and whether each has a proof."""
         self._ports_claimed: dict[bytes, Sequence[int]] = {}
@@ -163,6 +164,9 @@ class LocatorPorts:
     def note_forwarded(self, forwards: Mapping[int, HostPort]) -> None:
         """Note the ports that the kernel forwarded before the start, and their locators."""
         self._forwarded = {p: locator for p, locator in forwards.items() if p in self.pool.range}
+        self._forwarded_to = {}
+        for port, locator in self._forwarded.items():
+            self._forwarded_to.setdefault(locator, []).append(port)
 
     def note_claims(self, prefix: bytes, ports: Sequence[int], proven_count: int) -> None:
         """Note the ports that a participant claims; the first ``proven_count`` have a proof."""
@@ -224,38 +228,58 @@ class LocatorPorts:
             self._forget_former()
         if not self.pool.free:
             return None  # the search takes long, and a datagram may name a thousand locators
-        claims = self._claims_of((prefix, kind), locator, former_port)
+        own, others, disputed = self._ports_by_claim((prefix, kind), locator, former_port)
         order = partial(order_for, f"{prefix.hex()} {locator}", self.pool.range)
-        unclaimed = (port for port in order() if claims.get(port) in (None, _Claim.UNCLAIMED))
-        others = (port for port in order() if claims.get(port) is _Claim.OF_ANOTHER)
-        disputed = (port for port in order() if claims.get(port) is _Claim.DISPUTED)
+        unclaimed = (port for port in order() if port not in others and port not in disputed)
         first = next(order())
         length = len(self.pool.range)
-        own = [port for port, claim in claims.items() if claim < _Claim.UNCLAIMED]
-        own.sort(key=lambda port: (claims[port], (port - first) % length))
-        port = next(filter(self.pool.claim, chain(own, unclaimed, others, disputed)), None)
+        best = sorted(own, key=lambda port: (own[port], (port - first) % length))
+        worse = (port for ports in (others, disputed) for port in order() if port in ports)
+        port = next(filter(self.pool.claim, chain(best, unclaimed, worse)), None)
         if port is not None:
             self._former_users.pop(port, None)
             self._forwarded.pop(port, None)
-            self._lent[port] = prefix, claims.get(port, _Claim.UNCLAIMED)
+            if port in others:
+                claim = _Claim.OF_ANOTHER
+            else:
+                claim = _Claim.DISPUTED if port in disputed else _Claim.UNCLAIMED
+            self._lent[port] = prefix, own.get(port, claim)
         return port
 
     def _forget_former(self) -> None:
         """Forget the evidence from before the start, because `EVIDENCE_PERIOD_S` is over."""
         self._former_users.clear()
         self._forwarded.clear()
+        self._forwarded_to.clear()
         self._claims.clear()
         self._ports_claimed.clear()
         self._lent.clear()
         self._disputed.clear()
 
-    def _claims_of(
+    def _ports_by_claim(
         self, user: _User, locator: HostPort, former_port: int | None
-    ) -> dict[int, _Claim]:
-        """The claim of a participant to each port for which there is any evidence."""
-        ports = {*self._former_users, *self._forwarded, *self._claims, *self._disputed}
-        ports |= {former_port} if former_port else set()
-        return {port: self._claim(port, user, locator, former_port) for port in ports}
+    ) -> tuple[dict[int, _Claim], set[int], set[int]]:
+        """The ports with any evidence, by the claim of a participant.
+
+        Three values: the ports that the participant claims, with its claims; the ports of another
+        participant; the disputed ports. Outside may name participants at all ports. So the method
+        looks closely only at the ports with evidence for this participant.
+        """
+        prefix, _ = user
+        named = self._former_users
+        concerned = {port for port, users in named.items() if prefix in users.prefixes}
+        concerned |= {*self._ports_claimed.get(prefix, ()), *self._forwarded_to.get(locator, ())}
+        concerned |= {former_port} if former_port else set()
+        claims = {port: self._claim(port, user, locator, former_port) for port in concerned}
+        rest = {port for port, users in named.items() if users.prefixes}
+        rest.update(self._claims, self._disputed, self._forwarded)
+        rest -= concerned
+        disputed = rest & self._disputed.keys() - self._forwarded.keys()
+        others = rest - disputed
+        others |= {port for port, claim in claims.items() if claim is _Claim.OF_ANOTHER}
+        disputed |= {port for port, claim in claims.items() if claim is _Claim.DISPUTED}
+        own = {port: claim for port, claim in claims.items() if claim < _Claim.UNCLAIMED}
+        return own, others, disputed
 
     def _claim(self, port: int, user: _User, locator: HostPort, former_port: int | None) -> _Claim:
         """The claim of a participant to a port, for a locator."""
