@@ -113,7 +113,27 @@ def test_the_log_names_so_many_changed_forwards_and_no_more(
     assert len(caplog.records) == MOST_LINES
     now = LINES_PERIOD_S
     syncer._log(Changes({}, {11400: HostPort("172.30.0.5", 7413)}))
-    assert len(caplog.records) == MOST_LINES + 1
+    assert [record.message for record in caplog.records[MOST_LINES:]] == [
+        "200 more forwards of topics have changed; the log names 200 in 60 s",
+        "a node that has ended: the kernel forwards port 11400 to 172.30.0.5:7413",
+    ]
+
+
+def test_the_log_counts_changed_forwards_also_if_no_more_change(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    now = 0.0
+    syncer = kernel_plane(monkeypatch, Problems(), clock=lambda: now).syncer
+    caplog.set_level(logging.INFO)
+    syncer._log(Changes({}, {p: HostPort("172.30.0.5", p) for p in range(MOST_LINES + 7)}))
+    syncer.look_around()
+    assert len(caplog.records) == MOST_LINES
+    now = LINES_PERIOD_S
+    for _ in range(2):
+        syncer.look_around()
+    assert [record.message for record in caplog.records[MOST_LINES:]] == [
+        "7 more forwards of topics have changed; the log names 200 in 60 s"
+    ]
 
 
 @pytest.mark.parametrize(("has_connections", "pauses"), [(True, []), (False, [DATAGRAM_PAUSE_S])])

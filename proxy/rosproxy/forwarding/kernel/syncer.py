@@ -90,7 +90,8 @@ class ForwardSyncer:
         self._retry_at = float("inf")
         self._routes_until = 0.0
         self._logged: dict[LeaseHolder, str] = {}
-        self._lines = 0
+        self._lines = self._unnamed = 0
+        """The changed forwards since `_lines_since` with a line in the log, and without."""
         self._lines_since = clock()
         self.traffic = "topics" if table.has_connections else "datagrams"
         self.subject = SUBJECT if table.has_connections else f"{SUBJECT} for UDP"
@@ -121,7 +122,11 @@ class ForwardSyncer:
         return self.usable
 
     def look_around(self) -> None:
-        """Read what this network namespace forwards, and drop old routes and ended endpoints."""
+        """Read what this network namespace forwards, and drop old routes and ended endpoints.
+
+        Also log how many changed forwards had no line of their own.
+        """
+        self._begin_lines_period()
         endpoints = set(self._endpoints)
         self._logged = {e: why for e, why in self._logged.items() if e in endpoints}
         self._host = read_forwarding()
@@ -305,15 +310,22 @@ class ForwardSyncer:
                     wanted[endpoint.fast_port] = target
         return wanted
 
+    def _begin_lines_period(self) -> None:
+        """After LINES_PERIOD_S, log how many changes had no line of their own, and begin anew."""
+        if self._clock() - self._lines_since < LINES_PERIOD_S:
+            return
+        if self._unnamed:
+            text = "%d more forwards of %s have changed; the log names %d in %d s"
+            log.info(text, self._unnamed, self.traffic, MOST_LINES, LINES_PERIOD_S)
+        self._lines = self._unnamed = 0
+        self._lines_since = self._clock()
+
     def _log(self, change: Changes) -> None:
-        if self._clock() - self._lines_since >= LINES_PERIOD_S:
-            self._lines = 0
-            self._lines_since = self._clock()
+        self._begin_lines_period()
         changed = [*{**change.removed, **change.added}]
         logged = changed[: MOST_LINES - self._lines]
         self._lines += len(logged)
-        if len(logged) < len(changed):
-            log.debug("%d more forwards have changed", len(changed) - len(logged))
+        self._unnamed += len(changed) - len(logged)
         for port in logged:
             endpoint = self._accounts.owners.get(port)
             target = change.added.get(port)
