@@ -34,7 +34,7 @@ from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master_client import CALLER_ID, MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
-from rosproxy.ros1.registry.remembered_leases import NAMESPACE, lease_at
+from rosproxy.ros1.registry.remembered_leases import NAMESPACE, LeasesAtMaster
 from rosproxy.telemetry.metrics import Metrics
 
 MOST_QUESTIONS = 32
@@ -140,7 +140,8 @@ class _Collector:
         names = sorted(graph.names())
         uris = await self._master.look_up("lookupNode", names)
         _, leases = await _attempt(self._master.call_master("getParam", NAMESPACE))
-        nodes = {name: _node_facts(name, uris.get(name, ""), leases) for name in names}
+        # In a thread: a long parameter would hold up the proxy, which asks for the live page.
+        nodes = await asyncio.to_thread(_all_node_facts, names, uris, leases)
         facts = replace(
             facts,
             graph=graph,
@@ -309,10 +310,18 @@ async def _exchange(target: HostPort, header: Mapping[str, str]) -> dict[str, st
         writer.close()
 
 
-def _node_facts(name: str, uri: str, leases: object) -> NodeFacts:
-    """The facts about a node at the master. ``leases``: what proxies store in a parameter there."""
+def _all_node_facts(
+    names: Iterable[str], uris: Mapping[str, str], leases: object
+) -> dict[str, NodeFacts]:
+    """The facts about all nodes at the master, by name; ``leases`` is the value of NAMESPACE."""
+    at_master = LeasesAtMaster(leases)
+    return {name: _node_facts(name, uris.get(name, ""), at_master) for name in names}
+
+
+def _node_facts(name: str, uri: str, leases: LeasesAtMaster) -> NodeFacts:
+    """The facts about a node at the master."""
     slave = parse_slave_uri(uri)
-    lease = lease_at(leases, slave) if slave else None
+    lease = leases.at(slave) if slave else None
     inside = parse_inside_path(uri) or (lease.node if lease else None)
     return NodeFacts(name, uri, inside.slave if inside else None)
 

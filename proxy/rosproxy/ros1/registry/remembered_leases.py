@@ -17,6 +17,7 @@ from the master, and the nodes have to confirm it (`rosproxy.ros1.upkeep.verifie
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 
 import msgspec
 
@@ -38,6 +39,8 @@ class RememberedLease(msgspec.Struct, frozen=True):
 
 NAMESPACE = "/rosproxy"
 """The namespace of the parameters of all proxies."""
+MOST_LINES = 65_536
+"""Lines that are read for an advertised host: as many as a host has ports."""
 
 
 def parameter_of(host: str, ports: PortMap) -> str:
@@ -52,29 +55,48 @@ def leases_text(endpoints: Iterable[Endpoint], ports: PortMap) -> str:
 
 def read_leases(value: object, ports: PortMap) -> Mapping[int, RememberedLease]:
     """Read the leases of the range from a value, by listening port; bad lines are left out."""
-    leases = {ports.listening(port): lease for port, lease in _read(value)}
+    lines = value.splitlines() if isinstance(value, str) else ()
+    leases = {ports.listening(port): lease for port, lease in _read(lines)}
     return {port: lease for port, lease in leases.items() if port is not None}
 
 
-def lease_at(parameters: object, advertised: HostPort) -> RememberedLease | None:
-    """The lease at an advertised host and port, of any proxy; None if no parameter has this lease.
+class LeasesAtMaster:
+    """The leases of all proxies at the master. ``parameters`` is the value of NAMESPACE there.
 
-    ``parameters`` is the value of NAMESPACE at the master.
+    Any program can write to the parameters, and may make them long. So each line is read once, up
+    to MOST_LINES for an advertised host.
     """
-    name = _name_of(advertised.host)
-    items = parameters.items() if isinstance(parameters, dict) else ()
-    # Only the port may follow: leases_robot_lan_50000 also begins with leases_robot_.
-    values = [v for key, v in items if re.fullmatch(rf"{name}\d+", str(key))]
-    return next((lease for v in values for p, lease in _read(v) if p == advertised.port), None)
+
+    def __init__(self, parameters: object) -> None:
+        self._values: dict[str, list[str]] = {}
+        """The values by the name of the parameter, without the port at its end."""
+        for key, value in parameters.items() if isinstance(parameters, dict) else ():
+            if isinstance(value, str):
+                self._values.setdefault(str(key).rstrip("0123456789"), []).append(value)
+        self._by_host: dict[str, dict[int, RememberedLease]] = {}
+
+    def at(self, advertised: HostPort) -> RememberedLease | None:
+        """The lease at an advertised host and port; None if no parameter has this lease."""
+        name = _name_of(advertised.host)
+        if name not in self._by_host:
+            self._by_host[name] = self._read(name)
+        return self._by_host[name].get(advertised.port)
+
+    def _read(self, name: str) -> dict[int, RememberedLease]:
+        lines = (line for value in self._values.get(name, ()) for line in value.splitlines())
+        leases: dict[int, RememberedLease] = {}
+        for port, lease in _read(islice(lines, MOST_LINES)):
+            leases.setdefault(port, lease)
+        return leases
 
 
 def _name_of(host: str) -> str:
     return f"leases_{_NOT_IN_NAMES.sub('_', host)}_"
 
 
-def _read(value: object) -> Iterator[tuple[int, RememberedLease]]:
-    """The advertised ports in a value, each with its lease."""
-    for line in value.splitlines() if isinstance(value, str) else ():
+def _read(lines: Iterable[str]) -> Iterator[tuple[int, RememberedLease]]:
+    """The advertised ports in the lines of values, each with its lease."""
+    for line in lines:
         match = _LINE.fullmatch(line)
         # Only the path counts. Host and port of the URI may be any.
         node = parse_inside_path(f"http://h:1{match[2]}") if match else None

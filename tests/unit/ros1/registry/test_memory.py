@@ -1,16 +1,17 @@
 """The text that outlasts the proxy: the node of each lease, and the node's location."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.uris import InsidePath
+from rosproxy.ros1.protocol.uris import InsidePath, parse_inside_path
 from rosproxy.ros1.registry import remembered_leases
 from rosproxy.ros1.registry.endpoint import MOST_SERVICE_PORTS
 from rosproxy.ros1.registry.remembered_leases import (
+    LeasesAtMaster,
     RememberedLease,
-    lease_at,
     parameter_of,
     read_leases,
 )
@@ -68,24 +69,24 @@ def test_what_any_proxy_has_at_an_address_is_told() -> None:
         "leases_robot_45000": "x",
         "y": 1,
     }
-    assert lease_at(parameters, HostPort("robot", 30003)) == RememberedLease(PLACE)
-    assert lease_at(parameters, HostPort("robot", 30004)) is None
-    assert lease_at(parameters, HostPort("laptop", 30003)) is None
-    assert lease_at("nothing", HostPort("robot", 30003)) is None
+    assert LeasesAtMaster(parameters).at(HostPort("robot", 30003)) == RememberedLease(PLACE)
+    assert LeasesAtMaster(parameters).at(HostPort("robot", 30004)) is None
+    assert LeasesAtMaster(parameters).at(HostPort("laptop", 30003)) is None
+    assert LeasesAtMaster("nothing").at(HostPort("robot", 30003)) is None
 
 
 def test_a_host_whose_name_begins_alike_has_other_leases() -> None:
     parameters = {"leases_robot_lan_30000": "30003 /10.0.0.9:40001/\n"}
-    assert lease_at(parameters, HostPort("robot", 30003)) is None
-    assert lease_at(parameters, HostPort("robot.lan", 30003)) is not None
+    assert LeasesAtMaster(parameters).at(HostPort("robot", 30003)) is None
+    assert LeasesAtMaster(parameters).at(HostPort("robot.lan", 30003)) is not None
     parameters["leases_robot_30000"] = "30003 /10.0.0.5:40001/\n"
-    assert lease_at(parameters, HostPort("robot", 30003)) == RememberedLease(PLACE)
+    assert LeasesAtMaster(parameters).at(HostPort("robot", 30003)) == RememberedLease(PLACE)
 
 
 @given(st.text() | st.integers() | st.lists(st.text()) | st.dictionaries(st.text(), st.text()))
 def test_nothing_that_somebody_writes_there_is_an_error(value: object) -> None:
     read_leases(value, PORTS)
-    lease_at(value, HostPort("robot", 30003))
+    LeasesAtMaster(value).at(HostPort("robot", 30003))
 
 
 LINES = st.builds(
@@ -102,3 +103,20 @@ def test_what_is_read_is_lawful(text: str) -> None:
         assert port in PORTS.listen
         assert len(lease.service_ports) <= MOST_SERVICE_PORTS
         assert all(0 < service < 65536 for service in lease.service_ports)
+
+
+def test_each_line_is_read_once_for_all_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For each node, the doctor read all lines of a parameter that any program can set."""
+    monkeypatch.setattr(remembered_leases, "MOST_LINES", 100)
+    read = list[str]()
+
+    def parse(uri: str) -> InsidePath | None:
+        read.append(uri)
+        return parse_inside_path(uri)
+
+    monkeypatch.setattr(remembered_leases, "parse_inside_path", parse)
+    lines = "".join(f"{30_000 + number} /10.0.0.5:1/\n" for number in range(1000))
+    leases = LeasesAtMaster({"leases_robot_30000": lines, "leases_robot_40000": lines})
+    found = [leases.at(HostPort("robot", 30_000 + number)) is not None for number in range(200)]
+    assert found == [True] * 100 + [False] * 100
+    assert len(read) == 100
