@@ -6,7 +6,7 @@ of replies. `scope` resolves the names in the user's question to nodes, services
 publisher and subscriber.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from enum import Enum
 from functools import cached_property
 from typing import Any
@@ -74,17 +74,34 @@ class SlaveReport(msgspec.Struct, frozen=True):
     counts: Mapping[tuple[str, str, str], tuple[int, int]] = {}
     at: float = 0.0
 
+    @property
+    def characters(self) -> int:
+        """The characters of all texts, with 200 for each row: the memory of a short row."""
+        topics = [*self.publishes.items(), *self.subscribes.items()]
+        return sum(200 + sum(map(len, row)) for row in (*topics, *self.peers))
+
 
 def slave_report(
-    publications: Any, subscriptions: Any, bus: Any, stats: Any = None, at: float = 0.0
+    publications: Any,
+    subscriptions: Any,
+    bus: Any,
+    stats: Any = None,
+    at: float = 0.0,
+    topics: Container[str] | None = None,
 ) -> SlaveReport:
     """Read the replies to getPublications, getSubscriptions, getBusInfo and getBusStats.
+
+    ``topics``: all other topics are left out; None: no topic is left out.
 
     A row of ``getBusInfo`` is ``[id, peer, direction, transport, topic, connected, ...]``. Booleans
     of XML-RPC arrive as text.
     """
+
+    def is_wanted(topic: str) -> bool:
+        return topics is None or topic in topics
+
     rows = [row for row in _items(bus) if isinstance(row, list) and len(row) > 5]
-    rows = [row for row in rows if row[5] not in (0, "0")]
+    rows = [row for row in rows if row[5] not in (0, "0") and is_wanted(str(row[4]))]
     counted = read_bus_stats(stats)
     links = {(str(row[2]), str(row[4]), str(row[1])): row[0] for row in rows}
     counts = {
@@ -92,9 +109,9 @@ def slave_report(
         for link, number in links.items()
         if isinstance(number, int) and number in counted.get(link[:2], {})
     }
-    return SlaveReport(
-        read_types(publications), read_types(subscriptions), frozenset(links), counts, at
-    )
+    types = [read_types(value) for value in (publications, subscriptions)]
+    published, subscribed = ({t: k for t, k in rows.items() if is_wanted(t)} for rows in types)
+    return SlaveReport(published, subscribed, frozenset(links), counts, at)
 
 
 def data_port(answer: Any) -> HostPort | None:
@@ -239,8 +256,9 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     ``service_uris``: URIs at the master by service. ``services``: attempts by service.
     ``uses_simulated_time``: the parameter /use_sim_time is true. ``names``: the nodes, topics and
     services in the user's question. ``data_ports``: by publisher and topic, the TCPROS address for
-    subscribers, and the attempt to reach this address. ``heard_participants``: participants on the
-    networks inside.
+    subscribers, and the attempt to reach this address. ``untried``: how many nodes the doctor has
+    not tried, because there are too many. ``heard_participants``: participants on the networks
+    inside.
     """
 
     admin: str = ""
@@ -259,6 +277,7 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     uses_simulated_time: bool = False
     names: tuple[str, ...] = ()
     data_ports: Mapping[tuple[str, str], tuple[str, Attempt]] = {}
+    untried: int = 0
     heard_participants: tuple[HeardParticipant, ...] = ()
 
     @property

@@ -10,13 +10,14 @@
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 import aiohttp
 from msgspec.structs import replace
 
+from rosproxy.admin.status_bounds import fair_choice
 from rosproxy.doctor.facts import (
     Attempt,
     DoctorFacts,
@@ -30,19 +31,27 @@ from rosproxy.doctor.facts import (
 )
 from rosproxy.doctor.rules.pair import is_connected
 from rosproxy.net.addresses import HostPort, parse_host_port
-from rosproxy.net.resolver import resolve
+from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.clients.master_client import CALLER_ID, MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
 from rosproxy.ros1.registry.remembered_leases import NAMESPACE, LeasesAtMaster
 from rosproxy.telemetry.metrics import Metrics
+from rosproxy.telemetry.text import brief
 
 MOST_QUESTIONS = 32
 """Nodes asked at once; fewer than the look-ups of names (`rosproxy.net.resolver`)."""
+MOST_TRIED = 1500
+"""Nodes that the doctor tries at most, with fair shares for the hosts in their URIs. Any program
+can register nodes at the master, and a node that does not answer takes ANSWER_TIMEOUT_S."""
+MOST_REPORT_CHARACTERS = 32_000_000
+"""Characters of the reports of all nodes at most. Each node has an equal part."""
 MOST_PAGE_QUESTIONS = 4
 """Nodes asked at once for the live page, which asks repeatedly."""
 ANSWER_TIMEOUT_S = 3.0
 """Seconds in which a node must answer."""
+LONGEST_REASON = 200
+"""Characters of the reason in an answer of a node or service."""
 
 Key = TypeVar("Key")
 Result = TypeVar("Result")
@@ -104,6 +113,8 @@ class _Collector:
         self._master = master
         self._nodes = nodes
         self._choose = choose
+        # For the live page, the proxy itself looks names up: those of nodes have a bound there.
+        self._source = NODES if choose else ""
         self._limit = asyncio.Semaphore(MOST_PAGE_QUESTIONS if choose else MOST_QUESTIONS)
 
     async def master(self) -> MasterFacts:
@@ -148,9 +159,10 @@ class _Collector:
             uses_simulated_time=await self._simulated_time(),
             service_uris=await self._master.look_up("lookupService", graph.services),
         )
-        to_try = facts.scope.nodes if facts.names else names
+        wanted = facts.scope.nodes if facts.names else names
+        to_try = _fair_part(nodes, wanted)
         nodes |= await _gather(to_try, lambda name: self._try_node(facts, nodes[name]))
-        facts = replace(facts, nodes=nodes)
+        facts = replace(facts, nodes=nodes, untried=len(wanted) - len(to_try))
         if self._choose:
             facts = replace(facts, names=self._choose(graph))
         return await self._examine_named(facts) if facts.names else facts
@@ -159,7 +171,12 @@ class _Collector:
         """Add the answers of the nodes, pairs and services in the scope."""
         scope = facts.scope
         nodes = facts.nodes
-        asked_nodes = await _gather(scope.nodes, lambda name: self._ask_node(facts, nodes[name]))
+        topics = {topic for topic, *_ in scope.pairs}
+        to_ask = _fair_part(nodes, scope.nodes)
+        most = MOST_REPORT_CHARACTERS // max(len(to_ask), 1)
+        asked_nodes = await _gather(
+            to_ask, lambda name: self._ask_node(facts, nodes[name], topics, most)
+        )
         facts = replace(facts, nodes={**nodes, **asked_nodes})
         unconnected = {
             (publisher, topic)
@@ -193,7 +210,7 @@ class _Collector:
             answered = next((a for a in attempts if a.reach is ReachOutcome.ANSWERED), None)
             return replace(node, attempt=answered) if answered else node
         async with self._limit:
-            addresses = tuple(await resolve(self._nodes.reach(slave).host))
+            addresses = tuple(await resolve(self._nodes.reach(slave).host, self._source))
             attempt = (
                 await self._ask_pid(slave) if addresses else Attempt(ReachOutcome.UNRESOLVABLE)
             )
@@ -205,8 +222,13 @@ class _Collector:
             return attempt
         return Attempt(ReachOutcome.STRANGER, "the answer is not that of a node")
 
-    async def _ask_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
-        """Add the report of a node; the doctor asks a node behind the proxy through the proxy."""
+    async def _ask_node(
+        self, facts: DoctorFacts, node: NodeFacts, topics: Collection[str], most: int
+    ) -> NodeFacts:
+        """Add the report of a node about ``topics``, unless it has more than ``most`` characters.
+
+        The doctor asks a node behind the proxy through the proxy.
+        """
         slave = _reached_at(facts, node.slave)
         ask = self._nodes.call_node
         if slave is None or node.attempt.failed:
@@ -220,7 +242,8 @@ class _Collector:
                 _, stats = await _attempt(ask(slave, ANSWER_TIMEOUT_S, "getBusStats"))
         except (Unreachable, MasterError):
             return node
-        return replace(node, report=slave_report(pubs, subs, bus, stats, at))
+        report = slave_report(pubs, subs, bus, stats, at, topics)
+        return replace(node, report=report) if report.characters <= most else node
 
     async def _try_data_port(
         self, facts: DoctorFacts, publisher: str, topic: str
@@ -249,7 +272,7 @@ class _Collector:
         # "*" matches any type (roscpp Publication::validateHeader; rospy tcpros_pubsub.py,
         # topic_connection_handler). This only tries the connection; a rule compares the types.
         header = {"callerid": CALLER_ID, "topic": topic, "type": "*", "md5sum": "*"}
-        return str(target), await _shake_hands(self._nodes.reach(target), header)
+        return str(target), await _shake_hands(self._nodes.reach(target), header, self._source)
 
     async def _try_service(self, facts: DoctorFacts, service: str) -> Attempt:
         """Ask a service for its type, as rosservice does."""
@@ -260,7 +283,7 @@ class _Collector:
         if target is None:
             return Attempt(ReachOutcome.REFUSED, "no node holds its port")
         header = {"callerid": CALLER_ID, "service": service, "md5sum": "*", "probe": "1"}
-        return await _shake_hands(self._nodes.reach(target), header)
+        return await _shake_hands(self._nodes.reach(target), header, self._source)
 
 
 def _reached_at(facts: DoctorFacts, target: HostPort | None) -> HostPort | None:
@@ -279,9 +302,9 @@ def _reached_at(facts: DoctorFacts, target: HostPort | None) -> HostPort | None:
     return HostPort(admin.host if bound in ("0.0.0.0", "::") else bound, lease.port)
 
 
-async def _shake_hands(target: HostPort, header: Mapping[str, str]) -> Attempt:
-    """Try a TCPROS address by an exchange of connection headers."""
-    addresses = await resolve(target.host)
+async def _shake_hands(target: HostPort, header: Mapping[str, str], source: str) -> Attempt:
+    """Try a TCPROS address by an exchange of connection headers; ``source``: see `resolve`."""
+    addresses = await resolve(target.host, source)
     if not addresses:
         return Attempt(ReachOutcome.UNRESOLVABLE)
     try:
@@ -294,7 +317,7 @@ async def _shake_hands(target: HostPort, header: Mapping[str, str]) -> Attempt:
     except HeaderError as error:
         return Attempt(ReachOutcome.STRANGER, str(error))
     return (
-        Attempt(ReachOutcome.STRANGER, reply["error"])
+        Attempt(ReachOutcome.STRANGER, brief(reply["error"], LONGEST_REASON))
         if "error" in reply
         else Attempt(ReachOutcome.ANSWERED)
     )
@@ -337,13 +360,30 @@ async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
         if isinstance(error.__cause__, aiohttp.ClientOSError | TimeoutError):
             return Attempt(ReachOutcome.SILENT), None
         # Without the name of the node or master at the beginning: the finding names the object.
-        reason = str(error).partition("\n")[0].partition(": ")[2][:200]
+        reason = str(error).partition("\n")[0].partition(": ")[2][:LONGEST_REASON]
         return Attempt(ReachOutcome.STRANGER, reason or "the answer can't be read"), None
+
+
+def _fair_part(nodes: Mapping[str, NodeFacts], names: Iterable[str]) -> list[str]:
+    """MOST_TRIED names of nodes, with fair shares for the hosts in their URIs."""
+
+    def host(name: str) -> str:
+        slave = nodes[name].slave
+        return slave.host if slave else ""
+
+    return fair_choice(names, host, MOST_TRIED)
 
 
 async def _gather(
     keys: Iterable[Key], work: Callable[[Key], Awaitable[Result]]
 ) -> dict[Key, Result]:
-    """The results of ``work`` for each key; all run concurrently."""
-    wanted = list(keys)
-    return dict(zip(wanted, await asyncio.gather(*map(work, wanted)), strict=True))
+    """The results of ``work`` for each key, for MOST_QUESTIONS keys at a time."""
+    waiting = iter(wanted := list(keys))
+    results: dict[Key, Result] = {}
+
+    async def work_in_order() -> None:
+        for key in waiting:
+            results[key] = await work(key)
+
+    await asyncio.gather(*(work_in_order() for _ in range(MOST_QUESTIONS)))
+    return {key: results[key] for key in wanted}

@@ -39,6 +39,13 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     )
     if not facts.names:
         yield from _counts(facts, findings)
+    if facts.untried:
+        text = f"{facts.untried} nodes are not tried: too many are registered at the master"
+        fix = (
+            "run the doctor with the name of a node or topic. To see who registers so many nodes, "
+        )
+        fix += "run rosnode list -a"
+        yield note(OUTSIDE, "nodes at the master", text, fix)
     wanted = facts.scope.nodes
     yield from (f for f in findings if not facts.names or not f.subject or f.subject in wanted)
 
@@ -87,12 +94,12 @@ def _present_and_ended(
     node with the same name answers at another address. An ended node keeps its port for a while.
     """
     answering = {name for node in nodes if node.state in ("ok", "new") for name in node.nodes}
-    ended = [
-        node
-        for node in nodes
-        if node.has_ended or (node.state in _ENDED and answering.issuperset(node.nodes))
-    ]
-    return [node for node in nodes if node not in ended], ended
+    present = list[EndpointStatus]()
+    ended = list[EndpointStatus]()
+    for node in nodes:
+        is_replaced = node.state in _ENDED and answering.issuperset(node.nodes)
+        (ended if node.has_ended or is_replaced else present).append(node)
+    return present, ended
 
 
 def _inside(facts: DoctorFacts) -> Iterator[DoctorFinding]:

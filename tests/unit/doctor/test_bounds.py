@@ -1,0 +1,118 @@
+"""What the doctor does at most, whatever nodes, participants and the master say."""
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from rosproxy.doctor import graph_survey
+from rosproxy.doctor.facts import DoctorFacts, ReachOutcome, SlaveReport, slave_report
+from rosproxy.doctor.graph_survey import MOST_QUESTIONS, MOST_TRIED, ask_graph
+from rosproxy.doctor.rules import node as node_rules
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.resolver import NODES
+
+
+class MadeUpMaster:
+    """A master and nodes that answer. ``asked`` are the hosts and methods of calls to nodes."""
+
+    def __init__(self, uris: Mapping[str, str], topics: Mapping[str, Any]) -> None:
+        self.master_uri = "http://robot:11311"
+        self.asked = list[tuple[str, str]]()
+        self.under_way = self.most_under_way = 0
+        self._uris = uris
+        self._state = [[*map(list, topics.items())], [], []]
+
+    async def master_addresses(self) -> list[str]:
+        return ["192.0.2.1"]
+
+    async def close(self) -> None:
+        pass
+
+    def reach(self, target: HostPort) -> HostPort:
+        return target
+
+    async def call_master(self, method: str, *_: Any) -> Any:
+        return {"getSystemState": self._state, "getPid": 1}.get(method)
+
+    async def look_up(self, _: str, names: Any) -> dict[str, str]:
+        return {name: self._uris[name] for name in names if name in self._uris}
+
+    async def call_node(self, slave: HostPort, _: float, method: str, *__: Any) -> Any:
+        self.asked.append((slave.host, method))
+        self.under_way += 1
+        self.most_under_way = max(self.most_under_way, self.under_way)
+        await asyncio.sleep(0)
+        self.under_way -= 1
+        return {"getPid": 7, "getPublications": [["/t", "x" * 1000]]}.get(method, [])
+
+
+@pytest.fixture
+def resolved(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The sources of the names that are looked up."""
+    sources = list[str]()
+
+    async def resolve(host: str, source: str = "") -> list[str]:
+        sources.append(source)
+        return [host]
+
+    monkeypatch.setattr(graph_survey, "resolve", resolve)
+    return sources
+
+
+async def survey(
+    monkeypatch: pytest.MonkeyPatch,
+    master: MadeUpMaster,
+    choose: Any = None,
+    names: tuple[str, ...] = (),
+) -> DoctorFacts:
+    monkeypatch.setattr(graph_survey, "MasterClient", lambda *_: master)
+    return await ask_graph(DoctorFacts(names=names), master.master_uri, None, choose)
+
+
+async def test_of_many_nodes_a_fair_part_is_tried(
+    monkeypatch: pytest.MonkeyPatch, resolved: list[str]
+) -> None:
+    """Ten thousand made-up nodes that do not answer took a quarter of an hour."""
+    uris = {f"/evil{n}": f"http://192.0.2.66:{n + 1}/" for n in range(MOST_TRIED + 500)}
+    uris["/robot"] = "http://192.0.2.7:40000/"
+    master = MadeUpMaster(uris, {"/t": list(uris)})
+    facts = await survey(monkeypatch, master)
+    assert len(master.asked) == MOST_TRIED
+    assert facts.nodes["/robot"].attempt.reach is ReachOutcome.ANSWERED
+    assert facts.untried == 501
+    assert master.most_under_way <= MOST_QUESTIONS
+    assert set(resolved) == {""}
+    texts = [f.text for f in node_rules.check(facts)]
+    assert "501 nodes are not tried: too many are registered at the master" in texts
+
+
+async def test_the_page_looks_names_up_as_names_of_nodes(
+    monkeypatch: pytest.MonkeyPatch, resolved: list[str]
+) -> None:
+    """Names that hang took the look-ups that the proxy needs for the master."""
+    master = MadeUpMaster({"/n": "http://robot:40000/"}, {"/t": ["/n"]})
+    await survey(monkeypatch, master, lambda _: ("/t",))
+    assert set(resolved) == {NODES}
+
+
+@pytest.mark.parametrize(("most", "is_kept"), [(2000, True), (1000, False)])
+async def test_a_long_report_of_a_node_is_not_kept(
+    monkeypatch: pytest.MonkeyPatch, resolved: list[str], most: int, is_kept: bool
+) -> None:
+    """While a page was open, the reports of hostile nodes filled the memory of the proxy."""
+    monkeypatch.setattr(graph_survey, "MOST_REPORT_CHARACTERS", 2 * most)
+    nodes = ["/m", "/n"]
+    uris = {name: f"http://192.0.2.7:4000{index}/" for index, name in enumerate(nodes)}
+    master = MadeUpMaster(uris, {"/t": nodes})
+    master._state[1] = [["/t", nodes]]
+    facts = await survey(monkeypatch, master, None, ("/t",))
+    assert {node.report is not None for node in facts.nodes.values()} == {is_kept}
+
+
+def test_a_report_has_only_the_topics_in_question() -> None:
+    bus = [[1, "/peer", "o", "TCPROS", topic, 1] for topic in ("/t", "/other")]
+    report = slave_report([["/t", "T"], ["/x", "X"]], [["/x", "X"]], bus, topics={"/t"})
+    assert report == SlaveReport({"/t": "T"}, {}, frozenset({("o", "/t", "/peer")}))
+    assert report.characters == 2 * 200 + len("/tT" + "o/t/peer")
