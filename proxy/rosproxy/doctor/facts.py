@@ -6,9 +6,11 @@ of replies. `scope` resolves the names in the user's question to nodes, services
 publisher and subscriber.
 """
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from enum import Enum
 from functools import cached_property
+from itertools import islice
+from operator import itemgetter
 from typing import Any
 
 import msgspec
@@ -19,6 +21,10 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.bus_stats import read_bus_stats
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.graph import read_types
+from rosproxy.ros2.registry.matching import in_turn
+
+MOST_PAIRS = 5000
+"""Pairs that the doctor examines at most: a topic with 1,000 subscribers of 5 publishers."""
 
 
 class ReachOutcome(Enum):
@@ -185,8 +191,9 @@ class Scope(msgspec.Struct, frozen=True):
     """The objects to examine for the names in the user's question.
 
     ``named_nodes``: the nodes among the names. ``nodes``: all nodes to examine. ``pairs``: (topic,
-    publisher, subscriber). ``one_sided_topics``: topics without publisher or without subscriber.
-    ``unknown``: names without node, topic or service.
+    publisher, subscriber), MOST_PAIRS at most. ``one_sided_topics``: topics without publisher or
+    without subscriber. ``unknown``: names without node, topic or service. ``has_more_pairs``: there
+    are more pairs than ``pairs`` has.
     """
 
     named_nodes: Sequence[str] = ()
@@ -195,6 +202,7 @@ class Scope(msgspec.Struct, frozen=True):
     services: Sequence[str] = ()
     unknown: Sequence[str] = ()
     nodes: frozenset[str] = frozenset()
+    has_more_pairs: bool = False
 
 
 def scope(graph: SystemState, names: Sequence[str]) -> Scope:
@@ -211,13 +219,9 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
     nodes = [name for name in names if name in all_nodes and name not in all_topics]
     services = [name for name in names if name in graph.services]
     candidates = sorted(topics or (all_topics - {"/rosout"} if nodes else ()))
-    pairs = [
-        (topic, publisher, subscriber)
-        for topic in candidates
-        for publisher in graph.publishers.get(topic, ())
-        for subscriber in graph.subscribers.get(topic, ())
-        if _is_asked_for({publisher, subscriber}, {*nodes})
-    ]
+    # In turn, so that no topic hides the pairs of the others.
+    every = in_turn(_pairs(graph, topic, {*nodes}) for topic in candidates)
+    pairs = sorted(islice(every, MOST_PAIRS), key=itemgetter(0))
     one_sided = [
         topic
         for topic in candidates
@@ -229,12 +233,31 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
     asked_nodes = {*nodes, *(node for name in services for node in graph.services[name])}
     sides = {node for _, *ends in pairs for node in ends}
     sides |= {node for topic in topics for node in graph.sides(topic)}
-    return Scope(nodes, pairs, one_sided, services, unknown, frozenset(asked_nodes | sides))
+    return Scope(
+        nodes,
+        pairs,
+        one_sided,
+        services,
+        unknown,
+        frozenset(asked_nodes | sides),
+        next(every, None) is not None,
+    )
 
 
-def _is_asked_for(pair: set[str], nodes: set[str]) -> bool:
-    """Whether the user asks for a pair: by both nodes, or by a single node that is in the pair."""
-    return pair <= nodes if len(nodes) > 1 else nodes <= pair
+def _pairs(graph: SystemState, topic: str, nodes: set[str]) -> Iterator[tuple[str, str, str]]:
+    """The pairs of a topic that the user asks for by ``nodes``; without nodes, all pairs.
+
+    Of several nodes both ends of a pair must be among these; a single node must be one end.
+    """
+    publishers = graph.publishers.get(topic, [])
+    subscribers = graph.subscribers.get(topic, [])
+    asked = [node for node in subscribers if node in nodes]
+    for publisher in publishers:
+        if not nodes or (len(nodes) == 1 and publisher in nodes):
+            ends = subscribers
+        else:
+            ends = asked if len(nodes) == 1 or publisher in nodes else []
+        yield from ((topic, publisher, subscriber) for subscriber in ends)
 
 
 class HeardParticipant(msgspec.Struct, frozen=True):

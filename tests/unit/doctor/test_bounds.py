@@ -7,11 +7,22 @@ from typing import Any
 import pytest
 
 from rosproxy.doctor import graph_survey
-from rosproxy.doctor.facts import DoctorFacts, ReachOutcome, SlaveReport, slave_report
+from rosproxy.doctor.facts import (
+    MOST_PAIRS,
+    DoctorFacts,
+    ReachOutcome,
+    SlaveReport,
+    SystemState,
+    scope,
+    slave_report,
+)
 from rosproxy.doctor.graph_survey import MOST_QUESTIONS, MOST_TRIED, ask_graph
 from rosproxy.doctor.rules import node as node_rules
+from rosproxy.doctor.rules import pair as pair_rules
+from rosproxy.doctor.rules.pair import MOST_COMPARED_NAMES, MOST_ONE_SIDED
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.resolver import NODES
+from tests.unit.doctor.cases import make_facts
 
 
 class MadeUpMaster:
@@ -116,3 +127,47 @@ def test_a_report_has_only_the_topics_in_question() -> None:
     report = slave_report([["/t", "T"], ["/x", "X"]], [["/x", "X"]], bus, topics={"/t"})
     assert report == SlaveReport({"/t": "T"}, {}, frozenset({("o", "/t", "/peer")}))
     assert report.characters == 2 * 200 + len("/tT" + "o/t/peer")
+
+
+def crowd(name: str, count: int) -> list[str]:
+    return [f"/{name}{number}" for number in range(count)]
+
+
+def test_many_pairs_of_a_topic_hide_no_other_topic() -> None:
+    """Two crowds of ten thousand nodes at a topic made a hundred million pairs."""
+    publishers = {"/crowded": crowd("p", 10_000), "/quiet": ["/n"]}
+    subscribers = {"/crowded": [*crowd("s", 10_000), "/n"], "/quiet": ["/m"]}
+    asked = scope(SystemState(publishers, subscribers), ["/n"])
+    assert len(asked.pairs) == MOST_PAIRS
+    assert asked.has_more_pairs
+    assert ("/quiet", "/n", "/m") in asked.pairs
+    assert not scope(SystemState(publishers, subscribers), ["/quiet"]).has_more_pairs
+
+
+def test_a_node_with_many_topics_has_a_bounded_number_of_findings() -> None:
+    topics = {f"/n{number}/t": ["/evil"] for number in range(MOST_ONE_SIDED + 5)}
+    facts = make_facts(graph=SystemState(topics), names=("/evil",))
+    findings = [*pair_rules.check(facts)]
+    assert len(findings) == MOST_ONE_SIDED + 1
+    assert "5 more topics" in findings[-1].text
+    assert findings[0].fix.startswith(
+        "compare with /n1/t, /n10/t, /n100/t, /n101/t, /n102/t and 99 "
+    )
+    assert all(len(finding.fix) < 400 for finding in findings)
+
+
+def test_an_unknown_name_is_compared_with_some_of_many_names(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    compared = list[int]()
+
+    def matches(_: str, names: list[str], *__: Any) -> list[str]:
+        compared.append(len(names))
+        return []
+
+    monkeypatch.setattr(pair_rules, "get_close_matches", matches)
+    topics = {f"/t{number}": ["/n"] for number in range(2 * MOST_COMPARED_NAMES)}
+    facts = make_facts(graph=SystemState(topics), names=("/absent",))
+    (finding,) = pair_rules.check(facts)
+    assert finding.check == "unknown name"
+    assert compared == [MOST_COMPARED_NAMES]

@@ -3,11 +3,11 @@
 The findings say which pairs of publisher and subscriber are not connected, and why.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 
 from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok
-from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, ReachOutcome
+from rosproxy.doctor.facts import MOST_PAIRS, Attempt, DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.node import CLEANUP
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.fixes import how_to
@@ -17,6 +17,13 @@ from rosproxy.telemetry.text import listed, quoted, size
 PAIR = "pair"
 """The name of the check in all findings of this module, except those with UNKNOWN_NAME."""
 ANY_TYPE = "*"
+MOST_ONE_SIDED = 100
+"""Topics without publisher or subscriber that have a finding of their own. A node may have ten
+thousand topics."""
+MOST_COMPARED_NAMES = 10_000
+"""Names that are compared with an unknown name, to find similar names: half a second."""
+MOST_LISTED = 5
+"""Names of similar topics in a fix; `listed` counts the others."""
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
@@ -29,7 +36,11 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         return
     scope = facts.scope
     yield from (_unknown(facts, name) for name in scope.unknown)
-    yield from (_one_sided_topic(facts, topic) for topic in scope.one_sided_topics)
+    yield from _one_sided_topics(facts)
+    if scope.has_more_pairs:
+        text = f"only {MOST_PAIRS} pairs are checked: these topics have more"
+        fix = "run the doctor with the names of a publisher and a subscriber"
+        yield note(PAIR, ", ".join(facts.names), text, fix)
     yield from (judge_pair(facts, *pair) for pair in scope.pairs)
     yield from (_service(facts, service) for service in scope.services)
     if scope.named_nodes and not scope.pairs:
@@ -64,7 +75,7 @@ def _without_pair(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
     system = facts.system
     names = sorted(system.names() | system.topics | {*system.services})
-    alike = get_close_matches(name, names, 3, 0.7)
+    alike = get_close_matches(name, names[:MOST_COMPARED_NAMES], 3, 0.7)
     # The user asked for /scan, and there is /robot/scan: the namespace was missing.
     alike += [n for n in names if n.endswith(name) and n not in alike][:3]
     hint = f"; similar names: {listed(alike)}" if alike else ""
@@ -73,18 +84,34 @@ def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
     return error(UNKNOWN_NAME, name, text, fix)
 
 
-def _one_sided_topic(facts: DoctorFacts, topic: str) -> DoctorFinding:
+def _one_sided_topics(facts: DoctorFacts) -> Iterator[DoctorFinding]:
+    topics = facts.scope.one_sided_topics
+    by_ending: dict[str, list[str]] = {}
+    for topic in sorted(facts.system.topics) if topics else ():
+        by_ending.setdefault(_ending(topic), []).append(topic)
+    for topic in topics[:MOST_ONE_SIDED]:
+        alike = [other for other in by_ending[_ending(topic)] if other != topic]
+        yield _one_sided_topic(facts, topic, alike)
+    if len(topics) > MOST_ONE_SIDED:
+        text = f"{len(topics) - MOST_ONE_SIDED} more topics have no publisher or no subscriber"
+        yield note(PAIR, ", ".join(facts.names), text, "run the doctor with the name of a topic")
+
+
+def _ending(topic: str) -> str:
+    """The name of a topic without its namespace."""
+    return topic.rpartition("/")[2]
+
+
+def _one_sided_topic(facts: DoctorFacts, topic: str, alike: Sequence[str]) -> DoctorFinding:
     system = facts.system
     published = bool(system.publishers.get(topic))
     verb, lacks = ("published", "subscribes to") if published else ("subscribed to", "publishes")
     text = f"{verb} by {listed(system.sides(topic))}; no node {lacks} {topic}"
-    topics = sorted(system.topics - {topic})
-    alike = [t for t in topics if t.rpartition("/")[2] == topic.rpartition("/")[2]]
     fix = (
         f"run rostopic info {quoted(topic)}; after a restart of roscore, restart the nodes outside"
     )
     if alike:
-        shown = listed(map(quoted, alike))
+        shown = listed([*map(quoted, alike[:MOST_LISTED]), *alike[MOST_LISTED:]])
         fix = f"compare with {shown}, check namespaces and remappings; {fix}"
     return (error if topic in facts.names else note)(PAIR, topic, text, fix)
 

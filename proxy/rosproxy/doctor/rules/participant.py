@@ -5,6 +5,7 @@ participants inside that the proxy does not hear, and the names in the user's qu
 """
 
 from collections.abc import Iterator
+from itertools import islice, product
 
 from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok, warning
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
@@ -14,6 +15,8 @@ from rosproxy.net.addresses import parse_host_port
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, participant_label
 from rosproxy.telemetry.text import listed, plural
 
+MOST_PAIRS = 5000
+"""Pairs of participants with the topic in question that the doctor reports at most."""
 RECENT_S = 120.0
 """Seconds for which the doctor reports a refusal. The proxy notes a lasting refusal more often."""
 SETTLED_AFTER_S = 10.0
@@ -51,8 +54,11 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
     is_settled = facts.proxy.uptime >= SETTLED_AFTER_S
     findings = [finding for domain in domains for finding in _domain(domain, is_settled)]
     if is_settled:
+        known = {p.guid_prefix for domain in domains for side in _sides(domain) for p in side}
         findings += [
-            finding for heard in facts.heard_participants for finding in _heard(heard, domains)
+            finding
+            for heard in facts.heard_participants
+            for finding in _heard(heard, domains, known)
         ]
     findings += [
         (error if problem.subject == HIDDEN else warning)(
@@ -130,11 +136,13 @@ def _finding(problem: DomainProblem) -> DoctorFinding:
 
 
 def _heard(
-    participant: HeardParticipant, domains: tuple[DomainStatus, ...]
+    participant: HeardParticipant, domains: tuple[DomainStatus, ...], known: set[str]
 ) -> Iterator[DoctorFinding]:
-    """The finding about a participant on a network inside that the proxy has not heard."""
+    """The finding about a participant on a network inside that the proxy has not heard.
+
+    ``known``: the GUID prefixes of the participants that the proxy has heard.
+    """
     served = [domain.domain for domain in domains]
-    prefixes = {p.guid_prefix for domain in domains for p in (*domain.inside, *domain.outside)}
     label = f"participant at {participant.address} ({participant.vendor}, inside)"
     if participant.domain not in served:
         text = f"{label}: is in domain {participant.domain}, but this proxy serves "
@@ -144,7 +152,7 @@ def _heard(
             f"{how_to('domain', domain=participant.domain)}"
         )
         yield warning(OTHER_DOMAIN, participant.guid_prefix, text, fix)
-    elif participant.guid_prefix not in prefixes:
+    elif participant.guid_prefix not in known:
         text = f"{label}: answers the doctor, but does not announce itself to the network: its "
         text += "discovery range is its own machine. So the proxy does not hear the participant"
         fix = "where the participant runs: set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET and unset "
@@ -183,13 +191,14 @@ def _name_in_domain(domain: DomainStatus, name: str) -> Iterator[DoctorFinding]:
         if own_side and not other_side:
             text = f"no participant {lacks} {name}"
             yield note("topic", name, text, "check the name; check that the other program runs")
-    pairs = [(p, s) for p in publishers for s in subscribers]
-    if pairs and all(p[1] is s[1] for p, s in pairs):
+    sides = {is_inside for _, is_inside in (*publishers, *subscribers)}
+    if publishers and subscribers and len(sides) == 1:
         text = "all publishers and subscribers are on one side, so no message passes the proxy"
         yield note("topic", name, text)
     troubled = {problem.subject for problem in domain_problems(domain) if problem.grave}
     mismatched = {(m.writer, m.reader) for m in domain.mismatches if m.name == name}
-    for (participant, from_inside), (peer, to_inside) in pairs:
+    pairs = product(publishers, subscribers)
+    for (participant, from_inside), (peer, to_inside) in islice(pairs, MOST_PAIRS):
         guids = participant.guid_prefix, peer.guid_prefix
         if from_inside is not to_inside and guids not in mismatched and not troubled & {*guids}:
             text = (
@@ -205,4 +214,4 @@ def _sides(domain: DomainStatus) -> tuple[tuple[ParticipantStatus, ...], ...]:
 
 def _counted(participants: tuple[ParticipantStatus, ...]) -> str:
     vendors = sorted({p.vendor for p in participants})
-    return f"{plural(len(participants), 'participant')} of {', '.join(vendors)}"
+    return f"{plural(len(participants), 'participant')} of {listed(vendors)}"

@@ -112,7 +112,7 @@ def comparison_steps(
         count += len(partners)
         if number % ITEMS_PER_STEP == 0:
             yield
-    pairs = _in_turn(map(_in_turn, by_address.values()))
+    pairs = in_turn(map(in_turn, by_address.values()))
     mismatched: dict[tuple[str, bytes, bytes, str], MismatchedPair] = {}
     for number, pair in enumerate(islice(pairs, MOST_COMPARED_PAIRS), start=1):
         _note_mismatch(*pair, mismatched)
@@ -152,8 +152,8 @@ class _Endpoints:
             owned = zip(repeat(participant), list(participant.endpoints.values()))
             by_address[participant.address].append(owned)
             count += len(participant.endpoints)
-        in_turn = _in_turn(map(_in_turn, by_address.values()))
-        self.owned = islice(in_turn, MOST_COMPARED_ENDPOINTS)
+        every = in_turn(map(in_turn, by_address.values()))
+        self.owned = islice(every, MOST_COMPARED_ENDPOINTS)
         self.left_out = max(count - MOST_COMPARED_ENDPOINTS, 0)
 
 
@@ -167,7 +167,7 @@ def _in_steps(every: Iterable[_Owned]) -> Generator[None, None, list[_Owned]]:
     return list(different.values())
 
 
-def _in_turn(sequences: Iterable[Iterable[_Item]]) -> Iterator[_Item]:
+def in_turn(sequences: Iterable[Iterable[_Item]]) -> Iterator[_Item]:
     """Yield the first item of each sequence, then the second item of each sequence, and so on."""
     waiting = deque(map(iter, sequences))
     while waiting:
