@@ -1,13 +1,16 @@
 """The output of findings."""
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity, failed
-from rosproxy.doctor.presentation import as_json, render
+from rosproxy.doctor.presentation import MOST_FINDINGS, as_json, render
 from rosproxy.doctor.rules import diagnose
 from tests.unit.doctor.cases import make_facts
 
 OK = DoctorFinding(Severity.OK, "ports", "ports", "100 free")
 NOTE = DoctorFinding(Severity.INFO, "node", "nodes", "3 registered")
 WARNING = DoctorFinding(Severity.WARNING, "time", "", "no clock", "rosparam set")
+ERROR_OF_MASTER = DoctorFinding(
+    Severity.ERROR, "master", "master", "refuses connections", "start roscore"
+)
 ERROR = DoctorFinding(Severity.ERROR, "node", "/talker", "gone", "rosnode cleanup")
 
 
@@ -81,3 +84,28 @@ def test_commands_are_not_torn_apart() -> None:
     command = "docker run -p 45000-45099:45000-45099"
     text = render([DoctorFinding(Severity.ERROR, "range", "range", "x " * 60, command)], 30)
     assert "45000-45099:45000-45099" in text
+
+
+def test_long_texts_lose_their_middle_and_no_character_moves_the_cursor() -> None:
+    """A node at the master may have a name of megabytes."""
+    hostile = DoctorFinding(Severity.ERROR, "node", "/\x1b[2J" * 10**5, "x" * 10**6, "y" * 10**6)
+    shown = render([hostile], 80)
+    (row,) = as_json([hostile])["findings"]
+    assert len(shown) < 5000
+    assert "\x1b" not in shown + str(row)
+    assert [len(row[key]) for key in ("subject", "text", "fix")] == [200, 1000, 1000]
+
+
+def test_many_findings_of_a_check_hide_no_other() -> None:
+    many = [
+        DoctorFinding(Severity.ERROR, "node", f"/n{n}", "silent", f"nc -vz evil {n}")
+        for n in range(MOST_FINDINGS)
+    ]
+    lines = render([ERROR_OF_MASTER, *many], 80).split("\n")
+    assert lines[0] == "ERROR    master: refuses connections"
+    assert "         ... and 4970 more findings (node): see --json" in lines
+    assert len(lines) < 100
+    rows = as_json([*many, ERROR_OF_MASTER])["findings"]
+    assert len(rows) == MOST_FINDINGS + 1
+    assert rows[-2]["subject"] == "master"
+    assert rows[-1]["text"] == "not shown: 1 more finding"
