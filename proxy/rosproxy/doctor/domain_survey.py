@@ -13,6 +13,7 @@ import contextlib
 import os
 import socket
 import time
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from ipaddress import ip_network
 
@@ -44,6 +45,8 @@ LEASE_DURATION_S = 5.0
 the doctor after this time."""
 MOST_HEARD = 200
 """Participants on a network that the doctor collects at most."""
+MOST_AT_ADDRESS = 32
+"""Of these, participants at an address at most: a container has a few processes."""
 
 
 def ask_participants(network: str, domains: Collection[int]) -> list[HeardParticipant]:
@@ -86,6 +89,7 @@ def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
     until then count.
     """
     by_prefix: dict[str, HeardParticipant] = {}
+    at_address = Counter[str]()
     with contextlib.closing(datagrams.bind(own_address, 0)) as sock:
         # Without multicast loop: the proxy on this machine would count the doctor as a participant.
         send_through(sock, own_address, loop=False)
@@ -95,7 +99,9 @@ def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
         _send(sock, announcement(prefix, [own_locator], LEASE_DURATION_S, SPDP_ENDPOINTS), targets)
         with contextlib.suppress(OSError):
             for participant in _answers(sock):
-                by_prefix[participant.guid_prefix] = participant
+                if at_address[participant.address] < MOST_AT_ADDRESS:
+                    at_address[participant.address] += participant.guid_prefix not in by_prefix
+                    by_prefix[participant.guid_prefix] = participant
                 if len(by_prefix) == MOST_HEARD:
                     break
             _send(sock, dispose_message(prefix), targets)

@@ -8,7 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.doctor import domain_survey
-from rosproxy.doctor.domain_survey import ask_participants, heard_participant
+from rosproxy.doctor.domain_survey import (
+    MOST_AT_ADDRESS,
+    ask_participants,
+    heard_participant,
+)
 from rosproxy.doctor.facts import HeardParticipant
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.announcement import dispose_message
@@ -92,3 +96,12 @@ def test_answers_count_if_the_network_is_gone_afterwards(
     monkeypatch.setattr("rosproxy.forwarding.datagrams.bind", lambda *_: FailingSocket(receives))
     (participant,) = ask_participants("127.0.0.0/8", [0])
     assert participant.guid_prefix == NAME
+
+
+def test_an_address_with_many_participants_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    crowd = [HeardParticipant(0, f"evil{n}", "172.30.0.66", "unknown") for n in range(1000)]
+    quiet = HeardParticipant(0, NAME, SOURCE, "Fast DDS")
+    monkeypatch.setattr(domain_survey, "_answers", lambda _: [*crowd, crowd[0], quiet])
+    monkeypatch.setattr(domain_survey, "send_through", lambda *_, **__: None)
+    monkeypatch.setattr("rosproxy.forwarding.datagrams.bind", lambda *_: FailingSocket(True))
+    assert ask_participants("127.0.0.0/8", [0]) == [*crowd[:MOST_AT_ADDRESS], quiet]
