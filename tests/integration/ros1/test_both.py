@@ -374,6 +374,25 @@ async def test_who_asks_for_many_takes_no_udpros_from_others(
     assert sorted(peers) == [MASTER] * 3 + [OUTSIDE]
 
 
+async def test_a_network_of_many_addresses_takes_no_udpros_from_others(
+    proxy: Proxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine may have any number of IPv6 addresses."""
+
+    def network(address: str) -> str:
+        return "127.0.9.0/24" if address.startswith("127.0.9.") else address
+
+    monkeypatch.setattr("rosproxy.ros1.stand_ins.udpros_relays.MOST_RELAYS", 4)
+    monkeypatch.setattr("rosproxy.ros1.stand_ins.udpros_relays.subnet", network, raising=False)
+    await node.publish(proxy.master)
+    at = proxy.lease(node)
+    for source in (OUTSIDE, *(f"127.0.9.{number}" for number in range(1, 10))):
+        offer = udp_offer("/chatter", source, 40000)
+        await rpc(at, "requestTopic", "/listener", "/chatter", [offer], source=source)
+    peers = [row["peer"] for row in proxy.app.status()["udpros"]]
+    assert sorted(peers) == [OUTSIDE, *(f"127.0.9.{number}" for number in (7, 8, 9))]
+
+
 async def test_a_call_with_many_offers_has_a_single_relay(proxy: Proxy, node: FakeNode) -> None:
     """Each of 500 offers in a call opened a relay, in one turn of the event loop."""
     await node.publish(proxy.master)

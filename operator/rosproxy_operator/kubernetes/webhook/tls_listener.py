@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from aiohttp import web
 
 from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort
+from rosproxy.net.addresses import HostPort, subnet
 from rosproxy.net.tasks import Tasks
 
 MOST_CONNECTIONS = 512
@@ -57,7 +57,7 @@ class TlsListener:
 
     If an address has too many connections, a new connection ends the oldest connection of this
     address. If all addresses together have too many, a new connection ends the oldest connection
-    of the address with most connections.
+    of the address, or IPv6 network (/64), with most connections.
     """
 
     def __init__(self, server: web.Server, context: ssl.SSLContext) -> None:
@@ -95,11 +95,14 @@ class TlsListener:
     def _make_room(self, source: str) -> None:
         """End a connection if a further connection of this source would exceed a bound."""
         self._connections = [c for c in self._connections if c.is_open]
-        counts = Counter(c.source for c in self._connections)
-        if counts[source] < MOST_OF_SOURCE:
-            if len(self._connections) < MOST_CONNECTIONS:
-                return
-            source = counts.most_common(1)[0][0]
-        oldest = next(c for c in self._connections if c.source == source)
+        of_source = [c for c in self._connections if c.source == source]
+        if len(of_source) >= MOST_OF_SOURCE:
+            oldest = of_source[0]
+        elif len(self._connections) >= MOST_CONNECTIONS:
+            networks = Counter(subnet(c.source) for c in self._connections)
+            largest = networks.most_common(1)[0][0]
+            oldest = next(c for c in self._connections if subnet(c.source) == largest)
+        else:
+            return
         oldest.end()
         self._connections.remove(oldest)

@@ -34,7 +34,7 @@ from hashlib import blake2b
 import msgspec
 
 from rosproxy.forwarding.datagrams import DatagramRelay, bind
-from rosproxy.net.addresses import HostPort
+from rosproxy.net.addresses import HostPort, subnet
 from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
@@ -50,8 +50,8 @@ from rosproxy.ros1.stand_ins.outside_nodes import Outside
 log = logging.getLogger(__name__)
 
 MOST_RELAYS = 256
-"""The highest number of relays. A further relay ends the oldest relay of the subscriber address
-with the most relays. So an address with many relays takes none from other addresses."""
+"""The highest number of relays. A further relay ends the oldest relay of the subscriber address, or
+IPv6 network (/64), with the most relays. So an address with many relays takes none from others."""
 MOST_RELAYS_EACH = 64
 """The highest number of relays for one subscriber address. A further relay of this address ends the
 oldest."""
@@ -244,12 +244,13 @@ class UdprosRelays:
 
     def _make_room(self, peer: str) -> None:
         """End a relay if there are too many for the subscriber's address, or in all."""
-        counts = Counter(s.peer for s in self._open)
-        if counts[peer] < MOST_RELAYS_EACH:
-            if len(self._open) < MOST_RELAYS:
-                return
-            peer = counts.most_common(1)[0][0]
-        self._end(next(s for s in self._open if s.peer == peer))
+        of_peer = [s for s in self._open if s.peer == peer]
+        if len(of_peer) >= MOST_RELAYS_EACH:
+            self._end(of_peer[0])
+        elif len(self._open) >= MOST_RELAYS:
+            networks = Counter(subnet(s.peer) for s in self._open)
+            largest = networks.most_common(1)[0][0]
+            self._end(next(s for s in self._open if subnet(s.peer) == largest))
 
     def _end(self, subscription: UdprosSubscription) -> None:
         relay, _ = self._open.pop(subscription, (None, None))

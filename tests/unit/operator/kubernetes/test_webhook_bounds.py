@@ -117,6 +117,23 @@ async def test_of_many_addresses_the_one_with_most_loses(callers: Callers) -> No
     assert not any(reader.at_eof() for reader, _ in kept)
 
 
+async def test_a_network_of_many_addresses_ends_its_own_connections(
+    callers: Callers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pod may have any number of IPv6 addresses."""
+
+    def network(address: str) -> str:
+        return "127.0.7.0/24" if address.startswith("127.0.7.") else address
+
+    listener = "rosproxy_operator.kubernetes.webhook.tls_listener"
+    monkeypatch.setattr(f"{listener}.MOST_CONNECTIONS", 6)
+    monkeypatch.setattr(f"{listener}.subnet", network, raising=False)
+    few = [await callers.connect("127.0.6.1") for _ in range(2)]
+    crowd = [await callers.connect(f"127.0.7.{number}") for number in range(1, 11)]
+    await until(lambda: all(reader.at_eof() for reader, _ in crowd[:6]))
+    assert not any(reader.at_eof() for reader, _ in (*few, *crowd[6:]))
+
+
 async def test_bodies_that_do_not_end_are_bounded(callers: Callers) -> None:
     """50 unfinished bodies of 8 MB took all memory of the operator."""
     share = webhook_server.MOST_HELD_BYTES_OF_SOURCE
