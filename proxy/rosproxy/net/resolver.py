@@ -34,9 +34,9 @@ MOST_FOR_SOURCES = 32
 """Look-ups at once for all sources except NODES and the proxy itself."""
 NODES = "nodes"
 """The source of the names of nodes in the master's graph, which does not say who gave a name."""
-MOST_FOR_NODES = 40
+MOST_FOR_NODES = 64
 """Look-ups at once for NODES, of names that have resolved before, and as many of other names. These
-names come all at once, a name for each machine."""
+names come all at once, a name for each machine: a single domain gets half of the look-ups."""
 MOST_FOR_OTHERS = 2 * MOST_FOR_NODES + MOST_FOR_SOURCES
 """Look-ups at once for all sources except the proxy itself."""
 MOST_LOOKUPS = MOST_FOR_OTHERS + 8
