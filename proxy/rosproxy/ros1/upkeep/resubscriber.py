@@ -299,7 +299,8 @@ class Resubscriber:
         """
         missed_uris: dict[tuple[str, str], set[str]] = {}
         for topic, node, uri in missed:
-            missed_uris.setdefault((topic, node), set()).add(uri)
+            if node in uris:  # otherwise the node has registered after the master's answer
+                missed_uris.setdefault((topic, node), set()).add(uri)
         calls = (
             self._publisher_updates.update(
                 uris[node], topic, [u for u in publishers.get(topic, []) if u not in missing]
