@@ -1,12 +1,13 @@
 """Rules of one kind, prepared to judge many names.
 
 A datagram of ROS 2 may bring hundreds of names, a policy may have a thousand rules, and an address
-may have thousands of node names. So a search for a part of each glob leaves out most rules before
-the comparison with the glob. The number of comparisons with node names has a bound.
+may have thousands of node names. So look-ups find the rules for a name or a namespace. For all
+other rules, a search for a part of the glob leaves out most. The number of comparisons with node
+names has a bound.
 """
 
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from itertools import compress, groupby
@@ -23,13 +24,28 @@ class RuleIndex:
     """Rules of one kind, each with its layer, in the order in which the policy applies them."""
 
     def __init__(self, rules: Sequence[tuple[PolicyLayer, Rule]]) -> None:
-        texts = [_fixed_texts(rule.glob) for _, rule in rules]
-        globs_with = Counter(text for of_glob in texts for text in of_glob)
         self._rules = rules
+        self._by_name: defaultdict[str, list[int]] = defaultdict(list)
+        """The indices of the rules for a single name."""
+        self._by_prefix: defaultdict[int, defaultdict[str, list[int]]]
+        self._by_prefix = defaultdict(lambda: defaultdict(list))
+        """The indices of the rules for all names with a prefix, by the length of the prefix."""
+        self._others = list[int]()
+        """The indices of all other rules."""
+        for index, (_, rule) in enumerate(rules):
+            texts = _fixed_texts(rule.glob)
+            if len(texts) == 1:
+                self._by_name[rule.glob].append(index)
+            elif len(texts) == 2 and rule.glob.endswith("*"):
+                self._by_prefix[len(texts[0])][texts[0]].append(index)
+            else:
+                self._others.append(index)
+        globs = [_fixed_texts(rules[index][1].glob) for index in self._others]
+        globs_with = Counter(text for texts in globs for text in texts)
         self._texts = [
-            min(of_glob, key=lambda text: (globs_with[text], -len(text))) for of_glob in texts
+            min(texts, key=lambda text: (globs_with[text], -len(text))) for texts in globs
         ]
-        """A text of the glob of each rule, which the other globs rarely have."""
+        """A text of the glob of each of the others, which the other globs rarely have."""
 
     @classmethod
     def of_kind(cls, layers: Iterable[PolicyLayer], kind: RuleKind, address: str) -> "RuleIndex":
@@ -42,7 +58,7 @@ class RuleIndex:
 
         The verdict has the first enforced denial, or else the first denial in audit mode.
         """
-        likely = compress(self._rules, map(name.__contains__, self._texts))
+        likely = (self._rules[index] for index in self._likely(name))
         about = [(layer, rule) for layer, rule in likely if matches(rule.glob, name)]
         compared = callers if len(about) * len(callers) <= MOST_CALLER_COMPARISONS else None
         verdict = ALLOWED
@@ -55,6 +71,14 @@ class RuleIndex:
             if denial is not None and verdict.rule is None:
                 verdict = Verdict(True, denial, layer.name)
         return verdict
+
+    def _likely(self, name: str) -> list[int]:
+        """The indices of the rules whose globs may match a name, in order."""
+        likely = [*self._by_name.get(name, ())]
+        for length, rules in self._by_prefix.items():
+            likely += rules.get(name[:length], ())
+        likely += compress(self._others, map(name.__contains__, self._texts))
+        return sorted(likely)
 
 
 def _denial(about: Sequence[Rule], callers: Sequence[str] | None) -> Rule | None:
