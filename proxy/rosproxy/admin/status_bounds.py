@@ -54,13 +54,15 @@ def bounded(status: ProxyStatus, most: int = MOST_BYTES) -> ProxyStatus:
         return status
     entries = _entries(status)
     wanted: defaultdict[str, int] = defaultdict(int)
+    by_owner: defaultdict[str, list[_Entry]] = defaultdict(list)
     for entry in entries:
         wanted[entry.owner] += entry.size
+        by_owner[entry.owner].append(entry)
     room = max(sum(wanted.values()) - excess - _OTHER_COUNTERS_BYTES, 0)
     shares = dict(zip(wanted, fair_shares(list(wanted.values()), room), strict=True))
     for owner, share in shares.items():
         if share < wanted[owner]:
-            _fit([entry for entry in entries if entry.owner == owner], share)
+            _fit(by_owner[owner], share)
     shown = iter(entries)
 
     def visit(_name: str, rows: Sequence[Row], _owner: Callable[[Row], str]) -> tuple[Row, ...]:
