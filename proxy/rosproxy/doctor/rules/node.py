@@ -41,10 +41,8 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         yield from _counts(facts, findings)
     if facts.untried:
         text = f"{facts.untried} nodes are not tried: too many are registered at the master"
-        fix = (
-            "run the doctor with the name of a node or topic. To see who registers so many nodes, "
-        )
-        fix += "run rosnode list -a"
+        fix = "run the doctor with the name of a node or topic; rosnode list -a shows the "
+        fix += "addresses of all nodes"
         yield note(OUTSIDE, "nodes at the master", text, fix)
     wanted = facts.scope.nodes
     yield from (f for f in findings if not facts.names or not f.subject or f.subject in wanted)
