@@ -18,6 +18,7 @@ import queue
 import signal
 import sys
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any, TextIO
 
@@ -26,6 +27,10 @@ import zenoh
 from rosproxy.zenoh.protocol.liveliness import ALL_TOKENS, LONGEST_TOKEN, MOST_TOKENS
 
 REPORT_INTERVAL_S = 1.0
+REOPEN_PAUSE_S = 0.5
+"""Seconds between the end of routers and the start of their successors. Other routers recompute
+their routes 0.1 s after a change. If a router ends and its successor connects within this time,
+they never send their subscriptions to the successor (zenoh 1.7.2, TREES_COMPUTATION_DELAY_MS)."""
 ANSWER_TIMEOUT_S = 5.0
 """Seconds in which a router has to describe itself. A router takes less than a millisecond."""
 _PR_SET_PDEATHSIG = 1
@@ -95,9 +100,11 @@ class Routers:
             for index, config in enumerate(configs)
             if index >= len(self._routers) or self._routers[index].config != config
         ]
-        for index in changed:
-            if index < len(self._routers):
-                self._routers[index].session.close()
+        ended = [self._routers[index] for index in changed if index < len(self._routers)]
+        for router in ended:
+            router.session.close()
+        if ended:
+            time.sleep(REOPEN_PAUSE_S)
         last = len(configs) - 1
         opened = {index: Router(configs[index], is_hub=index == last) for index in changed}
         kept = dict(enumerate(self._routers))

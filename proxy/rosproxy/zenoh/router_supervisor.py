@@ -30,7 +30,12 @@ START_TIMEOUT_S = 30.0
 CHANGE_TIMEOUT_S = 5.0
 """Seconds in which a process has to open routers with other configurations."""
 LEAST_START_INTERVAL_S = 1.0
-"""Seconds between two starts of the process. A process that has run longer starts again at once."""
+"""Seconds between two starts of the process. A process that has run longer starts again at once,
+after LEAST_PAUSE_S."""
+LEAST_PAUSE_S = 0.3
+"""Seconds between the end of a process and the next start. Other routers recompute their routes
+0.1 s after the end. If the next process connects before, they never send it their subscriptions
+(`rosproxy.zenoh.router_process.REOPEN_PAUSE_S`)."""
 MOST_LOG_LINES = 20
 """Lines of the library's own log that the proxy logs, for each process."""
 LONGEST_LOG_LINE = 300
@@ -113,7 +118,7 @@ class RouterSupervisor:
             self._first_outcome.set()
             self.restarts += 1
             log.error("zenoh routers ended: %s; starting the routers again", self.failure)
-            await asyncio.sleep(max(began + LEAST_START_INTERVAL_S - loop.time(), 0.0))
+            await asyncio.sleep(max(began + LEAST_START_INTERVAL_S - loop.time(), LEAST_PAUSE_S))
 
     async def _run_once(self) -> str:
         """Run a process, and return why the process has ended."""
