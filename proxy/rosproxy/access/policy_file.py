@@ -46,7 +46,7 @@ class PolicyFile:
         try:
             with self._path.open("rb") as file:
                 # Before the read: if the file changes during the read, the next check reads again.
-                self._last_signature = _signature(os.fstat(file.fileno()))
+                self._last_signature = file_signature(os.fstat(file.fileno()))
                 text = file.read(LONGEST_FILE_BYTES + 1)
             if len(text) > LONGEST_FILE_BYTES:
                 raise ValueError(f"{self._path} is longer than {LONGEST_FILE_BYTES} bytes")
@@ -67,7 +67,10 @@ class PolicyFile:
         again after a change of the other layers, because the check depends on all layers.
         """
         try:
-            if _signature(self._path.stat()) == self._last_signature and not self._is_refusal_old:
+            if (
+                file_signature(self._path.stat()) == self._last_signature
+                and not self._is_refusal_old
+            ):
                 return
         except OSError:
             self._last_signature = None
@@ -90,6 +93,6 @@ class PolicyFile:
         return self._refused_version not in (None, self._policy.version)
 
 
-def _signature(stat: os.stat_result) -> tuple[int, ...]:
+def file_signature(stat: os.stat_result) -> tuple[int, ...]:
     """A value that differs if the file has changed, or if another file has replaced it."""
     return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns
