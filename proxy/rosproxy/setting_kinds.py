@@ -22,7 +22,7 @@ from typing import (
 )
 
 from rosproxy.access.layers import PolicyLayer, read_layers
-from rosproxy.access.rules import parse_rules
+from rosproxy.access.rules import LONGEST_GLOB, parse_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy.net import addresses
 from rosproxy.net.addresses import HostPort, Network, parse_host_port
@@ -36,6 +36,10 @@ SlaveControl = Literal["any", "master"]
 DAY_S = 86400
 ZENOH_PORT = 7447
 """The port at which rmw_zenohd listens by default."""
+LINK_PROTOCOLS = ("tls", "quic")
+"""The protocols of a link between sites."""
+MOST_RATE_HZ = 10_000.0
+LEAST_RATE_HZ = 0.001
 _RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
 _TOKEN = re.compile(r"[!-~]{8,200}")
 _HASH = re.compile(r"[0-9a-f]{64}")
@@ -148,6 +152,42 @@ def _setting(field: str, hint: Any, default: Any) -> Setting:
     return Setting(field, option, None if default is Parameter.empty else default, words)
 
 
+@dataclass(frozen=True, slots=True)
+class SiteLink:
+    """A proxy at another site, and the protocol of the link to this proxy: tls or quic."""
+
+    protocol: str
+    peer: HostPort
+
+    def __str__(self) -> str:
+        """``tls/host:port``, as zenoh writes an endpoint."""
+        return f"{self.protocol}/{self.peer}"
+
+
+@dataclass(frozen=True, slots=True)
+class LinkPort:
+    """The port at which the proxy accepts links of other sites, and the protocol."""
+
+    protocol: str
+    port: int
+
+    def __str__(self) -> str:
+        """``tls/port``."""
+        return f"{self.protocol}/{self.port}"
+
+
+@dataclass(frozen=True, slots=True)
+class TopicLimit:
+    """Most messages a second of the topics that match ``glob``, all topics together."""
+
+    glob: str
+    rate_hz: float
+
+    def __str__(self) -> str:
+        """``glob=rateHz``."""
+        return f"{self.glob}={self.rate_hz:g}Hz"
+
+
 class SettingError(ValueError):
     """A setting has an unusable value. ``option`` is the name on the command line."""
 
@@ -222,6 +262,44 @@ def read_zenoh_peer(text: str) -> HostPort:
         return HostPort(read_host(text), ZENOH_PORT)
     except ValueError:
         return read_host_port(text, "HOST or HOST:PORT, such as robot or 192.0.2.7:7447")
+
+
+def read_site_link(text: str) -> SiteLink:
+    """Parse ``tls/host``, ``tls/host:port`` or the same with quic. Raises ValueError."""
+    protocol, _, peer = text.partition("/")
+    try:
+        if protocol in LINK_PROTOCOLS:
+            return SiteLink(protocol, read_zenoh_peer(peer))
+    except ValueError:
+        pass  # the message below has an example for links
+    example = "tls/HOST or tls/HOST:PORT, such as tls/cloud.example:7447"
+    raise ValueError(f"{text[:_LONGEST_QUOTE]!r} is not of the form {example}")
+
+
+def read_link_port(text: str) -> LinkPort:
+    """Parse ``tls/port`` or ``quic/port``. Raises ValueError."""
+    protocol, _, port = text.partition("/")
+    is_number = port.isascii() and port.isdigit() and len(port) <= 5
+    if protocol not in LINK_PROTOCOLS or not is_number or not 1 <= int(port) <= 65535:
+        example = "tls/PORT or quic/PORT, such as tls/7447"
+        raise ValueError(f"{text[:_LONGEST_QUOTE]!r} is not of the form {example}")
+    return LinkPort(protocol, int(port))
+
+
+def read_topic_limit(text: str) -> TopicLimit:
+    """Parse ``glob=rate`` or ``glob=rateHz``. Raises ValueError."""
+    glob, _, rate = text.rpartition("=")
+    try:
+        rate_hz = float(rate.removesuffix("Hz"))
+    except ValueError:
+        rate_hz = 0.0
+    if not LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ or glob[:1] not in ("/", "*"):
+        example = "TOPIC=RATEHz, such as /camera/*=2Hz"
+        bounds = f"with a rate from {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}"
+        raise ValueError(f"{text[:_LONGEST_QUOTE]!r} is not of the form {example}, {bounds}")
+    if len(glob) > LONGEST_GLOB:
+        raise ValueError(f"a topic must have at most {LONGEST_GLOB} characters")
+    return TopicLimit(glob, rate_hz)
 
 
 def read_network(text: str) -> Network:
@@ -310,6 +388,9 @@ BIND_ADDRESS = Text("ADDRESS", read_bind_address)
 HOST_PORT = Text("ADDRESS:PORT", read_host_port)
 PEER = Text("HOST[:PORT]", read_peer)
 ZENOH_PEER = Text("HOST[:PORT]", read_zenoh_peer)
+SITE_LINK = Text("tls/HOST[:PORT]", read_site_link)
+LINK_PORT = Text("tls/PORT", read_link_port)
+TOPIC_LIMIT = Text("TOPIC=RATE", read_topic_limit)
 NETWORK = Text("CIDR", read_network)
 MASTER_URI = Text("URI", read_master_uri)
 TOKEN = Text("TOKEN", read_token)

@@ -14,7 +14,16 @@ from rosproxy.access.layers import PolicyLayer, PolicyMode, check_bounds
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort, Network
-from rosproxy.setting_kinds import DataPlane, Direction, Option, SettingError, SlaveControl
+from rosproxy.setting_kinds import (
+    DataPlane,
+    Direction,
+    LinkPort,
+    Option,
+    SettingError,
+    SiteLink,
+    SlaveControl,
+    TopicLimit,
+)
 
 MEBIBYTE = 1024 * 1024
 LEAST_PORTS_PER_DOMAIN = 4
@@ -28,6 +37,10 @@ MOST_ZENOH_PEERS = 64
 """Links of the hub router to other routers."""
 MOST_ZENOH_HUBS = 128
 """Hubs of other hosts. Each hub has a session with each other hub."""
+MOST_ZENOH_LINKS = 16
+"""Links to other sites."""
+MOST_ZENOH_LIMITS = 64
+"""Limits of topics on links. zenoh compares the key of each new publisher with all limits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -401,6 +414,82 @@ class Settings:
             default="off",
         ),
     ] = None
+    zenoh_link: Annotated[
+        tuple[SiteLink, ...],
+        Option(
+            "rmw_zenoh: proxy [at another site](../guide/zenoh.md#a-link-between-sites) to which "
+            "the proxy connects with TLS and certificates of both sides, for example "
+            "`tls/cloud.example:7447`. `quic/…` uses QUIC, over UDP. Without a port: 7447. "
+            "Repeatable.",
+            kinds.SITE_LINK,
+            variables=("ROSPROXY_ZENOH_LINKS",),
+            repeatable=True,
+            default="none",
+            note="separated by spaces",
+        ),
+    ] = ()
+    zenoh_link_listen: Annotated[
+        LinkPort | None,
+        Option(
+            "rmw_zenoh: port at which proxies of other sites connect with `--zenoh-link`, for "
+            "example `tls/7447`, or `quic/7447` for QUIC. Publish this port.",
+            kinds.LINK_PORT,
+            default="off",
+        ),
+    ] = None
+    zenoh_certificate: Annotated[
+        str,
+        Option(
+            "rmw_zenoh: file with the certificate of this site for links, as PEM. With "
+            "`--zenoh-link-listen`, the certificate has the host name by which other sites "
+            "connect.",
+            kinds.FILE,
+            default="none",
+        ),
+    ] = ""
+    zenoh_key: Annotated[
+        str,
+        Option(
+            "rmw_zenoh: file with the private key of `--zenoh-certificate`, as PEM without a "
+            "passphrase.",
+            kinds.FILE,
+            default="none",
+        ),
+    ] = ""
+    zenoh_ca: Annotated[
+        str,
+        Option(
+            "rmw_zenoh: file with the certificates of the CAs for links, as PEM. The proxy "
+            "accepts other sites with certificates of these CAs only.",
+            kinds.FILE,
+            default="none",
+        ),
+    ] = ""
+    zenoh_limit: Annotated[
+        tuple[TopicLimit, ...],
+        Option(
+            "rmw_zenoh: most messages a second that leave by all links to other sites, of a topic "
+            "or of several topics together, for example `/camera/*=2Hz`. The first limit that "
+            "matches a topic counts. Repeatable.",
+            kinds.TOPIC_LIMIT,
+            variables=("ROSPROXY_ZENOH_LIMITS",),
+            repeatable=True,
+            default="none",
+            note="separated by spaces",
+        ),
+    ] = ()
+    zenoh_link_policy: Annotated[
+        tuple[tuple[Rule, ...], ...],
+        Option(
+            "rmw_zenoh: [rules](policy.md) about the topics and services that pass links to other "
+            "sites. All nodes of this site count as inside, for example `allow publish /status; "
+            "deny publish *`. Repeatable.",
+            kinds.POLICY_RULES,
+            repeatable=True,
+            default="everything passes",
+            note="rules separated by `;`",
+        ),
+    ] = ()
 
     def __post_init__(self) -> None:
         if self.admin_token and self.admin_token_hash:
@@ -474,6 +563,29 @@ class Settings:
         if len(self.zenoh_hub) > MOST_ZENOH_HUBS:
             text = f"{len(self.zenoh_hub)} proxies; give at most {MOST_ZENOH_HUBS}"
             raise SettingError("--zenoh-hub", text)
+        if len(self.zenoh_link) > MOST_ZENOH_LINKS:
+            text = f"{len(self.zenoh_link)} links; give at most {MOST_ZENOH_LINKS}"
+            raise SettingError("--zenoh-link", text)
+        if len(self.zenoh_limit) > MOST_ZENOH_LIMITS:
+            text = f"{len(self.zenoh_limit)} limits; give at most {MOST_ZENOH_LIMITS}"
+            raise SettingError("--zenoh-limit", text)
+        if self.has_site_links:
+            self._check_site_links()
+
+    def _check_site_links(self) -> None:
+        files = {
+            "--zenoh-certificate": self.zenoh_certificate,
+            "--zenoh-key": self.zenoh_key,
+            "--zenoh-ca": self.zenoh_ca,
+        }
+        for option, file in files.items():
+            if not file:
+                text = "missing; links between sites need a certificate, its key, and the CA of "
+                raise SettingError(option, f"{text}the other sites, each in a file")
+        try:
+            check_bounds(self.link_policy)
+        except ValueError as error:
+            raise SettingError("--zenoh-link-policy", str(error)) from None
 
     @property
     def ports(self) -> PortMap:
@@ -485,6 +597,17 @@ class Settings:
         """The layer with the rules of ``--policy``; empty without rules."""
         rules = tuple(rule for given in self.policy_rules for rule in given)
         return (PolicyLayer("--policy", rules, PolicyMode(self.policy_mode)),) if rules else ()
+
+    @property
+    def link_policy(self) -> tuple[PolicyLayer, ...]:
+        """The layer with the rules of ``--zenoh-link-policy``; empty without rules."""
+        rules = tuple(rule for given in self.zenoh_link_policy for rule in given)
+        return (PolicyLayer("--zenoh-link-policy", rules, PolicyMode.ENFORCE),) if rules else ()
+
+    @property
+    def has_site_links(self) -> bool:
+        """Whether the proxy connects to other sites, or accepts links of other sites."""
+        return self.for_zenoh and bool(self.zenoh_link or self.zenoh_link_listen)
 
     @property
     def for_ros1(self) -> bool:
@@ -507,6 +630,8 @@ class Settings:
             yield from (("--zenoh-ports", port) for port in self.zenoh_ports.ports())
         if self.for_zenoh and self.zenoh_listen is not None:
             yield "--zenoh-listen", self.zenoh_listen
+        if self.for_zenoh and self.zenoh_link_listen is not None:
+            yield "--zenoh-link-listen", self.zenoh_link_listen.port
 
     @property
     def range_versions(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rosproxy.access.rules import format_rules
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import SettingError
+from rosproxy.setting_kinds import LinkPort, SettingError
 from tests.run_options import parse_settings, settings_of
 
 GIVEN: dict[str, Any] = {
@@ -181,6 +181,45 @@ def test_rmw_zenoh_alone_needs_neither_master_nor_advertised_host() -> None:
     assert not [*parse_settings(GIVEN).zenoh_listeners()]
 
 
+LINKED = {
+    "ros": ("zenoh",),
+    "zenoh_link": ("tls/cloud.example", "quic/[fd00::7]:7448"),
+    "zenoh_certificate": "/c/tls.crt",
+    "zenoh_key": "/c/tls.key",
+    "zenoh_ca": "/c/ca.crt",
+}
+
+
+def test_links_between_sites_have_a_protocol_and_files() -> None:
+    settings = parse_settings(
+        {
+            **LINKED,
+            "zenoh_link_listen": "tls/7447",
+            "zenoh_limit": ("/camera/**=2Hz", "/scan=0.5"),
+            "zenoh_link_policy": ("allow publish /scan; deny publish *",),
+        }
+    )
+    assert [*map(str, settings.zenoh_link)] == ["tls/cloud.example:7447", "quic/[fd00::7]:7448"]
+    assert settings.zenoh_link_listen == LinkPort("tls", 7447)
+    assert [*map(str, settings.zenoh_limit)] == ["/camera/**=2Hz", "/scan=0.5Hz"]
+    assert ("--zenoh-link-listen", 7447) in settings.zenoh_listeners()
+    (layer,) = settings.link_policy
+    assert [*map(str, layer.rules)] == ["allow publish /scan", "deny publish *"]
+    assert not parse_settings(GIVEN).has_site_links
+    variables = {"ROSPROXY_ROS": "zenoh", "ROSPROXY_ZENOH_LINKS": "tls/a quic/b:1"}
+    with pytest.raises(SettingError, match="--zenoh-certificate: missing"):
+        settings_of(variables)
+
+
+@pytest.mark.parametrize("missing", ["zenoh_certificate", "zenoh_key", "zenoh_ca"])
+def test_a_link_needs_all_files(missing: str) -> None:
+    with pytest.raises(SettingError, match=f"--{missing.replace('_', '-')}: missing"):
+        parse_settings({**LINKED, missing: None})
+    alone = {**LINKED, "zenoh_link": (), "zenoh_link_listen": "tls/7447", missing: None}
+    with pytest.raises(SettingError, match=f"--{missing.replace('_', '-')}: missing"):
+        parse_settings(alone)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "complaint"),
     [
@@ -192,6 +231,20 @@ def test_rmw_zenoh_alone_needs_neither_master_nor_advertised_host() -> None:
         ("zenoh_peer", ("robot:x",), "--zenoh-peer: 'robot:x' is not of the form HOST or HOST"),
         ("zenoh_peer", tuple(f"h{n}" for n in range(65)), "--zenoh-peer: 65 routers; give at"),
         ("zenoh_hub", tuple(f"h{n}" for n in range(129)), "--zenoh-hub: 129 proxies; give at"),
+        ("zenoh_link", ("cloud",), "--zenoh-link: 'cloud' is not of the form tls/HOST or tls/"),
+        ("zenoh_link", ("tcp/cloud",), "--zenoh-link: 'tcp/cloud' is not of the form tls/HOST"),
+        ("zenoh_link", ("tls/a:b",), "--zenoh-link: 'tls/a:b' is not of the form tls/HOST or"),
+        ("zenoh_link", ("tls/cloud",), "--zenoh-certificate: missing; links between sites need"),
+        ("zenoh_link", tuple(f"tls/h{n}" for n in range(17)), "--zenoh-link: 17 links; give at"),
+        ("zenoh_link_listen", "7447", "--zenoh-link-listen: '7447' is not of the form tls/PORT"),
+        ("zenoh_link_listen", "tls/0", "--zenoh-link-listen: 'tls/0' is not of the form tls/"),
+        ("zenoh_link_listen", "tls/7450", "--zenoh-link-listen: port 7450 is taken by --zenoh-p"),
+        ("zenoh_limit", ("/camera/*",), "--zenoh-limit: '/camera/*' is not of the form TOPIC="),
+        ("zenoh_limit", ("/camera/*=0",), "--zenoh-limit: '/camera/*=0' is not of the form TOP"),
+        ("zenoh_limit", ("camera=nan",), "--zenoh-limit: 'camera=nan' is not of the form TOPIC"),
+        ("zenoh_limit", (f"/{'a' * 256}=1",), "--zenoh-limit: a topic must have at most 256"),
+        ("zenoh_limit", tuple(f"/t{n}=1" for n in range(65)), "--zenoh-limit: 65 limits; give"),
+        ("zenoh_link_policy", ("deny all *",), "--zenoh-link-policy: rule 'deny all *'"),
     ],
 )
 def test_what_rmw_zenoh_can_not_have(name: str, value: object, complaint: str) -> None:

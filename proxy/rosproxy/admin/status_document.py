@@ -362,10 +362,11 @@ class DomainStatus(msgspec.Struct, frozen=True):
 
 
 class ZenohLinkStatus(msgspec.Struct, frozen=True):
-    """A link of the hub to the router outside at ``peer``. ``since``: the age of this state.
+    """A link to the router outside at ``peer``. ``since``: the age of this state.
 
     ``error``: why the link is not up, a value of `rosproxy.zenoh.links.LinkFault`. ``hub``: the
-    router is the hub of another proxy (``--zenoh-hub``), which may be away.
+    router is the hub of another proxy (``--zenoh-hub``), which may be away. ``protocol`` is tls or
+    quic for a link to another site (``--zenoh-link``), otherwise tcp.
     """
 
     peer: str = ""
@@ -373,6 +374,25 @@ class ZenohLinkStatus(msgspec.Struct, frozen=True):
     error: str = ""
     since: Seconds = 0.0
     hub: bool = False
+    protocol: str = "tcp"
+
+    @property
+    def title(self) -> str:
+        """The peer, for a link to another site with the protocol."""
+        return self.peer if self.protocol == "tcp" else f"{self.protocol}/{self.peer}"
+
+
+class ZenohCertificateStatus(msgspec.Struct, frozen=True):
+    """A file for links to other sites, and the time in which its certificate is valid.
+
+    ``error``: why the file of now can't be used. ``starts_in``: the seconds until the certificate
+    is valid. ``ends_in``: the seconds until its end, negative after the end; None for a key.
+    """
+
+    file: str = ""
+    error: str = ""
+    starts_in: Seconds = 0.0
+    ends_in: float | None = None
 
 
 class ZenohSessionStatus(msgspec.Struct, frozen=True):
@@ -416,11 +436,17 @@ class ZenohStatus(msgspec.Struct, frozen=True):
     ``failure``: why the routers do not run. ``restarts``: how often the child process has ended.
     ``mismatches`` are pairs of nodes with a node inside: ``writer`` is the key of the node that
     publishes or serves, ``reader`` of the node that subscribes or calls. ``not_compared``: pairs of
-    nodes that the proxy has not compared.
+    nodes that the proxy has not compared. ``link_listen``: the port for links of other sites, such
+    as ``tls/7447``; ``link_listens``: whether this port accepts connections. ``limits``: the rates
+    of topics on links to other sites, as ``/camera/*=2Hz``.
     """
 
     ports: str = ""
     listen: Count | None = None
+    link_listen: str = ""
+    link_listens: bool = True
+    limits: tuple[str, ...] = ()
+    certificates: tuple[ZenohCertificateStatus, ...] = ()
     failure: str = ""
     restarts: Count = 0
     links: tuple[ZenohLinkStatus, ...] = ()

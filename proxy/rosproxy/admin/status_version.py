@@ -46,5 +46,6 @@ def _domain(domain: DomainStatus) -> object:
 
 
 def _zenoh(zenoh: ZenohStatus) -> object:
-    links = [(link.peer, link.up, link.error) for link in zenoh.links]
-    return zenoh.failure, links, zenoh.sessions, zenoh.nodes
+    links = [(link.title, link.up, link.error) for link in zenoh.links]
+    files = [(certificate.file, certificate.error) for certificate in zenoh.certificates]
+    return zenoh.failure, links, zenoh.link_listens, files, zenoh.sessions, zenoh.nodes

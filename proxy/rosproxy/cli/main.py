@@ -29,7 +29,7 @@ def main() -> None:
     "--check",
     is_flag=True,
     allow_from_autoenv=False,
-    help="Check the options and the file of --policy-file, and exit.",
+    help="Check the options and the files that they name, and exit.",
 )
 @click.option(
     "--deep",
@@ -61,10 +61,15 @@ def run(check: bool, deep: bool, log_format: str, log_level: str, **given: Any) 
 
 
 def _check(settings: Any, deep: bool) -> None:
-    """Check the policy file, and with ``deep`` print findings and exit. Raises SettingError."""
+    """Check the files of the options, and with ``deep`` print findings and exit.
+
+    Raises SettingError.
+    """
     from rosproxy.app.policy_sources import check_policy_file
+    from rosproxy.zenoh.site_links import SiteLinks
 
     check_policy_file(settings)
+    SiteLinks(settings).check()
     if deep:
         from rosproxy.cli.deep_check import deep_check
         from rosproxy.cli.questions import print_findings

@@ -40,6 +40,8 @@ def _summary(zenoh: ZenohStatus) -> str:
     ended = f", ended {plural(zenoh.restarts, 'time')}" if zenoh.restarts else ""
     state = f"do not run: {clean(zenoh.failure)}" if zenoh.failure else f"run{ended}"
     listens = "" if zenoh.listen is None else f"; port {zenoh.listen} for outside"
+    if zenoh.link_listen:
+        listens += f"; port {clean(zenoh.link_listen)} for other sites"
     links = listed(_link(link) for link in zenoh.links if not link.hub) or "none"
     hubs = listed(_link(link) for link in zenoh.links if link.hub)
     ports = f"ports {clean(zenoh.ports)} for containers{listens}"
@@ -49,7 +51,7 @@ def _summary(zenoh: ZenohStatus) -> str:
 
 def _link(link: ZenohLinkStatus) -> str:
     state = "up" if link.up else f"DOWN ({clean(link.error)})"
-    return f"{clean(link.peer)} {state} for {duration(link.since)}"
+    return f"{clean(link.title)} {state} for {duration(link.since)}"
 
 
 def _table(rows: list[tuple[str, ...]], left: int, columns: int) -> list[str]:

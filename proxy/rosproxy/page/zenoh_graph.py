@@ -36,7 +36,7 @@ from rosproxy.page.page_document import (
     shown_text,
 )
 from rosproxy.telemetry.text import listed
-from rosproxy.zenoh.findings import PEER
+from rosproxy.zenoh.findings import PEER, link_subject
 from rosproxy.zenoh.pairs import MATCH, SERVICE, Graph, Pair, is_inside
 
 NODE = "zenoh node"
@@ -92,9 +92,9 @@ def _router_nodes(status: ProxyStatus, zenoh: ZenohStatus, now: float) -> dict[s
     about = {f.subject: f for f in check(DoctorFacts(status=status)) if f.check == "link"}
     nodes = {}
     for link in zenoh.links:
-        kind, subject = (HUB, "zenoh hub") if link.hub else (ROUTER, "zenoh peer")
-        finding = about.get(f"{subject} {link.peer}")
-        nodes[f"{kind} {link.peer}"] = _router(link, kind, finding, now)
+        kind = HUB if link.hub else ROUTER
+        finding = about.get(link_subject(link))
+        nodes[f"{kind} {link.title}"] = _router(link, kind, finding, now)
     return nodes
 
 
@@ -105,9 +105,9 @@ def _router(
     node = PageNode(
         _lane(link.peer),
         kind,
-        shown_name(link.peer),
+        shown_name(link.title),
         UNKNOWN,
-        address=shown_name(link.peer),
+        address=shown_name(link.title),
         detail=f"{'linked' if link.up else 'not linked'} with the hub of the proxy",
         since=round(now - link.since),
     )
@@ -127,7 +127,7 @@ def _lane(address: str) -> str:
 def _routers(zenoh: ZenohStatus) -> list[str]:
     """The routers outside that may have nodes behind them; by link if there is only one."""
     remotes = [session.remote for session in zenoh.sessions if session.mode == "router"]
-    linked = [link.peer for link in zenoh.links if link.up]
+    linked = [link.title for link in zenoh.links if link.up]
     return linked if len(remotes) == len(linked) == 1 else remotes
 
 

@@ -5,16 +5,18 @@ The proxy reports these findings by itself, and the doctor reports them, too.
 
 from collections.abc import Iterator
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error, ok, warning
+from rosproxy.access.rules import matches
+from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
 from rosproxy.admin.status_document import (
     MismatchStatus,
+    ZenohCertificateStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
     ZenohStatus,
 )
 from rosproxy.fixes import how_to
 from rosproxy.net.addresses import parse_host_port
-from rosproxy.telemetry.text import brief, listed, plural, quoted
+from rosproxy.telemetry.text import brief, duration, listed, plural, quoted
 from rosproxy.zenoh.links import LinkFault
 from rosproxy.zenoh.matching import DURABILITY, TYPE, TYPE_HASH
 
@@ -23,6 +25,10 @@ PEER = "peer"
 """The mode of a session whose router passes no data on to other peers of this router."""
 LINK_GRACE_S = 5.0
 """Seconds in which a link has to come up before it counts as a fault."""
+CERTIFICATE_WARNING_S = 14 * 86400.0
+"""Seconds before the end of a certificate from which the doctor warns."""
+MOST_LIMIT_COMPARISONS = 20_000
+"""Pairs of a topic and a limit that are compared. A pair takes half a microsecond."""
 NO_TYPE_HASH = "TypeHashNotSupported"
 """The type hash of all types on Humble."""
 LONGEST_HASH = 24
@@ -54,7 +60,63 @@ _LINK_FAULTS = {
         "router, or two peers lead to the same router",
         "check the port, and give each router once",
     ),
+    LinkFault.NO_QUIC_SESSION: (
+        "no session over UDP. Either no proxy listens there for QUIC, a firewall drops UDP, or one "
+        "side refuses the certificate of the other",
+        "check these three; a link with tls/ in place of quic/ tells the cause",
+    ),
+    LinkFault.NO_TLS: (
+        "a program accepts connections there, but does not speak TLS",
+        "give the port at which the other proxy listens for links between sites",
+    ),
+    LinkFault.PEER_EXPIRED: (
+        "the certificate of the other site, or its CA, has expired",
+        "renew the files at the other site; if they are new, check the clock of this host",
+    ),
+    LinkFault.PEER_TOO_EARLY: (
+        "the certificate of the other site, or its CA, is not valid yet",
+        "check the clocks of both hosts",
+    ),
+    LinkFault.PEER_FOREIGN: (
+        "the certificate of the other site is of a CA that is not in the CA file of this proxy",
+        "if the host is the right one, add its CA to the CA file",
+    ),
+    LinkFault.PEER_OTHER_NAME: (
+        "the certificate of the other site is for another host name",
+        "give the host name of the certificate in the link, or add the host name of the link to "
+        "the certificate (subjectAltName)",
+    ),
+    LinkFault.PEER_INVALID: (
+        "the certificate of the other site is not valid for a TLS server",
+        "make a certificate with extendedKeyUsage serverAuth, or without extendedKeyUsage",
+    ),
+    LinkFault.OWN_EXPIRED: (
+        "the other site refuses the certificate of this proxy as expired",
+        "renew certificate and key of this proxy; if they are new, check the clock of the other "
+        "host",
+    ),
+    LinkFault.OWN_FOREIGN: (
+        "the other site refuses the certificate of this proxy: it is of a CA that is not in the CA "
+        "file there",
+        "give this proxy a certificate of that CA, or add its CA to the CA file there",
+    ),
+    LinkFault.OWN_REFUSED: (
+        "the other site refuses the certificate of this proxy",
+        "see rosproxy status there for the reason, and check the certificate of this proxy",
+    ),
 }
+_SITE_FAULTS = {
+    LinkFault.REFUSED.value: (
+        "connection refused: no proxy listens there",
+        "let the proxy of the other site listen for links between sites, and publish the port",
+    ),
+    LinkFault.NO_SESSION.value: (
+        "the program there accepts the certificate of this proxy, but zenoh opens no session",
+        "give each site once, and use keys with RSA, P-256, P-384 or Ed25519",
+    ),
+}
+"""Texts for links to other sites that differ from those for other links."""
+_RENEW = "write new files in place of the files. The proxy notices new files by itself"
 
 
 def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
@@ -65,6 +127,12 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
         fix += "restart the proxy"
         yield error("routers", ROUTERS, text, fix)
         return
+    yield from filter(None, map(_certificate, zenoh.certificates))
+    if not zenoh.link_listens:
+        text = "accepts no connections. Another program has the port, or zenoh can't use the key: "
+        text += "zenoh knows RSA from 2,048 bits on, ECDSA with P-256 and P-384, and Ed25519"
+        fix = "ss -ltunp shows whether another program has the port. Otherwise make another key"
+        yield error("link", f"zenoh port {zenoh.link_listen}", text, fix)
     for link in zenoh.links:
         is_tried = link.error != LinkFault.NOT_TRIED.value
         if not link.up and not link.hub and is_tried and link.since >= LINK_GRACE_S:
@@ -72,10 +140,34 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
     yield from shared_ports(zenoh).values()
 
 
+def _certificate(certificate: ZenohCertificateStatus) -> DoctorFinding | None:
+    """What is wrong with a file for links to other sites; None if it is right."""
+    subject = f"zenoh file {certificate.file}"
+    left = certificate.ends_in
+    if certificate.error:
+        return error("certificate", subject, certificate.error, _RENEW)
+    if certificate.starts_in:
+        text = f"not valid before another {duration(certificate.starts_in)} have passed"
+        return error("certificate", subject, text, "check the clock of this host")
+    if left is not None and left <= 0:
+        return error("certificate", subject, f"expired {duration(-left)} ago", _RENEW)
+    if left is not None and left < CERTIFICATE_WARNING_S:
+        return warning("certificate", subject, f"expires in {duration(left)}", _RENEW)
+    return None
+
+
+def link_subject(link: ZenohLinkStatus) -> str:
+    """The subject of findings about a link."""
+    kind = "hub" if link.hub else "peer" if link.protocol == "tcp" else "link"
+    return f"zenoh {kind} {link.title}"
+
+
 def _link_fault(link: ZenohLinkStatus) -> DoctorFinding:
     known = {fault.value: texts for fault, texts in _LINK_FAULTS.items()}
     text, fix = known.get(link.error, (link.error or "no session", _CHECK_PEER))
-    return error("link", f"zenoh peer {link.peer}", f"{text}. The hub tries again", fix)
+    if link.protocol != "tcp":
+        text, fix = _SITE_FAULTS.get(link.error, (text, fix))
+    return error("link", link_subject(link), f"{text}. The proxy tries again", fix)
 
 
 def shared_ports(zenoh: ZenohStatus) -> dict[int | None, DoctorFinding]:
@@ -103,6 +195,28 @@ def _shared_port(zenoh: ZenohStatus, port: int | None, hosts: set[str]) -> Docto
     if port is not None:
         fix = f"give each container a port of its own ({quoted(zenoh.ports)}); or {fix}"
     return warning("shared port", f"zenoh {at_port}", text, fix)
+
+
+def shared_limits(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
+    """Yield each limit of links to other sites that several topics of nodes inside share.
+
+    zenoh counts the messages of all topics of a limit together, so frequent topics may displace
+    others.
+    """
+    if not zenoh.limits:
+        return
+    globs = {limit: limit.rpartition("=")[0] for limit in zenoh.limits}
+    names = sorted({n for node in zenoh.nodes if node.port is not None for n in node.publishes})
+    topics_by_limit: dict[str, list[str]] = {}
+    for name in names[: MOST_LIMIT_COMPARISONS // len(globs)]:
+        limit = next((limit for limit, glob in globs.items() if matches(glob, name)), None)
+        if limit is not None:
+            topics_by_limit.setdefault(limit, []).append(name)
+    for limit, topics in topics_by_limit.items():
+        if len(topics) > 1:
+            text = f"{listed(topics)} share this rate. Some of them may never pass the links"
+            fix = "give each of these topics a limit of its own, before this limit"
+            yield note("limit", f"zenoh limit {limit}", text, fix)
 
 
 def place(node: ZenohNodeStatus) -> str:

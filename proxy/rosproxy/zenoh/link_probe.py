@@ -1,22 +1,32 @@
-"""Tries to connect to a router outside with which the hub has no session."""
+"""Tries to connect to a router outside with which the proxy has no session."""
 
-from collections.abc import Collection
+import asyncio
+import contextlib
+import socket
+import ssl
 
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
-from rosproxy.zenoh.links import LinkFault
+from rosproxy.zenoh.links import Link, LinkFault, alert_fault, verify_fault
+
+HANDSHAKE_TIMEOUT_S = 5.0
+"""Seconds in which a peer must finish the handshake of TLS."""
+ALERT_TIMEOUT_S = 2.0
+"""Seconds in which a peer refuses the certificate of the proxy, if the peer refuses it."""
 
 
-async def try_link(addresses: Collection[str], port: int) -> LinkFault:
-    """Return why the hub has no session with a router, as far as a TCP connection shows.
+async def try_link(link: Link, tls: ssl.SSLContext | None = None) -> LinkFault:
+    """Return why there is no session with the peer of a link, as far as a connection shows.
 
-    Without addresses: UNRESOLVABLE. If an address accepts: NO_SESSION. Otherwise the fault of the
-    last address.
+    Without addresses: UNRESOLVABLE. If an address accepts the connection, and the certificates of a
+    link with TLS: NO_SESSION. Otherwise the fault of the last address.
     """
     fault = LinkFault.UNRESOLVABLE
-    for address in addresses:
+    for address in link.addresses:
+        if link.protocol == "quic":  # Python has no QUIC
+            return LinkFault.NO_QUIC_SESSION
         try:
-            (await sockets.dial(HostPort(address, port))).close()
+            sock = await sockets.dial(HostPort(address, link.peer.port))
         except TimeoutError:
             fault = LinkFault.SILENT
         except ConnectionRefusedError:
@@ -24,5 +34,33 @@ async def try_link(addresses: Collection[str], port: int) -> LinkFault:
         except OSError:
             fault = LinkFault.UNREACHABLE
         else:
+            if link.protocol == "tls" and tls is not None:
+                return await _try_tls(sock, link.peer.host, tls)
+            sock.close()
             return LinkFault.NO_SESSION
     return fault
+
+
+async def _try_tls(sock: socket.socket, host: str, tls: ssl.SSLContext) -> LinkFault:
+    """Try the handshake of TLS on a connection, and close the connection."""
+    try:
+        reader, writer = await asyncio.open_connection(
+            sock=sock, ssl=tls, server_hostname=host, ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S
+        )
+    except ssl.SSLCertVerificationError as error:
+        return verify_fault(error.verify_code)
+    except OSError:  # ssl.SSLError is an OSError
+        return LinkFault.NO_TLS
+    try:
+        # In TLS 1.3 the peer checks the certificate of the proxy after the end of the handshake.
+        async with asyncio.timeout(ALERT_TIMEOUT_S):
+            await reader.read(1)
+    except ssl.SSLError as error:
+        return alert_fault(error.reason or "")
+    except OSError:  # also TimeoutError: the peer waits for the first message of zenoh
+        pass
+    finally:
+        writer.close()
+        with contextlib.suppress(OSError):
+            writer.transport.abort()
+    return LinkFault.NO_SESSION

@@ -1,7 +1,8 @@
-"""The links of the hub router to routers outside: which links are up, and why a link is down.
+"""The links to routers outside and to other sites: which links are up, and why a link is down.
 
-The hub dials each peer again and again. The hub reports the sessions, but not why there is no
-session with a peer. So the proxy tries to connect to such a peer.
+The hub dials each peer again and again, and the router of the links to other sites dials each site.
+Both report the sessions, but not why there is no session with a peer. So the proxy tries to connect
+to such a peer.
 """
 
 from collections.abc import Collection, Iterable
@@ -21,11 +22,52 @@ class LinkFault(Enum):
     SILENT = "silent"
     UNREACHABLE = "unreachable"
     NO_SESSION = "no session"
+    NO_QUIC_SESSION = "no session over UDP"
+    NO_TLS = "no TLS"
+    PEER_EXPIRED = "the certificate of the peer has expired"
+    PEER_TOO_EARLY = "the certificate of the peer is not valid yet"
+    PEER_FOREIGN = "the certificate of the peer is of a foreign CA"
+    PEER_OTHER_NAME = "the certificate of the peer is for another host name"
+    PEER_INVALID = "the certificate of the peer is not valid"
+    OWN_EXPIRED = "the peer refuses the own certificate as expired"
+    OWN_FOREIGN = "the peer refuses the own certificate as of a foreign CA"
+    OWN_REFUSED = "the peer refuses the own certificate"
+
+
+_VERIFY_FAULTS = {
+    9: LinkFault.PEER_TOO_EARLY,
+    10: LinkFault.PEER_EXPIRED,
+    18: LinkFault.PEER_FOREIGN,
+    19: LinkFault.PEER_FOREIGN,
+    20: LinkFault.PEER_FOREIGN,
+    21: LinkFault.PEER_FOREIGN,
+    62: LinkFault.PEER_OTHER_NAME,
+    64: LinkFault.PEER_OTHER_NAME,
+}
+"""Results of the check of a certificate (openssl/x509_vfy.h, X509_V_ERR_...)."""
+_ALERT_FAULTS = {
+    "CERTIFICATE_EXPIRED": LinkFault.OWN_EXPIRED,
+    "UNKNOWN_CA": LinkFault.OWN_FOREIGN,
+    "CERTIFICATE": LinkFault.OWN_REFUSED,
+}
+"""Words in the alerts of TLS with which a peer refuses a certificate (RFC 8446, 6.2)."""
+
+
+def verify_fault(code: int) -> LinkFault:
+    """The fault for a result of OpenSSL's check of a peer's certificate."""
+    return _VERIFY_FAULTS.get(code, LinkFault.PEER_INVALID)
+
+
+def alert_fault(reason: str) -> LinkFault:
+    """The fault for the reason that OpenSSL gives after a peer has ended a connection of TLS."""
+    return next((f for word, f in _ALERT_FAULTS.items() if word in reason), LinkFault.NO_SESSION)
 
 
 @dataclass
 class Link:
     """A link to a peer. ``addresses``: the addresses of the peer's host name.
+
+    ``protocol`` is tls or quic for a link to another site, otherwise tcp.
 
     ``fault``: None if the link is up. ``since``: the time in seconds at which the link went up or
     down.
@@ -35,8 +77,13 @@ class Link:
     peer: HostPort
     since: float
     is_hub: bool = False
+    protocol: str = "tcp"
     addresses: tuple[str, ...] = ()
     fault: LinkFault | None = LinkFault.NOT_TRIED
+
+    def __str__(self) -> str:
+        """The peer, for a link to another site with the protocol."""
+        return str(self.peer) if self.protocol == "tcp" else f"{self.protocol}/{self.peer}"
 
     def note(self, fault: LinkFault | None, now: float) -> bool:
         """Note the state of the link. Return whether the state or the fault has changed."""
@@ -53,10 +100,11 @@ def is_linked(
 ) -> bool:
     """Whether a connection of the hub with one of ``routers`` is with a peer at these addresses.
 
-    The peer may have dialed the hub, at the port ``listen``; None: the hub has no such port.
+    The peer may have dialed the hub, at the port ``listen``; None: the hub has no such port. For
+    QUIC, zenoh reports the host name that the hub has dialed.
     """
     return any(
-        ends.remote.host in addresses
+        (ends.remote.host in addresses or ends.remote.host == peer.host)
         and (ends.remote.port == peer.port or ends.local.port == listen)
         for ends in routers
     )

@@ -66,7 +66,7 @@ class Graph:
         self._hidden = {(h.kind, h.name, h.node, h.address): h.reason for h in policy.hidden}
         self._is_complete = not (policy.left_out or zenoh.mismatches_left_out or zenoh.not_compared)
         self._down = [
-            link.peer
+            link.title
             for link in zenoh.links
             if not link.up and link.error != LinkFault.NOT_TRIED.value
         ]

@@ -7,6 +7,8 @@ two containers are peers of two routers, and routers pass data on to each other.
 to all these routers, and to routers outside. The hub dials the routers of containers by sockets in
 a directory. So the access control of such a router distinguishes the hub from nodes.
 
+Links to other sites have a router of their own, which dials the hub (`rosproxy.zenoh.link_router`).
+
 The values come from rmw_zenohd (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_ROUTER_CONFIG.json5).
 Exceptions are the addresses, the bound of sessions, and the delay for scouting, which is off.
 """
@@ -14,6 +16,7 @@ Exceptions are the addresses, the bound of sessions, and the delay for scouting,
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
@@ -62,27 +65,41 @@ class RouterPlan:
     peers: Sequence[HostPort]
     directory: str = ""
 
-    def configs(self, access: Mapping[int, object]) -> list[RouterConfig]:
+    @property
+    def hub_socket(self) -> str:
+        """The endpoint at which the hub waits for the router of the links to other sites."""
+        return f"{HUB_PROTOCOL}/{self.directory}/hub"
+
+    def configs(
+        self, access: Mapping[int, object], links: RouterConfig | None = None
+    ) -> list[RouterConfig]:
         """The configurations of a router for each port, in order, and of the hub as the last.
 
-        ``access`` has the access control of routers by port. Raises ValueError if there is access
-        control, but no directory.
+        ``access`` has the access control of routers by port. ``links`` is the configuration of the
+        router of the links to other sites, which gets the place before the hub. Raises ValueError
+        if there is access control or such a router, but no directory.
         """
-        if access and not self.directory:
-            raise ValueError("access control needs a directory for sockets")
+        if (access or links) and not self.directory:
+            raise ValueError("access control and links need a directory for sockets")
         routers = [
-            _config([_tcp(HostPort(self.bind, port)), *self._socket(port)], [], access.get(port))
+            router_config(
+                [_tcp(HostPort(self.bind, port)), *self._socket(port)],
+                [],
+                _access(access.get(port)),
+            )
             for port in self.ports.ports()
         ]
         # The hub dials the other routers. So without ``listen``, others reach no port of the hub.
-        hub_ports = [] if self.listen is None else [HostPort(self.bind, self.listen)]
+        hub_ports = [] if self.listen is None else [_tcp(HostPort(self.bind, self.listen))]
+        hub_ports += [self.hub_socket] if links else []
         host = _LOOPBACK.get(self.bind, self.bind)
         dialed = [
             endpoint
             for port in self.ports.ports()
             for endpoint in self._socket(port) or [_tcp(HostPort(host, port))]
         ]
-        return [*routers, _config(map(_tcp, hub_ports), [*dialed, *map(_tcp, self.peers)], None)]
+        hub = router_config(hub_ports, [*dialed, *map(_tcp, self.peers)])
+        return [*routers, *([links] if links else []), hub]
 
     def _socket(self, port: int) -> list[str]:
         return [f"{HUB_PROTOCOL}/{self.directory}/{port}"] if self.directory else []
@@ -92,7 +109,15 @@ def _tcp(address: HostPort) -> str:
     return f"{NODE_PROTOCOL}/{address}"
 
 
-def _config(listen: Iterable[str], connect: Iterable[str], access: object) -> RouterConfig:
-    own: dict[str, object] = {"listen/endpoints": [*listen], "connect/endpoints": [*connect]}
-    own |= {"access_control": access} if access else {}
+def _access(access: object) -> dict[str, object]:
+    return {"access_control": access} if access else {}
+
+
+def router_config(
+    listen: Iterable[str],
+    connect: Iterable[str],
+    other: Mapping[str, object] = MappingProxyType({}),
+) -> RouterConfig:
+    """The configuration of a router; ``other`` has further values by zenoh's keys."""
+    own = {"listen/endpoints": [*listen], "connect/endpoints": [*connect], **other}
     return {key: json.dumps(value) for key, value in (_COMMON | own).items()}

@@ -24,6 +24,7 @@ from typing import Any, TextIO
 
 import zenoh
 
+from rosproxy.zenoh.protocol.library_log import LEVELS
 from rosproxy.zenoh.protocol.liveliness import ALL_TOKENS, LONGEST_TOKEN, MOST_TOKENS
 
 REPORT_INTERVAL_S = 1.0
@@ -134,14 +135,14 @@ def open_router(config: Mapping[str, str]) -> Any:
 
 
 def describe(router: Any) -> dict[str, Any]:
-    """The zenoh ID and the sessions of a router, from the router's admin space.
+    """The zenoh ID, the sessions and the addresses of a router, from the router's admin space.
 
     Raises ValueError if the router does not answer.
     """
     for reply in router.get(f"@/{router.info.zid()}/router", timeout=ANSWER_TIMEOUT_S):
         if reply.ok is not None:
             answer = json.loads(reply.ok.payload.to_bytes())
-            return {"zid": answer["zid"], "sessions": answer["sessions"]}
+            return {key: answer[key] for key in ("zid", "sessions", "locators")}
     raise ValueError(f"a router does not answer within {ANSWER_TIMEOUT_S:g} s")
 
 
@@ -188,7 +189,7 @@ def main() -> int:
     # Only reports go to the proxy, whatever the library prints.
     output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
-    zenoh.init_log_from_env_or("error")
+    zenoh.init_log_from_env_or(LEVELS)
     lines = queue.SimpleQueue[str]()
     threading.Thread(target=read_lines, args=[lines], daemon=True).start()
     try:

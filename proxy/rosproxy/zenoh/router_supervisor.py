@@ -18,6 +18,7 @@ from typing import TypeVar
 
 from rosproxy.net.tasks import Tasks
 from rosproxy.telemetry.text import brief
+from rosproxy.zenoh.protocol.library_log import certificate_refusal, is_about_links
 from rosproxy.zenoh.protocol.report import LONGEST_REPORT, Report, read_report
 from rosproxy.zenoh.router_configs import RouterConfig
 
@@ -53,7 +54,8 @@ class RoutersFailed(Exception):
 class RouterSupervisor:
     """Runs the router process of a proxy.
 
-    ``take_report`` gets each report. ``failure``: why no routers run; empty while the routers run.
+    ``take_report`` gets each report. ``refuse`` gets the reason for each certificate of another
+    site that the routers refuse. ``failure``: why no routers run; empty while the routers run.
     ``restarts``: the number of processes that have ended.
     """
 
@@ -61,7 +63,9 @@ class RouterSupervisor:
         self,
         tasks: Tasks,
         take_report: Callable[[Report], Awaitable[None]],
+        refuse: Callable[[str], None] = log.warning,
     ) -> None:
+        self._refuse = refuse
         self._tasks = tasks
         self._revision = 1
         self._line = b""
@@ -129,7 +133,7 @@ class RouterSupervisor:
         except OSError as error:  # no memory, or too many processes
             return f"the process can't be started: {error.strerror}"
         logging_task = self._tasks.spawn(
-            _log_lines(_piped(process.stderr)), "reading the log of routers"
+            _log_lines(_piped(process.stderr), self._refuse), "reading the log of routers"
         )
         self._process = process
         try:
@@ -189,13 +193,18 @@ def _exit_reason(status: int) -> str:
     return f"the process was ended by {signal.Signals(-status).name}"
 
 
-async def _log_lines(stream: asyncio.StreamReader) -> None:
+async def _log_lines(stream: asyncio.StreamReader, refuse: Callable[[str], None]) -> None:
     """Log what the library prints, up to a bound, and read the rest."""
     count = 0
     while line := await _read_line(stream):
+        text = line.decode(errors="replace").strip()
+        if is_about_links(text):
+            if reason := certificate_refusal(text):
+                refuse(reason)
+            continue
         count += 1
         if count <= MOST_LOG_LINES:
-            log.warning("zenoh: %s", brief(line.decode(errors="replace").strip(), LONGEST_LOG_LINE))
+            log.warning("zenoh: %s", brief(text, LONGEST_LOG_LINE))
 
 
 async def _read_line(stream: asyncio.StreamReader) -> bytes:

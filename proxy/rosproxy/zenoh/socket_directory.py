@@ -8,10 +8,12 @@ from pathlib import Path
 PARENTS = ("/dev/shm", "/run", "/tmp")  # noqa: S108 - mkdtemp makes a private directory
 """Parents of the directory; the first that is writable is used. With a read-only file system,
 containers can write to /dev/shm."""
-NO_DIRECTORY = (
-    "rules on rmw_zenoh need a directory for sockets, and none of "
-    f"{', '.join(PARENTS)} is writable. Mount a tmpfs at /dev/shm"
+_MOUNT = (
+    f"need a directory for sockets, and none of {', '.join(PARENTS)} is writable. "
+    "Mount a tmpfs at /dev/shm"
 )
+NO_DIRECTORY = f"rules on rmw_zenoh {_MOUNT}"
+LINKS_NEED_DIRECTORY = f"links to other sites {_MOUNT}"
 
 
 def make_socket_directory() -> str:

@@ -29,10 +29,12 @@ from rosproxy.zenoh.policy.access_control import access_control
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy.zenoh.protocol.liveliness import graph_of
 from rosproxy.zenoh.protocol.report import Report
-from rosproxy.zenoh.router_configs import RouterPlan
+from rosproxy.zenoh.router_configs import RouterConfig, RouterPlan
 from rosproxy.zenoh.router_policy import RouterPolicy
 from rosproxy.zenoh.router_supervisor import RoutersFailed, RouterSupervisor
+from rosproxy.zenoh.site_links import CHECK_INTERVAL_S, SiteLinks
 from rosproxy.zenoh.socket_directory import (
+    LINKS_NEED_DIRECTORY,
     NO_DIRECTORY,
     make_socket_directory,
     remove_socket_directory,
@@ -66,9 +68,10 @@ class Zenoh:
         runtime.policy.checks.append(self._check_layers)
         self._policy = RouterPolicy(runtime.policy, settings.zenoh_ports)
         self._access: dict[int, object] = {}
+        self._sites = SiteLinks(settings)
         self._awaiting = bool(settings.await_policy)
-        self.supervisor = RouterSupervisor(runtime.tasks, self._take_report)
-        self.state = ZenohState(settings, self.supervisor, runtime.now)
+        self.supervisor = RouterSupervisor(runtime.tasks, self._take_report, self._refuse)
+        self.state = ZenohState(settings, self.supervisor, runtime.now, self._sites.certificates)
 
     async def start(self) -> None:
         """Start the routers and the periodic checks. Raises SettingError.
@@ -79,6 +82,9 @@ class Zenoh:
         _check_ports(self._settings)
         self._plan = replace_plan(self._plan, directory=make_socket_directory())
         self._check_policy()
+        self._sites.check()
+        if self._settings.has_site_links and not self._plan.directory:
+            raise SettingError("--zenoh-link", LINKS_NEED_DIRECTORY)
         tasks = self._runtime.tasks
         if self._awaiting:
             tasks.spawn(self._start_with_policy(), "waiting for an operator's policy")
@@ -91,6 +97,8 @@ class Zenoh:
         tasks.repeat(self._look_at_links, LINK_INTERVAL_S, "looking at zenoh links")
         tasks.repeat(self._look_for_faults, FAULT_INTERVAL_S, "looking for faults of zenoh")
         tasks.repeat(self._look_at_policy, POLICY_INTERVAL_S, "applying the policy to zenoh")
+        if self._settings.has_site_links:
+            tasks.repeat(self._look_at_files, CHECK_INTERVAL_S, "checking the files of links")
 
     async def _start_with_policy(self) -> None:
         """Start the routers when the operator has sent the policy, or when the time is up."""
@@ -102,7 +110,7 @@ class Zenoh:
         """Start the routers with the present policy. Raises RoutersFailed."""
         self._access = self._policy.access()
         self._awaiting = False
-        await self.supervisor.start(self._plan.configs(self._access))
+        await self.supervisor.start(self._configs(self._access))
 
     async def stop(self) -> None:
         """Cancel all tasks. This also stops the routers."""
@@ -115,8 +123,12 @@ class Zenoh:
         settings = self._settings
         outside = [f"peers {listed(map(str, settings.zenoh_peer))}"] if settings.zenoh_peer else []
         outside += [f"hubs {listed(map(str, settings.zenoh_hub))}"] if settings.zenoh_hub else []
+        sites = [*settings.zenoh_link]
+        outside += [f"other sites {listed(map(str, sites))}"] if sites else []
         if settings.zenoh_listen is not None:
             outside.append(f"port {settings.zenoh_listen} for outside")
+        if settings.zenoh_link_listen is not None:
+            outside.append(f"port {settings.zenoh_link_listen} for other sites")
         ports = f"rmw_zenoh nodes connect to ports {settings.zenoh_ports}"
         return ", ".join([ports, *outside])
 
@@ -135,11 +147,13 @@ class Zenoh:
     async def try_ports(self) -> tuple[PortProbe, ...]:
         """Bind the ports and close them again, without a start. Return no results.
 
-        Raises SettingError if a port is taken, eclipse-zenoh is missing, or a rule is impossible.
+        Raises SettingError if a port is taken, eclipse-zenoh is missing, a rule is impossible, or a
+        file of links can't be used.
         """
         _check_package()
         _check_ports(self._settings)
         self._check_policy()
+        self._sites.check()
         return ()
 
     async def apply_policy(self) -> EnforcementCounts:
@@ -153,7 +167,7 @@ class Zenoh:
         async with self._applying:
             access = self._policy.access()
             if access is not self._access and access != self._access:
-                await self.supervisor.use(self._plan.configs(access))
+                await self.supervisor.use(self._configs(access))
                 ports = access.keys() | self._access.keys()
                 changed = sorted(p for p in ports if access.get(p) != self._access.get(p))
                 log.info("zenoh policy changed: ports %s", listed(map(str, changed)))
@@ -177,13 +191,29 @@ class Zenoh:
         self.state.take(report, graph)
         for link in self.state.links:
             if self.state.is_up(link) and link.note(None, self._runtime.now()):
-                log.info("zenoh link up: %s", link.peer)
+                log.info("zenoh link up: %s", link)
+
+    def _refuse(self, reason: str) -> None:
+        """Report that the routers have refused the certificate of another site."""
+        port = f"a connection to {self._settings.zenoh_link_listen}"
+        text = f"the certificate {reason}. If the site is known, look at rosproxy doctor there"
+        self._runtime.refusals.note("link_certificate", port, text)
 
     async def _look_at_policy(self) -> None:
         """Apply changes of the policy and of the containers at ports. Report denied names."""
         self._policy.note(self.state.container_sessions)
         await self.apply_policy()
         self._policy.look(self.state.inside_names())
+
+    async def _look_at_files(self) -> None:
+        """Restart the router of the links to other sites after a change of its files."""
+        if self._sites.look() and not self._awaiting:
+            async with self._applying:
+                await self.supervisor.use(self._configs(self._access))
+
+    def _configs(self, access: Mapping[int, object]) -> list[RouterConfig]:
+        """The configurations of all routers. Raises ValueError as `RouterPlan.configs` does."""
+        return self._plan.configs(access, self._sites.config(self._plan.hub_socket))
 
     def _check_policy(self) -> None:
         """Raise SettingError for rules that the routers cannot enforce."""
@@ -213,14 +243,15 @@ class Zenoh:
         link.addresses = tuple(await resolve(link.peer.host)) or link.addresses
         fault = None
         if not self.state.is_up(link):
-            fault = await try_link(link.addresses, link.peer.port)
+            files = self._sites.files
+            fault = await try_link(link, files.client if files else None)
         if self.supervisor.failure:  # the routers do not run, so the fault of the link is unknown
             return
         # The link may have come up during the try, which takes some seconds.
         fault = None if self.state.is_up(link) else fault
         if link.note(fault, self._runtime.now()):
             state = f"down, {fault.value}" if fault else "up"
-            log.info("zenoh link %s: %s", state, link.peer)
+            log.info("zenoh link %s: %s", state, link)
 
     async def _look_for_faults(self) -> None:
         """Log each fault once, and report the fault as a problem while the fault lasts."""
@@ -254,6 +285,10 @@ def _check_package() -> None:
 
 def _check_ports(settings: Settings) -> None:
     """Raise SettingError if another program has one of the ports."""
+    link = settings.zenoh_link_listen
+    udp_port = link.port if link and link.protocol == "quic" else None
     for option, port in settings.zenoh_listeners():
+        if port == udp_port:  # zenoh itself reports a port that is taken
+            continue
         with setting_error_if_taken(option, f"port {port}"):
             sockets.listen(settings.bind, port).close()

@@ -13,6 +13,7 @@ from rosproxy.admin.status_bounds import fair_choice
 from rosproxy.admin.status_document import (
     MismatchStatus,
     NamedTypeStatus,
+    ZenohCertificateStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
     ZenohSessionStatus,
@@ -37,7 +38,8 @@ MOST_LISTED_MISMATCHES = 100
 """Mismatches that the status lists, with fair shares by the address inside. As many pairs that
 differ in durability alone are listed, too; further ones are not counted."""
 _PlacedSession = tuple[int | None, RouterSession, Ends]
-"""A session with the port of its router, which is None for the hub, and with both ends."""
+"""A session with the port of its router, and with both ends. The port is None for the hub and for
+the router of the links to other sites."""
 
 
 class RouterProcess(Protocol):
@@ -51,9 +53,15 @@ class ZenohState(Collector):
     """The state of the routers, from their latest report."""
 
     def __init__(
-        self, settings: Settings, process: RouterProcess, now: Callable[[], float]
+        self,
+        settings: Settings,
+        process: RouterProcess,
+        now: Callable[[], float],
+        certificates: Callable[[], tuple[ZenohCertificateStatus, ...]] = tuple,
     ) -> None:
         self._settings = settings
+        self._certificates = certificates
+        self._link_listens = True
         self._process = process
         self._now = now
         self._sessions: tuple[_PlacedSession, ...] = ()
@@ -65,6 +73,8 @@ class ZenohState(Collector):
         hubs = dict.fromkeys(settings.zenoh_hub, True)
         peers = dict.fromkeys(settings.zenoh_peer, False)
         self.links = [Link(peer, now(), is_hub) for peer, is_hub in (peers | hubs).items()]
+        for site in dict.fromkeys(settings.zenoh_link):
+            self.links.append(Link(site.peer, now(), protocol=site.protocol))
 
     def take(self, report: Report, graph: TokenGraph | None) -> None:
         """Replace the sessions by those of a report, and the nodes by those of its tokens.
@@ -72,6 +82,9 @@ class ZenohState(Collector):
         ``graph``: what the tokens announce; None if the tokens have not changed.
         """
         self._sessions = tuple(self._sessions_of(report.routers))
+        if (port := self._settings.zenoh_link_listen) and report.routers:
+            at = [at for router in report.routers for at in router.locators]
+            self._link_listens = any(locator.startswith(f"{port.protocol}/") for locator in at)
         self._hub_routers = tuple(
             ends
             for port, session, _ in self._sessions
@@ -87,9 +100,13 @@ class ZenohState(Collector):
             self._compared_with = inside
 
     def is_up(self, link: Link) -> bool:
-        """Whether the routers run, and the hub has a session with the peer of a link."""
+        """Whether the routers run, and have a session with the peer of a link."""
+        settings = self._settings
+        listen = settings.zenoh_listen
+        if link.protocol != "tcp":
+            listen = settings.zenoh_link_listen.port if settings.zenoh_link_listen else None
         return not self._process.failure and is_linked(
-            link.peer, link.addresses, self._hub_routers, self._settings.zenoh_listen
+            link.peer, link.addresses, self._hub_routers, listen
         )
 
     @property
@@ -148,6 +165,10 @@ class ZenohState(Collector):
         return ZenohStatus(
             ports=str(self._settings.zenoh_ports),
             listen=self._settings.zenoh_listen,
+            link_listen=str(self._settings.zenoh_link_listen or ""),
+            link_listens=self._link_listens,
+            limits=tuple(map(str, self._settings.zenoh_limit)),
+            certificates=self._certificates(),
             failure=failure,
             restarts=self._process.restarts,
             links=tuple(map(self._link, self.links)),
@@ -167,7 +188,7 @@ class ZenohState(Collector):
         )
         for link in status.links:
             if not link.hub:
-                links.add_metric([link.peer], float(link.up))
+                links.add_metric([link.title], float(link.up))
         hubs = GaugeMetricFamily(
             "rosproxy_zenoh_hubs_up",
             "Proxies on other hosts to which the hub is linked.",
@@ -190,7 +211,8 @@ class ZenohState(Collector):
     def _sessions_of(self, routers: Sequence[RouterReport]) -> Iterator[_PlacedSession]:
         """The sessions with programs other than the routers themselves."""
         own = {router.zid for router in routers}
-        ports = [*self._settings.zenoh_ports.ports(), None]
+        # Without a port: the router of the links to other sites, if there are any, and the hub.
+        ports = [*self._settings.zenoh_ports.ports(), None, None]
         for port, router in zip(ports, routers, strict=False):
             for session in router.sessions:
                 ends = ends_of(session)
@@ -204,6 +226,7 @@ class ZenohState(Collector):
             error=link.fault.value if link.fault else "",
             since=round(max(self._now() - link.since, 0.0), 1),
             hub=link.is_hub,
+            protocol=link.protocol,
         )
 
 

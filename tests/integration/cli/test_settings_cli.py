@@ -15,6 +15,8 @@ import pytest
 from examples.demo.fake_http import Address, End, host_and_port
 from examples.demo.proxy_process import clean_environment
 from rosproxy.setting_kinds import SettingError
+from tests import certificates
+from tests.certificates import Authority
 from tests.integration.net import (
     HOST,
     MASTER,
@@ -155,6 +157,16 @@ def test_check_accepts_good_values_from_the_command_line_and_the_environment():
     on_line = {**good, "inside_network": tuple(good["inside_network"].split())}
     assert command(arguments(on_line)) == (0, "")
     assert command(["run", "--check"], **{variable(k): v for k, v in good.items()}) == (0, "")
+
+
+def test_check_reads_the_files_of_links_between_sites(tmp_path):
+    files = certificates.options(Authority().write(tmp_path / "site"))
+    given = {"ros": "zenoh", "zenoh_link": "tls/cloud.example", **files}
+    assert command(arguments(given)) == (0, "")
+    (tmp_path / "site" / certificates.CA).unlink()
+    code, text = command(arguments(given))
+    assert (code, text.count("\n")) == (2, 1)
+    assert f"--zenoh-ca: {tmp_path}/site/ca.crt can't be read: No such file" in text
 
 
 def test_the_command_line_wins_over_the_environment():

@@ -24,6 +24,7 @@ from rosproxy.setting_kinds import SettingError
 from rosproxy.zenoh import stack
 from rosproxy.zenoh.protocol.report import Report
 from rosproxy.zenoh.stack import Zenoh
+from tests import certificates
 from tests.integration.net import until
 from tests.run_options import parse_settings
 
@@ -48,6 +49,7 @@ for line in sys.stdin:
     print(json.dumps({"revision": json.loads(line)["revision"]}), flush=True)
 """
 Make = Callable[..., Zenoh]
+AUTHORITY = certificates.Authority()
 
 
 @pytest.fixture
@@ -247,3 +249,91 @@ async def test_tokens_are_read_while_the_event_loop_serves_others(make: Make) ->
     assert [node.name for node in zenoh.state.status().nodes] == ["/robot"]
     assert readers
     assert threading.get_ident() not in readers
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A folder with the files of a link to another site."""
+    return AUTHORITY.write(tmp_path / "files")
+
+
+def linked(make: Make, files: Path, **options: object) -> Zenoh:
+    return make(zenoh_link=("tls/127.0.2.7",), **certificates.options(files), **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"zenoh_ca": "/no/ca"}, "--zenoh-ca: /no/ca can't be read: No such file or directory"),
+        ({"zenoh_limit": "/a*b=2"}, "--zenoh-limit: /a.b=2Hz: write . for whole parts"),
+        (
+            {"zenoh_link_policy": "allow publish /a/b; deny publish /a/*"},
+            "--zenoh-link-policy: layer '--zenoh-link-policy': .*except /a/b",
+        ),
+    ],
+)
+async def test_links_that_can_not_be_are_refused_at_the_start(
+    make: Make, files: Path, options: dict[str, str], complaint: str
+) -> None:
+    given = {**certificates.options(files), **options}
+    zenoh = make(zenoh_link=("tls/127.0.2.7",), **given)
+    for start in (zenoh.start, zenoh.try_ports):
+        with pytest.raises(SettingError, match=complaint):
+            await start()
+
+
+async def test_links_need_a_directory_for_sockets(
+    make: Make, files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stack, "make_socket_directory", lambda: "")
+    with pytest.raises(SettingError, match="--zenoh-link: links to other sites need a directory"):
+        await linked(make, files).start()
+
+
+async def test_new_files_restart_the_router_of_links_alone(
+    make: Make,
+    files: Path,
+    tmp_path: Path,
+    lines: Lines,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A mounted Secret changes by a symlink. Bad files change nothing, and are told."""
+    caplog.set_level("INFO")
+    monkeypatch.setattr(stack, "CHECK_INTERVAL_S", 0.05)
+    volume = tmp_path / "volume"
+    certificates.mount(volume, files)
+    zenoh = with_confirming_process(linked(make, volume), tmp_path)
+    await zenoh.start()
+    assert "other sites tls/127.0.2.7:7447" in zenoh.greeting
+    certificates.mount(volume, AUTHORITY.write(tmp_path / "second"))
+    await until(lambda: len(lines()) == 2, "the routers have the new files")
+    before, after = (line["routers"] for line in lines())
+    assert [one == other for one, other in zip(before, after, strict=True)] == [True, False, True]
+    assert "were read again" in caplog.text
+    bad = AUTHORITY.write(tmp_path / "third")
+    (bad / certificates.KEY).write_bytes((files / certificates.KEY).read_bytes())
+    certificates.mount(volume, bad)
+    problems = zenoh._runtime.problems
+
+    def told() -> str:
+        return "; ".join(f"{problem.subject}: {problem.text}" for problem in problems.all())
+
+    key = volume / certificates.KEY
+    expected = f"zenoh file {key}: does not belong to the certificate in "
+    await until(lambda: expected in told(), told)
+    assert "The files that were read before stay in use" in told()
+    certificates.mount(volume, AUTHORITY.write(tmp_path / "fourth"))
+    await until(lambda: len(lines()) == 3, "the routers have the new files")
+    await until(lambda: "does not belong" not in told(), told)
+    assert not zenoh._sites.look(), "nothing has changed"
+
+
+async def test_a_foreign_certificate_of_another_site_is_told(make: Make, files: Path) -> None:
+    zenoh = linked(make, files, zenoh_link_listen="tls/47449")
+    zenoh._refuse("is of a CA that is not in the CA file")
+    (problem,) = zenoh._runtime.problems.all()
+    assert problem.subject == "refused: link certificate"
+    assert problem.text.startswith(
+        "from a connection to tls/47449: the certificate is of a CA that is not in the CA file"
+    )

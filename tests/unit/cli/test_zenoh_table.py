@@ -58,3 +58,10 @@ def test_proxies_on_other_hosts_stand_apart() -> None:
     zenoh = ZenohStatus(ports="7448-7448", links=(hub,))
     shown = render(ProxyStatus(settings=StatusSettings(ros=("zenoh",)), zenoh=zenoh), 200)
     assert "links to outside: none; proxies on other hosts: node2:7447 DOWN (unresolvable)" in shown
+
+
+def test_links_to_other_sites_have_their_protocol() -> None:
+    links = (ZenohLinkStatus("cloud:7447", True, since=3.0, protocol="tls"),)
+    zenoh = ZenohStatus(ports="7448-7448", links=links, link_listen="quic/7449")
+    shown = render(ProxyStatus(settings=StatusSettings(ros=("zenoh",)), zenoh=zenoh), 200)
+    assert "; port quic/7449 for other sites; links to outside: tls/cloud:7447 up for" in shown

@@ -125,3 +125,14 @@ def test_a_graph_with_gaps_is_a_warning() -> None:
     told = findings(replace(MET, left_out=3, not_compared=2))[2:]
     assert [finding.severity for finding in told] == [Severity.WARNING] * 2
     assert "left out of the status: 3." in told[0].text
+
+
+def test_links_to_other_sites_and_their_limits() -> None:
+    link = ZenohLinkStatus("cloud:7447", True, protocol="tls")
+    topics = ("/camera/image", "/camera/info")
+    node = replace(TALKER, publishes=topics)
+    told = findings(replace(GOOD, links=(link,), nodes=(node,), limits=("/camera/*=2Hz",)))
+    assert (told[0].severity, told[0].subject) == (Severity.OK, "zenoh link tls/cloud:7447")
+    assert (told[-1].severity, told[-1].subject) == (Severity.INFO, "zenoh limit /camera/*=2Hz")
+    alone = ZenohStatus(ports="7448-7467", link_listen="tls/7447", sessions=GOOD.sessions)
+    assert [finding.severity for finding in findings(alone)] == [Severity.OK]

@@ -15,6 +15,7 @@ from rosproxy.admin.status_document import (
     PortsStatus,
     ProxyStatus,
     StatusSettings,
+    ZenohCertificateStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
     ZenohSessionStatus,
@@ -23,6 +24,7 @@ from rosproxy.admin.status_document import (
 from rosproxy.page.graph_document import graph_document
 from rosproxy.page.measures import Measures
 from rosproxy.page.page_document import MOST_LINKS
+from rosproxy.zenoh.links import LinkFault
 
 STRING = NamedTypeStatus("/chatter", "std_msgs/msg/String")
 TALKER = ZenohNodeStatus(
@@ -228,3 +230,14 @@ def test_names_of_hostile_nodes_are_short_and_harmless(name: str, topic: str) ->
     shown = [*document["nodes"], *(link["name"] for link in document["links"].values())]
     assert all(text.isprintable() and len(text) <= 300 for text in shown)
     assert LINK in document["links"]
+
+
+def test_a_link_to_another_site_says_why_it_is_down() -> None:
+    down = replace(REFUSED, protocol="tls", error=LinkFault.PEER_FOREIGN.value)
+    router = made(links=(down,))["nodes"]["router tls/robot:7447"]
+    assert router["state"] == "broken"
+    assert "of a CA that is not in the CA file" in router["text"]
+    file = ZenohCertificateStatus("/c/tls.crt", ends_in=86400.0)
+    (finding,) = made(certificates=(file,))["findings"]
+    assert finding["subject"] == "zenoh file /c/tls.crt"
+    assert finding["text"] == "expires in 1 d"

@@ -5,11 +5,19 @@ from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import Severity
 from rosproxy.admin.status_document import (
+    ZenohCertificateStatus,
     ZenohLinkStatus,
+    ZenohNodeStatus,
     ZenohSessionStatus,
     ZenohStatus,
 )
-from rosproxy.zenoh.findings import LINK_GRACE_S, faults
+from rosproxy.zenoh.findings import (
+    CERTIFICATE_WARNING_S,
+    LINK_GRACE_S,
+    MOST_LIMIT_COMPARISONS,
+    faults,
+    shared_limits,
+)
 from rosproxy.zenoh.links import LinkFault
 
 LINK = ZenohLinkStatus("robot:7447", True, "", 60.0)
@@ -75,3 +83,80 @@ def test_peers_of_two_containers_at_a_port_are_told() -> None:
     (finding,) = faults(replace(GOOD, listen=7447, sessions=tuple(outside)))
     assert finding.subject == "zenoh port 7447"
     assert "a port of its own" not in finding.fix
+
+
+SITE = ZenohLinkStatus("cloud.example:7447", True, "", 60.0, protocol="tls")
+FILE = ZenohCertificateStatus("/run/certificates/tls.crt", ends_in=CERTIFICATE_WARNING_S + 1.0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "text", "fix"),
+    [
+        (LinkFault.REFUSED, "no proxy listens there", "publish the port"),
+        (LinkFault.SILENT, "a firewall drops the packets", "firewall"),
+        (LinkFault.NO_TLS, "does not speak TLS", "links between sites"),
+        (LinkFault.NO_QUIC_SESSION, "a firewall drops UDP", "tls/ in place of quic/"),
+        (LinkFault.NO_SESSION, "accepts the certificate", "P-256"),
+        (LinkFault.PEER_EXPIRED, "certificate of the other site, or its CA, has exp", "renew"),
+        (LinkFault.PEER_TOO_EARLY, "not valid yet", "clocks"),
+        (LinkFault.PEER_FOREIGN, "of a CA that is not in the CA file", "add its CA"),
+        (LinkFault.PEER_OTHER_NAME, "for another host name", "subjectAltName"),
+        (LinkFault.PEER_INVALID, "not valid for a TLS server", "serverAuth"),
+        (LinkFault.OWN_EXPIRED, "refuses the certificate of this proxy as expired", "renew"),
+        (LinkFault.OWN_FOREIGN, "not in the CA file there", "certificate of that CA"),
+        (LinkFault.OWN_REFUSED, "refuses the certificate of this proxy", "status there"),
+    ],
+)
+def test_a_link_to_another_site_says_why_it_is_down(fault: LinkFault, text: str, fix: str) -> None:
+    link = replace(SITE, up=False, error=fault.value)
+    (finding,) = faults(replace(GOOD, links=(link,)))
+    assert finding.severity is Severity.ERROR
+    assert finding.subject == "zenoh link tls/cloud.example:7447"
+    assert text in finding.text
+    assert fix in finding.fix
+
+
+@pytest.mark.parametrize(
+    ("file", "severity", "text"),
+    [
+        (replace(FILE, ends_in=13.5 * 86400), Severity.WARNING, "expires in 13 d 12 h"),
+        (replace(FILE, ends_in=-7200.0), Severity.ERROR, "expired 2 h ago"),
+        (replace(FILE, starts_in=3600.0), Severity.ERROR, "not valid before another 1 h have"),
+        (replace(FILE, error="can't be read: No such file"), Severity.ERROR, "can't be read: No"),
+    ],
+)
+def test_a_certificate_is_told_before_its_end_and_after(
+    file: ZenohCertificateStatus, severity: Severity, text: str
+) -> None:
+    (finding,) = faults(replace(GOOD, certificates=(FILE, file)))
+    assert finding.severity is severity
+    assert finding.subject == "zenoh file /run/certificates/tls.crt"
+    assert finding.text.startswith(text)
+    assert finding.fix
+
+
+def test_a_port_for_other_sites_that_is_not_open_is_told() -> None:
+    assert not [*faults(replace(GOOD, link_listen="tls/7447"))]
+    (finding,) = faults(replace(GOOD, link_listen="tls/7447", link_listens=False))
+    assert finding.subject == "zenoh port tls/7447"
+    assert "accepts no connections" in finding.text
+
+
+def test_topics_that_share_a_limit_are_told() -> None:
+    topics = ("/camera/image", "/camera/info", "/camera/raw", "/scan")
+    node = ZenohNodeStatus("/driver", publishes=topics, port=7448)
+    outside = ZenohNodeStatus("/far", publishes=("/camera/far",))
+    limits = ("/camera/raw=1Hz", "/camera/*=2Hz", "/scan=5Hz", "*=100Hz")
+    zenoh = replace(GOOD, nodes=(node, outside), limits=limits)
+    (finding,) = shared_limits(zenoh)
+    assert finding.severity is Severity.INFO
+    assert finding.subject == "zenoh limit /camera/*=2Hz"
+    assert finding.text.startswith("/camera/image, /camera/info share this rate")
+    assert not [*shared_limits(replace(zenoh, limits=()))]
+
+
+def test_the_comparison_of_topics_with_limits_is_bounded() -> None:
+    many = tuple(f"/t{number:05}" for number in range(MOST_LIMIT_COMPARISONS))
+    zenoh = replace(GOOD, nodes=(ZenohNodeStatus("/n", publishes=many, port=7448),))
+    (finding,) = shared_limits(replace(zenoh, limits=("/never=1Hz", "/t*=1Hz")))
+    assert f"{MOST_LIMIT_COMPARISONS // 2 - 5} more" in finding.text

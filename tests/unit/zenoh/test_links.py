@@ -3,7 +3,7 @@
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.zenoh.links import Link, LinkFault, is_linked
+from rosproxy.zenoh.links import Link, LinkFault, alert_fault, is_linked, verify_fault
 from rosproxy.zenoh.protocol.report import Ends
 
 PEER = HostPort("robot", 7447)
@@ -49,3 +49,31 @@ def test_a_link_knows_since_when_it_is_up_or_down() -> None:
     assert (link.fault, link.since) == (None, 5.0)
     assert link.note(LinkFault.REFUSED, 6.0)
     assert link.since == 6.0
+
+
+def test_zenoh_reports_the_dialed_name_of_a_link_over_quic() -> None:
+    ends = Ends(HostPort("0.0.0.0", 40000), HostPort("robot", 7447))
+    assert is_linked(PEER, (), [ends], None)
+    link = Link(PEER, 1.0, protocol="quic")
+    assert str(link) == "quic/robot:7447"
+    assert str(Link(PEER, 1.0)) == "robot:7447"
+
+
+@pytest.mark.parametrize(
+    ("reason", "fault"),
+    [
+        ("SSLV3_ALERT_CERTIFICATE_EXPIRED", LinkFault.OWN_EXPIRED),
+        ("TLSV1_ALERT_UNKNOWN_CA", LinkFault.OWN_FOREIGN),
+        ("SSLV3_ALERT_BAD_CERTIFICATE", LinkFault.OWN_REFUSED),
+        ("TLSV13_ALERT_CERTIFICATE_REQUIRED", LinkFault.OWN_REFUSED),
+        ("TLSV1_ALERT_INTERNAL_ERROR", LinkFault.NO_SESSION),
+    ],
+)
+def test_alerts_of_tls_tell_why_a_peer_refuses_the_certificate(
+    reason: str, fault: LinkFault
+) -> None:
+    assert alert_fault(reason) is fault
+
+
+def test_an_unknown_result_of_a_check_is_a_fault_of_the_certificate() -> None:
+    assert verify_fault(26) is LinkFault.PEER_INVALID

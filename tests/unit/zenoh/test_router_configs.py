@@ -70,5 +70,5 @@ def test_the_hub_dials_by_sockets_of_a_directory() -> None:
 
 def test_without_a_directory_there_is_no_access_control() -> None:
     """The routers could not tell the hub from nodes."""
-    with pytest.raises(ValueError, match="needs a directory"):
+    with pytest.raises(ValueError, match="need a directory"):
         RouterPlan("0.0.0.0", PORTS, None, ()).configs({7448: {"enabled": True}})

@@ -1,15 +1,22 @@
 """The state of the routers, from reports: sessions with both addresses, links, nodes, metrics."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
+import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
 from rosproxy.access.rules import RuleKind
-from rosproxy.admin.status_document import NamedTypeStatus, ZenohSessionStatus
+from rosproxy.admin.status_document import (
+    NamedTypeStatus,
+    ZenohCertificateStatus,
+    ZenohSessionStatus,
+)
 from rosproxy.zenoh.protocol.liveliness import graph_of
 from rosproxy.zenoh.protocol.report import Report, RouterReport, RouterSession, SessionConnection
 from rosproxy.zenoh.router_policy import InsideName
 from rosproxy.zenoh.status import MOST_LISTED_MISMATCHES, ZenohState
+from tests import certificates
 from tests.run_options import parse_settings
 
 NODE_ZID = "aa"
@@ -176,3 +183,54 @@ def test_metrics() -> None:
         'rosproxy_zenoh_nodes{side="inside"} 1.0',
     ):
         assert line in lines
+
+
+def sites_state(process: FakeProcess, protocol: str = "tls") -> ZenohState:
+    options = {
+        "ros": ("zenoh",),
+        "zenoh_ports": "7448-7448",
+        "zenoh_link": (f"{protocol}/cloud.example",),
+        "zenoh_link_listen": f"{protocol}/7449",
+        "zenoh_limit": ("/camera/*=2",),
+        **certificates.options(Path("/c")),
+    }
+    file = ZenohCertificateStatus("/c/tls.crt", ends_in=5.0)
+    state = ZenohState(parse_settings(options), process, lambda: 10.0, lambda: (file,))
+    state.links[0].addresses = ("192.0.2.9",)
+    return state
+
+
+def site_report(protocol: str, remote: str, *locators: str) -> Report:
+    """A router for containers, the router of links, and the hub."""
+    link = SessionConnection(f"{protocol}/172.18.0.2:50000", f"{protocol}/{remote}")
+    to_hub = RouterSession("03", "router", (SessionConnection("unixsock-stream/a", "b"),))
+    links = RouterReport("02", (RouterSession("09", "router", (link,)), to_hub), locators)
+    return Report((RouterReport("01"), links, RouterReport("03")))
+
+
+@pytest.mark.parametrize(
+    ("protocol", "remote"), [("tls", "192.0.2.9:7447"), ("quic", "cloud.example:7447")]
+)
+def test_a_link_to_another_site_is_a_session_of_its_router(protocol: str, remote: str) -> None:
+    state = sites_state(FakeProcess(), protocol)
+    assert not state.is_up(state.links[0])
+    state.take(site_report(protocol, remote, f"{protocol}/172.18.0.2:7449"), None)
+    assert state.is_up(state.links[0])
+    status = state.status()
+    (link,) = status.links
+    assert link.title == f"{protocol}/cloud.example:7447"
+    assert [session.port for session in status.sessions] == [None]
+    assert (status.link_listen, status.link_listens) == (f"{protocol}/7449", True)
+    assert status.limits == ("/camera/*=2Hz",)
+    assert [file.file for file in status.certificates] == ["/c/tls.crt"]
+    registry = CollectorRegistry()
+    registry.register(state)
+    shown = generate_latest(registry).decode()
+    assert f'rosproxy_zenoh_link_up{{peer="{protocol}/cloud.example:7447"}}' in shown
+
+
+def test_a_port_for_other_sites_may_fail_to_open() -> None:
+    state = sites_state(FakeProcess())
+    assert state.status().link_listens, "nothing is known before a report"
+    state.take(site_report("tls", "192.0.2.9:7447", "unixsock-stream/x"), None)
+    assert not state.status().link_listens

@@ -2,6 +2,7 @@
 
 `python node.py KIND NAME TOPIC`, where KIND is pub, shout, sub, latch, late, serve, call, probe
 or graph. Prints a line for each event, and runs until killed. NODE_TYPE: another type, as in keys.
+NODE_PERIOD_S: the time between two messages.
 """
 
 import os
@@ -16,7 +17,7 @@ from zenoh import ext
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 TYPE = os.environ.get("NODE_TYPE", "std_msgs::msg::dds_::String_")
-PERIOD_S = 0.1
+PERIOD_S = float(os.environ.get("NODE_PERIOD_S", "0.1"))
 
 
 def say(*words: object) -> None:

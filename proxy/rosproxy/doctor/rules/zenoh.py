@@ -15,7 +15,15 @@ from rosproxy.admin.status_document import ZenohStatus
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.fixes import how_to
 from rosproxy.telemetry.text import listed, plural
-from rosproxy.zenoh.findings import ROUTERS, faults, incomplete, mismatch_findings, place
+from rosproxy.zenoh.findings import (
+    ROUTERS,
+    faults,
+    incomplete,
+    link_subject,
+    mismatch_findings,
+    place,
+    shared_limits,
+)
 from rosproxy.zenoh.links import LinkFault
 from rosproxy.zenoh.pairs import Graph, troubles
 
@@ -31,6 +39,7 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         return
     yield from _outside(zenoh)
     yield from _nodes(zenoh)
+    yield from shared_limits(zenoh)
     mismatches = [f for _, f in mismatch_findings(zenoh) if f.severity > Severity.OK]
     yield from mismatches
     yield from incomplete(zenoh)
@@ -48,13 +57,12 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 def _outside(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
     for link in zenoh.links:
-        kind = "hub" if link.hub else "peer"
         if link.up:
-            yield ok("link", f"zenoh {kind} {link.peer}", "linked")
+            yield ok("link", link_subject(link), "linked")
         elif link.hub and link.error != LinkFault.NOT_TRIED.value:
             text = f"not linked ({link.error}). The hub tries again"
-            yield note("link", f"zenoh hub {link.peer}", text, how_to("zenoh hub"))
-    if not zenoh.links and zenoh.listen is None:
+            yield note("link", link_subject(link), text, how_to("zenoh hub"))
+    if not zenoh.links and zenoh.listen is None and not zenoh.link_listen:
         text = "no router outside is set, and the proxy listens for none. Nodes in containers "
         text += "reach only each other"
         yield warning("link", ROUTERS, text, how_to("zenoh outside"))

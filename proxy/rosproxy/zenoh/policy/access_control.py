@@ -1,9 +1,10 @@
-"""The access control of a container's router, for zenoh's configuration.
+"""The access control of a router, for zenoh's configuration.
 
-The access control filters what passes between the router and the hub, so that other containers and
-outside get and see nothing that the policy denies. The nodes of the container reach each other.
-Nodes connect by TCP, and the hub by a socket of the file system. The router distinguishes both by
-the protocol of the link.
+At the router of a container, the access control filters what passes between the router and the hub,
+so that other containers and outside get and see nothing that the policy denies. The nodes of the
+container reach each other. Nodes connect by TCP, and the hub by a socket of the file system. The
+router distinguishes both by the protocol of the link. At the router of the links to other sites,
+the access control filters what passes by TLS and QUIC.
 
 As in DDS, a denied topic or service is hidden from both sides: the subscription of a node outside
 is hidden from a publisher inside that may not publish to outside.
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import RuleKind
+from rosproxy.setting_kinds import LINK_PROTOCOLS
 from rosproxy.zenoh.policy.key_expressions import data_keys, in_cache, token_key
 from rosproxy.zenoh.policy.name_sets import ALL_NAMES, KINDS, NameSet, allowed_names
 from rosproxy.zenoh.protocol.liveliness import EntityKind
@@ -21,6 +23,10 @@ from rosproxy.zenoh.protocol.liveliness import EntityKind
 HUB_PROTOCOL = "unixsock-stream"
 """The protocol of the links between the hub and the routers of containers."""
 NODE_PROTOCOL = "tcp"
+_Protocols = tuple[tuple[str, ...], tuple[str, ...]]
+_AT_CONTAINER: _Protocols = ((NODE_PROTOCOL,), (HUB_PROTOCOL,))
+AT_LINKS: _Protocols = ((HUB_PROTOCOL,), LINK_PROTOCOLS)
+"""Where the access control of the links to other sites checks nothing, and where it checks."""
 _ALL_KEYS = ("**", "**/@adv/**", "@ros2_lv/**")
 _INTERESTS = ("declare_liveliness_subscriber", "liveliness_query")
 """Questions for tokens. The router checks the tokens in the answers."""
@@ -95,14 +101,18 @@ _MESSAGES = {
 }
 
 
-def access_control(layers: Sequence[PolicyLayer]) -> dict[str, Any] | None:
+def access_control(
+    layers: Sequence[PolicyLayer], protocols: _Protocols = _AT_CONTAINER
+) -> dict[str, Any] | None:
     """The value ``access_control`` for a router; None if the layers deny nothing.
 
+    ``protocols``: the protocols without checks, by which nodes inside come, and those with checks.
     Raises ValueError as `check_layers` does.
     """
     names = {kind: allowed_names(layers, kind) for kind in KINDS}
     if all(allowed == ALL_NAMES for allowed in names.values()):
         return None
+    free, checked = protocols
     rules = [
         _rule("nodes", _EVERY_MESSAGE, (_IN, _OUT), _ALL_KEYS),
         _rule("interests", _INTERESTS, (_IN, _OUT), _ALL_KEYS),
@@ -118,8 +128,8 @@ def access_control(layers: Sequence[PolicyLayer]) -> dict[str, Any] | None:
         "default_permission": "deny",
         "rules": rules,
         "subjects": [
-            {"id": "nodes", "link_protocols": [NODE_PROTOCOL]},
-            {"id": "hub", "link_protocols": [HUB_PROTOCOL]},
+            {"id": "nodes", "link_protocols": [*free]},
+            {"id": "hub", "link_protocols": [*checked]},
         ],
         "policies": [
             {"rules": ["nodes"], "subjects": ["nodes"]},

@@ -33,10 +33,11 @@ class RouterSession(msgspec.Struct, frozen=True):
 
 
 class RouterReport(msgspec.Struct, frozen=True):
-    """A router: the zenoh ID and the sessions."""
+    """A router: the zenoh ID, the sessions, and where the router listens, as ``tls/host:port``."""
 
     zid: str
     sessions: tuple[RouterSession, ...] = ()
+    locators: tuple[str, ...] = ()
 
 
 class Report(msgspec.Struct, frozen=True):

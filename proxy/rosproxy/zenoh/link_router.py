@@ -1,0 +1,109 @@
+"""The configuration of the router that has the links to other sites.
+
+The router dials other sites, and listens for other sites, by TLS or QUIC with certificates of both
+sides. It also dials the hub. zenoh reads certificates only when a router opens. So a change of
+certificates restarts this router alone, and all other sessions stay.
+
+The limits of topics and the rules of ``--zenoh-link-policy`` hold for what passes by TLS and QUIC.
+"""
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from rosproxy.access.layers import PolicyLayer
+from rosproxy.net.addresses import HostPort
+from rosproxy.setting_kinds import LINK_PROTOCOLS, LinkPort, SiteLink, TopicLimit
+from rosproxy.zenoh.policy.access_control import AT_LINKS, access_control
+from rosproxy.zenoh.policy.key_expressions import check_glob, data_keys, matches_no_name
+from rosproxy.zenoh.router_configs import RouterConfig, router_config
+
+LEASE_MS = 10_000
+"""Time without a packet after which a link counts as lost, for example if a robot changes its
+address. zenoh then connects again."""
+_KEEP_ALIVES = 4
+"""Packets within the lease on a link without messages."""
+_HUB_RETRY = "#retry_period_init_ms=50"
+"""The router opens before the hub. Without this value, the second try would follow after 1 s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """The certificate of this site, the key, and the CAs of other sites, all as PEM."""
+
+    certificate: bytes
+    key: bytes = field(repr=False)
+    ca: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class LinkPlan:
+    """The links to other sites: the sites to dial, the port for other sites, limits and rules."""
+
+    bind: str
+    dialed: Sequence[SiteLink]
+    listen: LinkPort | None
+    limits: Sequence[TopicLimit]
+    policy: Sequence[PolicyLayer]
+
+    def config(self, credentials: Credentials, hub_socket: str) -> RouterConfig:
+        """The configuration of the router. Raises ValueError as `check_layers` does."""
+        listen = self.listen
+        at = [f"{listen.protocol}/{HostPort(self.bind, listen.port)}"] if listen else []
+        own: dict[str, object] = {
+            # Otherwise a key that zenoh cannot use would end the routers of all containers.
+            "listen/exit_on_failure": False,
+            "listen/timeout_ms": -1,
+            "transport/link/tls": _tls(credentials),
+            "transport/link/tx/keep_alive": _KEEP_ALIVES,
+            "transport/link/tx/lease": LEASE_MS,
+        }
+        if access := access_control(self.policy, AT_LINKS):
+            own["access_control"] = access
+        if self.limits:
+            own["downsampling"] = [_downsampling(self.limits)]
+        return router_config(at, [f"{hub_socket}{_HUB_RETRY}", *map(str, self.dialed)], own)
+
+
+def check_limits(limits: Sequence[TopicLimit]) -> None:
+    """Raise ValueError, with the limit, if zenoh cannot count the messages of a limit."""
+    for limit in limits:
+        try:
+            check_glob(limit.glob)
+        except ValueError as error:
+            raise ValueError(f"{limit}: {error}") from None
+        if matches_no_name(limit.glob):
+            raise ValueError(f"{limit}: no topic of ROS 2 has such a name")
+        if len(data_keys(limit.glob)) > 1:  # zenoh would count each key expression by itself
+            text = "write * for whole parts of a name, or at the end: /camera/*, /*/image, /cam*"
+            raise ValueError(f"{limit}: {text}")
+
+
+def _tls(credentials: Credentials) -> dict[str, object]:
+    certificate = base64.b64encode(credentials.certificate).decode()
+    key = base64.b64encode(credentials.key).decode()
+    return {
+        "root_ca_certificate_base64": base64.b64encode(credentials.ca).decode(),
+        "listen_certificate_base64": certificate,
+        "listen_private_key_base64": key,
+        "connect_certificate_base64": certificate,
+        "connect_private_key_base64": key,
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+
+
+def _downsampling(limits: Sequence[TopicLimit]) -> dict[str, object]:
+    """The value for zenoh. The first rule that matches a key counts."""
+    return {
+        "id": "limits",
+        "link_protocols": [*LINK_PROTOCOLS],
+        "flows": ["egress"],
+        "messages": ["put", "delete"],
+        "rules": [
+            {"key_expr": key, "freq": limit.rate_hz}
+            for limit in limits
+            for key in data_keys(limit.glob)
+        ],
+    }

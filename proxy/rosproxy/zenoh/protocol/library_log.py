@@ -1,0 +1,31 @@
+"""Lines that the zenoh library logs about certificates of links to other sites.
+
+The library logs each connection that it refuses, without the address of the other end. The texts
+are those of rustls (rustls/src/error.rs).
+"""
+
+import re
+
+LEVELS = "error,zenoh_link_tls=warn,zenoh_link_quic=warn"
+"""What the library logs: the value of RUST_LOG."""
+_ABOUT_LINKS = re.compile(r"WARN.*zenoh_link_(?:tls|quic)")
+_REFUSALS = (
+    (
+        re.compile(r"invalid peer certificate: UnknownIssuer"),
+        "is of a CA that is not in the CA file",
+    ),
+    (re.compile(r"invalid peer certificate: certificate expired"), "has expired"),
+    (re.compile(r"invalid peer certificate: certificate not valid yet"), "is not valid yet"),
+    (re.compile(r"invalid peer certificate: "), "is not valid for a TLS client"),
+)
+"""Programs without a certificate, such as port scanners, are not reported."""
+
+
+def is_about_links(line: str) -> bool:
+    """Whether the library warns of a connection by TLS or QUIC."""
+    return _ABOUT_LINKS.search(line) is not None
+
+
+def certificate_refusal(line: str) -> str | None:
+    """Why the library has refused the certificate of another site; None for other warnings."""
+    return next((text for pattern, text in _REFUSALS if pattern.search(line)), None)

@@ -1,0 +1,128 @@
+"""The tries to connect to another site by TLS: the faults that a connection shows."""
+
+import contextlib
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.zenoh import link_probe
+from rosproxy.zenoh.link_probe import try_link
+from rosproxy.zenoh.links import Link, LinkFault
+from tests.certificates import CA, CERTIFICATE, DAY, KEY, SERVERS, Authority
+
+HOST = "127.0.2.9"
+AUTHORITY = Authority()
+
+
+def context(folder: Path, kind: int) -> ssl.SSLContext:
+    """Certificate and CA of a folder, for a server or a client."""
+    made = ssl.SSLContext(kind)
+    made.verify_mode = ssl.CERT_REQUIRED
+    made.load_cert_chain(folder / CERTIFICATE, folder / KEY)
+    made.load_verify_locations(folder / CA)
+    return made
+
+
+@contextlib.contextmanager
+def site(tls: ssl.SSLContext | None) -> Iterator[Link]:
+    """A server that waits for the first message of zenoh, as a link to this server.
+
+    The server has a thread, because asyncio sends no alerts of TLS.
+    """
+    with socket.create_server((HOST, 0)) as listening:
+        thread = threading.Thread(target=serve, args=[listening, tls])
+        thread.start()
+        port = listening.getsockname()[1]
+        try:
+            yield Link(HostPort("cloud.example", port), 0.0, protocol="tls", addresses=(HOST,))
+        finally:
+            listening.shutdown(socket.SHUT_RDWR)
+            thread.join()
+
+
+def serve(listening: socket.socket, tls: ssl.SSLContext | None) -> None:
+    """Accept connections until the socket is shut down, and read until each ends."""
+    with contextlib.suppress(OSError):
+        while True:
+            conn = listening.accept()[0]
+            with conn, contextlib.suppress(OSError):
+                conn.settimeout(5.0)
+                with tls.wrap_socket(conn, server_side=True) if tls else conn as reading:
+                    reading.recv(1)
+
+
+@pytest.fixture(autouse=True)
+def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_probe, "ALERT_TIMEOUT_S", 0.3)
+
+
+Write = Callable[[Path], object]
+
+
+def cloud(folder: Path) -> None:
+    AUTHORITY.write(folder, "cloud.example")
+
+
+def other_name(folder: Path) -> None:
+    AUTHORITY.write(folder, "other.example")
+
+
+def expired(folder: Path) -> None:
+    AUTHORITY.write(folder, "cloud.example", begins=-2 * DAY, ends=-DAY)
+
+
+def too_early(folder: Path) -> None:
+    AUTHORITY.write(folder, "cloud.example", begins=DAY, ends=2 * DAY)
+
+
+def for_servers(folder: Path) -> None:
+    AUTHORITY.write(folder, "cloud.example", usage=SERVERS)
+
+
+def foreign(folder: Path) -> None:
+    Authority("another CA").write(folder, "cloud.example")
+    (folder / CA).write_bytes(AUTHORITY.pem)
+
+
+@pytest.mark.parametrize(
+    ("there", "here", "fault"),
+    [
+        (cloud, cloud, LinkFault.NO_SESSION),
+        (other_name, cloud, LinkFault.PEER_OTHER_NAME),
+        (expired, cloud, LinkFault.PEER_EXPIRED),
+        (too_early, cloud, LinkFault.PEER_TOO_EARLY),
+        (foreign, cloud, LinkFault.PEER_FOREIGN),
+        (cloud, foreign, LinkFault.OWN_FOREIGN),
+        (cloud, expired, LinkFault.OWN_EXPIRED),
+        (cloud, for_servers, LinkFault.OWN_REFUSED),
+    ],
+)
+async def test_what_a_handshake_shows(
+    tmp_path: Path, there: Write, here: Write, fault: LinkFault
+) -> None:
+    there(tmp_path / "there")
+    here(tmp_path / "here")
+    client = context(tmp_path / "here", ssl.PROTOCOL_TLS_CLIENT)
+    with site(context(tmp_path / "there", ssl.PROTOCOL_TLS_SERVER)) as link:
+        assert await try_link(link, client) is fault
+
+
+async def test_a_program_without_tls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud(tmp_path)
+    monkeypatch.setattr(link_probe, "HANDSHAKE_TIMEOUT_S", 0.3)
+    client = context(tmp_path, ssl.PROTOCOL_TLS_CLIENT)
+    with site(None) as link:
+        assert await try_link(link, client) is LinkFault.NO_TLS
+        link.protocol = "tcp"
+        assert await try_link(link) is LinkFault.NO_SESSION
+    link.protocol = "tls"
+    assert await try_link(link, client) is LinkFault.REFUSED
+    link.protocol = "quic"
+    assert await try_link(link, client) is LinkFault.NO_QUIC_SESSION
+    link.addresses = ()
+    assert await try_link(link, client) is LinkFault.UNRESOLVABLE
