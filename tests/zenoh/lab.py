@@ -149,12 +149,11 @@ class Lab:
         """Wait until the hub is linked with the router of the robot."""
         wait_until("the link is up", lambda: self.zenoh().links[0].up, 30)
 
-    def router_process(self) -> int:
-        """The process of the routers."""
-        assert self.proxy is not None
-        (child,) = (
-            Path(f"/proc/{self.proxy.pid}/task/{self.proxy.pid}/children").read_text().split()
-        )
+    def router_process(self, proxy: Process | None = None) -> int:
+        """The process of the routers, of the proxy on px or of another."""
+        proxy = proxy or self.proxy
+        assert proxy is not None
+        (child,) = Path(f"/proc/{proxy.pid}/task/{proxy.pid}/children").read_text().split()
         return int(child)
 
     def start(self, role: str, argv: list[str], environment: Mapping[str, str]) -> Process:

@@ -1,5 +1,6 @@
 """The state of the routers for rmw_zenoh: as a part of ``/status``, and as metrics."""
 
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Protocol
@@ -206,7 +207,15 @@ class ZenohState(Collector):
         inside = sum(1 for node in status.nodes if node.address)
         nodes.add_metric(["inside"], inside)
         nodes.add_metric(["outside"], len(status.nodes) - inside)
-        yield from (links, hubs, sessions, nodes)
+        files = GaugeMetricFamily(
+            "rosproxy_zenoh_certificate_expiry_seconds",
+            "When a certificate for links to other sites expires, in seconds of Unix time.",
+            labels=["file"],
+        )
+        for file in status.certificates:
+            if file.ends_in is not None:
+                files.add_metric([file.file], time.time() + file.ends_in)
+        yield from (links, hubs, sessions, nodes, files)
 
     def _sessions_of(self, routers: Sequence[RouterReport]) -> Iterator[_PlacedSession]:
         """The sessions with programs other than the routers themselves."""

@@ -227,6 +227,7 @@ def test_a_link_to_another_site_is_a_session_of_its_router(protocol: str, remote
     registry.register(state)
     shown = generate_latest(registry).decode()
     assert f'rosproxy_zenoh_link_up{{peer="{protocol}/cloud.example:7447"}}' in shown
+    assert 'rosproxy_zenoh_certificate_expiry_seconds{file="/c/tls.crt"}' in shown
 
 
 def test_a_port_for_other_sites_may_fail_to_open() -> None:
