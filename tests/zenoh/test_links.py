@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from tests import certificates
 from tests.certificates import DAY, Authority
@@ -186,6 +187,49 @@ def test_a_link_comes_back_after_a_crash_of_routers(lab: Lab, side: str) -> None
     late = sites.in_cloud("pub", "late")
     graph.wait_for(f"^listed {late.title} MP ", timeout=30)
     flows(in_cloud)
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_a_site_without_its_ca_is_excluded(lab: Lab, protocol: str) -> None:
+    sites = Sites(lab, protocol)
+    of_robot = Authority("CA of the robot")
+    cloud_files = sites.files("cloud", CLOUD)
+    own = (cloud_files / certificates.CA).read_bytes()
+    (cloud_files / certificates.CA).write_bytes(own + of_robot.pem)
+    robot_files = of_robot.write(lab.folder / "client")
+    (robot_files / certificates.CA).write_bytes(own)
+    sites.start_cloud(cloud_files)
+    sites.start_robot(robot_files)
+    subscriber = sites.in_cloud("sub")
+    sites.at_robot("pub")
+    flows(subscriber)
+    (cloud_files / certificates.CA).write_bytes(own)
+
+    def told(role: str) -> str:
+        return "; ".join(f"{p.subject}: {p.text}" for p in lab.status(role).problems)
+
+    refused = f"from a connection to {protocol}/{ROUTER_PORT}: the certificate is of a CA that"
+    wait_until("the cloud tells the refusal", lambda: refused in told("out"), 30)
+    expected = "a CA that is not in the CA file there" if protocol == "tls" else "over UDP"
+    wait_until("the robot tells the refusal", lambda: expected in told("px"), 30)
+    mark = subscriber.mark()
+    sites.in_cloud("pub", "other")
+    flows(sites.in_cloud("sub", "other"))
+    assert "got" not in subscriber.output(since=mark)
+
+
+def test_a_key_that_zenoh_can_not_use_leaves_the_site_alone(lab: Lab) -> None:
+    sites = Sites(lab)
+    folder = sites.authority.write(lab.folder / "curve", CLOUD, curve=ec.SECP521R1())
+    lab.start_proxy("--zenoh-link-listen", "tls/7447", *written(folder), with_robot=False)
+    subscriber = lab.node(VERSION, "c2", "sub")
+    sites.at_robot("pub")
+    flows(subscriber)
+    wait_until("the port is told", lambda: lab.status().problems, 30)
+    (problem,) = lab.status().problems
+    assert problem.subject == "zenoh port tls/7447"
+    assert "ECDSA with P-256 and P-384" in problem.text
+    assert lab.zenoh().restarts == 0
 
 
 def test_a_limit_holds_for_the_link_alone(lab: Lab) -> None:
