@@ -165,8 +165,9 @@ def _chain(
             _load_key(context, credentials, paths)
         try:
             shown = _shown_certificate(client, server, checking)
-        except ssl.SSLCertVerificationError as error:
-            text = f"has no certificate for {role} of TLS: {error.verify_message}"
+        except ssl.SSLError as error:
+            reason = getattr(error, "verify_message", None) or error.reason
+            text = f"has no certificate for {role} of TLS: {reason}"
             raise UnusableFile(CERTIFICATE, path, text) from None
         if shown in checking.get_ca_certs():
             text = "begins with the certificate of a CA. Sign a certificate with this CA"

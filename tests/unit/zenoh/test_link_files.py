@@ -2,6 +2,7 @@
 
 import os
 import re
+import ssl
 import subprocess
 from datetime import timedelta
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from rosproxy.settings import Settings
+from rosproxy.zenoh import link_files
 from rosproxy.zenoh.link_files import UnusableFile, read_link_files
 from tests import certificates
 from tests.certificates import CA, CERTIFICATE, CLIENTS, DAY, KEY, SERVERS, Authority
@@ -134,6 +136,18 @@ def test_a_certificate_for_the_other_role(
 ) -> None:
     folder = authority.write(tmp_path / "other", "cloud.example", usage=usage)
     assert f"{CERTIFICATE} has no certificate for {role} of TLS" in fault(folder, role)
+
+
+def test_a_key_for_which_there_is_no_cipher(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a key of DSA, OpenSSL ends the handshake."""
+    error = ssl.SSLError(1, "[SSL: NO_SHARED_CIPHER] no shared cipher")
+    error.reason = "NO_SHARED_CIPHER"
+
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(link_files, "_shown_certificate", fail)
+    assert fault(good).endswith("has no certificate for clients of TLS: NO_SHARED_CIPHER")
 
 
 def test_the_ca_itself_is_no_certificate_of_a_site(tmp_path: Path) -> None:
