@@ -170,9 +170,10 @@ def check_contents(wheel: Path, sdist: Path) -> None:
     """Check for required and unwanted files."""
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    page = ("page.js", "view.js", "picture.js", "findings.js", "page.css", "index.html")
+    scripts = ("page.js", "view.js", "picture.js", "findings.js", "history.js")
     needed = {"rosproxy/py.typed", "rosproxy_operator/py.typed", "rosproxy/cli/main.py"}
-    needed |= {f"rosproxy/page/files/{name}" for name in (*page, "login.html")}
+    page = (*scripts, "page.css", "index.html", "login.html")
+    needed |= {f"rosproxy/page/files/{name}" for name in page}
     tops = {name.partition("/")[0].partition("-")[0] for name in names}
     if not needed <= names or tops != {"rosproxy", "rosproxy_operator"}:
         raise ReleaseFault(f"{wheel.name} has {sorted(tops)}, and lacks {sorted(needed - names)}")

@@ -92,6 +92,7 @@ def test_what_is_chosen_is_told_where_the_rest_is_hidden(browser: Browser) -> No
         lambda: told in browser.run(CHOOSE, "/group3/node3", "/outside3"),
         20,
     )
+    wait_until("the rate is known", lambda: "in the last minute" in browser.run(DETAILS))
     browser.run(MARK, "#details *")
     before = browser.run(DETAILS)
     wait_until("rates follow", lambda: browser.run(DETAILS) != before)

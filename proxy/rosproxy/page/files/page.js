@@ -4,6 +4,7 @@
 // However many changes come, it is drawn twice a second at most, and only what differs is touched.
 
 import { causesOf, follow, titleOf } from "./findings.js";
+import { curveOf, emptyHistory, lastMinute, minuteText, record } from "./history.js";
 import { boxesOf, DIRECT, hasFix, joined, layout, linesOf, selection } from "./picture.js";
 import { age, apply, duration, frequency, hertz, labelOf, megabytes, rateOf, visibleLinks, visibleNodes, WORDS } from "./view.js";
 
@@ -13,6 +14,8 @@ const MOST_FINDINGS = 30;
 const MOST_CHOSEN = 20;
 const AGAIN = 5000;
 const SILENT = 40000; // the proxy says something every 15 s
+const KNOWN = 20000; // after an event: until then the rates hold
+const CURVE = { width: 240, height: 28 };
 const LOST = "Not connected; what is shown may be old. Trying again…";
 
 const $ = (id) => document.getElementById(id);
@@ -29,6 +32,8 @@ const boxes = new Map();
 const ways = new Map();
 let source = null;
 let heard = 0;
+const rates = emptyHistory(Date.now()); // of the last minute
+let knownUntil = 0; // the time in milliseconds until which the rates are known
 let drawing = null;
 let clock = 0; // how many seconds the proxy's is ahead
 let selected = ""; // "n:" and a node, "k:" and a link, or the key of a box, a line or a cause
@@ -39,7 +44,12 @@ function listen() {
   if (source) source.close();
   const own = source = new EventSource("events");
   heard = Date.now();
-  const on = (kind, use) => own.addEventListener(kind, (event) => { heard = Date.now(); use(event.data); });
+  const on = (kind, use) => own.addEventListener(kind, (event) => {
+    note();
+    heard = Date.now();
+    knownUntil = heard + KNOWN;
+    use(event.data);
+  });
   on("clock", (data) => { clock = Number(data) - Date.now() / 1000; });
   on("all", (data) => {
     state.nodes.clear();
@@ -50,12 +60,18 @@ function listen() {
   on("change", (data) => take(JSON.parse(data)));
   own.addEventListener("error", () => {
     put($("connection"), LOST);
+    note();
+    knownUntil = Math.min(knownUntil, Date.now());
     if (own === source && own.readyState === EventSource.CLOSED) {
       setTimeout(() => { if (own === source) listen(); }, AGAIN);
       // Who is to give the token again sees nothing else than that here.
       fetch("graph").then((answer) => { if (answer.status === 403) location.reload(); }, () => {});
     }
   });
+}
+
+function note() {
+  record(rates, state.links, Date.now(), knownUntil);
 }
 
 // A connection may be cut off without an end, and a browser waits for one for hours.
@@ -357,9 +373,8 @@ function showWays(lines, places) {
     }
     return group;
   }, (group, { way, line }) => {
-    const values = [[group, "class", `${line.state} ${line.flow}${line.on ? " on" : ""}`], [group, "data-id", line.id],
-      [group.children[0], "d", way.d], [group.children[1], "d", way.arrows]];
-    for (const [one, name, value] of values) if (one.getAttribute(name) !== value) one.setAttribute(name, value);
+    setAll([[group, "class", `${line.state} ${line.flow}${line.on ? " on" : ""}`], [group, "data-id", line.id],
+      [group.children[0], "d", way.d], [group.children[1], "d", way.arrows]]);
   });
 }
 
@@ -386,9 +401,29 @@ function showDetails(on) {
   if (selected && !isFirst && !on.nodes.size && !on.links.size && !seen.has(selected)) selected = "";
   const parts = selected ? details(on) : [];
   const kinds = parts.map(([kind]) => kind).join(" ");
-  if ($("details").dataset.kinds !== kinds) $("details").replaceChildren(...parts.map(([kind]) => make(kind)));
+  if ($("details").dataset.kinds !== kinds) $("details").replaceChildren(...parts.map(([kind]) => kind === "figure" ? makeCurve() : make(kind)));
   $("details").dataset.kinds = kinds;
-  parts.forEach(([, text], index) => put($("details").children[index], text));
+  parts.forEach(([kind, text, curve], index) => {
+    const element = $("details").children[index];
+    put(kind === "figure" ? element.lastChild : element, text);
+    if (kind === "figure") setAll([[element.querySelector("path"), "d", curve]]);
+  });
+}
+
+// A curve and, for all users, the same in words.
+function makeCurve() {
+  const figure = make("figure");
+  const [svg, path] = ["svg", "path"].map((name) => document.createElementNS($("lines").namespaceURI, name));
+  setAll([[svg, "viewBox", `0 -2 ${CURVE.width} ${CURVE.height + 4}`], [svg, "width", CURVE.width], [svg, "height", CURVE.height + 4], [svg, "aria-hidden", "true"]]);
+  svg.append(path);
+  figure.append(svg, make("figcaption"));
+  return figure;
+}
+
+function setAll(values) {
+  for (const [element, name, value] of values) {
+    if (element.getAttribute(name) !== String(value)) element.setAttribute(name, value);
+  }
 }
 
 function details(on) {
@@ -409,10 +444,12 @@ function details(on) {
       ["p", node.text || ""], ["code", node.fix || ""]);
   }
   const links = [...on.links.values()];
-  for (const { link, from, to } of links.slice(0, MOST_CHOSEN)) {
+  for (const { id, link, from, to } of links.slice(0, MOST_CHOSEN)) {
+    const minute = lastMinute(rates, id, link);
     const type = link.type ? ` (${link.type})` : "";
     parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name}${type} from ${from}${to ? ` to ${to}` : ""}, ${frequency(link) || "– Hz"}, ` +
       `${megabytes(link)} MB/s, last message ${age(link, now)}, carried by ${link.carried || "–"}, port ${link.port || "–"}`],
+    ["figure", minute.length ? minuteText(minute, link.shared) : "", curveOf(minute, CURVE.width, CURVE.height)],
     ["p", link.text || ""], ["code", link.text && !cause ? link.fix || "" : ""]);
   }
   if (links.length > MOST_CHOSEN) parts.push(["p", `${links.length - MOST_CHOSEN} more are marked in the table.`]);
@@ -452,7 +489,7 @@ function start() {
     draw();
   });
   addEventListener("keydown", (event) => { if (event.key === "Escape" && selected) choose(selected, false); });
-  setInterval(() => { draw(); watch(); }, 1000); // ages grow
+  setInterval(() => { note(); draw(); watch(); }, 1000); // ages grow
   // For tests, and whoever looks into it.
   window.rosproxyPage = { state };
   listen();
