@@ -1,6 +1,6 @@
 """ROS 2 in the document of a proxy: participants, topics and services of both sides.
 
-The proxy does not read user data, so the document has no count and no rate of messages. The proxy
+The proxy does not read messages, so the document has no count and no rate of messages. The proxy
 measures the ports of a participant instead: all links to the participant share these measures.
 """
 

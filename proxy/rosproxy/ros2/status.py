@@ -266,7 +266,7 @@ class Ros2State(Collector):
             publishes=tuple(sorted(publishes - {""})),
             subscribes=tuple(sorted(subscribes - {""})),
             services=tuple(sorted(services - {""})),
-            nodes=tuple(sorted({node for node in map(_node_of, endpoints) if node})),
+            nodes=tuple(sorted({node for endpoint in endpoints for node in _nodes_of(endpoint)})),
             left_out=len(participant.endpoints) - len(endpoints) if self.with_names else 0,
             domain=participant.traits.domain,
             security=participant.traits.security.value,
@@ -276,20 +276,21 @@ class Ros2State(Collector):
 
 
 def _first_endpoints(participant: Participant, most: int) -> list[DdsEndpoint]:
-    """At most ``most`` readers and writers; readers that name a node (`_node_of`) come first."""
+    """At most ``most`` readers and writers; those that name nodes come first."""
     endpoints = participant.endpoints.values()
     if not most:
         return []
     if most < len(endpoints):
-        return list(islice(sorted(endpoints, key=lambda e: _node_of(e) is None), most))
+        return list(islice(sorted(endpoints, key=lambda e: not _nodes_of(e)), most))
     return list(endpoints)
 
 
-def _node_of(endpoint: DdsEndpoint) -> str | None:
-    """The ROS node that a reader names by its topic (`ros_node`); None for any other endpoint."""
+def _nodes_of(endpoint: DdsEndpoint) -> tuple[str, ...]:
+    """The ROS nodes that a reader names by its topic (`ros_node`), or a writer by its samples."""
     if endpoint.kind is not EndpointKind.READER:
-        return None
-    return ros_node(endpoint.topic, endpoint.type_name)
+        return endpoint.nodes
+    node = ros_node(endpoint.topic, endpoint.type_name)
+    return (node,) if node else ()
 
 
 def _address_inside(pair: MismatchedPair) -> str:

@@ -132,6 +132,7 @@ def test_two_that_meet_through_the_proxy(vendor: str) -> None:
     domain = make_domain(peers=(SUBSCRIBER,), lan_relay=None)
     sent = list[Outgoing]()
     nodes = set[str | None]()
+    in_samples = set[str]()
     inside = set[tuple[EndpointKind, str]]()
     outside = set[tuple[EndpointKind, str]]()
     for datagram in recorded(vendor):
@@ -139,6 +140,7 @@ def test_two_that_meet_through_the_proxy(vendor: str) -> None:
         insiders = domain.inside.by_prefix.values()
         outsiders = domain.outside.by_prefix.values()
         every = [e for p in (*insiders, *outsiders) for e in p.endpoints.values()]
+        in_samples |= {node for e in every for node in e.nodes}
         nodes |= {ros_node(e.topic, e.type_name) for e in every if e.kind is EndpointKind.READER}
         inside |= _endpoints(insiders)
         outside |= _endpoints(outsiders)
@@ -147,6 +149,8 @@ def test_two_that_meet_through_the_proxy(vendor: str) -> None:
     assert (EndpointKind.READER, "rt/chatter") in outside
     # The recorded program of Cyclone DDS is no ROS node.
     assert nodes - {None} == (set() if vendor == "cyclone" else {"/talker", "/listener"})
+    # User data to outside does not pass the proxy.
+    assert in_samples == (set() if vendor == "cyclone" else {"/listener"})
     assert domain.refused.count == 0
     outwards = [out.datagram for out in sent if out.target.host == SUBSCRIBER]
     assert outwards

@@ -154,6 +154,11 @@ def test_a_participant_has_the_names_of_all_its_nodes(monkeypatch: pytest.Monkey
     monkeypatch.setattr("rosproxy.ros2.status.MOST_LISTED_ENDPOINTS", 1)
     (inside,) = told(domain).inside
     assert (inside.nodes, inside.services) == (("/driver",), ("/driver/get_parameters",))
+    graph = DdsEndpoint(EndpointKind.WRITER, "ros_discovery_info", "Graph", nodes=("/driver", "/x"))
+    domain.inside.notes.note(domain.inside.by_prefix[A], b"\0\0\1\3", graph)
+    monkeypatch.setattr("rosproxy.ros2.status.MOST_LISTED_ENDPOINTS", 3)
+    (inside,) = told(domain).inside
+    assert inside.nodes == ("/arm/planner", "/driver", "/x")
 
 
 @pytest.mark.parametrize(("both_ways", "direction"), [(False, "out"), (True, "both")])
@@ -244,7 +249,7 @@ def test_outside_comes_in_or_may_still_do_so() -> None:
 
 def test_without_names_no_reader_or_writer_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     """The check of the domains, every 5 s, sorted all readers and writers to list none."""
-    monkeypatch.setattr("rosproxy.ros2.status._node_of", None)
+    monkeypatch.setattr("rosproxy.ros2.status._nodes_of", None)
     endpoint = DdsEndpoint(EndpointKind.READER, "rt/chatter", "std_msgs::msg::dds_::String_")
     participant = Participant(A, INSIDE, b"\x01\x0f", 0.0, endpoints={b"only": endpoint})
     assert _first_endpoints(participant, 0) == []

@@ -9,9 +9,10 @@ the participant inside, with a *stand-in* in place of the locator for metatraffi
 proxy can rewrite all of it.
 
 User data to inside goes through the range. User data to outside goes directly or, with
-``--direction both``, through stand-ins. The proxy forwards user data unread, with one exception:
+``--direction both``, through stand-ins. The proxy forwards user data unread, with two exceptions:
 some implementations act on discovery that arrives at a port for user data. So the proxy also reads
-discovery at such a port (`Participant.reads_discovery_at`).
+discovery at such a port (`Participant.reads_discovery_at`). And samples of ``ros_discovery_info``
+name the nodes of a participant (`NodeNames`).
 
 This module does no I/O: methods that handle a datagram or the passing of time return the datagrams
 to send. After each call, `stand_ins` has the ports of stand-ins that have to be open.
@@ -49,6 +50,7 @@ from rosproxy.ros2.discovery.announcements.to_outside import AnnouncementsToOuts
 from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
 from rosproxy.ros2.discovery.disposal import Disposal
 from rosproxy.ros2.discovery.fragments import FragmentStores
+from rosproxy.ros2.discovery.node_names import NodeNames
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
 from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
 from rosproxy.ros2.discovery.participants.prefix_owners import PrefixOwners
@@ -127,6 +129,7 @@ class Domain:
         self.refused = refused = Refused(settings.note)
         self.proofs = proofs = AddressProofs(secret)
         self.rates = DiscoveryRates()
+        self.node_names = NodeNames(self.standing)
         self.passed = Counter[tuple[TrafficKind, bool]]()
         self.ports = LocatorPorts(pool, monotonic_s)
         self.mappings = PortMappings(settings, self.ports, refused, proofs)
@@ -293,6 +296,7 @@ class Domain:
             insider, mapping = mapped
             is_for_data = mapping.kind is TrafficKind.USER_DATA
             if is_for_data and not (mapping.is_read and may_be_discovery(datagram)):
+                self.node_names.read(self.outside, datagram, source, now)
                 return [self._passed(mapping, datagram, True, is_user_data=True)]
             if self.outside.refuses_source(source):
                 return []
@@ -307,6 +311,8 @@ class Domain:
                 passed, back = self._read_at_range_port(
                     port, source, insider, datagram, received, now
                 )
+            else:
+                self.node_names.read(self.outside, datagram, source, now)
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
         return [self._passed(mapping, d, True, is_user_data=not is_read) for d in passed] + back
@@ -317,6 +323,7 @@ class Domain:
         sent = list[Outgoing]()
         if not self.must_queue_at_stand_in(port, datagram, source):
             is_of_participant = source in self.inside.count_by_address
+            self.node_names.read(self.inside, datagram, source, now)
             return self._to_outside(users, datagram, True) if is_of_participant else []
         if not self._take_allowance(datagram, source, now):
             return []

@@ -6,12 +6,13 @@ name of the topic, and from the direction of the data.
 """
 
 from rosproxy.access.rules import RuleKind
-from rosproxy.ros2.protocol.ros_names import is_of_requests, is_of_service, ros_name
+from rosproxy.ros2.protocol.ros_names import (
+    GRAPH_TOPIC,
+    is_of_requests,
+    is_of_service,
+    ros_name,
+)
 from rosproxy.ros2.registry.participants import EndpointKind
-
-GRAPH_TOPIC = "ros_discovery_info"
-"""The topic on which participants publish their nodes. Without this topic, `ros2 node list` is
-empty."""
 
 
 def rule_about(kind: EndpointKind, dds_topic: str, is_inside: bool) -> tuple[RuleKind, str] | None:

@@ -7,6 +7,9 @@ namespace, ``dds_``.
 
 from rosproxy.net.addresses import cached
 
+GRAPH_TOPIC = "ros_discovery_info"
+"""The topic on which participants publish their nodes. Without this topic, `ros2 node list` is
+empty."""
 _TOPIC = "rt/"
 _REQUEST = "rq/"
 _REPLY = "rr/"

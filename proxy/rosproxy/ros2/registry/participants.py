@@ -16,6 +16,7 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.qos import EndpointQos
+from rosproxy.ros2.protocol.ros_names import GRAPH_TOPIC
 from rosproxy.ros2.protocol.rtps import CYCLONE_DDS, FAST_DDS, NO_VENDOR, RTI
 
 VENDORS = {
@@ -86,12 +87,16 @@ class PortShortage(msgspec.Struct, frozen=True):
 
 
 class DdsEndpoint(msgspec.Struct, frozen=True):
-    """A reader or writer of a participant, as announced by SEDP."""
+    """A reader or writer of a participant, as announced by SEDP.
+
+    ``nodes``: the names of the participant's nodes, if the writer has told them (GRAPH_TOPIC).
+    """
 
     kind: EndpointKind
     topic: str
     type_name: str
     qos: EndpointQos = EndpointQos()
+    nodes: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -99,7 +104,7 @@ class DdsEndpoint(msgspec.Struct, frozen=True):
 
         A single wide character makes all characters of a text take four bytes each.
         """
-        texts = (self.topic, self.type_name, *(self.qos.partitions or ()))
+        texts = (self.topic, self.type_name, *(self.qos.partitions or ()), *self.nodes)
         return ENDPOINT_OVERHEAD + sum(map(getsizeof, texts))
 
 
@@ -201,7 +206,7 @@ class Participant:
     For a participant inside, this is the rewritten datagram for outside. For a participant outside,
     this is the received datagram, without other submessages (`participant_alone`). ``next_number``
     is the sequence number after that of the announcement. ``endpoints`` are by entity id, and
-    ``mappings`` by locator.
+    ``mappings`` by locator. ``graph_writer`` is the entity id of the writer of GRAPH_TOPIC.
     """
 
     prefix: bytes
@@ -213,6 +218,7 @@ class Participant:
     metatraffic: HostPort | None = None
     traits: ParticipantTraits = UNKNOWN_TRAITS
     endpoints: dict[bytes, DdsEndpoint] = field(default_factory=dict)
+    graph_writer: bytes = b""
     mappings: dict[HostPort, PortMapping] = field(default_factory=dict)
 
     @property
@@ -267,9 +273,23 @@ class EndpointNotes:
         former = participant.endpoints.pop(entity, None)
         if former is not None:
             self._count(participant.address, -former.size)
-        if endpoint is not None and self._has_room(participant, endpoint.size):
+        if endpoint is None:
+            return
+        if (endpoint.kind, endpoint.topic) == (EndpointKind.WRITER, GRAPH_TOPIC):
+            participant.graph_writer = entity
+            nodes = former.nodes if former is not None else endpoint.nodes
+            endpoint = msgspec.structs.replace(endpoint, nodes=nodes)
+        if self._has_room(participant, endpoint.size):
             participant.endpoints[entity] = endpoint
             self._count(participant.address, endpoint.size)
+
+    def note_nodes(self, participant: Participant, nodes: tuple[str, ...]) -> None:
+        """Remember the nodes that the ``graph_writer`` of a participant has told, if known."""
+        endpoint = participant.endpoints.get(participant.graph_writer)
+        if endpoint is not None and endpoint.nodes != nodes:
+            self.note(participant, participant.graph_writer, None)
+            named = msgspec.structs.replace(endpoint, nodes=nodes)
+            self.note(participant, participant.graph_writer, named)
 
     def forget(self, participant: Participant) -> None:
         """Forget the readers and writers of a participant that has gone."""
