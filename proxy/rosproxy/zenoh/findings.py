@@ -6,7 +6,8 @@ The proxy reports these findings by itself, and the doctor reports them, too.
 from collections.abc import Iterator
 
 from rosproxy.access.rules import matches
-from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
+from rosproxy.admin.status_bounds import fair_choice
 from rosproxy.admin.status_document import (
     MismatchStatus,
     ZenohCertificateStatus,
@@ -33,6 +34,8 @@ NO_TYPE_HASH = "TypeHashNotSupported"
 """The type hash of all types on Humble."""
 LONGEST_HASH = 24
 """Characters of a type hash in a text."""
+MOST_REPORTED_MISMATCHES = 20
+"""Topics and services with a mismatch that the proxy reports by itself. The doctor reports all."""
 _MISMATCH_FIXES = {
     TYPE: "use the same type in both programs, or remap the name in one of them",
     TYPE_HASH: "build both programs with the same definition of the type: the same version of its "
@@ -249,6 +252,21 @@ def mismatch_findings(zenoh: ZenohStatus) -> Iterator[tuple[MismatchStatus, Doct
         writer = f"the {sides[0]} {places.get(pair.writer, pair.writer)}"
         reader = f"the {sides[1]} {places.get(pair.reader, pair.reader)}"
         yield pair, _mismatch(pair, writer, reader)
+
+
+def first_mismatches(zenoh: ZenohStatus) -> dict[str, DoctorFinding]:
+    """The first error of each topic and service whose nodes do not match, by subject.
+
+    At most MOST_REPORTED_MISMATCHES, with fair shares by the address inside.
+    """
+    addresses = {node.key: node.address for node in zenoh.nodes if node.port is not None}
+    first: dict[str, tuple[str, DoctorFinding]] = {}
+    for pair, finding in mismatch_findings(zenoh):
+        if finding.severity is Severity.ERROR:
+            owner = addresses.get(pair.writer, addresses.get(pair.reader, ""))
+            first.setdefault(finding.subject, (owner, finding))
+    chosen = fair_choice(first.values(), lambda one: one[0], MOST_REPORTED_MISMATCHES)
+    return {finding.subject: finding for _, finding in chosen}
 
 
 def _mismatch(pair: MismatchStatus, writer: str, reader: str) -> DoctorFinding:

@@ -61,6 +61,7 @@ class Zenoh:
         self._runtime = runtime
         self._settings = runtime.settings
         self._faults: dict[str, DoctorFinding] = {}
+        self._mismatches: dict[str, DoctorFinding] = {}
         self._applying = asyncio.Lock()
         settings = runtime.settings
         dialed = tuple(dict.fromkeys((*settings.zenoh_peer, *settings.zenoh_hub)))
@@ -254,10 +255,18 @@ class Zenoh:
             log.info("zenoh link %s: %s", state, link)
 
     async def _look_for_faults(self) -> None:
-        """Log each fault once, and report the fault as a problem while the fault lasts."""
+        """Log each fault once, and report the fault as a problem while the fault lasts.
+
+        A mismatch has to last for two looks, because nodes that start have not told all yet.
+        """
         if self._awaiting:
             return
-        current = {fault.subject: fault for fault in findings.faults(self.state.status())}
+        zenoh = self.state.status()
+        current = {fault.subject: fault for fault in findings.faults(zenoh)}
+        mismatches = findings.first_mismatches(zenoh)
+        lasting = mismatches.items() & self._mismatches.items()
+        self._mismatches = mismatches
+        current |= dict(lasting)
         if self.supervisor.failure:  # other faults are unknown meanwhile, and stay
             current = self._faults | current
         for subject in self._faults.keys() | current.keys():

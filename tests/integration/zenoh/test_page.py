@@ -18,7 +18,7 @@ from rosproxy.page.feed import PageWatch
 from rosproxy.runtime import Runtime
 from rosproxy.zenoh import stack
 from rosproxy.zenoh.stack import Zenoh
-from tests.integration.net import PATIENCE
+from tests.integration.net import PATIENCE, until
 from tests.run_options import parse_settings
 
 HOST = "127.0.2.2"
@@ -80,6 +80,11 @@ class Page:
         written.write_text(json.dumps(report))
         written.rename(self._report)
 
+    def problems(self) -> str:
+        """The problems that the proxy reports by itself."""
+        noted = self._runtime.problems.all()
+        return "; ".join(f"{problem.subject}: {problem.text}" for problem in noted)
+
     async def document(self, table: str, key: str, **wanted: Any) -> dict[str, Any]:
         """The first document with these values in the row of a table; None: without the key."""
         status = PageWatch(
@@ -101,6 +106,7 @@ class Page:
 async def page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> AsyncIterator[Page]:
     monkeypatch.setattr(stack, "_check_package", lambda: None)
     monkeypatch.setattr(stack, "LINK_INTERVAL_S", 0.05)
+    monkeypatch.setattr(stack, "FAULT_INTERVAL_S", 0.05)
     monkeypatch.setattr("rosproxy.zenoh.findings.LINK_GRACE_S", 0.0)
     monkeypatch.setattr("rosproxy.page.feed.DOCUMENT_INTERVAL_S", 0.05)
     page = Page(tmp_path)
@@ -123,14 +129,21 @@ async def test_nodes_come_meet_and_go(page: Page) -> None:
     assert LINK not in document["links"]
 
 
-async def test_another_type_breaks_a_link_until_it_is_the_same(page: Page) -> None:
+async def test_another_type_breaks_a_link_until_it_is_the_same(
+    page: Page, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "rosproxy")
     talker = tokens("aa", "talker", "MP")
     page.tell([*talker, *tokens("bb", "listener", "MS", key_type=NUMBER)])
     document = await page.document("links", LINK, state="broken")
     assert "requests std_msgs/msg/Int32" in document["links"][LINK]["text"]
     assert not document["findings"], "the link shows the finding"
+    text = "topic /chatter: type differs: the publisher /talker (172.18.0.3) offers"
+    await until(lambda: text in page.problems(), page.problems)
     page.tell([*talker, *tokens("bb", "listener", "MS")])
     await page.document("links", LINK, state="ok", text=None)
+    await until(lambda: not page.problems(), page.problems)
+    assert caplog.text.count(text) == caplog.text.count("topic /chatter: the fault is over") == 1
 
 
 async def test_another_domain_is_named(page: Page) -> None:

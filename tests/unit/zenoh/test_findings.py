@@ -5,6 +5,7 @@ from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import Severity
 from rosproxy.admin.status_document import (
+    MismatchStatus,
     ZenohCertificateStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
@@ -15,7 +16,9 @@ from rosproxy.zenoh.findings import (
     CERTIFICATE_WARNING_S,
     LINK_GRACE_S,
     MOST_LIMIT_COMPARISONS,
+    MOST_REPORTED_MISMATCHES,
     faults,
+    first_mismatches,
     shared_limits,
 )
 from rosproxy.zenoh.links import LinkFault
@@ -160,3 +163,19 @@ def test_the_comparison_of_topics_with_limits_is_bounded() -> None:
     zenoh = replace(GOOD, nodes=(ZenohNodeStatus("/n", publishes=many, port=7448),))
     (finding,) = shared_limits(replace(zenoh, limits=("/never=1Hz", "/t*=1Hz")))
     assert f"{MOST_LIMIT_COMPARISONS // 2 - 5} more" in finding.text
+
+
+def test_each_address_has_a_share_of_the_reported_mismatches() -> None:
+    nodes = tuple(
+        ZenohNodeStatus(f"/{host}", address=f"172.18.0.{host}", port=7448, key=f"{host}")
+        for host in (3, 4)
+    )
+    names = [("3", f"/a{number}") for number in range(50)] + [("4", "/b"), ("4", "/c")]
+    pairs = [MismatchStatus("topic", name, "type", "A", "B", key, "9") for key, name in names]
+    late = MismatchStatus("topic", "/late", "durability", "A", "B", "4", "9")
+    again = replace(pairs[-1], reader="8")
+    zenoh = replace(GOOD, nodes=nodes, mismatches=(*pairs, late, again))
+    found = first_mismatches(zenoh)
+    assert len(found) == MOST_REPORTED_MISMATCHES
+    assert "/late" not in str(found)
+    assert "the subscription 9 requests B" in found["topic /c"].text
