@@ -414,6 +414,7 @@ class ZenohNodeStatus(msgspec.Struct, frozen=True):
     ``port`` and ``mode`` are those of the node's session with a router of the proxy. ``port``: the
     port for containers; None: the node is outside. ``calls``: the services of which the node has a
     client. ``key`` is the same at all proxies, since several nodes may have the same name.
+    ``not_judged``: the proxy has still to compare names of the node with the rules of the policy.
     """
 
     name: str = ""
@@ -428,6 +429,7 @@ class ZenohNodeStatus(msgspec.Struct, frozen=True):
     port: Count | None = None
     mode: str = ""
     key: str = ""
+    not_judged: bool = False
 
 
 class ZenohStatus(msgspec.Struct, frozen=True):

@@ -123,8 +123,8 @@ class Graph:
         mismatch = self._mismatches.get((kind, name, source.key, target.key))
         if mismatch and mismatch.check != "qos":
             return mismatch
-        if source.port != target.port and (rule := self._rule(pair)):
-            return self._hidden_name(subject, name, rule)
+        if source.port != target.port and (by_policy := self._by_policy(pair, subject)):
+            return by_policy
         if shared := self._shared_port(source, target):
             return shared
         if not self._is_complete:
@@ -144,8 +144,8 @@ class Graph:
         kind, name, source, target = pair
         node = source or target or ZenohNodeStatus()
         missing = _ROLES[kind][1 if source else 0]
-        if rule := self._rule(pair):
-            return self._hidden_name(subject, name, rule)
+        if by_policy := self._by_policy(pair, subject):
+            return by_policy
         text = f"no {missing} is known in domain {node.domain}"
         if others := [*self._alone_elsewhere(kind, name, node.domain, 1 if source else 0)]:
             named = [f"{place(o)} in domain {o.domain}" for o in others[:MOST_NAMED_NODES]]
@@ -164,21 +164,22 @@ class Graph:
             if not sides[1 - side]:
                 yield from sides[side]
 
-    def _rule(self, pair: Pair) -> str:
-        """The rule that hides the name at one of the nodes inside; empty without a rule."""
-        ends = zip(_RULES[pair.kind], (pair.source, pair.target), strict=True)
-        reasons = (
-            self._hidden.get((rule, pair.name, node.name, node.address))
-            for rule, node in ends
+    def _by_policy(self, pair: Pair, subject: str) -> DoctorFinding | None:
+        """The finding about a rule that hides the name, or may hide the name, at a node inside."""
+        ends = [
+            (rule, node)
+            for rule, node in zip(_RULES[pair.kind], (pair.source, pair.target), strict=True)
             if node and is_inside(node)
-        )
-        return next(filter(None, reasons), "")
-
-    @staticmethod
-    def _hidden_name(subject: str, name: str, rule: str) -> DoctorFinding:
-        text = f"hidden from outside by the policy: {rule}"
-        fix = f"if these nodes shall exchange {name}, change the rule"
-        return note("policy", subject, text, fix)
+        ]
+        reasons = (self._hidden.get((rule, pair.name, n.name, n.address)) for rule, n in ends)
+        if reason := next(filter(None, reasons), ""):
+            text = f"hidden from outside by the policy: {reason}"
+            fix = f"if these nodes shall exchange {pair.name}, change the rule"
+            return note("policy", subject, text, fix)
+        if any(node.not_judged for _, node in ends):
+            text = "not known yet: the proxy compares the names with the rules of the policy"
+            return note("policy", subject, text)
+        return None
 
 
 def is_inside(node: ZenohNodeStatus) -> bool:

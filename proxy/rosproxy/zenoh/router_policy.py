@@ -98,6 +98,17 @@ class RouterPolicy:
             subject = f"{name.name} of {name.node}"
             self._verdicts[name] = self._policy.report(verdict, name.kind, subject, name.address)
 
+    def not_judged(self, names: Iterable[InsideName]) -> set[tuple[int, str, str]]:
+        """Port, address and name of the nodes with names that `look` has still to judge.
+
+        Without rules at the port, no rule can deny a name.
+        """
+        return {
+            (name.port, name.address, name.node)
+            for name in names
+            if self._layers.get(name.port) and name not in self._verdicts
+        }
+
     def hidden(self) -> tuple[list[HiddenStatus], int]:
         """The names that the policy hides from outside, and how many are left out."""
         denied = [pair for pair in self._verdicts.items() if not pair[1].allowed]

@@ -183,7 +183,8 @@ class Zenoh:
     def extended_status(self, status: ProxyStatus) -> ProxyStatus:
         """The status of the proxy, with the routers."""
         policy = with_hidden(status.policy, *self._policy.hidden())
-        return replace(status, zenoh=self.state.status(), policy=policy)
+        waiting = self._policy.not_judged(self.state.inside_names())
+        return replace(status, zenoh=self.state.status(waiting), policy=policy)
 
     async def _take_report(self, report: Report) -> None:
         tokens = report.tokens

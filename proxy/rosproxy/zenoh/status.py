@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Protocol
 
 from msgspec.structs import replace
@@ -132,13 +132,17 @@ class ZenohState(Collector):
                 names += [InsideName(port, address, node.name, kind, name) for name in of_kind]
         return names
 
-    def status(self) -> ZenohStatus:
-        """The part of the status."""
+    def status(self, not_judged: Collection[tuple[int, str, str]] = ()) -> ZenohStatus:
+        """The part of the status. ``not_judged``: the result of `RouterPolicy.not_judged`."""
         failure = self._process.failure
         if failure:  # all else is of a process that has ended
             return self._status_of_routers(failure)
         by_zid = {session.peer: (port, session, ends) for port, session, ends in self._sessions}
-        nodes = tuple(_node_status(node, by_zid.get(node.session)) for node in self._graph.nodes)
+        placed = (_node_status(node, by_zid.get(node.session)) for node in self._graph.nodes)
+        nodes = tuple(
+            replace(n, not_judged=True) if (n.port, n.address, n.name) in not_judged else n
+            for n in placed
+        )
         addresses = {node.key: node.address for node in nodes if node.port is not None}
 
         def owner(pair: MismatchStatus) -> str:

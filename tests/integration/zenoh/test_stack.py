@@ -22,7 +22,12 @@ from rosproxy.net import sockets
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
 from rosproxy.zenoh import stack
-from rosproxy.zenoh.protocol.report import Report
+from rosproxy.zenoh.protocol.report import (
+    Report,
+    RouterReport,
+    RouterSession,
+    SessionConnection,
+)
 from rosproxy.zenoh.stack import Zenoh
 from tests import certificates
 from tests.integration.net import until
@@ -337,3 +342,24 @@ async def test_a_foreign_certificate_of_another_site_is_told(make: Make, files: 
     assert problem.text.startswith(
         "from a connection to tls/47449: the certificate is of a CA that is not in the CA file"
     )
+
+
+async def test_a_name_counts_as_not_judged_until_it_is_compared_with_the_rules(make: Make) -> None:
+    zenoh = make(policy="deny publish /chatter")
+    zenoh.supervisor.failure = ""
+    ends = (SessionConnection(f"tcp/{HOST}:47448", "tcp/172.18.0.3:50000"),)
+    routers = (RouterReport("01", (RouterSession("aa", "peer", ends),)), RouterReport("02"))
+    start = "@ros2_lv/0/aa/0"
+    entity = f"{start}/1/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/RIHS01_0/::,10:,:,:,,"
+    await zenoh._take_report(Report(routers, (f"{start}/0/NN/%/%/talker", entity)))
+    zenoh._policy.access()
+
+    def told() -> tuple[bool, int]:
+        status = zenoh.extended_status(ProxyStatus())
+        assert status.zenoh
+        assert status.policy
+        return status.zenoh.nodes[0].not_judged, len(status.policy.hidden)
+
+    assert told() == (True, 0)
+    zenoh._policy.look(zenoh.state.inside_names())
+    assert told() == (False, 1)

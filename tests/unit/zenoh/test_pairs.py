@@ -101,6 +101,12 @@ def test_a_rule_keeps_nodes_of_two_containers_apart_and_not_those_of_one() -> No
     beside = replace(NEIGHBOUR, port=TALKER.port, address=TALKER.address)
     assert checks(TALKER, beside, policy=HIDDEN) == ["match"]
     assert checks(TALKER, policy=HIDDEN) == ["policy"], "also without another end"
+    new = replace(TALKER, not_judged=True)
+    for finding in (*judged(new, LISTENER), *judged(new)):
+        assert finding.severity is Severity.INFO
+        assert finding.text.startswith("not known yet")
+    assert judged(new, LISTENER, policy=HIDDEN) == [denied]
+    assert checks(new, replace(beside, not_judged=True)) == ["match"]
 
 
 def test_a_rule_for_another_container_changes_nothing() -> None:

@@ -117,6 +117,14 @@ def test_names_are_judged_in_bounded_steps(monkeypatch: pytest.MonkeyPatch) -> N
     names = [name(f"/{number}") for number in range(5)]
     counts = []
     for _ in range(3):
+        assert policy.not_judged(names) == {(7448, FIRST, "/driver")}
         policy.look(names)
         counts.append(len(hidden(policy)))
     assert counts == [2, 4, 5]
+    assert not policy.not_judged(names)
+
+
+def test_without_rules_no_name_waits_for_a_verdict() -> None:
+    policy, _, _ = make(container_layer("deny publish /a", FIRST, 7449))
+    policy.access()
+    assert policy.not_judged([name("/a"), name("/a", 7449)]) == {(7449, FIRST, "/driver")}
