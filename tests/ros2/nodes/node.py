@@ -258,13 +258,20 @@ def read_options() -> argparse.Namespace:
     parser.add_argument("--in-turn", action="store_true", help="call after the last reply")
     parser.add_argument("--of", default="", help="the node to ask for parameters")
     parser.add_argument("--contexts", type=int, default=1)
+    parser.add_argument("--without-services", action="store_true", help="of the node itself")
     return parser.parse_args(sys.argv[1:])
 
 
 def run(name: str, options: argparse.Namespace) -> None:
     context = Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.ALL)
-    node = Node(name, context=context)
+    described = Parameter("start_type_description_service", value=not options.without_services)
+    node = Node(
+        name,
+        context=context,
+        start_parameter_services=not options.without_services,
+        parameter_overrides=[described],
+    )
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     try:
