@@ -63,10 +63,11 @@ bench: $(VENV)/.bench ## speed and memory next to a direct connection, socat, HA
 	@$(BIN)/python -m tests.bench $(BENCH)
 
 .PHONY: screenshot
-screenshot: $(VENV)/.dev ## paint docs/live-page.png anew: the live page with real nodes and a broken link; as root on Debian, installs ROS and Chromium
+screenshot: $(VENV)/.dev ## paint docs/live-page.png anew: the live page with real nodes and a broken link, and docs/live-page with made-up robots; as root on Debian, installs ROS and Chromium
 	@scripts/install-ros.sh
 	@scripts/install-browser.sh
 	@$(BIN)/python -m tests.browser.screenshot docs/live-page.png
+	@$(BIN)/python -m tests.browser.screenshot --made-up docs/live-page
 
 .PHONY: check
 check: $(VENV)/.dev ## format, lint, types, import rules, unit tests

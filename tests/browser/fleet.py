@@ -13,7 +13,8 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterator
+from functools import partial
 from typing import Any
 
 from aiohttp import web
@@ -141,14 +142,15 @@ def _link(domain: str, i: int, source: str, target: str, is_direct: bool = False
     )
 
 
-async def serve(port: int, nodes: int) -> None:
-    """Serve the page for good."""
+async def unchanged(nodes: int) -> AsyncGenerator[dict[str, Any]]:
+    """Yield a document that never changes."""
+    while True:
+        yield merged(documents(nodes), "0", "docker logs {}".format)
+        await asyncio.sleep(3600)
 
-    async def make() -> AsyncGenerator[dict[str, Any]]:
-        while True:
-            yield merged(documents(nodes), "0", "docker logs {}".format)
-            await asyncio.sleep(3600)
 
+async def serve(port: int, make: Callable[[], AsyncGenerator[dict[str, Any]]]) -> None:
+    """Serve a page with these documents for good."""
     page = Page(Feed(Tasks(), make), Visitors(None, time.monotonic))
     app = web.Application()
     for (method, path), handler in page.routes.items():
@@ -161,4 +163,4 @@ async def serve(port: int, nodes: int) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(serve(int(sys.argv[1]), int(sys.argv[2])))
+    asyncio.run(serve(int(sys.argv[1]), partial(unchanged, int(sys.argv[2]))))

@@ -1,23 +1,45 @@
-"""Make a picture of the live page with real nodes and a broken link: ``make screenshot``.
+"""Make pictures of the live page: ``make screenshot``.
 
 python -m tests.browser.screenshot FILE
+python -m tests.browser.screenshot --made-up FOLDER
+
+The first has real nodes and a broken link. The others have made-up robots (`tests.browser.robots`).
 """
 
 from __future__ import annotations
 
 import sys
 import tempfile
+from itertools import product
 from pathlib import Path
 
-from tests.browser.page import URL, cut, play, row
+from tests.browser.page import DETAILS, THIS_MACHINE, URL, cut, made_up, play, row, rows
+from tests.browser.test_picture import geometry
 from tests.browser.webdriver import Browser
 from tests.ros.cpp import compiled_node
 from tests.ros.forks import Forks
 from tests.ros.lab import Lab
+from tests.ros.processes import wait_until
 from tests.ros.topology import SHARED, Topology, remove_leftovers
 
 WIDTH = 1200
 HIGH = 760
+SIZES = (5, 30, 100, 1000)
+DEVICES = {"desktop": (1440, 1000, 1), "phone": (390, 844, 2)}
+"""Width and height in CSS pixels, and pixels of a CSS pixel."""
+SCHEMES = ("light", "dark")
+QUALITY = 70
+CHOSEN = "/amr_01/camera/image_raw/compressed"
+CHOSEN_SECONDS = 50
+"""Seconds of the curve in the picture of a chosen link."""
+CHOOSE = """
+[...document.querySelectorAll("#boxes .line")].find((line) =>
+  line.textContent.includes(arguments[0])).click();
+"""
+KNOWN = """
+const text = document.querySelector("#details figcaption")?.textContent || "60 s not known";
+return 60 - Number((text.match(/(\\d+) s not known/) || [0, 0])[1]);
+"""
 
 
 def paint(lab: Lab, folder: Path) -> bytes:
@@ -38,10 +60,8 @@ def paint(lab: Lab, folder: Path) -> bytes:
         browser.close()
 
 
-def main() -> int:
-    if len(sys.argv) != 2:
-        print(__doc__, file=sys.stderr)
-        return 2
+def paint_real(file: Path) -> None:
+    """Write the picture with real nodes."""
     remove_leftovers()
     compiled_node()
     topology = Topology(SHARED)
@@ -56,7 +76,58 @@ def main() -> int:
             lab.stop()
             forks.stop()
             topology.remove()
-    Path(sys.argv[1]).write_bytes(picture)
+    file.write_bytes(picture)
+
+
+def paint_made_up(target: Path) -> None:
+    """Write the pictures with made-up robots, and a picture with a chosen link."""
+    target.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        browser = Browser(THIS_MACHINE, Path(folder))
+        try:
+            for nodes in SIZES:
+                with made_up(browser, Path(folder), nodes, "robots"):
+                    paint_all(browser, target, nodes)
+            with made_up(browser, Path(folder), 30, "robots"):
+                (target / "chosen.webp").write_bytes(paint_chosen(browser))
+        finally:
+            browser.close()
+
+
+def paint_all(browser: Browser, target: Path, nodes: int) -> None:
+    """Write the pictures of a number of nodes, for each device and scheme.
+
+    Raises AssertionError if the graph has a fault, such as labels that overlap.
+    """
+    wait_until("the page shows rows", lambda: bool(rows(browser)))
+    for (device, size), scheme in product(DEVICES.items(), SCHEMES):
+        browser.resize(*size)
+        browser.prefer(scheme)
+        wait_until("the picture has this width", lambda: not geometry(browser))
+        picture = browser.small_screenshot(QUALITY)
+        (target / f"{nodes}-{device}-{scheme}.webp").write_bytes(picture)
+
+
+def paint_chosen(browser: Browser) -> bytes:
+    """The picture of a chosen link with the rate of the last minute."""
+    browser.resize(*DEVICES["desktop"])
+    browser.prefer("light")
+    wait_until("the page shows rows", lambda: bool(rows(browser)))
+    browser.run(CHOOSE, CHOSEN)
+    assert CHOSEN in browser.run(DETAILS)
+    wait_until("the curve is long", lambda: browser.run(KNOWN) >= CHOSEN_SECONDS, 90)
+    return browser.small_screenshot(QUALITY)
+
+
+def main() -> int:
+    match sys.argv[1:]:
+        case ["--made-up", folder]:
+            paint_made_up(Path(folder))
+        case [file]:
+            paint_real(Path(file))
+        case _:
+            print(__doc__, file=sys.stderr)
+            return 2
     return 0
 
 

@@ -57,9 +57,9 @@ class Browser:
         """Run a script. Return the result."""
         return self._post("/execute/sync", script=script, args=list(arguments))
 
-    def resize(self, width: int, height: int) -> None:
-        """Set the size of the viewport in CSS pixels."""
-        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    def resize(self, width: int, height: int, scale: int = 1) -> None:
+        """Set the size of the viewport in CSS pixels. ``scale``: pixels of a CSS pixel."""
+        metrics = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
         self.devtools("Emulation.setDeviceMetricsOverride", **metrics)
 
     def prefer(self, scheme: str) -> None:
@@ -80,6 +80,11 @@ class Browser:
     def screenshot(self) -> bytes:
         """The visible page, as PNG."""
         return base64.b64decode(self._call("GET", f"{self._session}/screenshot"))
+
+    def small_screenshot(self, quality: int) -> bytes:
+        """The visible page, as WebP with a quality in percent."""
+        answer = self.devtools("Page.captureScreenshot", format="webp", quality=quality)
+        return base64.b64decode(answer["data"])
 
     def console(self) -> list[str]:
         """The messages of the console since the previous call: errors, refused content."""
