@@ -1,13 +1,14 @@
 #!/bin/sh
-# Installs the requirements of `make bench`, on Debian or Ubuntu, as root: ROS 1 and ROS 2 of the
-# tests, image messages, the other relays, the tools of the kernel's packet filter, and the programs
-# of a Kubernetes cluster. Does nothing if all are installed.
+# Installs the requirements of `make bench`, on Debian or Ubuntu, as root: ROS 1, ROS 2 and zenoh of
+# the tests, image messages, the other relays, the tools of the kernel's packet filter, and the
+# programs of a Kubernetes cluster. Does nothing if all are installed.
 set -eu
 cd "$(dirname "$0")/.."
 . scripts/debian.sh
 
 scripts/install-ros.sh
 scripts/install-ros2.sh
+scripts/install-zenoh.sh
 scripts/install-browser.sh
 scripts/install-kubernetes.sh
 need install-bench \

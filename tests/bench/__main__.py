@@ -38,6 +38,7 @@ SECTIONS = {
     "nodes": Section("nodes", 1),
     "ros": Section("bytes", 3),
     "ros2": Section("participants", 5),
+    "rmw_zenoh": Section("containers", 5),
     "page": Section("nodes", 3),
     "cluster": Section("nodes", 1),
     "docker": Section("containers", 1),

@@ -26,6 +26,7 @@ TITLES = {
     "nodes": "Many nodes",
     "ros": "Real ROS nodes",
     "ros2": "ROS 2",
+    "rmw_zenoh": "rmw_zenoh",
     "page": "The live page",
     "cluster": "The operator in a growing cluster",
     "docker": "The operator on a Docker host",

@@ -12,12 +12,12 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S
-from tests.bench.book import DIRECT, Book, in_turn, loss, percentile
+from tests.bench.book import DIRECT, Book
 from tests.bench.nodes import busy
-from tests.bench.ros import RosNode, running_node, wait_for_rest
+from tests.bench.ros import RosNode, running_node
+from tests.bench.talks import Site, measure
 from tests.bench.ways import COPY, KERNEL, PLANES
 from tests.bench.world import (
     ADDRESSES,
@@ -27,7 +27,6 @@ from tests.bench.world import (
     SYSTEM_PATH,
     World,
     anonymous,
-    cpu_seconds,
     world,
 )
 from tests.ros.processes import Process
@@ -38,8 +37,6 @@ FIRST_PORT = 41000
 NETWORK = "172.31.0.0/24"
 SECOND = "172.31.0.3"
 """Another address of the inside machine: the proxy serves at most 64 participants at an address."""
-SECONDS = 2.0
-QUICK_SECONDS = 1.0
 SIZES = (1, 10, 100)
 QUICK_SIZES = (1, 10)
 IDLE_SECONDS = 10.0
@@ -50,37 +47,10 @@ PATIENCE = 120.0
 PATH = "rosproxy"
 
 
-class Stream(NamedTuple):
-    """Messages of a size, at a rate."""
-
-    title: str
-    size: int
-    rate: float
-
-
-PINGS = {"100 B ping": 100, "100 kB ping": 100_000}
-STREAMS = (Stream("1 KiB at 200 Hz", 1024, 200), Stream("1 MB at 20 Hz", 1_000_000, 20))
-
-
-class Site(NamedTuple):
-    """A way with a node at either end, and perhaps the process of a proxy."""
-
-    name: str
-    nodes: dict[str, RosNode]
-    pid: int | None
-
-
 def run(book: Book, rounds: int, quick: bool) -> None:
     with ExitStack() as stack:
         sites = [stack.enter_context(site(name)) for name in (DIRECT, KERNEL, COPY)]
-        seconds = QUICK_SECONDS if quick else SECONDS
-        for number in range(rounds):
-            for title, size in PINGS.items():
-                for current_site in in_turn(sites, number):
-                    measure_ping(book, current_site, title, size, seconds)
-            for stream in STREAMS:
-                for current_site in in_turn(sites, number):
-                    measure_stream(book, current_site, stream, seconds)
+        measure(book, sites, rounds, quick)
     for _ in range(min(rounds, MOST_ROUNDS)):
         for size in QUICK_SIZES if quick else SIZES:
             book.add("discovery, s", DIRECT, discovered(size), size)
@@ -90,33 +60,6 @@ def run(book: Book, rounds: int, quick: bool) -> None:
         "found a writer of each participant. The proxy has run for half a minute before. "
         "Participants are of Cyclone DDS, up to fifty in one process"
     )
-
-
-def measure_ping(book: Book, site: Site, title: str, size: int, seconds: float) -> None:
-    times = [float(delay) for delay in site.nodes["outside"].ask("ping", size, seconds)[1:]]
-    enter(book, site, f"{title}, round trip", times)
-
-
-def measure_stream(book: Book, site: Site, stream: Stream, seconds: float) -> None:
-    before = cpu_seconds(site.pid) if site.pid else 0.0
-    sent = int(site.nodes["outside"].ask("go", stream.size, stream.rate, seconds)[1])
-    wait_for_rest(site.nodes["inside"], sent)
-    ages = [float(age) for age in site.nodes["inside"].ask("off")[1:]]
-    enter(book, site, f"{stream.title}, one way", ages)
-    book.add(f"{stream.title}, one way: loss, %", site.name, 100 * loss(sent, len(ages)))
-    if site.pid:
-        spent = (cpu_seconds(site.pid) - before) / sent
-        row = f"{stream.title}, one way: CPU of the proxy, us a message"
-        book.add(row, site.name, spent * 1e6)
-
-
-def enter(book: Book, site: Site, title: str, times: list[float]) -> None:
-    if len(times) < 2:
-        book.note(f"{site.name}, {title}: {len(times)} messages arrived")
-        return
-    for percent in (50, 99):
-        row = f"{title}: latency p{percent}, us"
-        book.add(row, site.name, percentile(times, percent))
 
 
 @contextmanager
