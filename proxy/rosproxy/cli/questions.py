@@ -72,7 +72,7 @@ def status(admin: Any, as_json: bool, watch: bool, wait: float, opens: bool) -> 
     """Show the master, the ports, and the nodes behind the proxy.
 
     Exits with 0 if the proxy is ready for nodes. Exits with 1 if the proxy or its master does not
-    answer.
+    answer, or if the routers for rmw_zenoh do not run.
     """
     if as_json + watch + opens > 1:
         raise click.UsageError("--json, --watch and --open exclude each other; give one of them")
