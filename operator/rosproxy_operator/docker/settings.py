@@ -211,8 +211,9 @@ class PlanSettings:
         tuple[str, ...],
         Option(
             "ROS 2: host that the label `rosproxy.peers` may name, written as for "
-            "`--allow-master`. An entry without a port allows any port, and the well-known "
-            "ports. `--ros2-peer` is always allowed. Repeatable.",
+            "`--allow-master`. For rmw_zenoh, also the variable `ZENOH_CONFIG_OVERRIDE`. An entry "
+            "without a port allows any port, and the well-known ports. For DDS, `--ros2-peer` is "
+            "always allowed. Repeatable.",
             option_values.HOST_PATTERN,
             repeatable=True,
             default="any",
@@ -221,8 +222,8 @@ class PlanSettings:
     ros2_peer: Annotated[
         tuple[str, ...],
         Option(
-            "ROS 2: outside host to which every proxy announces its participants. Or another "
-            "proxy, with the first port of that proxy's range. Repeatable.",
+            "ROS 2: outside host to which every proxy for DDS announces its participants. Or "
+            "another proxy, with the first port of that proxy's range. Repeatable.",
             option_values.PEER_NAME,
             variables=("ROSPROXY_ROS2_PEERS",),
             repeatable=True,
