@@ -117,9 +117,21 @@ FIXES = {
         "add HOST to spec.peers. HOST runs a router",
     ),
     "zenoh hub": Fix(
-        "if the other proxy runs, set --zenoh-listen there, and let the firewall accept the port",
-        "if the other proxy runs, set --zenoh-listen there, and let the firewall accept the port",
+        "if the other proxy runs, set --zenoh-hub-listen there, and let the firewall accept the "
+        "port",
+        "if the other proxy runs, set --zenoh-hub-listen there, and let the firewall accept the "
+        "port",
         "if the other proxy runs, let the proxies connect to each other at port 7447 (firewall)",
+    ),
+    "zenoh certificate": Fix(
+        "give all proxies of the graph a valid --zenoh-hub-certificate of the same CA, with the "
+        "name in --zenoh-hub of the others, and check the clocks of the hosts",
+        "give all proxies of the graph a valid --zenoh-hub-certificate of the same CA, with the "
+        "name in --zenoh-hub of the others, and check the clocks of the hosts",
+        "the operator makes this certificate from its key, the Secret with a name that ends in -key. "
+        "After a change of the key, wait until the operator has recreated all proxies of the "
+        "RosProxy. If the finding stays, delete the pods of both proxies, and check that no other "
+        "pod has the labels of a proxy",
     ),
     "zenoh nodes": Fix(
         "set for the nodes in containers: RMW_IMPLEMENTATION=rmw_zenoh_cpp and "

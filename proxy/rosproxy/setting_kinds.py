@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from inspect import Parameter, signature
 from ipaddress import ip_address, ip_network
 from typing import (
@@ -43,6 +43,9 @@ LEAST_RATE_HZ = 0.001
 _RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
 _TOKEN = re.compile(r"[!-~]{8,200}")
 _HASH = re.compile(r"[0-9a-f]{64}")
+_PEM = re.compile(r"-----BEGIN ([A-Z ]{1,30})-----\s[A-Za-z0-9+/=\s]+-----END \1-----\n?")
+_LONGEST_PEM = 32 * 1024
+"""Characters of a text with certificates at most. Three long RSA keys need half of this."""
 _LONGEST_QUOTE = 40
 """Characters of a bad value that a message repeats."""
 _Value = TypeVar("_Value")
@@ -186,6 +189,15 @@ class TopicLimit:
     def __str__(self) -> str:
         """``glob=rateHz``."""
         return f"{self.glob}={self.rate_hz:g}Hz"
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """A certificate, its private key, and the CAs of the other side, all as PEM."""
+
+    certificate: bytes
+    key: bytes = field(repr=False)
+    ca: bytes
 
 
 class SettingError(ValueError):
@@ -341,6 +353,24 @@ def read_token_hash(text: str) -> str | None:
     return digits or None
 
 
+def read_hub_certificate(text: str) -> Credentials | None:
+    """Parse a hub's private key, certificate and CA; None for an empty text.
+
+    Raises ValueError, which does not repeat the text.
+    """
+    if not text.strip():
+        return None
+    found = [*_PEM.finditer(text[:_LONGEST_PEM])]
+    kinds = [block[1].rpartition("PRIVATE ")[2] for block in found]
+    if kinds != ["KEY", "CERTIFICATE", "CERTIFICATE"]:
+        raise ValueError(
+            "must be three blocks of PEM: the private key, the certificate of this key, and the "
+            "CA that has signed the certificate"
+        )
+    key, certificate, ca = (block[0].encode() for block in found)
+    return Credentials(certificate, key, ca)
+
+
 def read_policy_layers(text: str) -> tuple[PolicyLayer, ...]:
     """Parse the layers of a policy from JSON; empty for an empty text. Raises ValueError."""
     try:
@@ -398,3 +428,4 @@ TOKEN_HASH = Text("HASH", read_token_hash)
 POLICY_RULES = Text("RULES", parse_rules, separable=False)
 POLICY_LAYERS = Text("JSON", read_policy_layers)
 FILE = Text("FILE", str)
+HUB_CERTIFICATE = Text("PEM", read_hub_certificate)

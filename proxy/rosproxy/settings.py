@@ -15,6 +15,7 @@ from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort, Network
 from rosproxy.setting_kinds import (
+    Credentials,
     DataPlane,
     Direction,
     LinkPort,
@@ -396,8 +397,8 @@ class Settings:
         tuple[HostPort, ...],
         Option(
             "rmw_zenoh: proxy on another host that serves the same graph, at the port of its "
-            "`--zenoh-listen`. Without a port: 7447. Unlike with `--zenoh-peer`, both proxies may "
-            "name each other, and a proxy that is away is no fault. Repeatable.",
+            "`--zenoh-hub-listen`. Without a port: 7447. Unlike with `--zenoh-peer`, both proxies "
+            "may name each other, and a proxy that is away is no fault. Repeatable.",
             kinds.ZENOH_PEER,
             variables=("ROSPROXY_ZENOH_HUBS",),
             repeatable=True,
@@ -405,6 +406,27 @@ class Settings:
             note="separated by spaces",
         ),
     ] = ()
+    zenoh_hub_listen: Annotated[
+        int | None,
+        Option(
+            "rmw_zenoh: port at which the proxies on other hosts connect that name this proxy as "
+            "`--zenoh-hub`, usually 7447. Let only these hosts reach this port.",
+            kinds.PORT,
+            default="off",
+        ),
+    ] = None
+    zenoh_hub_certificate: Annotated[
+        Credentials | None,
+        Option(
+            "rmw_zenoh: [key and certificate](../guide/zenoh.md#several-hosts) with which this "
+            "proxy and the proxies of `--zenoh-hub` prove themselves to each other: the private "
+            "key, the certificate and the CA, as PEM. All these proxies need certificates of the "
+            "same CA, and a certificate has to contain the name in `--zenoh-hub`. Set the "
+            "variable: all users of the machine can see a command line.",
+            kinds.HUB_CERTIFICATE,
+            default="none",
+        ),
+    ] = field(default=None, repr=False)
     zenoh_listen: Annotated[
         int | None,
         Option(
@@ -628,6 +650,8 @@ class Settings:
         """Yield the option and the port of each zenoh listener; nothing without rmw_zenoh."""
         if self.for_zenoh:
             yield from (("--zenoh-ports", port) for port in self.zenoh_ports.ports())
+        if self.for_zenoh and self.zenoh_hub_listen is not None:
+            yield "--zenoh-hub-listen", self.zenoh_hub_listen
         if self.for_zenoh and self.zenoh_listen is not None:
             yield "--zenoh-listen", self.zenoh_listen
         if self.for_zenoh and self.zenoh_link_listen is not None:

@@ -23,6 +23,10 @@ HASH = "9f9f5111f7b27a781f1f1ddde5ebc2dd2b796bfc7365c9c28b548e564176929f"
 """``printf %s 0123456789abcdef | sha256sum``"""
 
 
+PRIVATE = "-----BEGIN PRIVATE KEY-----\nQUFB\n-----END PRIVATE KEY-----\n"
+CERTIFICATE = "-----BEGIN CERTIFICATE-----\nQkJC\nQ0M=\n-----END CERTIFICATE-----\n"
+
+
 def test_the_defaults() -> None:
     settings = parse_settings(GIVEN)
     both = PortRange(45000, 45099)
@@ -175,6 +179,8 @@ def test_rmw_zenoh_alone_needs_neither_master_nor_advertised_host() -> None:
     assert settings.range_versions == ()
     listeners = dict.fromkeys(port for _, port in settings.zenoh_listeners())
     assert [*listeners] == [*range(7448, 7468)]
+    hub = parse_settings({"ros": ("zenoh",), "zenoh_hub_listen": 7447})
+    assert ("--zenoh-hub-listen", 7447) in hub.zenoh_listeners()
     both = parse_settings({**GIVEN, "ros": ("1", "zenoh"), "zenoh_listen": 7447})
     assert both.range_versions == ("1",)
     assert ("--zenoh-listen", 7447) in both.zenoh_listeners()
@@ -251,6 +257,39 @@ def test_what_rmw_zenoh_can_not_have(name: str, value: object, complaint: str) -
     with pytest.raises(SettingError) as caught:
         parse_settings({**GIVEN, "ros": ("1", "zenoh"), name: value})
     assert str(caught.value).startswith(complaint)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_valid"),
+    [
+        (f"{PRIVATE}\n{CERTIFICATE}{CERTIFICATE}", True),
+        (f"# of node 1\n{PRIVATE.replace('PRIV', 'EC PRIV')}{CERTIFICATE}\n\n{CERTIFICATE}", True),
+        (f"{CERTIFICATE}{CERTIFICATE}{PRIVATE}", False),
+        (f"{PRIVATE}{CERTIFICATE}", False),
+        (f"{PRIVATE}{CERTIFICATE * 3}", False),
+        (f"{PRIVATE.replace('PRIVATE', 'PUBLIC')}{CERTIFICATE * 2}", False),
+        (f"{' ' * 40_000}{PRIVATE}{CERTIFICATE * 2}", False),
+        ("secret", False),
+    ],
+)
+def test_a_hubs_certificate_is_a_key_a_certificate_and_a_ca(text: str, is_valid: bool) -> None:
+    variables = {"ROSPROXY_ROS": "zenoh", "ROSPROXY_ZENOH_HUB_CERTIFICATE": text}
+    if not is_valid:
+        with pytest.raises(SettingError) as caught:
+            settings_of(variables)
+        assert str(caught.value).startswith("--zenoh-hub-certificate: must be three blocks of PEM")
+        assert "QUFB" not in str(caught.value)
+        return
+    settings = settings_of(variables)
+    assert settings.zenoh_hub_certificate is not None
+    assert settings.zenoh_hub_certificate.certificate == CERTIFICATE.encode()
+    assert b"PRIVATE" in settings.zenoh_hub_certificate.key
+    assert "QUFB" not in repr(settings)
+
+
+def test_no_certificate_is_an_empty_text() -> None:
+    settings = settings_of({"ROSPROXY_ROS": "zenoh", "ROSPROXY_ZENOH_HUB_CERTIFICATE": ""})
+    assert settings.zenoh_hub_certificate is None
 
 
 @pytest.mark.parametrize(

@@ -103,10 +103,10 @@ def test_messages_calls_and_the_graph_pass_a_link(lab: Lab, protocol: str, versi
 @pytest.mark.parametrize(
     ("side", "fault", "told"),
     [
-        ("cloud", "foreign", "is of a CA that is not in the CA file of this proxy"),
-        ("cloud", "expired", "the certificate of the other site, or its CA, has expired"),
+        ("cloud", "foreign", "is of a CA that this proxy does not trust"),
+        ("cloud", "expired", "the certificate of the other proxy, or its CA, has expired"),
         ("cloud", "name", "is for another host name"),
-        ("robot", "foreign", "it is of a CA that is not in the CA file there"),
+        ("robot", "foreign", "it is of a CA that the other proxy does not trust"),
         ("robot", "expired", "refuses the certificate of this proxy as expired"),
     ],
 )
@@ -210,7 +210,7 @@ def test_a_site_without_its_ca_is_excluded(lab: Lab, protocol: str) -> None:
 
     refused = f"from a connection to {protocol}/{ROUTER_PORT}: the certificate is of a CA that"
     wait_until("the cloud tells the refusal", lambda: refused in told("out"), 30)
-    expected = "a CA that is not in the CA file there" if protocol == "tls" else "over UDP"
+    expected = "a CA that the other proxy does not trust" if protocol == "tls" else "over UDP"
     wait_until("the robot tells the refusal", lambda: expected in told("px"), 30)
     mark = subscriber.mark()
     sites.in_cloud("pub", "other")

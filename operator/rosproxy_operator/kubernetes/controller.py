@@ -38,6 +38,7 @@ from rosproxy_operator.kubernetes.planner.partition import (
 )
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan, stand_by
 from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.proxies.hub_certificate import hub_certificates
 from rosproxy_operator.kubernetes.proxies.proxy_sync import ClusterProxySync
 from rosproxy_operator.kubernetes.proxies.sandbox import SandboxFailures
 from rosproxy_operator.kubernetes.proxies.token_key import TokenKey
@@ -232,6 +233,7 @@ class KubernetesController:
             observed,
             reports=self._proxy_sync.reports,
             failures=self._applier.failures,
+            hub_certificates=hub_certificates(observed.rosproxies, observed.key),
             webhook=WebhookState(self._settings.webhook is not None, self._webhook_since()),
         )
         scope = self._due.due_partition(

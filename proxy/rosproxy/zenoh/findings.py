@@ -18,7 +18,7 @@ from rosproxy.admin.status_document import (
 from rosproxy.fixes import how_to
 from rosproxy.net.addresses import parse_host_port
 from rosproxy.telemetry.text import brief, duration, listed, plural, quoted
-from rosproxy.zenoh.links import LinkFault
+from rosproxy.zenoh.links import CERTIFICATE_FAULTS, LinkFault
 from rosproxy.zenoh.matching import DURABILITY, TYPE, TYPE_HASH
 
 ROUTERS = "zenoh routers"
@@ -73,45 +73,45 @@ _LINK_FAULTS = {
         "give the port at which the other proxy listens for links between sites",
     ),
     LinkFault.PEER_EXPIRED: (
-        "the certificate of the other site, or its CA, has expired",
-        "renew the files at the other site; if they are new, check the clock of this host",
+        "the certificate of the other proxy, or its CA, has expired",
+        "renew the files there; if they are new, check the clock of this host",
     ),
     LinkFault.PEER_TOO_EARLY: (
-        "the certificate of the other site, or its CA, is not valid yet",
+        "the certificate of the other proxy, or its CA, is not valid yet",
         "check the clocks of both hosts",
     ),
     LinkFault.PEER_FOREIGN: (
-        "the certificate of the other site is of a CA that is not in the CA file of this proxy",
+        "the certificate of the other proxy is of a CA that this proxy does not trust",
         "if the host is the right one, add its CA to the CA file",
     ),
     LinkFault.PEER_OTHER_NAME: (
-        "the certificate of the other site is for another host name",
+        "the certificate of the other proxy is for another host name",
         "give the host name of the certificate in the link, or add the host name of the link to "
         "the certificate (subjectAltName)",
     ),
     LinkFault.PEER_INVALID: (
-        "the certificate of the other site is not valid for a TLS server",
+        "the certificate of the other proxy is not valid for a TLS server",
         "make a certificate with extendedKeyUsage serverAuth, or without extendedKeyUsage",
     ),
     LinkFault.OWN_EXPIRED: (
-        "the other site refuses the certificate of this proxy as expired",
+        "the other proxy refuses the certificate of this proxy as expired",
         "renew certificate and key of this proxy; if they are new, check the clock of the other "
         "host",
     ),
     LinkFault.OWN_FOREIGN: (
-        "the other site refuses the certificate of this proxy: it is of a CA that is not in the CA "
-        "file there",
+        "the other proxy refuses the certificate of this proxy: it is of a CA that the other proxy "
+        "does not trust",
         "give this proxy a certificate of that CA, or add its CA to the CA file there",
     ),
     LinkFault.OWN_REFUSED: (
-        "the other site refuses the certificate of this proxy",
+        "the other proxy refuses the certificate of this proxy",
         "see rosproxy status there for the reason, and check the certificate of this proxy",
     ),
 }
 _SITE_FAULTS = {
     LinkFault.REFUSED.value: (
         "connection refused: no proxy listens there",
-        "let the proxy of the other site listen for links between sites, and publish the port",
+        "let the other proxy listen for links between sites, and publish the port",
     ),
     LinkFault.NO_SESSION.value: (
         "the program there accepts the certificate of this proxy, but zenoh opens no session",
@@ -138,7 +138,9 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
         yield error("link", f"zenoh port {zenoh.link_listen}", text, fix)
     for link in zenoh.links:
         is_tried = link.error != LinkFault.NOT_TRIED.value
-        if not link.up and not link.hub and is_tried and link.since >= LINK_GRACE_S:
+        # A hub that is away is no fault.
+        is_fault = not link.hub or link.error in CERTIFICATE_FAULTS
+        if not link.up and is_fault and is_tried and link.since >= LINK_GRACE_S:
             yield _link_fault(link)
     yield from shared_ports(zenoh).values()
 
@@ -170,6 +172,8 @@ def _link_fault(link: ZenohLinkStatus) -> DoctorFinding:
     text, fix = known.get(link.error, (link.error or "no session", _CHECK_PEER))
     if link.protocol != "tcp":
         text, fix = _SITE_FAULTS.get(link.error, (text, fix))
+    elif link.hub:
+        fix = how_to("zenoh certificate")
     return error("link", link_subject(link), f"{text}. The proxy tries again", fix)
 
 

@@ -14,12 +14,16 @@ HANDSHAKE_TIMEOUT_S = 5.0
 ALERT_TIMEOUT_S = 2.0
 """Seconds in which a peer refuses the certificate of the proxy, if the peer refuses it."""
 
+HANDSHAKE_TIMEOUT_S = 5.0
+"""Seconds for the handshake of TLS with a hub."""
+
 
 async def try_link(link: Link, tls: ssl.SSLContext | None = None) -> LinkFault:
     """Return why there is no session with the peer of a link, as far as a connection shows.
 
-    Without addresses: UNRESOLVABLE. If an address accepts the connection, and the certificates of a
-    link with TLS: NO_SESSION. Otherwise the fault of the last address.
+    ``tls``: what proves the proxy to the peer of a link with TLS. Without addresses: UNRESOLVABLE.
+    If an address accepts the connection, and with ``tls`` the certificate of the proxy: NO_SESSION.
+    Otherwise the fault of the last address.
     """
     fault = LinkFault.UNRESOLVABLE
     for address in link.addresses:
@@ -34,7 +38,7 @@ async def try_link(link: Link, tls: ssl.SSLContext | None = None) -> LinkFault:
         except OSError:
             fault = LinkFault.UNREACHABLE
         else:
-            if link.protocol == "tls" and tls is not None:
+            if tls is not None:
                 return await _try_tls(sock, link.peer.host, tls)
             sock.close()
             return LinkFault.NO_SESSION

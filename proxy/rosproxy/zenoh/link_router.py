@@ -7,16 +7,15 @@ certificates restarts this router alone, and all other sessions stay.
 The limits of topics and the rules of ``--zenoh-link-policy`` hold for what passes by TLS and QUIC.
 """
 
-import base64
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import LINK_PROTOCOLS, LinkPort, SiteLink, TopicLimit
+from rosproxy.setting_kinds import LINK_PROTOCOLS, Credentials, LinkPort, SiteLink, TopicLimit
 from rosproxy.zenoh.policy.access_control import AT_LINKS, access_control
 from rosproxy.zenoh.policy.key_expressions import check_glob, data_keys, matches_no_name
-from rosproxy.zenoh.router_configs import RouterConfig, router_config
+from rosproxy.zenoh.router_configs import RouterConfig, router_config, tls_values
 
 LEASE_MS = 10_000
 """Time without a packet after which a link counts as lost, for example if a robot changes its
@@ -25,15 +24,6 @@ _KEEP_ALIVES = 4
 """Packets within the lease on a link without messages."""
 _HUB_RETRY = "#retry_period_init_ms=50"
 """The router opens before the hub. Without this value, the second try would follow after 1 s."""
-
-
-@dataclass(frozen=True, slots=True)
-class Credentials:
-    """The certificate of this site, the key, and the CAs of other sites, all as PEM."""
-
-    certificate: bytes
-    key: bytes = field(repr=False)
-    ca: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +44,8 @@ class LinkPlan:
             # Otherwise a key that zenoh cannot use would end the routers of all containers.
             "listen/exit_on_failure": False,
             "listen/timeout_ms": -1,
-            "transport/link/tls": _tls(credentials),
+            **tls_values(credentials),
+            "transport/link/tls/close_link_on_expiration": True,
             "transport/link/tx/keep_alive": _KEEP_ALIVES,
             "transport/link/tx/lease": LEASE_MS,
         }
@@ -77,21 +68,6 @@ def check_limits(limits: Sequence[TopicLimit]) -> None:
         if len(data_keys(limit.glob)) > 1:  # zenoh would count each key expression by itself
             text = "write * for whole parts of a name, or at the end: /camera/*, /*/image, /cam*"
             raise ValueError(f"{limit}: {text}")
-
-
-def _tls(credentials: Credentials) -> dict[str, object]:
-    certificate = base64.b64encode(credentials.certificate).decode()
-    key = base64.b64encode(credentials.key).decode()
-    return {
-        "root_ca_certificate_base64": base64.b64encode(credentials.ca).decode(),
-        "listen_certificate_base64": certificate,
-        "listen_private_key_base64": key,
-        "connect_certificate_base64": certificate,
-        "connect_private_key_base64": key,
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-        "close_link_on_expiration": True,
-    }
 
 
 def _downsampling(limits: Sequence[TopicLimit]) -> dict[str, object]:

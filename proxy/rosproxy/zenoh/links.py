@@ -34,7 +34,15 @@ class LinkFault(Enum):
     OWN_REFUSED = "the peer refuses the own certificate"
 
 
+CERTIFICATE_FAULTS = frozenset(
+    fault.value
+    for fault in LinkFault
+    if fault is LinkFault.NO_TLS or fault.name.startswith(("PEER_", "OWN_"))
+)
+"""Values of the faults of a peer that accepts connections: the peer does not prove itself, or
+refuses the certificate of the proxy."""
 _VERIFY_FAULTS = {
+    7: LinkFault.PEER_FOREIGN,  # a CA with the same name and another key
     9: LinkFault.PEER_TOO_EARLY,
     10: LinkFault.PEER_EXPIRED,
     18: LinkFault.PEER_FOREIGN,
@@ -48,6 +56,7 @@ _VERIFY_FAULTS = {
 _ALERT_FAULTS = {
     "CERTIFICATE_EXPIRED": LinkFault.OWN_EXPIRED,
     "UNKNOWN_CA": LinkFault.OWN_FOREIGN,
+    "DECRYPT_ERROR": LinkFault.OWN_FOREIGN,  # a CA with the same name and another key
     "CERTIFICATE": LinkFault.OWN_REFUSED,
 }
 """Words in the alerts of TLS with which a peer refuses a certificate (RFC 8446, 6.2)."""
@@ -96,15 +105,15 @@ class Link:
 
 
 def is_linked(
-    peer: HostPort, addresses: Collection[str], routers: Iterable[Ends], listen: int | None
+    peer: HostPort, addresses: Collection[str], routers: Iterable[Ends], listen: Collection[int]
 ) -> bool:
     """Whether a connection of the hub with one of ``routers`` is with a peer at these addresses.
 
-    The peer may have dialed the hub, at the port ``listen``; None: the hub has no such port. For
-    QUIC, zenoh reports the host name that the hub has dialed.
+    The peer may have dialed the proxy, at a port of ``listen``. For QUIC, zenoh reports the host
+    name that the router has dialed.
     """
     return any(
         (ends.remote.host in addresses or ends.remote.host == peer.host)
-        and (ends.remote.port == peer.port or ends.local.port == listen)
+        and (ends.remote.port == peer.port or ends.local.port in listen)
         for ends in routers
     )

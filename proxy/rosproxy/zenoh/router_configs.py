@@ -13,6 +13,7 @@ The values come from rmw_zenohd (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_ROUTER_C
 Exceptions are the addresses, the bound of sessions, and the delay for scouting, which is off.
 """
 
+import base64
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,11 +22,13 @@ from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.setting_kinds import Credentials
 from rosproxy.zenoh.policy.access_control import HUB_PROTOCOL, NODE_PROTOCOL
 from rosproxy.zenoh.protocol.report import MOST_SESSIONS
 
 RouterConfig = Mapping[str, str]
 """Values as JSON, by the keys of zenoh's configuration."""
+_TLS = "tls"
 _LOOPBACK = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 _COMMON: dict[str, Any] = {
     "mode": "router",
@@ -55,6 +58,8 @@ class RouterPlan:
     """Where the routers listen, and what they dial.
 
     ``listen`` is the port of the hub for outside, ``peers`` are routers that the hub dials.
+    ``hub_listen`` is the port of the hub for the hubs of other proxies, ``hubs`` are such hubs.
+    With ``certificate``, the hubs use TLS, and each proves itself to the other.
     ``directory`` has the sockets by which the hub dials the routers of containers. If empty, the
     hub dials by TCP, and the routers can have no access control.
     """
@@ -64,6 +69,9 @@ class RouterPlan:
     listen: int | None
     peers: Sequence[HostPort]
     directory: str = ""
+    hub_listen: int | None = None
+    hubs: Sequence[HostPort] = ()
+    certificate: Credentials | None = None
 
     @property
     def hub_socket(self) -> str:
@@ -89,17 +97,28 @@ class RouterPlan:
             )
             for port in self.ports.ports()
         ]
-        # The hub dials the other routers. So without ``listen``, others reach no port of the hub.
-        hub_ports = [] if self.listen is None else [_tcp(HostPort(self.bind, self.listen))]
-        hub_ports += [self.hub_socket] if links else []
+        return [*routers, *([links] if links else []), self._hub(bool(links))]
+
+    def _hub(self, has_links: bool) -> RouterConfig:
+        """The configuration of the hub.
+
+        The hub dials the other routers. So without the two ports, others reach no port of the hub.
+        """
+        protocol = _TLS if self.certificate else NODE_PROTOCOL
+        listeners = ((NODE_PROTOCOL, self.listen), (protocol, self.hub_listen))
+        listen = [f"{p}/{HostPort(self.bind, port)}" for p, port in listeners if port is not None]
+        listen += [self.hub_socket] if has_links else []
         host = _LOOPBACK.get(self.bind, self.bind)
         dialed = [
             endpoint
             for port in self.ports.ports()
             for endpoint in self._socket(port) or [_tcp(HostPort(host, port))]
         ]
-        hub = router_config(hub_ports, [*dialed, *map(_tcp, self.peers)])
-        return [*routers, *([links] if links else []), hub]
+        dialed += [_tcp(peer) for peer in self.peers if peer not in self.hubs]
+        dialed += [f"{protocol}/{hub}" for hub in self.hubs]
+        return router_config(
+            listen, dialed, tls_values(self.certificate) if self.certificate else {}
+        )
 
     def _socket(self, port: int) -> list[str]:
         return [f"{HUB_PROTOCOL}/{self.directory}/{port}"] if self.directory else []
@@ -121,3 +140,22 @@ def router_config(
     """The configuration of a router; ``other`` has further values by zenoh's keys."""
     own = {"listen/endpoints": [*listen], "connect/endpoints": [*connect], **other}
     return {key: json.dumps(value) for key, value in (_COMMON | own).items()}
+
+
+def tls_values(credentials: Credentials) -> dict[str, object]:
+    """The values with which a router proves itself, and demands the same of others.
+
+    zenoh's user names and passwords do not serve: a router with a password of its own refuses to
+    dial a router without (zenoh-transport, ext/auth/usrpwd.rs, ``recv_init_ack``). The hub also
+    dials such routers. With TLS, only the links of hubs and of sites need a proof.
+    """
+    values: dict[str, object] = {"enable_mtls": True, "verify_name_on_connect": True}
+    values["root_ca_certificate_base64"] = _base64(credentials.ca)
+    for side in ("listen", "connect"):
+        values[f"{side}_private_key_base64"] = _base64(credentials.key)
+        values[f"{side}_certificate_base64"] = _base64(credentials.certificate)
+    return {f"transport/link/tls/{key}": value for key, value in values.items()}
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import logging
+import ssl
 from collections.abc import Mapping, Sequence
 from dataclasses import replace as replace_plan
 from importlib import metadata
@@ -23,6 +24,7 @@ from rosproxy.setting_kinds import SettingError
 from rosproxy.settings import Settings
 from rosproxy.telemetry.text import listed
 from rosproxy.zenoh import findings
+from rosproxy.zenoh.certificates import CLIENTS, SERVERS, Unusable, check_credentials
 from rosproxy.zenoh.link_probe import try_link
 from rosproxy.zenoh.links import Link
 from rosproxy.zenoh.policy.access_control import access_control
@@ -64,8 +66,16 @@ class Zenoh:
         self._mismatches: dict[str, DoctorFinding] = {}
         self._applying = asyncio.Lock()
         settings = runtime.settings
-        dialed = tuple(dict.fromkeys((*settings.zenoh_peer, *settings.zenoh_hub)))
-        self._plan = RouterPlan(settings.bind, settings.zenoh_ports, settings.zenoh_listen, dialed)
+        self._plan = RouterPlan(
+            settings.bind,
+            settings.zenoh_ports,
+            settings.zenoh_listen,
+            settings.zenoh_peer,
+            hub_listen=settings.zenoh_hub_listen,
+            hubs=settings.zenoh_hub,
+            certificate=settings.zenoh_hub_certificate,
+        )
+        self._hub_client: ssl.SSLContext | None = None
         runtime.policy.checks.append(self._check_layers)
         self._policy = RouterPolicy(runtime.policy, settings.zenoh_ports)
         self._access: dict[int, object] = {}
@@ -81,6 +91,7 @@ class Zenoh:
         """
         _check_package()
         _check_ports(self._settings)
+        self._hub_client = _hub_client(self._settings)
         self._plan = replace_plan(self._plan, directory=make_socket_directory())
         self._check_policy()
         self._sites.check()
@@ -126,6 +137,8 @@ class Zenoh:
         outside += [f"hubs {listed(map(str, settings.zenoh_hub))}"] if settings.zenoh_hub else []
         sites = [*settings.zenoh_link]
         outside += [f"other sites {listed(map(str, sites))}"] if sites else []
+        if settings.zenoh_hub_listen is not None:
+            outside.append(f"port {settings.zenoh_hub_listen} for hubs")
         if settings.zenoh_listen is not None:
             outside.append(f"port {settings.zenoh_listen} for outside")
         if settings.zenoh_link_listen is not None:
@@ -153,6 +166,7 @@ class Zenoh:
         """
         _check_package()
         _check_ports(self._settings)
+        _hub_client(self._settings)
         self._check_policy()
         self._sites.check()
         return ()
@@ -196,10 +210,14 @@ class Zenoh:
                 log.info("zenoh link up: %s", link)
 
     def _refuse(self, reason: str) -> None:
-        """Report that the routers have refused the certificate of another site."""
-        port = f"a connection to {self._settings.zenoh_link_listen}"
-        text = f"the certificate {reason}. If the site is known, look at rosproxy doctor there"
-        self._runtime.refusals.note("link_certificate", port, text)
+        """Report that the routers have refused the certificate of another site, or of a hub."""
+        settings = self._settings
+        at_hub = settings.zenoh_hub_listen if settings.zenoh_hub_certificate else None
+        ports = [str(at) for at in (settings.zenoh_link_listen, at_hub) if at is not None]
+        text = f"the certificate {reason}. If the proxy is known, look at rosproxy doctor there"
+        self._runtime.refusals.note(
+            "link_certificate", f"a connection to {' or '.join(ports)}", text
+        )
 
     async def _look_at_policy(self) -> None:
         """Apply changes of the policy and of the containers at ports. Report denied names."""
@@ -245,8 +263,7 @@ class Zenoh:
         link.addresses = tuple(await resolve(link.peer.host)) or link.addresses
         fault = None
         if not self.state.is_up(link):
-            files = self._sites.files
-            fault = await try_link(link, files.client if files else None)
+            fault = await try_link(link, self._client_for(link))
         if self.supervisor.failure:  # the routers do not run, so the fault of the link is unknown
             return
         # The link may have come up during the try, which takes some seconds.
@@ -254,6 +271,12 @@ class Zenoh:
         if link.note(fault, self._runtime.now()):
             state = f"down, {fault.value}" if fault else "up"
             log.info("zenoh link %s: %s", state, link)
+
+    def _client_for(self, link: Link) -> ssl.SSLContext | None:
+        """What proves the proxy to the peer of a link; None for a link without TLS."""
+        if link.is_hub:
+            return self._hub_client
+        return self._sites.files.client if link.protocol == "tls" and self._sites.files else None
 
     async def _look_for_faults(self) -> None:
         """Log each fault once, and report the fault as a problem while the fault lasts.
@@ -291,6 +314,19 @@ def _check_package() -> None:
     except metadata.PackageNotFoundError:
         text = "needs the package eclipse-zenoh. Install rosproxy[zenoh]"
         raise SettingError(_ROS_OPTION, text) from None
+
+
+def _hub_client(settings: Settings) -> ssl.SSLContext | None:
+    """What proves the proxy to other hubs; None without a certificate.
+
+    Raises SettingError for a bad certificate.
+    """
+    if settings.zenoh_hub_certificate is None:
+        return None
+    try:
+        return check_credentials(settings.zenoh_hub_certificate, (CLIENTS, SERVERS)).client
+    except Unusable as error:
+        raise SettingError("--zenoh-hub-certificate", str(error)) from None
 
 
 def _check_ports(settings: Settings) -> None:

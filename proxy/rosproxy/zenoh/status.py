@@ -73,6 +73,8 @@ class ZenohState(Collector):
         self._left_out = 0
         hubs = dict.fromkeys(settings.zenoh_hub, True)
         peers = dict.fromkeys(settings.zenoh_peer, False)
+        listeners = (settings.zenoh_listen, settings.zenoh_hub_listen)
+        self._listen = frozenset(port for port in listeners if port is not None)
         self.links = [Link(peer, now(), is_hub) for peer, is_hub in (peers | hubs).items()]
         for site in dict.fromkeys(settings.zenoh_link):
             self.links.append(Link(site.peer, now(), protocol=site.protocol))
@@ -84,7 +86,9 @@ class ZenohState(Collector):
         """
         self._sessions = tuple(self._sessions_of(report.routers))
         if (port := self._settings.zenoh_link_listen) and report.routers:
-            at = [at for router in report.routers for at in router.locators]
+            at = report.routers[-2:][
+                0
+            ].locators  # the last is the hub, which may listen by TLS, too
             self._link_listens = any(locator.startswith(f"{port.protocol}/") for locator in at)
         self._hub_routers = tuple(
             ends
@@ -102,10 +106,10 @@ class ZenohState(Collector):
 
     def is_up(self, link: Link) -> bool:
         """Whether the routers run, and have a session with the peer of a link."""
-        settings = self._settings
-        listen = settings.zenoh_listen
+        at_links = self._settings.zenoh_link_listen
+        listen = self._listen
         if link.protocol != "tcp":
-            listen = settings.zenoh_link_listen.port if settings.zenoh_link_listen else None
+            listen = frozenset([at_links.port] if at_links else [])
         return not self._process.failure and is_linked(
             link.peer, link.addresses, self._hub_routers, listen
         )

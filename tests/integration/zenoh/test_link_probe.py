@@ -1,4 +1,4 @@
-"""The tries to connect to another site by TLS: the faults that a connection shows."""
+"""The tries to connect to another site or hub by TLS: the faults that a connection shows."""
 
 import contextlib
 import socket
@@ -10,10 +10,19 @@ from pathlib import Path
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.zenoh import link_probe
+from rosproxy.runtime import Runtime
+from rosproxy.setting_kinds import Credentials, SettingError, read_hub_certificate
+from rosproxy.zenoh import link_probe, stack
+from rosproxy.zenoh.certificates import CLIENTS, SERVERS, check_credentials
 from rosproxy.zenoh.link_probe import try_link
 from rosproxy.zenoh.links import Link, LinkFault
-from tests.certificates import CA, CERTIFICATE, DAY, KEY, SERVERS, Authority
+from rosproxy.zenoh.stack import Zenoh
+from rosproxy_operator.kubernetes.proxies.hub_certificate import hub_certificate
+from rosproxy_operator.kubernetes.resources.model import Name
+from rosproxy_operator.kubernetes.resources.names import hub_address
+from tests.certificates import CA, CERTIFICATE, DAY, KEY, Authority
+from tests.certificates import SERVERS as FOR_SERVERS
+from tests.run_options import settings_of
 
 HOST = "127.0.2.9"
 AUTHORITY = Authority()
@@ -29,7 +38,7 @@ def context(folder: Path, kind: int) -> ssl.SSLContext:
 
 
 @contextlib.contextmanager
-def site(tls: ssl.SSLContext | None) -> Iterator[Link]:
+def site(tls: ssl.SSLContext | None, name: str = "cloud.example") -> Iterator[Link]:
     """A server that waits for the first message of zenoh, as a link to this server.
 
     The server has a thread, because asyncio sends no alerts of TLS.
@@ -39,7 +48,7 @@ def site(tls: ssl.SSLContext | None) -> Iterator[Link]:
         thread.start()
         port = listening.getsockname()[1]
         try:
-            yield Link(HostPort("cloud.example", port), 0.0, protocol="tls", addresses=(HOST,))
+            yield Link(HostPort(name, port), 0.0, protocol="tls", addresses=(HOST,))
         finally:
             listening.shutdown(socket.SHUT_RDWR)
             thread.join()
@@ -81,7 +90,7 @@ def too_early(folder: Path) -> None:
 
 
 def for_servers(folder: Path) -> None:
-    AUTHORITY.write(folder, "cloud.example", usage=SERVERS)
+    AUTHORITY.write(folder, "cloud.example", usage=FOR_SERVERS)
 
 
 def foreign(folder: Path) -> None:
@@ -126,3 +135,69 @@ async def test_a_program_without_tls(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert await try_link(link, client) is LinkFault.NO_QUIC_SESSION
     link.addresses = ()
     assert await try_link(link, client) is LinkFault.UNRESOLVABLE
+
+
+ZENOH = Name("robots", "zenoh")
+HUB = hub_address(ZENOH, "two").host
+HUB_KEY = bytes(32)
+
+
+def credentials_of(key: bytes = HUB_KEY, of: Name = ZENOH) -> Credentials:
+    credentials = read_hub_certificate(hub_certificate(key, of))
+    assert credentials is not None
+    return credentials
+
+
+def hub_context(credentials: Credentials, folder: Path) -> ssl.SSLContext:
+    """A server that demands a certificate of the same CA, as a hub does."""
+    (folder / CERTIFICATE).write_bytes(credentials.certificate)
+    (folder / KEY).write_bytes(credentials.key)
+    (folder / CA).write_bytes(credentials.ca)
+    return context(folder, ssl.PROTOCOL_TLS_SERVER)
+
+
+@pytest.mark.parametrize(
+    ("there", "name", "fault"),
+    [
+        (credentials_of(), HUB, LinkFault.NO_SESSION),
+        (credentials_of(b"1" * 32), HUB, LinkFault.PEER_FOREIGN),
+        (credentials_of(of=Name("robots", "arm")), HUB, LinkFault.PEER_FOREIGN),
+        (credentials_of(), "hub.example", LinkFault.PEER_OTHER_NAME),
+        (None, HUB, LinkFault.NO_TLS),
+    ],
+    ids=["same", "other key", "other RosProxy", "other name", "no certificate"],
+)
+async def test_what_a_handshake_with_a_hub_shows(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    there: Credentials | None,
+    name: str,
+    fault: LinkFault,
+) -> None:
+    monkeypatch.setattr(link_probe, "HANDSHAKE_TIMEOUT_S", 0.3 if there is None else 5.0)
+    own = check_credentials(credentials_of(), (CLIENTS, SERVERS)).client
+    with site(hub_context(there, tmp_path) if there else None, name) as link:
+        link.protocol = "tcp"
+        link.is_hub = True
+        assert await try_link(link, own) is fault
+
+
+async def test_a_key_of_another_certificate_is_refused_at_the_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(stack, "_check_package", lambda: None)
+    own = credentials_of()
+    mixed = (credentials_of(b"1" * 32).key, own.certificate, own.ca)
+    variables = {
+        "ROSPROXY_ROS": "zenoh",
+        "ROSPROXY_BIND": HOST,
+        "ROSPROXY_ZENOH_HUB_CERTIFICATE": b"".join(mixed).decode(),
+    }
+    zenoh = Zenoh(Runtime(settings_of(variables)))
+    for start in (zenoh.start, zenoh.try_ports):
+        with pytest.raises(
+            SettingError, match="--zenoh-hub-certificate: the key does not belong"
+        ) as caught:
+            await start()
+        assert "PRIVATE" not in str(caught.value)
+    await zenoh.stop()

@@ -336,11 +336,11 @@ async def test_new_files_restart_the_router_of_links_alone(
 
 async def test_a_foreign_certificate_of_another_site_is_told(make: Make, files: Path) -> None:
     zenoh = linked(make, files, zenoh_link_listen="tls/47449")
-    zenoh._refuse("is of a CA that is not in the CA file")
+    zenoh._refuse("is of a CA that this proxy does not trust")
     (problem,) = zenoh._runtime.problems.all()
     assert problem.subject == "refused: link certificate"
     assert problem.text.startswith(
-        "from a connection to tls/47449: the certificate is of a CA that is not in the CA file"
+        "from a connection to tls/47449: the certificate is of a CA that this proxy does not trust"
     )
 
 

@@ -16,6 +16,7 @@ from rosproxy.admin.status_document import (
 )
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.doctor.rules import diagnose
+from rosproxy.zenoh.links import LinkFault
 
 GOOD = ZenohStatus(
     ports="7448-7467",
@@ -69,6 +70,13 @@ def test_a_hub_that_is_away_is_a_note() -> None:
     assert f"{told[1].subject}: {told[1].text}" == (
         "zenoh hub b: not linked (refused). The hub tries again"
     )
+
+
+def test_a_hub_without_the_certificate_is_one_error() -> None:
+    links = (ZenohLinkStatus("b", error=LinkFault.PEER_FOREIGN.value, since=60.0, hub=True),)
+    told = findings(ZenohStatus(links=links, sessions=GOOD.sessions))
+    assert [finding.severity for finding in told] == [Severity.ERROR, Severity.OK]
+    assert told[0].subject == "zenoh hub b"
 
 
 def test_names_that_the_user_asks_for() -> None:

@@ -236,7 +236,7 @@ def test_a_link_to_another_site_says_why_it_is_down() -> None:
     down = replace(REFUSED, protocol="tls", error=LinkFault.PEER_FOREIGN.value)
     router = made(links=(down,))["nodes"]["router tls/robot:7447"]
     assert router["state"] == "broken"
-    assert "of a CA that is not in the CA file" in router["text"]
+    assert "of a CA that this proxy does not trust" in router["text"]
     file = ZenohCertificateStatus("/c/tls.crt", ends_in=86400.0)
     (finding,) = made(certificates=(file,))["findings"]
     assert finding["subject"] == "zenoh file /c/tls.crt"

@@ -70,6 +70,17 @@ def test_a_link_has_time_to_come_up() -> None:
 def test_a_hub_that_is_away_is_no_fault() -> None:
     hub = replace(LINK, up=False, error="refused", hub=True)
     assert not [*faults(replace(GOOD, links=(LINK, hub)))]
+    unseen = replace(hub, error="no session")  # behind NAT, the other side may see the session
+    assert not [*faults(replace(GOOD, links=(LINK, unseen)))]
+
+
+def test_a_hub_without_the_certificate_is_a_fault() -> None:
+    hub = replace(LINK, up=False, error=LinkFault.PEER_FOREIGN.value, hub=True)
+    (finding,) = faults(replace(GOOD, links=(hub,)))
+    assert finding.severity is Severity.ERROR
+    assert finding.subject == "zenoh hub robot:7447"
+    assert "of a CA that this proxy does not trust" in finding.text
+    assert "--zenoh-hub-certificate" in finding.fix
 
 
 def test_peers_of_two_containers_at_a_port_are_told() -> None:
@@ -100,13 +111,13 @@ FILE = ZenohCertificateStatus("/run/certificates/tls.crt", ends_in=CERTIFICATE_W
         (LinkFault.NO_TLS, "does not speak TLS", "links between sites"),
         (LinkFault.NO_QUIC_SESSION, "a firewall drops UDP", "tls/ in place of quic/"),
         (LinkFault.NO_SESSION, "accepts the certificate", "P-256"),
-        (LinkFault.PEER_EXPIRED, "certificate of the other site, or its CA, has exp", "renew"),
+        (LinkFault.PEER_EXPIRED, "certificate of the other proxy, or its CA, has exp", "renew"),
         (LinkFault.PEER_TOO_EARLY, "not valid yet", "clocks"),
-        (LinkFault.PEER_FOREIGN, "of a CA that is not in the CA file", "add its CA"),
+        (LinkFault.PEER_FOREIGN, "of a CA that this proxy does not trust", "add its CA"),
         (LinkFault.PEER_OTHER_NAME, "for another host name", "subjectAltName"),
         (LinkFault.PEER_INVALID, "not valid for a TLS server", "serverAuth"),
         (LinkFault.OWN_EXPIRED, "refuses the certificate of this proxy as expired", "renew"),
-        (LinkFault.OWN_FOREIGN, "not in the CA file there", "certificate of that CA"),
+        (LinkFault.OWN_FOREIGN, "the other proxy does not trust", "certificate of that CA"),
         (LinkFault.OWN_REFUSED, "refuses the certificate of this proxy", "status there"),
     ],
 )

@@ -10,8 +10,8 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import parse_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import LinkPort, SiteLink, TopicLimit
-from rosproxy.zenoh.link_router import Credentials, LinkPlan, check_limits
+from rosproxy.setting_kinds import Credentials, LinkPort, SiteLink, TopicLimit
+from rosproxy.zenoh.link_router import LinkPlan, check_limits
 from rosproxy.zenoh.router_configs import RouterPlan
 
 CREDENTIALS = Credentials(b"certificate", b"secret key", b"authority")
@@ -45,7 +45,8 @@ def test_the_router_dials_the_site_and_the_hub() -> None:
 
 
 def test_both_sides_have_to_show_certificates() -> None:
-    tls = config(LinkPort("quic", 7447))["transport/link/tls"]
+    made = config(LinkPort("quic", 7447))
+    tls = {key.rpartition("/")[2]: value for key, value in made.items() if "/tls/" in key}
     assert tls["enable_mtls"]
     assert tls["verify_name_on_connect"]
     assert tls["close_link_on_expiration"]

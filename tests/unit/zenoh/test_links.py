@@ -13,20 +13,20 @@ ADDRESSES = ("192.0.2.7", "fd00::7")
 @pytest.mark.parametrize(
     ("local", "remote", "listen", "expected"),
     [
-        (HostPort("172.18.0.2", 40000), HostPort("192.0.2.7", 7447), None, True),
-        (HostPort("fd00::2", 40000), HostPort("fd00::7", 7447), None, True),
-        (HostPort("172.18.0.2", 40000), HostPort("192.0.2.8", 7447), None, False),
+        (HostPort("172.18.0.2", 40000), HostPort("192.0.2.7", 7447), 7449, True),
+        (HostPort("fd00::2", 40000), HostPort("fd00::7", 7447), 7449, True),
+        (HostPort("172.18.0.2", 40000), HostPort("192.0.2.8", 7447), 7449, False),
         # Another router of the same machine.
-        (HostPort("172.18.0.2", 40000), HostPort("192.0.2.7", 7448), None, False),
+        (HostPort("172.18.0.2", 40000), HostPort("192.0.2.7", 7448), 7449, False),
         # The peer has dialed the hub.
         (HostPort("172.18.0.2", 7447), HostPort("192.0.2.7", 50000), 7447, True),
     ],
 )
 def test_a_link_is_a_session_with_the_peer(
-    local: HostPort, remote: HostPort, listen: int | None, expected: bool
+    local: HostPort, remote: HostPort, listen: int, expected: bool
 ) -> None:
-    assert is_linked(PEER, ADDRESSES, [Ends(local, remote)], listen) is expected
-    assert not is_linked(PEER, (), [Ends(local, remote)], listen)
+    assert is_linked(PEER, ADDRESSES, [Ends(local, remote)], [listen]) is expected
+    assert not is_linked(PEER, (), [Ends(local, remote)], [listen])
 
 
 def test_two_routers_that_dial_each_other_have_two_connections() -> None:
@@ -35,8 +35,8 @@ def test_two_routers_that_dial_each_other_have_two_connections() -> None:
         Ends(HostPort("10.244.0.2", 7447), HostPort("10.88.0.12", 50000)),
         Ends(HostPort("10.244.0.2", 50001), HostPort("192.0.2.7", 7447)),
     ]
-    assert is_linked(PEER, ADDRESSES, ends, 7447)
-    assert not is_linked(PEER, ADDRESSES, ends[:1], 7447)
+    assert is_linked(PEER, ADDRESSES, ends, [7447])
+    assert not is_linked(PEER, ADDRESSES, ends[:1], [7447])
 
 
 def test_a_link_knows_since_when_it_is_up_or_down() -> None:

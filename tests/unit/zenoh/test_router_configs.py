@@ -1,11 +1,13 @@
 """The configurations of the routers: which router listens where, and which router dials which."""
 
+import base64
 import json
 
 import pytest
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.setting_kinds import Credentials
 from rosproxy.zenoh.router_configs import RouterConfig, RouterPlan
 
 PORTS = PortRange(7448, 7449)
@@ -41,6 +43,39 @@ def test_the_hub_reaches_routers_at_the_bound_address(bind: str, listens: str, d
     hub = RouterPlan(bind, PORTS, 7447, ()).configs({})[-1]
     assert endpoints(hub, "listen") == [listens]
     assert endpoints(hub, "connect")[0] == dialed
+
+
+HUBS = (HostPort("hub-b.hubs.svc", 7447), HostPort("robot", 7447))
+
+
+def test_hubs_without_a_certificate_use_plain_tcp() -> None:
+    peers = (HostPort("robot", 7447), HostPort("arm", 7447))
+    plan = RouterPlan("0.0.0.0", PORTS, None, peers, hub_listen=7446, hubs=HUBS)
+    hub = plan.configs({})[-1]
+    assert endpoints(hub, "listen") == ["tcp/0.0.0.0:7446"]
+    outside = ["tcp/arm:7447", "tcp/hub-b.hubs.svc:7447", "tcp/robot:7447"]
+    assert endpoints(hub, "connect")[2:] == outside
+    assert not any("tls" in key for key in hub)
+
+
+def test_hubs_with_a_certificate_demand_the_same_of_other_hubs_alone() -> None:
+    certificate = Credentials(b"its certificate", b"the key", b"the CA")
+    plan = RouterPlan(
+        "::", PORTS, 7449, HUBS[1:], hub_listen=7447, hubs=HUBS[:1], certificate=certificate
+    )
+    *routers, hub = plan.configs({})
+    assert endpoints(hub, "listen") == ["tcp/[::]:7449", "tls/[::]:7447"]
+    assert endpoints(hub, "connect")[2:] == ["tcp/robot:7447", "tls/hub-b.hubs.svc:7447"]
+    tls = {key[len("transport/link/tls/") :]: v for key, v in hub.items() if "/tls/" in key}
+    assert tls["enable_mtls"] == tls["verify_name_on_connect"] == "true"
+    decoded = {k: base64.b64decode(json.loads(v)) for k, v in tls.items() if k.endswith("base64")}
+    assert decoded == {
+        "root_ca_certificate_base64": b"the CA",
+        **dict.fromkeys(("listen_private_key_base64", "connect_private_key_base64"), b"the key"),
+        "listen_certificate_base64": b"its certificate",
+        "connect_certificate_base64": b"its certificate",
+    }
+    assert not any("tls" in key for router in routers for key in router)
 
 
 def test_every_value_is_json() -> None:

@@ -80,7 +80,8 @@ class ProxySite(msgspec.Struct, frozen=True):
     ``master`` is the real master for the proxy's settings. The ``uri`` is set even if the master is
     a Service. If ``address`` is empty, the proxy resolves the host name. If ``publish`` is 0, the
     proxy does not publish the master. ``relay_secret`` is the shared secret of the proxy and the
-    LAN relay.
+    LAN relay. ``hub_certificate`` has the key and the certificate that the hubs of a RosProxy for
+    rmw_zenoh share.
 
     Only the site of a new proxy has ``peers`` and ``hubs``. ``peers`` has the ROS 2 peers: the
     peers that the RosProxy names, and the proxies on other nodes. ``hubs`` has the proxies for
@@ -96,6 +97,7 @@ class ProxySite(msgspec.Struct, frozen=True):
     peers: tuple[str, ...] = ()
     relay_secret: str = ""
     hubs: tuple[str, ...] = ()
+    hub_certificate: str = ""
 
     @property
     def own_ports(self) -> PortRange:
@@ -173,7 +175,7 @@ def proxy_fingerprint(site: ProxySite, settings: ClusterSettings) -> str:
     """
     rosproxy = site.rosproxy
     inputs = (rosproxy.uid, rosproxy.spec, site.node, site.advertise_host, site.ports, site.master)
-    key = (*inputs, site.token_hash, site.relay_secret, settings)
+    key = (*inputs, site.token_hash, site.relay_secret, site.hub_certificate, settings)
     name = proxy_id(rosproxy.id, site.node.name)
     cached = _FINGERPRINTS.get(name)
     if cached is None or cached[0] != key:
@@ -501,7 +503,8 @@ def _zenoh_settings_fields(site: ProxySite, spec: ZenohSpec) -> Mapping[str, Any
         "zenoh_ports": ROUTERS,
         "zenoh_peer": spec.peers,
         "zenoh_hub": site.hubs,
-        "zenoh_listen": HUB_PORT,
+        "zenoh_hub_listen": HUB_PORT,
+        "zenoh_hub_certificate": site.hub_certificate,
     }
 
 

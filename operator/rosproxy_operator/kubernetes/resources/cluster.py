@@ -241,6 +241,7 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     From the operator itself:
 
     - ``key``: the key of the proxies' tokens.
+    - ``hub_certificates``: key, certificate and CA of the hubs of each RosProxy for rmw_zenoh.
     - ``reports``: the proxies' reports, by the uid of the pod.
     - ``failures``: the API server's errors about actions that failed at the last try, by RosProxy
       and object.
@@ -265,6 +266,7 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     policies_error: str = ""
     vanished: Mapping[ProxyPlace, float] = {}
     key: bytes = b""
+    hub_certificates: Mapping[Name, str] = {}
     reports: Mapping[str, ProxyReport] = {}
     unusable: Mapping[Name, InvalidRosProxy] = {}
     failures: Mapping[Name, Mapping[Name, str]] = {}

@@ -145,14 +145,18 @@ def hubs_service_id(rosproxy: Name) -> Name:
     return Name(rosproxy.namespace, f"{_HUBS_PREFIX}{rosproxy.name}")
 
 
+def hub_domain(rosproxy: Name) -> str:
+    """Return the part that the DNS names of a RosProxy's hubs share."""
+    hubs = hubs_service_id(rosproxy)
+    return f"{hubs.name}.{hubs.namespace}.svc"
+
+
 def hub_address(rosproxy: Name, node: str) -> HostPort:
     """Return the name and port at which the hubs of other nodes reach the hub on a node.
 
     The name stays the same when the proxy's pod is recreated with another address.
     """
-    hubs = hubs_service_id(rosproxy)
-    host = f"{proxy_id(rosproxy, node).name}.{hubs.name}.{hubs.namespace}.svc"
-    return HostPort(host, HUB_PORT)
+    return HostPort(f"{proxy_id(rosproxy, node).name}.{hub_domain(rosproxy)}", HUB_PORT)
 
 
 def policy_id(rosproxy: Name) -> Name:

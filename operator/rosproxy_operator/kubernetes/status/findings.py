@@ -43,8 +43,8 @@ NO_PEER = "PeerUnreachable"
 WARNS = "ProxyWarns"
 REFUSES = "PolicyRefused"
 _MOST_TEXT_CHARACTERS = 600
-_ZENOH_PEER = "zenoh peer "
-"""The beginning of a problem about a router outside (rosproxy.zenoh.findings)."""
+_OF_ZENOH_LINKS = {"zenoh peer ": NO_PEER, "zenoh hub ": "HubRefused"}
+"""The reason for a problem about a link of the hub, by its beginning (rosproxy.zenoh.findings)."""
 _UNRESOLVED = "can't be resolved"
 """Part of the error of a proxy about a host name (rosproxy.net.http_client)."""
 
@@ -200,8 +200,9 @@ def _answered(
 
 def _told(rosproxy: RosProxy, subject: str, problem: str) -> ClusterFinding:
     """The finding for a problem that a proxy reports."""
-    if problem.startswith(_ZENOH_PEER):
-        return finding(rosproxy, NO_PEER, bounded(problem, _MOST_TEXT_CHARACTERS), subject=subject)
+    reason = next((r for begin, r in _OF_ZENOH_LINKS.items() if problem.startswith(begin)), "")
+    if reason:
+        return finding(rosproxy, reason, bounded(problem, _MOST_TEXT_CHARACTERS), subject=subject)
     return ClusterFinding(subject, problem, fatal=False, reason=WARNS, of=rosproxy.id)
 
 

@@ -24,8 +24,11 @@ from rosproxy.zenoh.findings import (
     place,
     shared_limits,
 )
-from rosproxy.zenoh.links import LinkFault
+from rosproxy.zenoh.links import CERTIFICATE_FAULTS, LinkFault
 from rosproxy.zenoh.pairs import Graph, troubles
+
+_NOT_NOTED = CERTIFICATE_FAULTS | {LinkFault.NOT_TRIED.value}
+"""Errors of hubs that are unknown yet, or that `faults` reports."""
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
@@ -59,7 +62,7 @@ def _outside(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
     for link in zenoh.links:
         if link.up:
             yield ok("link", link_subject(link), "linked")
-        elif link.hub and link.error != LinkFault.NOT_TRIED.value:
+        elif link.hub and link.error not in _NOT_NOTED:
             text = f"not linked ({link.error}). The hub tries again"
             yield note("link", link_subject(link), text, how_to("zenoh hub"))
     if not zenoh.links and zenoh.listen is None and not zenoh.link_listen:

@@ -1,4 +1,4 @@
-"""Lines that the zenoh library logs about certificates of links to other sites.
+"""Lines that the zenoh library logs about certificates of links to other sites and to hubs.
 
 The library logs each connection that it refuses, without the address of the other end. The texts
 are those of rustls (rustls/src/error.rs).
@@ -11,8 +11,8 @@ LEVELS = "error,zenoh_link_tls=warn,zenoh_link_quic=warn"
 _ABOUT_LINKS = re.compile(r"WARN.*zenoh_link_(?:tls|quic)")
 _REFUSALS = (
     (
-        re.compile(r"invalid peer certificate: UnknownIssuer"),
-        "is of a CA that is not in the CA file",
+        re.compile(r"invalid peer certificate: (?:UnknownIssuer|BadSignature)"),
+        "is of a CA that this proxy does not trust",
     ),
     (re.compile(r"invalid peer certificate: certificate expired"), "has expired"),
     (re.compile(r"invalid peer certificate: certificate not valid yet"), "is not valid yet"),
@@ -27,5 +27,5 @@ def is_about_links(line: str) -> bool:
 
 
 def certificate_refusal(line: str) -> str | None:
-    """Why the library has refused the certificate of another site; None for other warnings."""
+    """Why the library has refused the certificate of another proxy; None for other warnings."""
     return next((text for pattern, text in _REFUSALS if pattern.search(line)), None)

@@ -222,7 +222,8 @@ def test_a_proxy_understands_its_variables_and_has_no_hostport():
     settings = settings_of(env_of(body))
     assert settings.ros == ("zenoh",)
     assert settings.zenoh_ports == names.ROUTERS
-    assert settings.zenoh_listen == names.HUB_PORT
+    assert settings.zenoh_hub_listen == names.HUB_PORT
+    assert settings.zenoh_listen is None
     assert settings.zenoh_peer == (HostPort("192.0.2.7", 7447), HostPort("robot", 7448))
     assert settings.zenoh_hub == (HostPort("hub.hubs.ros.svc", 7447),)
     assert body["spec"]["containers"][0]["ports"] == []
@@ -654,6 +655,16 @@ def test_the_doctor_says_which_peer_is_down():
     (peers,) = (f for f in reported if f.text.startswith("PeersReachable is False: "))
     assert FAULT in peers.text
     assert "spec.peers" in peers.fix
+
+
+def test_a_hub_that_refuses_is_told_with_an_event():
+    of = ofz()
+    problem = "zenoh hub two.hubs:7447: the program there does not prove itself"
+    plan = look(answered(of, replace(report(STATUS), problems=(problem,))))
+    assert conditions(plan)["Degraded"] == ("True", "HubRefused")
+    assert conditions(plan)["Ready"] == ("True", "Serving")
+    (text,) = told(plan, "HubRefused")
+    assert text.endswith(problem)
 
 
 def test_peers_that_are_linked():

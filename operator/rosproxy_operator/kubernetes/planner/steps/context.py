@@ -167,7 +167,16 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
     published = replace(master, publish=publish)
     token_hash = hash_token(token) if token else ""
     relay_secret = relay_secret_of(context.observed.key, name, node.name)
-    return ProxySite(rosproxy, node, host, ports, published, token_hash, relay_secret=relay_secret)
+    return ProxySite(
+        rosproxy,
+        node,
+        host,
+        ports,
+        published,
+        token_hash,
+        relay_secret=relay_secret,
+        hub_certificate=context.observed.hub_certificates.get(place.of, ""),
+    )
 
 
 def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
