@@ -128,8 +128,8 @@ FIXES = {
         "name in --zenoh-hub of the others, and check the clocks of the hosts",
         "give all proxies of the graph a valid --zenoh-hub-certificate of the same CA, with the "
         "name in --zenoh-hub of the others, and check the clocks of the hosts",
-        "the operator makes this certificate from its key, the Secret with a name that ends in -key. "
-        "After a change of the key, wait until the operator has recreated all proxies of the "
+        "the operator makes this certificate from its key, a Secret with a name that ends in "
+        "-key. After a change of the key, wait until the operator has recreated all proxies of the "
         "RosProxy. If the finding stays, delete the pods of both proxies, and check that no other "
         "pod has the labels of a proxy",
     ),

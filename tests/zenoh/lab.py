@@ -100,6 +100,13 @@ class Lab:
         override = f'mode="client";connect/endpoints=["tcp/{proxy}:{port}"]'
         return {"ZENOH_CONFIG_OVERRIDE": override}
 
+    def as_laptop(self) -> dict[str, str]:
+        """The variable that makes nodes clients of the published port for outside."""
+        override = (
+            f'mode="client";connect/endpoints=["tcp/{self.topology.plan.host}:{ROUTER_PORT}"]'
+        )
+        return {"ZENOH_CONFIG_OVERRIDE": override}
+
     def redirect(self, role: str) -> None:
         """Lead localhost:7447 in a container to the port of the container at the proxy."""
         place = self.topology.places[role]

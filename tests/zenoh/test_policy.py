@@ -19,6 +19,7 @@ LISTS = (
     "allow call /c/al*; deny call *"
 )
 """The same for these names, as lists of what is allowed."""
+ENDS = ("denied", "allowed")
 BACK_WITHIN_S = 15.0
 
 
@@ -71,10 +72,9 @@ def test_denied_names_stop_at_the_container(lab: Lab, version: str, far: str, ru
     for graph in graphs.values():
         graph.wait_for("^ready")
     ways = {"p": ("c1", far), "s": (far, "c1"), "f": (far, "c1"), "c": ("c1", far)}
-    ends = ("denied", "allowed")
     pairs = {
         (kind, end): Pair(lab, version, *way, f"{kind}/{end}")
-        for end in ends
+        for end in ENDS
         for kind, way in ways.items()
     }
     for (_, end), pair in pairs.items():
@@ -168,6 +168,33 @@ def test_a_change_of_rules_concerns_one_container(lab: Lab, version: str) -> Non
     # No node inside has found the port of the hub.
     at_hub = {s.remote.rpartition(":")[0] for s in lab.zenoh().sessions if s.port is None}
     assert at_hub == {lab.topology.plan.robot}
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_rules_hold_for_laptops(lab: Lab, version: str) -> None:
+    """A laptop gets no denied name of the robot either, since both are outside."""
+    rules = "deny publish /p/denied; deny subscribe /s/denied; deny serve /f/denied"
+    started(lab, version, "--zenoh-listen", "7447", "--policy", rules)
+    laptop = lab.as_laptop()
+    heard = {}
+    for source in ("c1", "out"):
+        for end in ("denied", "allowed"):
+            topic = f"p/{end}/{source}" if end == "allowed" else "p/denied"
+            heard[source, end] = lab.node(version, "out", "sub", topic, **laptop)
+            lab.node(version, source, "pub", topic)
+    calls = {end: lab.node(version, "out", "call", f"f/{end}", **laptop) for end in ENDS}
+    taken = {end: lab.node(version, "c1", "sub", f"s/{end}") for end in ENDS}
+    for end in ENDS:
+        lab.node(version, "c1", "serve", f"f/{end}")
+        lab.node(version, "out", "pub", f"s/{end}", **laptop)
+    for source in ("c1", "out"):
+        heard[source, "allowed"].wait_for_count("^got hello ", 3, 30)
+    calls["allowed"].wait_for_count("^answer of ", 3, 30)
+    taken["allowed"].wait_for_count("^got hello ", 3, 30)
+    silent = [*(heard[source, "denied"] for source in ("c1", "out")), calls["denied"]]
+    for node in (*silent, taken["denied"]):
+        assert "hello" not in node.output()
+        assert "answer" not in node.output()
 
 
 def test_the_policy_outlives_routers_and_proxy(lab: Lab) -> None:

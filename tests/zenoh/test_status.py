@@ -1,4 +1,4 @@
-"""Routers, sessions and nodes in the proxy's status, and laptops that reach the hub."""
+"""Routers, sessions and nodes in the proxy's status, and laptops that reach the proxy."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ VERSION = "1.6.2"
 def test_a_laptop_reaches_containers_at_the_published_port(lab: Lab) -> None:
     lab.start_proxy("--zenoh-listen", str(ROUTER_PORT), with_robot=False)
     lab.redirect("c1")
-    override = f'mode="client";connect/endpoints=["tcp/{lab.topology.plan.host}:{ROUTER_PORT}"]'
-    subscriber = lab.node(VERSION, "out", "sub", ZENOH_CONFIG_OVERRIDE=override)
+    subscriber = lab.node(VERSION, "out", "sub", **lab.as_laptop())
     publisher = lab.node(VERSION, "c1", "pub")
     subscriber.wait_for_count("^got hello ", 5, timeout=30)
     wait_until("both nodes are known", lambda: len(lab.zenoh().nodes) == 2, 10)

@@ -1,11 +1,12 @@
-"""The configurations of the proxy's routers: a router for each container, and the hub.
+"""The configurations of the proxy's routers: for each container, for outside, and the hub.
 
 A router never passes data between two peers of this router: zenoh expects such peers to reach each
 other directly. rmw_zenoh makes each node a peer that listens on loopback. So nodes of the same
 container reach each other, and nodes of two containers do not. With a router for each container,
 two containers are peers of two routers, and routers pass data on to each other. The hub is linked
 to all these routers, and to routers outside. The hub dials the routers of containers by sockets in
-a directory. So the access control of such a router distinguishes the hub from nodes.
+a directory. So the access control of such a router distinguishes the hub from nodes. Laptops and
+routers of other sites that connect to the proxy have one more router of this kind.
 
 Links to other sites have a router of their own, which dials the hub (`rosproxy.zenoh.link_router`).
 
@@ -57,11 +58,11 @@ _COMMON: dict[str, Any] = {
 class RouterPlan:
     """Where the routers listen, and what they dial.
 
-    ``listen`` is the port of the hub for outside, ``peers`` are routers that the hub dials.
+    ``listen`` is the port of the router for outside, ``peers`` are routers that the hub dials.
     ``hub_listen`` is the port of the hub for the hubs of other proxies, ``hubs`` are such hubs.
     With ``certificate``, the hubs use TLS, and each proves itself to the other.
-    ``directory`` has the sockets by which the hub dials the routers of containers. If empty, the
-    hub dials by TCP, and the routers can have no access control.
+    ``directory`` has the sockets by which the hub dials the other routers of the proxy. If empty,
+    the hub dials by TCP, and the routers can have no access control.
     """
 
     bind: str
@@ -74,6 +75,11 @@ class RouterPlan:
     certificate: Credentials | None = None
 
     @property
+    def all_ports(self) -> list[int]:
+        """The ports for containers, and the port for outside."""
+        return [*self.ports.ports(), *([] if self.listen is None else [self.listen])]
+
+    @property
     def hub_socket(self) -> str:
         """The endpoint at which the hub waits for the router of the links to other sites."""
         return f"{HUB_PROTOCOL}/{self.directory}/hub"
@@ -81,7 +87,7 @@ class RouterPlan:
     def configs(
         self, access: Mapping[int, object], links: RouterConfig | None = None
     ) -> list[RouterConfig]:
-        """The configurations of a router for each port, in order, and of the hub as the last.
+        """The configurations of a router for each of `all_ports`, in order, and then of the hub.
 
         ``access`` has the access control of routers by port. ``links`` is the configuration of the
         router of the links to other sites, which gets the place before the hub. Raises ValueError
@@ -95,30 +101,29 @@ class RouterPlan:
                 [],
                 _access(access.get(port)),
             )
-            for port in self.ports.ports()
+            for port in self.all_ports
         ]
         return [*routers, *([links] if links else []), self._hub(bool(links))]
 
     def _hub(self, has_links: bool) -> RouterConfig:
         """The configuration of the hub.
 
-        The hub dials the other routers. So without the two ports, others reach no port of the hub.
+        The hub dials the other routers. So without ``hub_listen``, others reach no port of the hub.
         """
         protocol = _TLS if self.certificate else NODE_PROTOCOL
-        listeners = ((NODE_PROTOCOL, self.listen), (protocol, self.hub_listen))
-        listen = [f"{p}/{HostPort(self.bind, port)}" for p, port in listeners if port is not None]
+        hub_ports = [] if self.hub_listen is None else [HostPort(self.bind, self.hub_listen)]
+        listen = [f"{protocol}/{address}" for address in hub_ports]
         listen += [self.hub_socket] if has_links else []
         host = _LOOPBACK.get(self.bind, self.bind)
         dialed = [
             endpoint
-            for port in self.ports.ports()
+            for port in self.all_ports
             for endpoint in self._socket(port) or [_tcp(HostPort(host, port))]
         ]
         dialed += [_tcp(peer) for peer in self.peers if peer not in self.hubs]
         dialed += [f"{protocol}/{hub}" for hub in self.hubs]
-        return router_config(
-            listen, dialed, tls_values(self.certificate) if self.certificate else {}
-        )
+        tls = tls_values(self.certificate) if self.certificate else {}
+        return router_config(listen, dialed, tls)
 
     def _socket(self, port: int) -> list[str]:
         return [f"{HUB_PROTOCOL}/{self.directory}/{port}"] if self.directory else []

@@ -34,11 +34,15 @@ class InsideName(NamedTuple):
 
 
 class RouterPolicy:
-    """The layers of the policy by port, and the verdicts about the names of nodes inside."""
+    """The layers of the policy by port, and the verdicts about the names of nodes inside.
 
-    def __init__(self, policy: AccessPolicy, ports: PortRange) -> None:
+    ``ports`` are for containers, ``listen`` is the port for outside; None: there is no such port.
+    """
+
+    def __init__(self, policy: AccessPolicy, ports: PortRange, listen: int | None = None) -> None:
         self._policy = policy
         self._ports = ports
+        self._listen = listen
         self._addresses: dict[int, frozenset[str]] = {}
         self._layers: dict[int, tuple[PolicyLayer, ...]] = {}
         self._access: dict[int, object] = {}
@@ -77,6 +81,10 @@ class RouterPolicy:
             if made[layers]:
                 access[port] = made[layers]
             self._note_layers(port, layers)
+        if self._listen is not None:
+            for_all = layers_at(self._policy.layers, self._listen, ())
+            if control := access_control(for_all, outside=True):
+                access[self._listen] = control
         self._access = access
         self._access_inputs = inputs
         return access

@@ -77,7 +77,7 @@ class Zenoh:
         )
         self._hub_client: ssl.SSLContext | None = None
         runtime.policy.checks.append(self._check_layers)
-        self._policy = RouterPolicy(runtime.policy, settings.zenoh_ports)
+        self._policy = RouterPolicy(runtime.policy, settings.zenoh_ports, settings.zenoh_listen)
         self._access: dict[int, object] = {}
         self._sites = SiteLinks(settings)
         self._awaiting = bool(settings.await_policy)
@@ -213,10 +213,12 @@ class Zenoh:
         """Report that the routers have refused the certificate of another site, or of a hub."""
         settings = self._settings
         at_hub = settings.zenoh_hub_listen if settings.zenoh_hub_certificate else None
-        ports = [str(at) for at in (settings.zenoh_link_listen, at_hub) if at is not None]
+        ports = " or ".join(
+            str(port) for port in (settings.zenoh_link_listen, at_hub) if port is not None
+        )
         text = f"the certificate {reason}. If the proxy is known, look at rosproxy doctor there"
         self._runtime.refusals.note(
-            "link_certificate", f"a connection to {' or '.join(ports)}", text
+            "link_certificate", f"a connection to {ports}", text
         )
 
     async def _look_at_policy(self) -> None:

@@ -39,8 +39,8 @@ MOST_LISTED_MISMATCHES = 100
 """Mismatches that the status lists, with fair shares by the address inside. As many pairs that
 differ in durability alone are listed, too; further ones are not counted."""
 _PlacedSession = tuple[int | None, RouterSession, Ends]
-"""A session with the port of its router, and with both ends. The port is None for the hub and for
-the router of the links to other sites."""
+"""A session with the port of its router, and with both ends. The port is None for the router for
+outside, the router of the links to other sites, and the hub: the nodes of all three are outside."""
 
 
 class RouterProcess(Protocol):
@@ -86,9 +86,8 @@ class ZenohState(Collector):
         """
         self._sessions = tuple(self._sessions_of(report.routers))
         if (port := self._settings.zenoh_link_listen) and report.routers:
-            at = report.routers[-2:][
-                0
-            ].locators  # the last is the hub, which may listen by TLS, too
+            # The last router is the hub, which may listen by TLS, too.
+            at = report.routers[-2:][0].locators
             self._link_listens = any(locator.startswith(f"{port.protocol}/") for locator in at)
         self._hub_routers = tuple(
             ends
@@ -228,8 +227,9 @@ class ZenohState(Collector):
     def _sessions_of(self, routers: Sequence[RouterReport]) -> Iterator[_PlacedSession]:
         """The sessions with programs other than the routers themselves."""
         own = {router.zid for router in routers}
-        # Without a port: the router of the links to other sites, if there are any, and the hub.
-        ports = [*self._settings.zenoh_ports.ports(), None, None]
+        for_outside = [] if self._settings.zenoh_listen is None else [None]
+        for_links = [None] if self._settings.has_site_links else []
+        ports = [*self._settings.zenoh_ports.ports(), *for_outside, *for_links, None]
         for port, router in zip(ports, routers, strict=False):
             for session in router.sessions:
                 ends = ends_of(session)

@@ -161,7 +161,7 @@ def hub_context(credentials: Credentials, folder: Path) -> ssl.SSLContext:
     [
         (credentials_of(), HUB, LinkFault.NO_SESSION),
         (credentials_of(b"1" * 32), HUB, LinkFault.PEER_FOREIGN),
-        (credentials_of(of=Name("robots", "arm")), HUB, LinkFault.PEER_FOREIGN),
+        (credentials_of(of=Name("robots", "arm")), HUB, LinkFault.PEER_OTHER_NAME),
         (credentials_of(), "hub.example", LinkFault.PEER_OTHER_NAME),
         (None, HUB, LinkFault.NO_TLS),
     ],

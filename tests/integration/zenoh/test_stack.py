@@ -325,7 +325,7 @@ async def test_new_files_restart_the_router_of_links_alone(
         return "; ".join(f"{problem.subject}: {problem.text}" for problem in problems.all())
 
     key = volume / certificates.KEY
-    expected = f"zenoh file {key}: does not belong to the certificate in "
+    expected = f"zenoh file {key}: does not belong to the certificate. "
     await until(lambda: expected in told(), told)
     assert "The files that were read before stay in use" in told()
     certificates.mount(volume, AUTHORITY.write(tmp_path / "fourth"))

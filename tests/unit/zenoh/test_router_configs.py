@@ -35,14 +35,23 @@ def test_a_router_for_each_port_and_a_hub_that_dials_all() -> None:
 @pytest.mark.parametrize(
     ("bind", "listens", "dialed"),
     [
-        ("::", "tcp/[::]:7447", "tcp/[::1]:7448"),
-        ("172.18.0.2", "tcp/172.18.0.2:7447", "tcp/172.18.0.2:7448"),
+        ("::", "tcp/[::]:7450", ["tcp/[::1]:7448", "tcp/[::1]:7449", "tcp/[::1]:7450"]),
+        (
+            "127.0.0.2",
+            "tcp/127.0.0.2:7450",
+            [f"tcp/127.0.0.2:{port}" for port in range(7448, 7451)],
+        ),
     ],
 )
-def test_the_hub_reaches_routers_at_the_bound_address(bind: str, listens: str, dialed: str) -> None:
-    hub = RouterPlan(bind, PORTS, 7447, ()).configs({})[-1]
-    assert endpoints(hub, "listen") == [listens]
-    assert endpoints(hub, "connect")[0] == dialed
+def test_outside_has_a_router_that_the_hub_reaches_at_the_bound_address(
+    bind: str, listens: str, dialed: list[str]
+) -> None:
+    plan = RouterPlan(bind, PORTS, 7450, ())
+    *_, for_outside, hub = plan.configs({})
+    assert endpoints(for_outside, "listen") == [listens]
+    assert endpoints(hub, "listen") == []
+    assert endpoints(hub, "connect") == dialed
+    assert plan.all_ports == [7448, 7449, 7450]
 
 
 HUBS = (HostPort("hub-b.hubs.svc", 7447), HostPort("robot", 7447))
@@ -61,11 +70,11 @@ def test_hubs_without_a_certificate_use_plain_tcp() -> None:
 def test_hubs_with_a_certificate_demand_the_same_of_other_hubs_alone() -> None:
     certificate = Credentials(b"its certificate", b"the key", b"the CA")
     plan = RouterPlan(
-        "::", PORTS, 7449, HUBS[1:], hub_listen=7447, hubs=HUBS[:1], certificate=certificate
+        "::", PORTS, 7450, HUBS[1:], hub_listen=7447, hubs=HUBS[:1], certificate=certificate
     )
     *routers, hub = plan.configs({})
-    assert endpoints(hub, "listen") == ["tcp/[::]:7449", "tls/[::]:7447"]
-    assert endpoints(hub, "connect")[2:] == ["tcp/robot:7447", "tls/hub-b.hubs.svc:7447"]
+    assert endpoints(hub, "listen") == ["tls/[::]:7447"]
+    assert endpoints(hub, "connect")[3:] == ["tcp/robot:7447", "tls/hub-b.hubs.svc:7447"]
     tls = {key[len("transport/link/tls/") :]: v for key, v in hub.items() if "/tls/" in key}
     assert tls["enable_mtls"] == tls["verify_name_on_connect"] == "true"
     decoded = {k: base64.b64decode(json.loads(v)) for k, v in tls.items() if k.endswith("base64")}

@@ -12,6 +12,7 @@ from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
 from rosproxy.zenoh import router_policy
+from rosproxy.zenoh.policy.access_control import access_control
 from rosproxy.zenoh.router_policy import InsideName, RouterPolicy
 
 FIRST = "172.18.0.3"
@@ -26,11 +27,13 @@ def container_layer(rules: str, address: str, *ports: int) -> PolicyLayer:
     )
 
 
-def make(*layers: PolicyLayer) -> tuple[RouterPolicy, AccessPolicy, Metrics]:
+def make(
+    *layers: PolicyLayer, listen: int | None = None
+) -> tuple[RouterPolicy, AccessPolicy, Metrics]:
     metrics = Metrics()
     refusals = Refusals(metrics, Problems(), lambda: 0.0)
     policy = AccessPolicy(layers, (), metrics, refusals)
-    return RouterPolicy(policy, PORTS), policy, metrics
+    return RouterPolicy(policy, PORTS, listen), policy, metrics
 
 
 def name(topic: str, port: int = 7448, kind: RuleKind = RuleKind.PUBLISH) -> InsideName:
@@ -57,6 +60,17 @@ def test_a_layer_holds_at_the_ports_of_its_containers(
 ) -> None:
     policy, _, _ = make(layer)
     assert sorted(policy.access()) == ports
+
+
+def test_rules_for_all_hold_at_the_port_for_outside_as_seen_from_there() -> None:
+    common = PolicyLayer("common", parse_rules("deny publish /a"))
+    policy, _, _ = make(common, container_layer("deny publish /b", FIRST, 7448), listen=7447)
+    access = policy.access()
+    assert sorted(access) == [7447, 7448, 7449, 7450]
+    assert access[7447] == access_control([common], outside=True)
+    assert access[7449] == access_control([common])
+    policy, _, _ = make(container_layer("deny publish /b", FIRST, 7448), listen=7447)
+    assert sorted(policy.access()) == [7448]
 
 
 def test_rules_follow_an_address_to_other_ports_and_stay() -> None:

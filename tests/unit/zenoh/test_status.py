@@ -40,6 +40,13 @@ def session(zid: str, mode: str, local: str, remote: str) -> RouterSession:
     return RouterSession(zid, mode, (SessionConnection(f"tcp/{local}", f"tcp/{remote}"),))
 
 
+HUB = RouterReport(
+    "03",
+    (
+        session("01", "router", "127.0.0.1:50001", "127.0.0.1:7448"),
+        session("04", "router", "172.18.0.2:50003", "192.0.2.7:7447"),
+    ),
+)
 REPORT = Report(
     (
         RouterReport(
@@ -50,13 +57,7 @@ REPORT = Report(
             ),
         ),
         RouterReport("02"),
-        RouterReport(
-            "03",
-            (
-                session("01", "router", "127.0.0.1:50001", "127.0.0.1:7448"),
-                session("04", "router", "172.18.0.2:50003", "192.0.2.7:7447"),
-            ),
-        ),
+        HUB,
     ),
     TOKENS,
     tokens_left_out=5,
@@ -74,6 +75,20 @@ def make_state(process: FakeProcess) -> ZenohState:
         link.addresses = (link.peer.host,)
     state.take(REPORT, graph_of(TOKENS))
     return state
+
+
+def test_sessions_at_the_port_for_outside_are_outside() -> None:
+    given = {"ros": ("zenoh",), "zenoh_ports": "7448-7448", "zenoh_listen": 7447}
+    state = ZenohState(parse_settings(given), FakeProcess(), lambda: 10.0)
+    laptop = session(NODE_ZID, "client", "172.18.0.2:7447", "192.0.2.7:50002")
+    node = session("bb", "peer", "172.18.0.2:7448", "172.18.0.3:50002")
+    for_hub = session("03", "router", "172.18.0.2:7447", "172.18.0.2:50001")
+    routers = (RouterReport("01", (node,)), RouterReport("02", (laptop, for_hub)), HUB)
+    state.take(Report(routers, TOKENS), graph_of(TOKENS))
+    ports = {s.zid: s.port for s in state.status().sessions}
+    assert ports == {NODE_ZID: None, "bb": 7448, "04": None}
+    assert state.container_sessions == [(7448, "172.18.0.3")]
+    assert not state.inside_names()
 
 
 def test_sessions_have_both_addresses_and_their_router() -> None:

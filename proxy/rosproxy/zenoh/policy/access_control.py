@@ -101,15 +101,30 @@ _MESSAGES = {
 }
 
 
+_SEEN_FROM_OUTSIDE = {
+    RuleKind.PUBLISH: RuleKind.SUBSCRIBE,
+    RuleKind.SUBSCRIBE: RuleKind.PUBLISH,
+    RuleKind.SERVE: RuleKind.CALL,
+    RuleKind.CALL: RuleKind.SERVE,
+}
+"""What nodes outside do with a name about which a rule allows or denies nodes inside something."""
+
+
 def access_control(
-    layers: Sequence[PolicyLayer], protocols: _Protocols = _AT_CONTAINER
+    layers: Sequence[PolicyLayer],
+    protocols: _Protocols = _AT_CONTAINER,
+    *,
+    outside: bool = False,
 ) -> dict[str, Any] | None:
     """The value ``access_control`` for a router; None if the layers deny nothing.
 
-    ``protocols``: the protocols without checks, by which nodes inside come, and those with checks.
-    Raises ValueError as `check_layers` does.
+    ``protocols``: the protocols without checks, by which the nodes of the router come, and those
+    with checks. With ``outside``, the nodes of the router are outside: what containers may publish,
+    these nodes may subscribe to, and so on. Raises ValueError as `check_layers` does.
     """
-    names = {kind: allowed_names(layers, kind) for kind in KINDS}
+    names = {
+        _SEEN_FROM_OUTSIDE[kind] if outside else kind: allowed_names(layers, kind) for kind in KINDS
+    }
     if all(allowed == ALL_NAMES for allowed in names.values()):
         return None
     free, checked = protocols

@@ -27,6 +27,8 @@ SENT = {
     RuleKind.SERVE: ("query", "ingress"),
     RuleKind.CALL: ("query", "egress"),
 }
+REVERSE = {"egress": "ingress", "ingress": "egress"}
+"""What leaves the router of a container enters the router for outside."""
 TOKENS = {
     RuleKind.PUBLISH: ("MP", "MS"),
     RuleKind.SUBSCRIBE: ("MS", "MP"),
@@ -87,6 +89,12 @@ def test_the_router_decides_as_the_rules(kind: RuleKind, rules: str, name: str) 
     inside, outside = TOKENS[kind]
     for flow, entity in (("egress", inside), ("ingress", outside)):
         assert permits(access, "liveliness_token", flow, token(name, entity), "hub") == allowed
+    at_outside = access_control(policy, outside=True)
+    assert at_outside is not None
+    message, sent = SENT[kind]
+    assert permits(at_outside, message, REVERSE[sent], data_key(name), "hub") == allowed
+    for flow, entity in (("ingress", inside), ("egress", outside)):
+        assert permits(at_outside, "liveliness_token", flow, token(name, entity), "hub") == allowed
 
 
 @given(RULES, RULES, NAMES)

@@ -20,6 +20,7 @@ COLOURED = (
     ("text", "reason"),
     [
         ("invalid peer certificate: UnknownIssuer", "is of a CA that this proxy does not trust"),
+        ("invalid peer certificate: BadSignature", "is of a CA that this proxy does not trust"),
         ("invalid peer certificate: certificate expired: verification time 17", "has expired"),
         ("invalid peer certificate: certificate not valid yet: ver", "is not valid yet"),
         ("invalid peer certificate: CaUsedAsEndEntity", "is not valid for a TLS client"),
