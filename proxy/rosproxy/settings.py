@@ -431,7 +431,8 @@ class Settings:
         int | None,
         Option(
             "rmw_zenoh: port at which laptops, and routers of other sites, connect to the proxy, "
-            "usually 7447. The [policy](../guide/zenoh.md#policy) applies there. Publish this port.",
+            "usually 7447. The [policy](../guide/zenoh.md#policy) applies there. Publish this "
+            "port.",
             kinds.PORT,
             default="off",
         ),

@@ -115,6 +115,7 @@ OPTIONS: dict[str, dict[str, Values]] = {
                 "portWindow": "11400-19999",
                 "dataPlanes": ["Auto", "Kernel"],
                 "images": ["registry.example/*"],
+                "listen": ["NodePort"],
             },
             "policy": {"rules": ["deny publish /camera/* by /driver"], "mode": "Audit"},
             "imagePullSecrets": [{"name": "registry"}],

@@ -8,6 +8,7 @@ from scripts.custom_resource_docs import custom_resource
 
 from rosproxy.access.rules import LONGEST_GLOB
 from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.policy import MOST_RULES_OF_AUTHOR
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.cluster import (
@@ -24,7 +25,7 @@ from rosproxy_operator.kubernetes.resources.spec import (
     RULE_KINDS,
     rosproxy,
 )
-from rosproxy_operator.kubernetes.status.rosproxy_status import status_of
+from rosproxy_operator.kubernetes.status.rosproxy_status import Addresses, status_of
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, words
 from tests.chart.chart import Json
 
@@ -182,11 +183,12 @@ def test_status_is_in_the_definition() -> None:
         ),
     )
     stamp = "2026-01-01T00:00:00Z"
-    status = status_of(own, states, (), "192.0.2.9", "http://robot:11311", stamp)
-    zenoh = rosproxy({**body, "spec": {"ros": "zenoh"}})
+    status = status_of(own, states, (), Addresses("192.0.2.9", "http://robot:11311"), stamp)
+    zenoh = rosproxy({**body, "spec": {"ros": "zenoh", "listen": {"type": "NodePort"}}})
     routers = ProxyReport(True, True, zenoh=ZenohReport(("/talker",), 1))
     of_zenoh = (RosProxyOnNode("n", "", ports, proxy, (pod,), routers),)
-    other_status = status_of(zenoh, of_zenoh, (), "192.0.2.9", "", stamp)
+    addresses = Addresses("192.0.2.9", "", HostPort("192.0.2.1", 31000))
+    other_status = status_of(zenoh, of_zenoh, (), addresses, stamp)
     written = {*paths(status, "status"), *paths(other_status, "status")}
     assert written <= set(STATUS)
     unused = {"status.perNode[].message", "status.conditions[].observedGeneration"}

@@ -149,6 +149,7 @@ def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
         data_planes=("auto", "kernel") if allow else ("auto", "splice", "copy"),
         images=tuple(allow.get("images", ())),
         slave_control="master" if allow else "any",
+        listen=tuple(allow.get("listen", ())),
     )
     assert settings.plan.network_policy
     operator, *peers = settings.plan.admin_from or ()

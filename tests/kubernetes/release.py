@@ -27,7 +27,11 @@ _OTHER = "rosproxy:other"
 _IMAGES: Json = {
     "image": {"repository": "rosproxy-operator", "tag": "test", "pullPolicy": "Never"},
     "proxy": {"image": {"repository": "rosproxy", "tag": "test", "pullPolicy": "Never"}},
-    "allow": {"dataPlanes": ["Auto", "Kernel", "Splice", "Copy"], "images": ["rosproxy:*"]},
+    "allow": {
+        "dataPlanes": ["Auto", "Kernel", "Splice", "Copy"],
+        "images": ["rosproxy:*"],
+        "listen": ["NodePort"],
+    },
     "crds": {"keep": False},
     "tests": {
         "image": "rosproxy-test-ros:latest",

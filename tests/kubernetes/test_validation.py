@@ -61,6 +61,15 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "rmw_zenoh with a master": ({"ros": "zenoh", "master": GOOD}, "ROS 2 has none"),
     "rmw_zenoh with ports": ({"ros": "zenoh", "ports": 64}, "has no ports on the node"),
     "rmw_zenoh with a domain": ({"ros": "zenoh", "domain": 1}, "takes peers alone"),
+    "ROS 2 with a port for laptops": (
+        {"ros": 2, "listen": {"type": "NodePort"}},
+        "listen is for rmw_zenoh",
+    ),
+    "a port for laptops of no type": ({"ros": "zenoh", "listen": {}}, "type"),
+    "a class without a load balancer": (
+        {"ros": "zenoh", "listen": {"type": "NodePort", "loadBalancerClass": "a.example/b"}},
+        "loadBalancerClass is for type: LoadBalancer",
+    ),
     "no domain": ({"ros": 2, "domain": 233}, "domain"),
     "no peer": ({"ros": 2, "peers": ["a b"]}, "peers[0]"),
     "few ports for ROS 2": ({"ros": 2, "ports": 4, "multicast": True}, "too low for ROS 2"),
@@ -97,7 +106,10 @@ def test_rules_of_a_policy_are_taken(net: Namespace) -> None:
     "spec",
     [{"ros": 2}, {"ros": "2", "domain": 0, "peers": ["robot", "192.0.2.9:11400"]},
      {"ros": "1,2", "master": GOOD, "multicast": True}, {"ros": 1, "master": GOOD},
-     {"ros": "zenoh"}, {"ros": "zenoh", "peers": ["robot:7447"], "podEgress": "Proxy"}],
+     {"ros": "zenoh"},
+     {"ros": "zenoh", "listen": {"type": "NodePort", "nodePort": 31447, "annotations": {"a": "b"}}},
+     {"ros": "zenoh", "listen": {"type": "LoadBalancer", "loadBalancerClass": "a.example/b"}},
+     {"ros": "zenoh", "peers": ["robot:7447"], "podEgress": "Proxy"}],
 )  # fmt: skip
 def test_versions_of_ros_are_taken(spec: dict[str, Any], net: Namespace) -> None:
     stored = rosproxy(net.name, **spec).body["spec"]

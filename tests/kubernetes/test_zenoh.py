@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import pytest
@@ -31,6 +32,7 @@ CABLE = "rpxzenoh"
 START = 120
 """Seconds that nodes get to start and to find each other, all at once."""
 GOT = "got hello "
+OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
 _numbers = itertools.count(1)
 
 
@@ -45,10 +47,11 @@ class Robot:
         log = self.root / "tmp/router.log"
         wait_until(lambda: "router runs" in log.read_text(), 30, "the router runs")
 
-    def node(self, kind: str, topic: str) -> Node:
-        """Start a node with its output in a file."""
+    def node(self, kind: str, topic: str, override: str = "") -> Node:
+        """Start a node with its output in a file; with ``override`` as a laptop does."""
         name = f"robot_{kind}_{next(_numbers)}"
-        self._start(name, " ".join((*NODE, kind, name, topic)))
+        variable = (f"ZENOH_CONFIG_OVERRIDE={quote(override)}",) if override else ()
+        self._start(name, " ".join(("env", *variable, *NODE, kind, name, topic)))
         path = self.root / f"tmp/{name}.log"
         return Node(name, Log(lambda: path.read_text() if path.exists() else ""))
 
@@ -250,11 +253,53 @@ def test_a_peer_that_is_down_is_told(world: World) -> None:
     of.wait_for("Degraded", "False", seconds=60)
 
 
+def test_a_pod_without_the_certificate_has_no_session_with_a_hub(
+    world: World, listeners: dict[str, Node]
+) -> None:
+    """The cluster of the tests does not enforce NetworkPolicies."""
+    hub = world.proxy("node1").body["status"]["podIP"]
+    wait = "connect/timeout_ms=-1"
+    own = {OVERRIDE: f'mode="client";connect/endpoints=["tcp/{hub}:7447"];{wait}'}
+    stranger = world.pod("sub", "chatter", "node1", labels={}, env=own)
+    router = {OVERRIDE: own[OVERRIDE].replace("7447", "7448")}
+    accepted = world.pod("sub", "chatter", "node1", labels={}, env=router)
+    accepted.wait_for(GOT, 20, START)
+    assert not stranger.has("ready")
+    assert all(node.has(GOT) for node in listeners.values())
+
+
+def test_a_laptop_uses_the_port_that_is_told(world: World, listeners: dict[str, Node]) -> None:
+    of = world.rosproxy
+    of.change(listen={"type": "NodePort"})
+    of.wait_event("ServiceCreated", "port-of-rosproxy-")
+    told = of.wait_for("Listening", reason="Listening", seconds=90)["message"]
+    override = told.partition(f"{OVERRIDE}='")[2].rstrip("'")
+    assert of.status["listen"] in override
+    for on in ("node1", "node2"):
+        of.wait_status(partial(is_linked, on), f"the links of {on}")
+    laptop = world.robot.node("sub", "chatter", override)
+    laptop.wait_for(GOT, 5, START)
+    world.robot.node("pub", "laptop", override)
+    world.pod("sub", "laptop", "node2").wait_for(GOT, 5, START)
+    print(world.describe())
+
+    of.change(listen=None)
+
+    def is_gone() -> bool:
+        service = api.get("services", of.namespace, f"port-of-rosproxy-{of.name}")
+        return not service and "listen" not in of.status
+
+    wait_until(is_gone, 60, of.tell)
+    for node in listeners.values():
+        node.wait_for(GOT, 5, START)
+    assert "Listening" not in {c["type"] for c in of.status["conditions"]}
+
+
 def test_a_pod_that_goes_its_own_way_is_told(world: World) -> None:
-    own = {"ZENOH_CONFIG_OVERRIDE": f'connect/endpoints=["tcp/{ADDRESS}:7447"]'}
+    own = {OVERRIDE: f'connect/endpoints=["tcp/{ADDRESS}:7447"]'}
     pod = world.net.idle(on="node1", env=own, image=ZENOH)
     wait_event(world.net.name, pod.name, "Pod", "NotWired", "connects the nodes past the proxy")
-    assert pod.environment["ZENOH_CONFIG_OVERRIDE"] == own["ZENOH_CONFIG_OVERRIDE"]
+    assert pod.environment[OVERRIDE] == own[OVERRIDE]
     pod.remove(grace=0, wait=False)
 
 
@@ -264,7 +309,8 @@ def test_nothing_is_left(world: World) -> None:
 
     def left() -> list[Any]:
         found = [
-            api.get("services", of.namespace, f"{p}rosproxy-{of.name}") for p in ("", "hubs-of-")
+            api.get("services", of.namespace, f"{prefix}rosproxy-{of.name}")
+            for prefix in ("", "hubs-of-", "port-of-")
         ]
         return [*filter(None, found), *of.proxies]
 

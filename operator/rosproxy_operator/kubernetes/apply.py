@@ -307,11 +307,7 @@ def _uid(action: Action) -> str:
 
 def _uids(observed: ClusterSnapshot) -> set[str]:
     """Return the uids of all objects that the operator may change or delete."""
-    services = {
-        service.uid
-        for services in (observed.services, observed.hub_services)
-        for service in services.values()
-    }
+    services = {service.uid for service in observed.all_services}
     policies = {policy.uid for policy in observed.policies.values()}
     return services | policies | {pod.uid for pod in observed.pods}
 

@@ -25,7 +25,7 @@ from rosproxy_operator.common.images import IMAGE
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds, make_proxy_bounds
 from rosproxy_operator.kubernetes import option_values
-from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.model import Json, ListenType, Name
 from rosproxy_operator.kubernetes.resources.pod_defaults import PodDefaults
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.proxy_spec.spec import WISHES
@@ -121,6 +121,17 @@ class Bounds(msgspec.Struct, frozen=True):
             name="--allow-multicast",
         ),
     ] = True
+
+    listen: Annotated[
+        tuple[ListenType, ...],
+        Option(
+            "rmw_zenoh: type of Service that `spec.listen` may ask for. At such a Service, laptops "
+            "reach the proxies, and zenoh does not authenticate laptops. Repeatable.",
+            name="--allow-listen",
+            repeatable=True,
+            default="none",
+        ),
+    ] = ()
 
 
 class ClusterSettings(msgspec.Struct, frozen=True):

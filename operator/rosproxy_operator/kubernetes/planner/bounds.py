@@ -127,8 +127,12 @@ def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
 
 
 def _zenoh_violations(spec: ZenohSpec, settings: ClusterSettings) -> Iterator[str]:
-    """Yield the violations in the peers, and rules of the administrator that zenoh can't hold."""
+    """Yield the violations in peers and listen, and administrator's rules that zenoh can't hold."""
     yield from _peer_violations(spec.peers, settings.bounds)
+    if spec.listen and spec.listen.type not in settings.bounds.listen:
+        others = " or ".join(settings.bounds.listen)
+        fix = f"Choose {others}" if others else "Remove spec.listen"
+        yield _refusal("spec.listen.type", spec.listen.type, fix, "allow.listen")
     try:
         check_layers(settings.policy)
     except ValueError as error:

@@ -16,6 +16,7 @@ from rosproxy_operator.kubernetes.planner.proxy_ports import STAND_INS, fixed_po
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     Json,
+    ListenSpec,
     MasterSpec,
     Name,
     RosProxy,
@@ -32,10 +33,13 @@ from rosproxy_operator.kubernetes.resources.names import (
     KIND,
     MASTER_PORT,
     NODE,
+    OUTSIDE_PORT,
+    OUTSIDE_SERVICE_PORT,
     PORT_RANGE,
     PROXY,
     ROUTERS,
     hubs_service_id,
+    outside_service_id,
     own_labels,
     proxy_id,
     service_id,
@@ -223,6 +227,23 @@ def hubs_service(rosproxy: RosProxy) -> Json:
         # Hubs link before their proxies are ready.
         "publishNotReadyAddresses": True,
         "ports": [_service_port("hub", HUB_PORT)],
+    }
+    body = {"apiVersion": "v1", "kind": "Service", "metadata": meta, "spec": spec}
+    annotations[FINGERPRINT] = digest(body)
+    return body
+
+
+def outside_service(rosproxy: RosProxy, listen: ListenSpec) -> Json:
+    """The Service at which outside reaches the proxies of a RosProxy for rmw_zenoh."""
+    annotations = dict(listen.annotations)
+    meta = metadata(rosproxy, outside_service_id(rosproxy.id), annotations)
+    port = {**_service_port("zenoh", OUTSIDE_SERVICE_PORT), "targetPort": OUTSIDE_PORT}
+    balancer_class = listen.load_balancer_class
+    spec: dict[str, Any] = {
+        "type": listen.type,
+        "selector": meta["labels"],
+        "ports": [{**port, **({"nodePort": listen.node_port} if listen.node_port else {})}],
+        **({"loadBalancerClass": balancer_class} if balancer_class else {}),
     }
     body = {"apiVersion": "v1", "kind": "Service", "metadata": meta, "spec": spec}
     annotations[FINGERPRINT] = digest(body)
@@ -505,6 +526,7 @@ def _zenoh_settings_fields(site: ProxySite, spec: ZenohSpec) -> Mapping[str, Any
         "zenoh_hub": site.hubs,
         "zenoh_hub_listen": HUB_PORT,
         "zenoh_hub_certificate": site.hub_certificate,
+        "zenoh_listen": OUTSIDE_PORT if spec.listen else None,
     }
 
 

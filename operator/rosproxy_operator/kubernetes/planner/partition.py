@@ -101,13 +101,14 @@ def partition_snapshot(observed: ClusterSnapshot, partition: Partition) -> Clust
         image_checks=_within(observed.image_checks, namespaces),
         services=_named_within(observed.services, namespaces),
         hub_services=_named_within(observed.hub_services, namespaces),
+        outside_services=_named_within(observed.outside_services, namespaces),
         policies=_named_within(observed.policies, namespaces),
     )
 
 
 def _own_objects(observed: ClusterSnapshot) -> Iterator[Name]:
     """Yield the names of RosProxies that have Services, and of NetworkPolicies."""
-    yield from (*observed.services, *observed.hub_services, *observed.policies)
+    yield from (*(service.of for service in observed.all_services), *observed.policies)
 
 
 def _named_within(objects: Mapping[Name, T], namespaces: frozenset[str]) -> dict[Name, T]:

@@ -41,6 +41,7 @@ from rosproxy_operator.kubernetes.planner.steps.context import (
     ClusterContext,
     advertise_host,
     master_of,
+    outside_address,
     peers,
     site_of,
 )
@@ -56,6 +57,7 @@ from rosproxy_operator.kubernetes.planner.steps.network_policy import (
 from rosproxy_operator.kubernetes.planner.steps.reconcile import (
     reconcile_hubs_service,
     reconcile_orphans,
+    reconcile_outside_service,
     reconcile_proxies,
     reconcile_service,
     seconds_to_deadlines,
@@ -74,11 +76,16 @@ from rosproxy_operator.kubernetes.resources.pod_defaults import with_pod_default
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status import events
 from rosproxy_operator.kubernetes.status.findings import finding, findings
-from rosproxy_operator.kubernetes.status.rosproxy_status import status_of, status_of_invalid
+from rosproxy_operator.kubernetes.status.rosproxy_status import (
+    Addresses,
+    status_of,
+    status_of_invalid,
+)
 
 _STEPS = (
     reconcile_service,
     reconcile_hubs_service,
+    reconcile_outside_service,
     reconcile_policies,
     reconcile_proxies,
     reconcile_lan_relays,
@@ -183,10 +190,11 @@ def _status(
     problems: tuple[ClusterFinding, ...],
     stamp: str,
 ) -> Json:
-    """The status of a RosProxy, with the address of its Service and the URI of its master."""
+    """The status of a RosProxy, with the addresses of its Services and the URI of its master."""
     master, _ = master_of(rosproxy, context.observed)
     uri = master.uri if master else ""
-    return status_of(rosproxy, states, problems, context.cluster_ip(rosproxy), uri, stamp)
+    addresses = Addresses(context.cluster_ip(rosproxy), uri, outside_address(context, rosproxy))
+    return status_of(rosproxy, states, problems, addresses, stamp)
 
 
 def stand_by(

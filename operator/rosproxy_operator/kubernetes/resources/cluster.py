@@ -16,7 +16,12 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPlace,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.names import ROUTERS, hubs_service_id, service_id
+from rosproxy_operator.kubernetes.resources.names import (
+    ROUTERS,
+    hubs_service_id,
+    outside_service_id,
+    service_id,
+)
 
 
 class PodFailure(Enum):
@@ -74,10 +79,27 @@ class HelperPod(OwnPod, frozen=True, kw_only=True):
     component: str
 
 
-class ProxyService(msgspec.Struct, frozen=True):
-    """A Service of a RosProxy. At its address, each pod reaches the proxy on its own node.
+class ServiceRole(Enum):
+    """What a Service of a RosProxy is for."""
 
-    ``names_hubs``: the Service is headless, and gives the proxies for rmw_zenoh their names.
+    PODS = "pods"  # each pod reaches the proxy on its own node
+    HUBS = "hubs"  # headless: gives the proxies for rmw_zenoh their names
+    OUTSIDE = "outside"  # outside reaches the proxies for rmw_zenoh
+
+
+SERVICE_IDS = {
+    ServiceRole.PODS: service_id,
+    ServiceRole.HUBS: hubs_service_id,
+    ServiceRole.OUTSIDE: outside_service_id,
+}
+"""The functions that return the name of a RosProxy's Service."""
+
+
+class ProxyService(msgspec.Struct, frozen=True):
+    """A Service of a RosProxy.
+
+    A Service for outside has ``node_port``, the port of each node of the cluster, and of type
+    LoadBalancer ``balancer``, the name or address of the load balancer; empty before there is one.
     """
 
     of: Name
@@ -86,12 +108,14 @@ class ProxyService(msgspec.Struct, frozen=True):
     cluster_ip: str
     fingerprint: str
     deleting: bool = False
-    names_hubs: bool = False
+    role: ServiceRole = ServiceRole.PODS
+    node_port: int = 0
+    balancer: str = ""
 
     @property
     def id(self) -> Name:
         """The namespace and name of the Service."""
-        return hubs_service_id(self.of) if self.names_hubs else service_id(self.of)
+        return SERVICE_IDS[self.role](self.of)
 
 
 class MasterService(msgspec.Struct, frozen=True):
@@ -223,7 +247,8 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
       these pods, also all pods with hostPorts, and all pods of some namespaces: the namespaces with
       a RosProxy or with a pod of the operator.
     - ``services``: the Services of RosProxies, by RosProxy. ``hub_services``: the Services that
-      name the proxies for rmw_zenoh.
+      name the proxies for rmw_zenoh. ``outside_services``: the Services at which outside reaches
+      these proxies.
     - ``masters``: for each Service that a RosProxy names as its master, the address and the
       problem. Either the address or the problem is empty.
     - ``consents``: for each such Service, other namespaces whose RosProxies may name the Service.
@@ -256,6 +281,7 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     image_checks: tuple[HelperPod, ...] = ()
     services: Mapping[Name, ProxyService] = {}
     hub_services: Mapping[Name, ProxyService] = {}
+    outside_services: Mapping[Name, ProxyService] = {}
     masters: Mapping[Name, tuple[str, str]] = {}
     consents: Mapping[Name, frozenset[str]] = {}
     selected: frozenset[str] = frozenset()
@@ -271,6 +297,12 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     unusable: Mapping[Name, InvalidRosProxy] = {}
     failures: Mapping[Name, Mapping[Name, str]] = {}
     webhook: WebhookState = WebhookState()
+
+    @property
+    def all_services(self) -> tuple[ProxyService, ...]:
+        """All Services of RosProxies."""
+        groups = (self.services, self.hub_services, self.outside_services)
+        return tuple(service for group in groups for service in group.values())
 
     @property
     def own_pods(self) -> tuple[OwnPod, ...]:

@@ -78,10 +78,30 @@ class Ros2Spec(msgspec.Struct, frozen=True):
         return self.domain or 0
 
 
+ListenType = Literal["NodePort", "LoadBalancer"]
+"""The type of a Service that outside reaches."""
+
+
+class ListenSpec(msgspec.Struct, frozen=True):
+    """The Service at which outside reaches the proxies of a RosProxy for rmw_zenoh.
+
+    With ``node_port`` 0, the API server chooses the port.
+    """
+
+    type: ListenType
+    node_port: int = 0
+    load_balancer_class: str = ""
+    annotations: Mapping[str, str] = {}
+
+
 class ZenohSpec(msgspec.Struct, frozen=True):
-    """The fields of a RosProxy for rmw_zenoh. ``peers`` are routers outside, as ``host:port``."""
+    """The fields of a RosProxy for rmw_zenoh. ``peers`` are routers outside, as ``host:port``.
+
+    With ``listen`` None, no port leads from outside to the proxies.
+    """
 
     peers: tuple[str, ...] = ()
+    listen: ListenSpec | None = None
 
 
 class Advertise(Enum):

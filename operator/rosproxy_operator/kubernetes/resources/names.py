@@ -70,6 +70,10 @@ HUB_PORT = 7447
 ROUTERS = PortRange(7448, 7448)
 """The port of a proxy for rmw_zenoh at which pods reach a router. This is the range of such a
 proxy, and no hostPort."""
+OUTSIDE_PORT = 7449
+"""The port of a proxy for rmw_zenoh for laptops, and for routers of other sites."""
+OUTSIDE_SERVICE_PORT = 7447
+"""The port of the Service that leads to OUTSIDE_PORT: the port of rmw_zenohd."""
 CONTAINER = "proxy"
 """Name of the container in a proxy's pod."""
 TOKEN_VARIABLE = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
@@ -77,6 +81,7 @@ TOKEN_VARIABLE = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
 
 _PREFIX = "rosproxy-"
 _HUBS_PREFIX = "hubs-of-rosproxy-"
+_OUTSIDE_PREFIX = "port-of-rosproxy-"
 _HASH_DIGITS = 6
 """Hex digits of the hash in a pod's name."""
 _MOST_HOST_NAME_CHARACTERS = 63
@@ -143,6 +148,11 @@ def hubs_service_id(rosproxy: Name) -> Name:
     A name of `service_id` begins with ``rosproxy-``, so this name differs from all of them.
     """
     return Name(rosproxy.namespace, f"{_HUBS_PREFIX}{rosproxy.name}")
+
+
+def outside_service_id(rosproxy: Name) -> Name:
+    """Return the namespace and name of the Service at which outside reaches the proxies."""
+    return Name(rosproxy.namespace, f"{_OUTSIDE_PREFIX}{rosproxy.name}")
 
 
 def hub_domain(rosproxy: Name) -> str:

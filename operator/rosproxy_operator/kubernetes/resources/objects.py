@@ -21,6 +21,7 @@ from rosproxy_operator.kubernetes.resources.checks import (
     texts_at,
 )
 from rosproxy_operator.kubernetes.resources.cluster import (
+    SERVICE_IDS,
     HelperPod,
     MasterService,
     ProxyPod,
@@ -177,13 +178,17 @@ def _own_pod(obj: Json, container: Json) -> dict[str, Any]:
 def service(obj: Json) -> ProxyService | None:
     """Return a Service of the operator, None for another Service."""
     meta = submap(obj, "metadata")
-    address = text_at(submap(obj, "spec"), "clusterIP")
+    spec = submap(obj, "spec")
+    address = text_at(spec, "clusterIP")
     labels = texts_at(meta, "labels")
     owner = _owner(meta)
     rosproxy = Name(text_at(meta, "namespace"), labels.get(names.PROXY_OF, ""))
-    own_ids = (names.service_id(rosproxy), names.hubs_service_id(rosproxy))
-    if not names.is_own(labels) or not owner or name_of(meta) not in own_ids:
+    roles = (role for role, id_of in SERVICE_IDS.items() if id_of(rosproxy) == name_of(meta))
+    role = next(roles, None)
+    if not names.is_own(labels) or not owner or role is None:
         return None
+    balancers = submaps(submap(obj, "status", "loadBalancer"), "ingress")
+    hosts = (text_at(balancer, "ip") or text_at(balancer, "hostname") for balancer in balancers)
     return ProxyService(
         of=rosproxy,
         owner=owner,
@@ -191,7 +196,9 @@ def service(obj: Json) -> ProxyService | None:
         cluster_ip="" if address == "None" else address,
         fingerprint=text_at(submap(meta, "annotations"), names.FINGERPRINT),
         deleting=is_deleted(meta),
-        names_hubs=name_of(meta) == names.hubs_service_id(rosproxy),
+        role=role,
+        node_port=next((int_at(port, "nodePort") for port in submaps(spec, "ports")), 0),
+        balancer=next(filter(None, hosts), ""),
     )
 
 

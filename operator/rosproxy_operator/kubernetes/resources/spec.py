@@ -39,6 +39,8 @@ from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
     InvalidRosProxy,
     Json,
+    ListenSpec,
+    ListenType,
     MasterSpec,
     MaxUnavailable,
     Name,
@@ -50,6 +52,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     ZenohSpec,
 )
 from rosproxy_operator.kubernetes.resources.names import (
+    GROUP,
     MASTER_PORT,
     REMAKE,
     router_host,
@@ -91,6 +94,7 @@ RULE_KINDS = {
 }
 _GLOB = re.compile(r"[^\s;]{1,256}")
 _POD_EGRESS: dict[str, PodEgress] = {"Any": "any", "Proxy": "proxy"}
+_LISTEN_TYPES: dict[str, ListenType] = {"NodePort": "NodePort", "LoadBalancer": "LoadBalancer"}
 _ADVERTISE = {a.value: a for a in Advertise}
 _PULL_POLICY = {policy: policy for policy in ("", "Always", "IfNotPresent", "Never")}
 _OPERATORS = {operator: operator for operator in ("In", "NotIn", "Exists", "DoesNotExist")}
@@ -164,7 +168,7 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
     spec = RosProxySpec(
         ros1="1" in for_ros,
         ros2=ros2,
-        zenoh=ZenohSpec(_peers(field, read_router_name)) if "zenoh" in for_ros else None,
+        zenoh=_zenoh_spec(field) if "zenoh" in for_ros else None,
         master=_master(field["master"], of) if "1" in for_ros else MasterSpec(),
         ports=ports,
         window=_window(field["portWindow"], ports),
@@ -206,6 +210,10 @@ def _check_versions(field: Field, for_ros: tuple[str, ...]) -> None:
             _check_absent(field[name], ros, for_ros)
     if for_ros == ("1",):
         _check_absent(field["peers"], "2", for_ros)
+    listen = field["listen"]
+    if "zenoh" not in for_ros and listen.value is not None:
+        fix = "Remove the field, or set spec.ros: zenoh"
+        raise listen.error(f"is for rmw_zenoh, but spec.ros is {for_ros[0]}", fix)
 
 
 def _check_absent(field: Field, ros: str, for_ros: tuple[str, ...]) -> None:
@@ -234,6 +242,29 @@ def _ros2_spec(field: Field) -> Ros2Spec:
         domain=None if domain.value is None else domain.number(0, 0, LAST_DOMAIN),
         peers=_peers(field, read_peer_name),
         multicast=field["multicast"].boolean(),
+    )
+
+
+def _zenoh_spec(field: Field) -> ZenohSpec:
+    return ZenohSpec(_peers(field, read_router_name), _given(field["listen"], _listen))
+
+
+def _listen(field: Field) -> ListenSpec:
+    """Return the Service for outside."""
+    listen_type = field["type"].one_of(_LISTEN_TYPES, "")
+    balancer_class = field["loadBalancerClass"]
+    if listen_type != "LoadBalancer" and balancer_class.text():
+        raise balancer_class.error("is for type: LoadBalancer", "Remove the field")
+    annotations = field["annotations"]
+    for key in annotations.map():
+        if not is_label_key(key) or key.startswith(f"{GROUP}/"):
+            fix = f"Copy the key from the documentation of your load balancer, without {GROUP}/"
+            raise Field(annotations.path, key).error("can't be the key of an annotation", fix)
+    return ListenSpec(
+        listen_type,
+        node_port=field["nodePort"].number(0, 1, 65535),
+        load_balancer_class=balancer_class.text(),
+        annotations=annotations.texts(),
     )
 
 

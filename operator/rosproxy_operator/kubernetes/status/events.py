@@ -15,8 +15,10 @@ from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateHelper,
     CreateProxy,
+    CreateService,
     DeleteHelper,
     DeleteProxy,
+    DeleteService,
     Emit,
     EvictPod,
     SetImage,
@@ -30,6 +32,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     LAN_RELAY,
     NODE,
     PORT_RANGE,
+    outside_service_id,
 )
 
 EVENT_REPEAT_QUIET_S = 60.0
@@ -133,6 +136,18 @@ def _result(action: Action) -> tuple[str, str]:
             return f"{_HELPERS[component]}Created", text
         case DeleteHelper(component=component, id=id, why=why):
             return f"{_HELPERS[component]}Deleted", f"deleted pod {id.name}: {why}"
+        case _:
+            return _service_result(action)
+
+
+def _service_result(action: Action) -> tuple[str, str]:
+    """The same for an action about a Service: an Event about the Service for outside."""
+    match action:
+        case CreateService(body={"metadata": meta, "spec": {"type": kind}}) if kind != "ClusterIP":
+            text = f"created Service {meta['name']} of type {kind} for outside"
+            return "ServiceCreated", f"{text}. The condition Listening has the address"
+        case DeleteService(of=of, id=id, why=why) if id == outside_service_id(of):
+            return "ServiceDeleted", f"deleted Service {id.name}: {why}"
         case _:
             return "", ""
 

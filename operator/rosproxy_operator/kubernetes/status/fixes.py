@@ -24,7 +24,10 @@ _BY_REASON = {
     "NameTaken": "delete the object that the message names, or create it under another name",
     "HubsApart": "let the proxies connect to each other's port 7447, and check that pods resolve "
     "names by the cluster's DNS",
+    "HubRefused": f"wait until the operator has recreated all proxies, then {_PODS}",
     "NoAdvertiseHost": ADDRESS_FIX,
+    "NoAddress": "install a controller for Services of type LoadBalancer, or correct spec.listen: "
+    f"{_EDIT}",
     "NoZenoh": _BY_POD,
     "NodeLeftOut": f"correct spec.nodeSelector: {_EDIT}",
     "NodeNotReady": "read kubectl get nodes, and kubectl describe node NODE",

@@ -1,14 +1,15 @@
 """The status of a RosProxy, with its conditions (``metav1.Condition``)."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TypeGuard
 
 import msgspec
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.telemetry.text import clean, plural, shorten
 from rosproxy_operator.common.problem import bounded
-from rosproxy_operator.common.zenoh import tcp_endpoint
+from rosproxy_operator.common.zenoh import OVERRIDE, client_override, tcp_endpoint
 from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
@@ -28,6 +29,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     INJECT,
     hub_address,
     master_uri,
+    outside_service_id,
     router_of,
 )
 from rosproxy_operator.kubernetes.status.findings import (
@@ -47,6 +49,7 @@ MASTER = "MasterReachable"
 DEGRADED = "Degraded"
 WAY_IN = "PortsReachable"
 PEERS = "PeersReachable"
+LISTENING = "Listening"
 MOST_MESSAGE_CHARACTERS = 1024
 """Characters of a message at most."""
 MOST_NODES = 200
@@ -71,6 +74,19 @@ _OF_ZENOH = ("sessions", "peers")
 """Fields of ``perNode`` about rmw_zenoh that only the proxy of the node knows."""
 
 
+class Addresses(msgspec.Struct, frozen=True):
+    """The addresses in the status of a RosProxy.
+
+    ``cluster_ip`` is the address of the Service for pods, empty before the Service exists.
+    ``master`` is the URI of the real master for the proxies, empty if unknown. ``outside`` is where
+    outside reaches the proxies for rmw_zenoh; None: no address yet.
+    """
+
+    cluster_ip: str = ""
+    master: str = ""
+    outside: HostPort | None = None
+
+
 class Condition(msgspec.Struct, frozen=True):
     """A condition without times. ``status`` is True, False or Unknown."""
 
@@ -84,8 +100,7 @@ def status_of(
     rosproxy: RosProxy,
     states: tuple[RosProxyOnNode, ...],
     problems: tuple[ClusterFinding, ...],
-    cluster_ip: str,
-    master: str,
+    addresses: Addresses,
     stamp: str,
 ) -> Json:
     """The status of a RosProxy, with the fields of the CRD.
@@ -93,10 +108,8 @@ def status_of(
     While a proxy has not answered, the facts that only this proxy knows stay as in the former
     status. So a start of the operator changes no status.
 
-    ``problems`` are all findings about the RosProxy, with the findings about pods. ``cluster_ip``
-    is the address of the Service, empty before the Service exists. ``master`` is the URI of the
-    real master for the proxies, empty if unknown. ``stamp`` is the time for conditions that change,
-    in RFC 3339.
+    ``problems`` are all findings about the RosProxy, with the findings about pods. ``stamp`` is the
+    time for conditions that change, in RFC 3339.
     """
     former = rosproxy.status
     shown = _shown_nodes(states)
@@ -117,12 +130,13 @@ def status_of(
         *([_reached(states, problems, former)] if spec.ros1 else []),
         *([_way_in(states, problems, former)] if not spec.zenoh else []),
         *([_linked(states, problems, former)] if spec.zenoh and spec.zenoh.peers else []),
+        *_listening(rosproxy, wanted, addresses.outside),
         _degraded(problems),
     )
     return {
         "observedGeneration": rosproxy.generation,
         "message": _message(ready, problems),
-        **_addressed(rosproxy, cluster_ip, master),
+        **_addressed(rosproxy, addresses),
         **({"domain": spec.ros2.number, "participants": participant_count} if spec.ros2 else {}),
         **({"sessions": sum(int_at(n, "sessions") for n in lines)} if spec.zenoh else {}),
         "nodes": len(wanted),
@@ -148,21 +162,24 @@ def participants(observed: ClusterSnapshot) -> dict[int, int]:
     return counts
 
 
-def _addressed(rosproxy: RosProxy, cluster_ip: str, master: str) -> dict[str, object]:
-    """The addresses at which pods find the proxy of their node, and the URI of the real master.
+def _addressed(rosproxy: RosProxy, addresses: Addresses) -> dict[str, object]:
+    """The addresses for pods and for outside, and the URI of the real master.
 
     Without a Service the former address stays in the status: the next Service asks for the same
     address.
     """
     fields: dict[str, object] = {}
+    cluster_ip = addresses.cluster_ip
     if rosproxy.spec.ros1:
         uri = master_uri(cluster_ip) if cluster_ip else text_at(rosproxy.status, "masterURI")
-        fields = {"master": master, "masterURI": uri}
+        fields = {"master": addresses.master, "masterURI": uri}
     if rosproxy.spec.ros2:
         fields["staticPeers"] = cluster_ip or rosproxy.cluster_ip
     if rosproxy.spec.zenoh:
         address = cluster_ip or rosproxy.cluster_ip
         fields["routerEndpoint"] = tcp_endpoint(router_of(address)) if address else ""
+    if addresses.outside:
+        fields["listen"] = tcp_endpoint(addresses.outside)
     return fields
 
 
@@ -473,6 +490,32 @@ def _linked(
         return Condition(PEERS, "Unknown", "Linking", f"not linked yet: {', '.join(down)}")
     text = "every proxy is linked with every router of spec.peers"
     return Condition(PEERS, "True", "Reached", text)
+
+
+def _listening(
+    rosproxy: RosProxy, wanted: Sequence[RosProxyOnNode], outside: HostPort | None
+) -> Iterator[Condition]:
+    """The condition Listening of a RosProxy with ``spec.listen``: what laptops have to set."""
+    listen = rosproxy.spec.zenoh.listen if rosproxy.spec.zenoh else None
+    if listen is None:
+        return
+    service = outside_service_id(rosproxy.id).name
+    if outside is None and listen.type == "NodePort" and not wanted:
+        yield Condition(LISTENING, "Unknown", "NoProxies", _NO_PROXY)
+        return
+    if outside is None:
+        text = f"Service {service} has no address yet"
+        if listen.type == "LoadBalancer":
+            text += ". The address comes from a controller for load balancers: that of the cloud, "
+            text += "or one such as MetalLB"
+        yield Condition(LISTENING, "False", "NoAddress", text)
+        return
+    variable = f"on a laptop, set {OVERRIDE}='{client_override(outside)}'"
+    if any(map(_serving, wanted)):
+        yield Condition(LISTENING, "True", "Listening", variable)
+    else:
+        text = f"no proxy is ready, so none answers at {outside}. Then {variable}"
+        yield Condition(LISTENING, "Unknown", "NoProxies", text)
 
 
 def _may_answer(state: RosProxyOnNode) -> bool:

@@ -32,6 +32,7 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     ProxyPod,
     ProxyPolicy,
     ProxyService,
+    ServiceRole,
 )
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
@@ -180,8 +181,9 @@ class ClusterStore:
             rosproxies=rosproxies,
             unusable={r.id: r for r in self._records_of(PLURAL, InvalidRosProxy)},
             nodes={node.name: node for node in self._records_of("nodes", ClusterNode)},
-            services={s.of: s for s in services if not s.names_hubs},
-            hub_services={s.of: s for s in services if s.names_hubs},
+            services={s.of: s for s in services if s.role is ServiceRole.PODS},
+            hub_services={s.of: s for s in services if s.role is ServiceRole.HUBS},
+            outside_services={s.of: s for s in services if s.role is ServiceRole.OUTSIDE},
             masters={id: read_master(s, id, ports) for id, (s, ports) in masters.items()},
             consents={id: s.allowed if s else frozenset() for id, (s, _) in masters.items()},
             misspelt_services={id: s.misspelt for id, (s, _) in masters.items() if s},

@@ -22,7 +22,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.names import own_labels, proxy_id, service_id
 from rosproxy_operator.kubernetes.status.findings import findings
-from rosproxy_operator.kubernetes.status.rosproxy_status import status_of
+from rosproxy_operator.kubernetes.status.rosproxy_status import Addresses, status_of
 
 Obj = dict[str, Any]
 
@@ -173,7 +173,8 @@ def status(
     resource = of or rosproxy()
     problems = (*findings(resource, states, given.get("failures", {})), *more)
     stamp = given.get("stamp", STAMP)
-    return status_of(resource, states, problems, given.get("cluster_ip", CLUSTER_IP), ROBOT, stamp)
+    addresses = Addresses(given.get("cluster_ip", CLUSTER_IP), ROBOT, given.get("outside"))
+    return status_of(resource, states, problems, addresses, stamp)
 
 
 def condition(rosproxy_status: Json, type: str) -> Any:

@@ -50,6 +50,7 @@ CHANGES: tuple[dict[str, Any], ...] = (
     {"ros": 2, "multicast": None, "domain": 7},
     {"ros": "1,2", "multicast": True},
     {"ros": "zenoh", "peers": ["robot"]},
+    {"ros": "zenoh", "listen": {"type": "NodePort"}},
     {"ros": 1},
 )
 LABELS = ({names.INJECT: "true"}, {names.INJECT: "robot", "app": "x"}, {names.INJECT: "arm"},
@@ -66,6 +67,7 @@ def mended(spec: Object) -> Object:
             ("master", "multicast", "domain", "advertise", "cleanupAfterSeconds")
         )
         return spec | absent | {"ports": 32, "portWindow": window}
+    spec = spec | {"listen": None}
     if "1" not in ros:
         spec = spec | {"master": None}
     elif not spec["master"]:

@@ -31,7 +31,11 @@ from rosproxy_operator.kubernetes.resources.pod_defaults import with_pod_default
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 from rosproxy_operator.proxy_spec.spec import WISHES, ProxySpec
 
-BOUNDS = Bounds(data_planes=("auto", "kernel", "splice", "copy"), images=("*",))
+BOUNDS = Bounds(
+    data_planes=("auto", "kernel", "splice", "copy"),
+    images=("*",),
+    listen=("NodePort", "LoadBalancer"),
+)
 SETTINGS = ClusterSettings(image="rosproxy:1", bounds=BOUNDS, network_policy=False)
 """Everything is allowed, without NetworkPolicies. Bounds and NetworkPolicies have separate
 tests.

@@ -32,7 +32,11 @@ from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources import objects as parse
 from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyReport
+from rosproxy_operator.kubernetes.resources.cluster import (
+    ClusterSnapshot,
+    ProxyReport,
+    ServiceRole,
+)
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 
@@ -312,8 +316,9 @@ class Cluster:
             proxies=tuple(own),
             lan_relays=tuple(h for h in helpers if h.component == names.LAN_RELAY),
             image_checks=tuple(h for h in helpers if h.component == names.IMAGE_CHECK),
-            services={service.of: service for service in services if not service.names_hubs},
-            hub_services={service.of: service for service in services if service.names_hubs},
+            services={s.of: s for s in services if s.role is ServiceRole.PODS},
+            hub_services={s.of: s for s in services if s.role is ServiceRole.HUBS},
+            outside_services={s.of: s for s in services if s.role is ServiceRole.OUTSIDE},
             policies={policy.id: policy for policy in filter(None, map(parse.policy, policies))},
             key=self.key,
             masters=dict.fromkeys(masters, resolved),
@@ -435,4 +440,6 @@ class Controller:
         self.old = None
 
 
-SETTINGS = replace(ClusterSettings(), image="rosproxy:1", bounds=Bounds(images=("*",)))
+SETTINGS = replace(
+    ClusterSettings(), image="rosproxy:1", bounds=Bounds(images=("*",), listen=("NodePort",))
+)

@@ -251,7 +251,8 @@ class World:
         owners = sorted(service["metadata"]["ownerReferences"][0]["uid"] for service in services)
         uids = sorted(rosproxy.uid for rosproxy in rosproxies)
         with_hubs = [rosproxy.uid for rosproxy in rosproxies if rosproxy.spec.zenoh]
-        assert owners == sorted([*uids, *with_hubs])
+        with_port = [r.uid for r in rosproxies if r.spec.zenoh and r.spec.zenoh.listen]
+        assert owners == sorted([*uids, *with_hubs, *with_port])
         policies = state.policies.values()
         assert sorted(p["metadata"]["ownerReferences"][0]["uid"] for p in policies) == uids
         for rosproxy in rosproxies:

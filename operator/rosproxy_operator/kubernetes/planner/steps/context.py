@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import msgspec
 from msgspec.structs import replace
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import hash_token
 from rosproxy.settings import MOST_ZENOH_HUBS
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
@@ -25,6 +26,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
+    OUTSIDE_SERVICE_PORT,
     hub_address,
     proxy_id,
     relay_secret_of,
@@ -125,6 +127,25 @@ def advertise_host(rosproxy: RosProxy, node: ClusterNode) -> tuple[str, str]:
         f"has no address of type {wanted_type} (types of its addresses: {types}). Set another "
         f"spec.advertise, or run kubectl annotate node {node.name} rosproxy.io/advertise-host=HOST"
     )
+
+
+def outside_address(context: ClusterContext, rosproxy: RosProxy) -> HostPort | None:
+    """The address at which outside reaches the proxies for rmw_zenoh; None: no address yet.
+
+    A port of the nodes leads to the proxies from all nodes. The address is that of the first node
+    with a proxy: the external address, or else the internal one.
+    """
+    service = context.observed.outside_services.get(rosproxy.id)
+    listen = rosproxy.spec.zenoh.listen if rosproxy.spec.zenoh else None
+    if service is None or listen is None or service.owner != rosproxy.uid:
+        return None
+    if listen.type == "LoadBalancer":
+        return HostPort(service.balancer, OUTSIDE_SERVICE_PORT) if service.balancer else None
+    names = sorted(place.node for place in context.view.places.get(rosproxy.id, ()))
+    nodes = filter(None, map(context.observed.nodes.get, names))
+    addresses = (n.addresses.get("ExternalIP") or n.addresses.get("InternalIP") for n in nodes)
+    ports = (HostPort(address, service.node_port) for address in addresses if address)
+    return next(ports, None) if service.node_port else None
 
 
 def site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle:

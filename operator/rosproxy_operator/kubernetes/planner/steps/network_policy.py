@@ -3,6 +3,7 @@
 `policy` says which sources may reach which ports of the proxies:
 
 - Any source: ``spec.portWindow`` and a published master. ROS 1 uses TCP, ROS 2 and UDPROS use UDP.
+  With ``spec.listen``, the port of rmw_zenoh for outside.
 - The selected pods: the master port and the discovery port of ROS 2. With ``direction: Both`` or
   for ROS 2 also the ports of stand-ins. UDPROS from pods to outside goes through these ports, too.
   For rmw_zenoh, the port of the router, and nothing else.
@@ -48,6 +49,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     HUB_PORT,
     INJECT,
     MASTER_PORT,
+    OUTSIDE_PORT,
     ROUTERS,
     own_labels,
     pods_policy_id,
@@ -198,7 +200,7 @@ def _hub_rules(rosproxy: RosProxy) -> Iterator[Json]:
 
 
 def _public_ports(rosproxy: RosProxy, ranges: Collection[PortRange]) -> Iterator[Json]:
-    """The ports for any source: the window and a published master, without the proxy's own ports.
+    """The ports for any source, without the proxy's own ports. See the docstring of the module.
 
     The own ports are the master port, the admin port, the well-known ports of ROS 2, and the ports
     of stand-ins outside ``ranges``.
@@ -209,6 +211,8 @@ def _public_ports(rosproxy: RosProxy, ranges: Collection[PortRange]) -> Iterator
         stand_ins = [*gaps(proxy_ports.STAND_INS, (), ranges)] if has_stand_ins else []
         for ports in gaps(rosproxy.spec.window, own_ports, stand_ins):
             yield _port(ports.first, ports.last, protocol)
+    if rosproxy.spec.zenoh and rosproxy.spec.zenoh.listen:
+        yield _port(OUTSIDE_PORT)
     publish = rosproxy.spec.master.publish
     if publish and publish not in rosproxy.spec.window:
         yield _port(publish)

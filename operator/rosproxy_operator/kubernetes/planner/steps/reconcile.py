@@ -52,11 +52,11 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
-    hubs_service_id,
     proxy_id,
     router_host,
     service_id,
 )
+from rosproxy_operator.kubernetes.resources.objects import name_of
 
 IMAGE_CHANGE_RESTART_S = 60.0
 """Seconds in which a kubelet restarts a container after a change of the image."""
@@ -86,14 +86,32 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
 def reconcile_hubs_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
     """Yield the action that creates or deletes the headless Service for rmw_zenoh."""
     service = context.observed.hub_services.get(rosproxy.id)
-    if rosproxy.spec.zenoh is None:
+    body = manifests.hubs_service(rosproxy) if rosproxy.spec.zenoh else None
+    yield from _reconcile_zenoh_service(context, rosproxy, service, body, "spec.ros is not zenoh")
+
+
+def reconcile_outside_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
+    """Yield the action that creates or deletes the Service at which outside reaches rmw_zenoh."""
+    service = context.observed.outside_services.get(rosproxy.id)
+    listen = rosproxy.spec.zenoh.listen if rosproxy.spec.zenoh else None
+    body = manifests.outside_service(rosproxy, listen) if listen else None
+    yield from _reconcile_zenoh_service(context, rosproxy, service, body, "spec.listen is not set")
+
+
+def _reconcile_zenoh_service(
+    context: ClusterContext,
+    rosproxy: RosProxy,
+    service: ProxyService | None,
+    body: Json | None,
+    why_not: str,
+) -> Iterator[Action]:
+    """Yield the action that creates, replaces or deletes a Service; ``body`` None: not wanted."""
+    if body is None:
         if service is not None:
-            yield from _delete_service(context, service, "spec.ros is not zenoh")
-        return
-    body = manifests.hubs_service(rosproxy)
-    if service is not None:
+            yield from _delete_service(context, service, why_not)
+    elif service is not None:
         yield from _replace_service(context, rosproxy, service, body)
-    elif context.retries.is_due(Task(rosproxy.id, "create", hubs_service_id(rosproxy.id))):
+    elif context.retries.is_due(Task(rosproxy.id, "create", name_of(body["metadata"]))):
         yield CreateService(rosproxy.id, body)
 
 
@@ -327,8 +345,7 @@ def reconcile_orphans(context: ClusterContext) -> Iterator[Action]:
         yield from _delete_pod(context, proxy, "its RosProxy is gone", retire=not takes_over)
     # An unusable RosProxy is not gone. So its Service stays, and its pods keep the address.
     unusable = {r.uid for r in context.observed.unusable.values()}
-    services = (*context.observed.services.values(), *context.observed.hub_services.values())
-    for service in services:
+    for service in context.observed.all_services:
         if service.of not in context.view.rosproxies and service.owner not in unusable:
             yield from _delete_service(context, service, "its RosProxy is gone")
 
