@@ -123,6 +123,11 @@ FIXES = {
         "port",
         "if the other proxy runs, let the proxies connect to each other at port 7447 (firewall)",
     ),
+    "rmw_zenoh": Fix(
+        "for such nodes, start the proxy with --ros zenoh",
+        "a container with that variable gets another proxy by the same label",
+        "select such pods with a RosProxy that has spec.ros: zenoh",
+    ),
     "zenoh certificate": Fix(
         "give all proxies of the graph a valid --zenoh-hub-certificate of the same CA, with the "
         "name in --zenoh-hub of the others, and check the clocks of the hosts",

@@ -116,6 +116,7 @@ OPTIONS: dict[str, dict[str, Values]] = {
                 "dataPlanes": ["Auto", "Kernel"],
                 "images": ["registry.example/*"],
                 "listen": ["NodePort"],
+                "peers": ["192.0.2.*", "[fd00::*]"],
             },
             "policy": {"rules": ["deny publish /camera/* by /driver"], "mode": "Audit"},
             "imagePullSecrets": [{"name": "registry"}],

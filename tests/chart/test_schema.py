@@ -79,6 +79,8 @@ BAD: list[tuple[Json, str]] = [
     ({"extraVolumeMounts": [{"name": "a"}]}, "mountPath"),
     ({"serviceMonitor": {"relabelings": [{"target": "a"}]}}, "target"),
     ({"webhook": {"objectSelector": {"matchExpressions": [{"key": "a"}]}}}, "operator"),
+    ({"allow": {"peers": ["robot:7447"]}}, "allow/peers/0"),
+    ({"allow": {"listen": ["ClusterIP"]}}, "allow/listen/0"),
     ({"networkPolicy": {"metricsFrom": [{}]}}, "networkPolicy/metricsFrom/0"),
     ({"serviceMonitor": {"interval": "often"}}, "serviceMonitor/interval"),
     ({"serviceMonitor": {"scrapeTimeout": "5"}}, "serviceMonitor/scrapeTimeout"),

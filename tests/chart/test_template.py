@@ -150,6 +150,7 @@ def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
         images=tuple(allow.get("images", ())),
         slave_control="master" if allow else "any",
         listen=tuple(allow.get("listen", ())),
+        peers=tuple(allow.get("peers", ())),
     )
     assert settings.plan.network_policy
     operator, *peers = settings.plan.admin_from or ()

@@ -61,6 +61,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "rmw_zenoh with a master": ({"ros": "zenoh", "master": GOOD}, "ROS 2 has none"),
     "rmw_zenoh with ports": ({"ros": "zenoh", "ports": 64}, "has no ports on the node"),
     "rmw_zenoh with a domain": ({"ros": "zenoh", "domain": 1}, "takes peers alone"),
+    "ROS 2 with an IPv6 peer": ({"ros": 2, "peers": ["[fd00::7]"]}, "proxies for DDS have no IPv6"),
     "ROS 2 with a port for laptops": (
         {"ros": 2, "listen": {"type": "NodePort"}},
         "listen is for rmw_zenoh",
@@ -109,7 +110,7 @@ def test_rules_of_a_policy_are_taken(net: Namespace) -> None:
      {"ros": "zenoh"},
      {"ros": "zenoh", "listen": {"type": "NodePort", "nodePort": 31447, "annotations": {"a": "b"}}},
      {"ros": "zenoh", "listen": {"type": "LoadBalancer", "loadBalancerClass": "a.example/b"}},
-     {"ros": "zenoh", "peers": ["robot:7447"], "podEgress": "Proxy"}],
+     {"ros": "zenoh", "peers": ["robot:7447", "[fd00::7]"], "podEgress": "Proxy"}],
 )  # fmt: skip
 def test_versions_of_ros_are_taken(spec: dict[str, Any], net: Namespace) -> None:
     stored = rosproxy(net.name, **spec).body["spec"]

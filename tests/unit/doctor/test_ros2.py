@@ -196,7 +196,8 @@ def test_an_engine_that_hides_who_sends_is_an_error() -> None:
 
 def test_nothing_is_heard_of_zenoh() -> None:
     told = diagnose_domain(DomainStatus(peers=("10.0.0.9",)))["inside", "domain 0"][1]
-    assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp" in told
+    assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp does not use DDS" in told
+    assert "start the proxy with --ros zenoh" in told
 
 
 def test_a_proxy_that_has_just_started_misses_no_participant_yet() -> None:

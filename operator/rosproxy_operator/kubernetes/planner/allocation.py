@@ -51,13 +51,20 @@ class ClusterRanges(msgspec.Struct, frozen=True):
 
     ``given`` has the range of each place that gets a range. ``exhausted`` gives the reason for each
     other place. ``published`` has the ports for a master in the cluster, where free. ``findings``
-    report ranges that are too short, and masters that are not published.
+    report ranges that are too short, and masters that are not published. ``of_zenoh`` are the
+    places of proxies for rmw_zenoh, whose range has no ports of the node.
     """
 
     given: dict[ProxyPlace, PortRange] = {}
     published: dict[ProxyPlace, PortRange] = {}
     exhausted: dict[ProxyPlace, str] = {}
     findings: list[ClusterFinding] = []
+    of_zenoh: set[ProxyPlace] = set()
+
+    @property
+    def on_hosts(self) -> dict[ProxyPlace, PortRange]:
+        """The ranges with ports of nodes: all but the ranges of proxies for rmw_zenoh."""
+        return {place: r for place, r in self.given.items() if place not in self.of_zenoh}
 
 
 def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> ClusterRanges:
@@ -72,6 +79,7 @@ def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> Clus
     for place in view.wanted:
         if view.rosproxies[place.of].spec.zenoh:  # no hostPort, so no conflict
             ranges.given[place] = ROUTERS
+            ranges.of_zenoh.add(place)
     places = group_by_key((p.node, p) for p in view.wanted if p not in ranges.given)
     refused = group_by_key(state.taken)
     for node, wanted in sorted(places.items()):
@@ -159,14 +167,14 @@ class _Node(msgspec.Struct):
         The ports of a former proxy for rmw_zenoh are no range of the node.
         """
         current = self.view.current.get(place)
-        proxies = [p for p in self.proxies if place_of(p) == place]
+        proxies = [p for p in self.proxies if place_of(p) == place and not p.of_zenoh]
         known = (
             *(p.range for p in sorted(proxies, key=lambda p: p is not current)),
             self.state.given.get(place),
             self.state.served.get(place),
             self.view.rosproxies[place.of].former_ranges.get(self.node),
         )
-        yield from (r for r in known if r is not None and r != ROUTERS)
+        yield from (r for r in known if r is not None)
 
     def _taken(self, place: ProxyPlace) -> set[int]:
         """Return the ports that a proxy can't get back.

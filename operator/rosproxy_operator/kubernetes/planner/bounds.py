@@ -17,7 +17,7 @@ from itertools import islice
 
 from msgspec.structs import replace
 
-from rosproxy.net.addresses import HostPort, is_address
+from rosproxy.net.addresses import HostPort, is_address, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.setting_kinds import read_peer
 from rosproxy.zenoh.policy.name_sets import check_layers
@@ -110,8 +110,10 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
 def _violations_of_versions(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
     """Yield the violations in the fields for DDS, for rmw_zenoh, and for all but rmw_zenoh."""
     if spec.ros2:
+        yield from _peer_violations(spec.ros2.peers, spec, settings.bounds)
         yield from _ros2_violations(spec.ros2, settings.bounds)
     if spec.zenoh:  # has neither hostPorts nor a data plane
+        yield from _peer_violations(spec.zenoh.peers, spec, settings.bounds)
         yield from _zenoh_violations(spec.zenoh, settings)
         return
     yield from _port_violations(spec, settings.bounds)
@@ -119,16 +121,14 @@ def _violations_of_versions(spec: RosProxySpec, settings: ClusterSettings) -> It
 
 
 def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
-    """Yield the violations in the peers and multicast of ROS 2."""
-    yield from _peer_violations(spec.peers, bounds)
+    """Yield the violation in the multicast of ROS 2."""
     if spec.multicast and not bounds.multicast:
         fix = "Remove the field, and name the hosts outside in spec.peers"
         yield _refusal("spec.multicast", True, fix, "allow.multicast")
 
 
 def _zenoh_violations(spec: ZenohSpec, settings: ClusterSettings) -> Iterator[str]:
-    """Yield the violations in peers and listen, and administrator's rules that zenoh can't hold."""
-    yield from _peer_violations(spec.peers, settings.bounds)
+    """Yield the violation in listen, and rules of the administrator that zenoh can't hold."""
     if spec.listen and spec.listen.type not in settings.bounds.listen:
         others = " or ".join(settings.bounds.listen)
         fix = f"Choose {others}" if others else "Remove spec.listen"
@@ -142,13 +142,25 @@ def _zenoh_violations(spec: ZenohSpec, settings: ClusterSettings) -> Iterator[st
         )
 
 
-def _peer_violations(peers: Iterable[str], bounds: Bounds) -> Iterator[str]:
-    """Yield the violations in ``spec.peers``."""
+def _peer_violations(peers: Iterable[str], spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
+    """Yield the violations in ``spec.peers``.
+
+    If the RosProxy itself gives addresses for a host name, these count instead of the host name.
+    """
+    patterns = tuple(f"http://{_bracketed(pattern)}:1" for pattern in bounds.peers)
     for peer in peers if bounds.peers else ():
-        uri = slave_uri(HostPort(read_peer(peer).host, 1))
-        if not is_allowed_master(uri, tuple(f"http://{p}:1" for p in bounds.peers)):
+        name = read_peer(peer).host
+        hosts = _aliased(name, spec) or [name]
+        # Each address in one form: fd00:0::7 and fd00::7 are the same.
+        uris = [slave_uri(HostPort(parse_address(host) or host, 1)) for host in hosts]
+        if not all(is_allowed_master(uri, patterns) for uri in uris):
             fix = f"Choose a peer that fits {_any_of(bounds.peers)}"
             yield _refusal("spec.peers", peer, fix, "allow.peers")
+
+
+def _bracketed(pattern: str) -> str:
+    """A pattern of hosts, with brackets if the pattern is for IPv6 addresses."""
+    return f"[{pattern}]" if ":" in pattern and not pattern.startswith("[") else pattern
 
 
 def _data_plane_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
@@ -197,9 +209,14 @@ def _masters(spec: RosProxySpec) -> Iterator[str]:
     if host_port is None:
         yield master.uri
         return
-    aliases = (a["ip"] for a in spec.host_aliases if host_port.host in a.get("hostnames", ()))
+    aliases = _aliased(host_port.host, spec)
     for host in [*filter(None, (master.address, *aliases))] or [host_port.host]:
         yield slave_uri(HostPort(host, host_port.port))
+
+
+def _aliased(host: str, spec: RosProxySpec) -> list[str]:
+    """The addresses that a RosProxy itself gives for a host name."""
+    return [alias["ip"] for alias in spec.host_aliases if host in alias.get("hostnames", ())]
 
 
 def _fits(text: str, pattern: str) -> bool:

@@ -127,13 +127,13 @@ def plan(
     cluster_view = view(observed)
     learned = learn(cluster_view, state, now)
     ranges = allocate(cluster_view, settings, learned)
-    decided = decide(learned, ranges.given, now)
+    decided = decide(learned, ranges.on_hosts, now)
     retries = Retries(decided.attempts, observed.failures, now)
     context = ClusterContext(cluster_view, settings, decided, ranges, retries, now)
     actions = [*reconcile_orphans(context), *reconcile_orphaned_policies(context)]
     pod_findings = _pod_findings(cluster_view, decided, now)
     problems = [*pod_findings]
-    shared = (*pod_findings, *moves(cluster_view, decided, ranges.given))
+    shared = (*pod_findings, *moves(cluster_view, decided, ranges.on_hosts))
     for _, rosproxy in sorted(cluster_view.rosproxies.items()):
         own = [action for step in _STEPS for action in step(context, rosproxy)]
         states = tuple(_states(context, rosproxy))

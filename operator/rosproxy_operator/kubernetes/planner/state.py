@@ -33,7 +33,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPlace,
     RosProxySpec,
 )
-from rosproxy_operator.kubernetes.resources.names import ROUTERS
 from rosproxy_operator.kubernetes.status.findings import finding
 
 TRIED_RANGE_REPORTED_S = 60.0
@@ -130,8 +129,7 @@ def moves(
     for moved, has_served in ((state.moved, True), (state.tried, False)):
         for place, move in sorted(moved.items()):
             rosproxy = view.rosproxies[place.of]
-            is_published = not rosproxy.spec.zenoh and move.ports != ROUTERS
-            if place in ranges and is_published and is_moved(move.ports, ranges[place]):
+            if place in ranges and is_moved(move.ports, ranges[place]):
                 why = "the old ports are not free. Nothing needs to be done"
                 if has_served:
                     lost = advice_after_move(rosproxy.spec.ros1, rosproxy.spec.ros2 is not None)
@@ -142,7 +140,7 @@ def moves(
 
 
 def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:
-    """The range on which each proxy last served.
+    """The range of the node on which each proxy last served.
 
     Only the first look reads the ranges in the statuses: later, the state is newer than a status.
     """
@@ -152,7 +150,8 @@ def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:
             served |= {
                 ProxyPlace(name, node): ports for node, ports in rosproxy.former_ranges.items()
             }
-    served |= {place_of(p): p.range for p in view.observed.proxies if serves(p)}
+    proxies = (p for p in view.observed.proxies if serves(p) and not p.of_zenoh)
+    served |= {place_of(p): p.range for p in proxies}
     return _possible(view, served)
 
 

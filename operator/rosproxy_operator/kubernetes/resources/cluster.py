@@ -17,7 +17,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
-    ROUTERS,
     hubs_service_id,
     outside_service_id,
     service_id,
@@ -59,18 +58,20 @@ class ProxyPod(OwnPod, frozen=True, kw_only=True):
 
     ``restarts`` is the restart count of the container. ``runs``: the container's last known state
     is running. ``token`` is the token of the admin endpoint if a former operator wrote the token
-    into the pod, otherwise empty.
+    into the pod, otherwise empty. ``of_zenoh``: the proxy is for rmw_zenoh, and ``range`` has no
+    ports of the node.
     """
 
     range: PortRange
     token: str = ""
     restarts: int = 0
     runs: bool = False
+    of_zenoh: bool = False
 
     @property
     def has_registrations(self) -> bool:
         """Whether nodes of the proxy are known outside by ports. With rmw_zenoh they are not."""
-        return self.range != ROUTERS
+        return not self.of_zenoh
 
 
 class HelperPod(OwnPod, frozen=True, kw_only=True):

@@ -40,6 +40,8 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.pod_failures import pod_failure
 
 MASTER_VARIABLE = "ROS_MASTER_URI"
+ROS_VARIABLE = "ROSPROXY_ROS"
+"""Variable of a proxy with the versions of ROS that the proxy serves."""
 ROS2_VARIABLES = frozenset(
     {
         "ROS_STATIC_PEERS",
@@ -134,6 +136,7 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
         token=variables.get(names.TOKEN_VARIABLE, ""),
         restarts=sum(int_at(c, "restartCount") for c in statuses),
         runs=any(submap(c, "state").get("running") for c in statuses),
+        of_zenoh=variables.get(ROS_VARIABLE) == "zenoh",
     )
 
 

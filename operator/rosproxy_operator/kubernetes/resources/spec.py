@@ -240,7 +240,7 @@ def _ros2_spec(field: Field) -> Ros2Spec:
     domain = field["domain"]
     return Ros2Spec(
         domain=None if domain.value is None else domain.number(0, 0, LAST_DOMAIN),
-        peers=_peers(field, read_peer_name),
+        peers=_peers(field, _read_ipv4_peer),
         multicast=field["multicast"].boolean(),
     )
 
@@ -266,6 +266,14 @@ def _listen(field: Field) -> ListenSpec:
         load_balancer_class=balancer_class.text(),
         annotations=annotations.texts(),
     )
+
+
+def _read_ipv4_peer(text: str) -> str:
+    """Return a peer of ROS 2, as `read_peer_name` does. The proxies use only IPv4 for ROS 2."""
+    peer = read_peer_name(text)
+    if peer.count(":") > 1:
+        raise ValueError("an IPv6 address")
+    return peer
 
 
 def _peers(field: Field, read: Callable[[str], str]) -> tuple[str, ...]:

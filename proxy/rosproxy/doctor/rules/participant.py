@@ -92,8 +92,9 @@ def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
         fix = (
             f"{how_to('participants inside')}, and set "
             f"ROS_DOMAIN_ID={domain.domain} and ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET. If the "
-            "network has no multicast, set ROS_STATIC_PEERS to the proxy's address there. The "
-            "proxy can't carry RMW_IMPLEMENTATION=rmw_zenoh_cpp, which does not use DDS"
+            "network has no multicast, set ROS_STATIC_PEERS to the proxy's address there. "
+            "RMW_IMPLEMENTATION=rmw_zenoh_cpp does not use DDS: "
+            f"{how_to('rmw_zenoh')}"
         )
         yield warning("inside", subject, text, fix)
     else:

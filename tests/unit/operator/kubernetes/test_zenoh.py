@@ -193,6 +193,42 @@ def test_the_administrators_bounds_hold():
     assert "allow.peers" in refusal
 
 
+@pytest.mark.parametrize(
+    ("peer", "pattern", "is_allowed"),
+    [
+        ("[fd00::7]:7447", "fd00::*", True),
+        ("[fd00::7]:7447", "[fd00::*]", True),
+        ("[fd00:0:0::7]:7447", "fd00::7", True),
+        ("[fd01::7]:7447", "fd00::*", False),
+        ("fd.example:7447", "fd*", True),
+        ("fd.example:7447", "[fd*]", False),
+        ("192.0.2.7:7447", "fd00::*", False),
+    ],
+)
+def test_the_administrator_allows_ipv6_routers(peer: str, pattern: str, is_allowed: bool):
+    bounds = replace(SETTINGS, bounds=Bounds(peers=(pattern,)))
+    assert bool(bounds_violation(ofz(peer), {}, bounds)) != is_allowed
+
+
+def test_an_own_address_for_a_name_counts_instead_of_the_name():
+    alias = ({"ip": "198.51.100.1", "hostnames": ["robot"]},)
+    of = ofz("robot:7447", host_aliases=alias)
+    by_name, by_address = (
+        replace(SETTINGS, bounds=Bounds(peers=(pattern,))) for pattern in ("robot", "198.51.100.*")
+    )
+    assert "allow.peers" in bounds_violation(of, {}, by_name)
+    assert not bounds_violation(of, {}, by_address)
+    dds = some.rosproxy(ros1=False, ros2=Ros2Spec(peers=("robot",)), host_aliases=alias)
+    assert "allow.peers" in bounds_violation(dds, {}, by_name)
+
+
+def test_ipv6_routers_are_read():
+    given = ["[fd00::7]", "[fd00::8]:7448"]
+    assert specified(ros="zenoh", peers=given).zenoh.peers == ("[fd00::7]:7447", "[fd00::8]:7448")
+    with pytest.raises(InvalidField, match="is not a peer"):
+        specified(ros=2, peers=given)
+
+
 def test_bounds_of_ports_do_not_concern_a_proxy_without_ports():
     narrow = replace(SETTINGS, bounds=Bounds(max_ports=1))
     assert not bounds_violation(ofz(ports=32), {}, narrow)
@@ -353,6 +389,44 @@ def test_the_port_of_the_router_is_no_former_range():
     going = look(observed(back, service(back), some.pod(), former))
     made = creation(look(observed(back, service(back), some.pod()), going.state))
     assert some.ports_of(made) == "7000-7003"
+
+
+def test_a_proxy_of_ros_1_may_have_the_port_of_the_router_as_its_range():
+    of = some.rosproxy(ports=1, window=PortRange(7448, 7448))
+    of_ros1 = proxy(of, ports=names.ROUTERS)
+    assert of_ros1.has_registrations
+    assert not proxy_of(ofz()).has_registrations
+    plan = look(observed(of, service(of), some.pod(), of_ros1))
+    assert not done(plan)
+    wider = replace(of, spec=replace(of.spec, window=PortRange(7440, 7459)))
+    moved = look(observed(wider, service(wider), some.pod(), of_ros1), plan.state)
+    assert not done(moved)  # the proxy keeps its ports
+    other = replace(of, spec=replace(of.spec, window=PortRange(7450, 7459)))
+    left = look(observed(other, service(other), some.pod(), of_ros1), plan.state)
+    (action,) = done(left)
+    assert isinstance(action, DeleteProxy)
+    assert action.retire
+    assert "has left ports 7448-7448 for 7450-7450" in told(left, "PortConflict")[0]
+
+
+@pytest.mark.parametrize(
+    ("rosproxy", "wired"),
+    [
+        (ofz(), {"wired_master_uri": "http://10.96.1.1:11311"}),
+        (ofz(), {"static_peers": "10.96.1.1"}),
+        (some.rosproxy(), {"router_endpoint": "tcp/10.96.1.1:7448"}),
+        (some.rosproxy(ros1=False, ros2=Ros2Spec()), {"router_endpoint": "tcp/10.96.1.1:7448"}),
+    ],
+)
+def test_a_pod_that_was_wired_for_another_version_is_told(rosproxy: RosProxy, wired: Any):
+    labels = {names.INJECT: "true"}
+    former = pod(
+        labels=labels, containers=(PodContainer("ros:1"),), workload="deployment/a", **wired
+    )
+    plan = look(observed(rosproxy, service(rosproxy), former))
+    (text,) = told(plan, "NotWired")
+    assert "since spec.ros of RosProxy robot has changed after the pod was created" in text
+    assert text.endswith("Run kubectl -n ros rollout restart deployment/a")
 
 
 def test_a_proxy_is_told_its_policy_and_no_callers():

@@ -310,6 +310,9 @@ def missing_variable_text(
     if not webhook.served:
         fix = edit_fix(f"Set {variable} in the template", pod)
         return f"{text}, since the operator serves no webhook (webhook.enabled=false). {fix}"
+    if pod.wired_master_uri or pod.static_peers or pod.router_endpoint:
+        changed = f"spec.ros of RosProxy {rosproxy.id.name} has changed"
+        return f"{text}, since {changed} after the pod was created. {restart}"
     if _is_older(pod, rosproxy):
         return f"{text}, since the pod is older than RosProxy {rosproxy.id.name}. {restart}"
     reason = (
