@@ -1,5 +1,6 @@
 """The objects of the chart for single values and combinations."""
 
+import ast
 import json
 import re
 import shutil
@@ -12,8 +13,10 @@ import pytest
 from rosproxy import __version__
 from rosproxy.access.layers import PolicyMode
 from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.cli import main
 from rosproxy_operator.common.proxy_bounds import ProxyBounds
+from rosproxy_operator.common.zenoh import client_override
 from rosproxy_operator.kubernetes.resources.pod_defaults import PodDefaults
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.kubernetes.settings import (
@@ -412,8 +415,8 @@ def test_definition_is_kept() -> None:
     assert "annotations" not in deleted["metadata"]
 
 
-@pytest.mark.parametrize("ros", [1, 2])
-def test_global_registry_and_secrets(ros: int) -> None:
+@pytest.mark.parametrize("ros", [1, 2, "zenoh"])
+def test_global_registry_and_secrets(ros: int | str) -> None:
     values = {
         "global": {"imageRegistry": "mirror.example/", "imagePullSecrets": [{"name": "all"}]},
         "image": {"repository": "registry.example:5000/ros/rosproxy-operator", "tag": "1"},
@@ -431,9 +434,35 @@ def test_global_registry_and_secrets(ros: int) -> None:
     secrets = json.loads(text.removeprefix("--proxy-pod="))["imagePullSecrets"]
     assert secrets == [{"name": "all"}, {"name": "proxies"}]
     (test,) = of_kind(manifests, "Pod")
-    image = "ros:jazzy-ros-core" if ros == 2 else "ros:noetic-ros-core-focal"
-    assert test["spec"]["containers"][0]["image"] == f"mirror.example/{image}"
-    assert test["spec"]["imagePullSecrets"] == [{"name": "all"}]
+    images = {1: "ros:noetic-ros-core-focal", 2: "ros:jazzy-ros-core", "zenoh": "rosproxy:1"}
+    assert test["spec"]["containers"][0]["image"] == f"mirror.example/{images[ros]}"
+    of_proxies = [{"name": "proxies"}] if ros == "zenoh" else []
+    assert test["spec"]["imagePullSecrets"] == [{"name": "all"}, *of_proxies]
+
+
+@pytest.mark.parametrize("webhook", [True, False])
+def test_the_test_of_rmw_zenoh_runs_in_the_proxys_image(webhook: bool) -> None:
+    values = {
+        "tests": {"ros": "zenoh"},
+        "webhook": {"enabled": webhook},
+        "proxy": {"image": {"tag": "1", "pullPolicy": "Never"}},
+    }
+    manifests = objects(values)
+    (rosproxy,) = of_kind(manifests, "RosProxy")
+    assert rosproxy["spec"]["ros"] == "zenoh"
+    assert not {"domain", "ports", "portWindow", "master"} & rosproxy["spec"].keys()
+    (test,) = of_kind(manifests, "Pod")
+    (container,) = test["spec"]["containers"]
+    assert container["command"] == ["python3", "/test/test.py"]
+    assert "args" not in container
+    assert (container["image"], container["imagePullPolicy"]) == ("rosproxy:1", "Never")
+    variables = {v["name"]: v.get("value", "") for v in container["env"]}
+    name = rosproxy["metadata"]["name"]
+    override = client_override(HostPort(f"rosproxy-{name}", 7448))
+    assert variables.get("ZENOH_CONFIG_OVERRIDE") == (None if webhook else override)
+    (scripts,) = (m for m in of_kind(manifests, "ConfigMap") if "echo.py" in m.get("data", {}))
+    for script in scripts["data"].values():
+        ast.parse(script)
 
 
 def test_namespace_override() -> None:

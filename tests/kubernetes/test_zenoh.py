@@ -1,6 +1,7 @@
 """Nodes of rmw_zenoh: in pods of two nodes of the cluster, and behind a robot's router."""
 
 import itertools
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from tests.docker.engine import docker, inspect, wait_until
 from tests.docker.images import ZENOH, build_image
 from tests.docker.nodes import Log
 from tests.docker.zenoh import NODE, Node
-from tests.kubernetes import api
+from tests.kubernetes import api, release
 from tests.kubernetes.api import Json
 from tests.kubernetes.cluster.control_plane import kubectl
 from tests.kubernetes.cluster.images import load_images
@@ -301,6 +302,15 @@ def test_a_pod_that_goes_its_own_way_is_told(world: World) -> None:
     wait_event(world.net.name, pod.name, "Pod", "NotWired", "connects the nodes past the proxy")
     assert pod.environment[OVERRIDE] == own[OVERRIDE]
     pod.remove(grace=0, wait=False)
+
+
+def test_helm_test() -> None:
+    """The test's two pods keep away from each other, so the answer passes two hubs."""
+    release.upgrade(tests={"ros": "zenoh"})
+    told = release.helm("test", release.NAME, "--namespace", release.NAMESPACE, seconds=300)
+    assert re.search("PASSED: a question went to the pod on node node[12]", told), told
+    assert "both pods are on node" not in told
+    release.upgrade()
 
 
 def test_nothing_is_left(world: World) -> None:

@@ -36,7 +36,14 @@ With the default security contexts it meets the standard "restricted".
 automountServiceAccountToken: false
 restartPolicy: {{ .restart }}
 terminationGracePeriodSeconds: 1
-{{- $secrets := dict "root" .root "secrets" .root.Values.tests.imagePullSecrets }}
+{{- $tests := .root.Values.tests }}
+{{- $zenoh := eq (toString $tests.ros) "zenoh" }}
+{{- $proxy := .root.Values.proxy }}
+{{- $own := $tests.imagePullSecrets }}
+{{- if $zenoh }}
+{{- $own = concat $own (default list $proxy.pod.imagePullSecrets) | uniq }}
+{{- end }}
+{{- $secrets := dict "root" .root "secrets" $own }}
 {{- with include "rosproxy.pullSecrets" $secrets | fromJsonArray }}
 imagePullSecrets:
   {{- toYaml . | nindent 2 }}
@@ -47,14 +54,17 @@ securityContext:
 {{- end }}
 containers:
   - name: ros
-    {{- $tests := .root.Values.tests }}
+    {{- if $zenoh }}
+    image: {{ include "rosproxy.image" (dict "root" .root "image" $proxy.image) | quote }}
+    {{- else }}
     {{- $image := ternary $tests.ros2Image $tests.image (eq (int $tests.ros) 2) }}
     image: {{ include "rosproxy.mirrored" (dict "root" .root "name" $image) | quote }}
-    {{- with .root.Values.tests.imagePullPolicy }}
+    {{- end }}
+    {{- with $tests.imagePullPolicy | default (ternary $proxy.image.pullPolicy "" $zenoh) }}
     imagePullPolicy: {{ . }}
     {{- end }}
-    # Not as command: the entry point of ROS's images sets the environment up.
-    args:
+    # The entry point of ROS's images sets the environment up. That of the proxy's image is rosproxy.
+    {{ ternary "command" "args" $zenoh }}:
       {{- toYaml .args | nindent 6 }}
     env:
       - name: HOME
