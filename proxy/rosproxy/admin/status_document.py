@@ -435,6 +435,7 @@ class ZenohNodeStatus(msgspec.Struct, frozen=True):
 class ZenohStatus(msgspec.Struct, frozen=True):
     """The routers for rmw_zenoh: ports for containers, and the port ``listen`` for outside.
 
+    ``hub_listen``: the port of the hub for the hubs of other proxies.
     ``failure``: why the routers do not run. ``restarts``: how often the child process has ended.
     ``mismatches`` are pairs of nodes with a node inside: ``writer`` is the key of the node that
     publishes or serves, ``reader`` of the node that subscribes or calls. ``not_compared``: pairs of
@@ -458,6 +459,7 @@ class ZenohStatus(msgspec.Struct, frozen=True):
     mismatches: tuple[MismatchStatus, ...] = ()
     mismatches_left_out: Count = 0
     not_compared: Count = 0
+    hub_listen: Count | None = None
 
 
 class ProxyStatus(msgspec.Struct, frozen=True):

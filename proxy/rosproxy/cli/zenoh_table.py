@@ -2,7 +2,13 @@
 
 from collections.abc import Iterator
 
-from rosproxy.admin.status_document import ZenohLinkStatus, ZenohNodeStatus, ZenohStatus
+from rosproxy.admin.status_document import (
+    ZenohLinkStatus,
+    ZenohNodeStatus,
+    ZenohSessionStatus,
+    ZenohStatus,
+)
+from rosproxy.net.addresses import parse_host_port
 from rosproxy.telemetry.tables import GAP, besides_first, table
 from rosproxy.telemetry.text import clean, duration, listed, plural, wrap
 
@@ -23,7 +29,7 @@ def zenoh_lines(zenoh: ZenohStatus, columns: int) -> Iterator[str]:
                 clean(session.remote),
                 clean(session.mode),
                 clean(session.local),
-                "hub" if session.port is None else f"port {session.port}",
+                _router(session, zenoh),
             )
             for session in zenoh.sessions
         ]
@@ -42,11 +48,21 @@ def _summary(zenoh: ZenohStatus) -> str:
     listens = "" if zenoh.listen is None else f"; port {zenoh.listen} for outside"
     if zenoh.link_listen:
         listens += f"; port {clean(zenoh.link_listen)} for other sites"
+    if zenoh.hub_listen is not None:
+        listens += f"; port {zenoh.hub_listen} for proxies on other hosts"
     links = listed(_link(link) for link in zenoh.links if not link.hub) or "none"
     hubs = listed(_link(link) for link in zenoh.links if link.hub)
     ports = f"ports {clean(zenoh.ports)} for containers{listens}"
     text = f"zenoh routers {state}; {ports}; links to outside: {links}"
     return f"{text}; proxies on other hosts: {hubs}" if hubs else text
+
+
+def _router(session: ZenohSessionStatus, zenoh: ZenohStatus) -> str:
+    """The router of a session: the hub, or the router at a port."""
+    local = parse_host_port(session.local)
+    for_outside = zenoh.listen if local and local.port == zenoh.listen else None
+    port = session.port or for_outside
+    return f"port {port}" if port else "hub"
 
 
 def _link(link: ZenohLinkStatus) -> str:

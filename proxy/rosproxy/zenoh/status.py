@@ -173,6 +173,7 @@ class ZenohState(Collector):
         return ZenohStatus(
             ports=str(self._settings.zenoh_ports),
             listen=self._settings.zenoh_listen,
+            hub_listen=self._settings.zenoh_hub_listen,
             link_listen=str(self._settings.zenoh_link_listen or ""),
             link_listens=self._link_listens,
             limits=tuple(map(str, self._settings.zenoh_limit)),

@@ -24,6 +24,7 @@ STATUS = ProxyStatus(
         sessions=(
             ZenohSessionStatus(7448, "peer", "ab", "172.18.0.2:7448", "172.18.0.3:50000"),
             ZenohSessionStatus(None, "router", "cd", "172.18.0.2:40000", "192.0.2.7:7447"),
+            ZenohSessionStatus(None, "client", "ef", "172.18.0.2:7447", "192.0.2.9:50000"),
         ),
         nodes=(
             ZenohNodeStatus("/talker\x1b[2J", 0, "172.18.0.3", ("/chatter",), (), ("/add",)),
@@ -40,6 +41,7 @@ left out 3 names and entries: /status is bounded, see docs/reference/limits.md
 REMOTE            MODE    LOCAL             ROUTER
 172.18.0.3:50000  peer    172.18.0.2:7448   port 7448
 192.0.2.7:7447    router  172.18.0.2:40000  hub
+192.0.2.9:50000   client  172.18.0.2:7447   port 7447
 NODE            DOMAIN  ADDRESS     PUB  SUB  SRV
 /talker\\x1b[2J  0       172.18.0.3    1    0    1
     publishes  /chatter
@@ -55,8 +57,9 @@ def test_the_routers() -> None:
 
 def test_proxies_on_other_hosts_stand_apart() -> None:
     hub = ZenohLinkStatus("node2:7447", False, "unresolvable", 3.0, hub=True)
-    zenoh = ZenohStatus(ports="7448-7448", links=(hub,))
+    zenoh = ZenohStatus(ports="7448-7448", links=(hub,), hub_listen=7447)
     shown = render(ProxyStatus(settings=StatusSettings(ros=("zenoh",)), zenoh=zenoh), 200)
+    assert "; port 7447 for proxies on other hosts; links to outside: none; " in shown
     assert "links to outside: none; proxies on other hosts: node2:7447 DOWN (unresolvable)" in shown
 
 

@@ -60,6 +60,11 @@ def test_without_outside_and_without_nodes_the_doctor_says_what_to_set() -> None
     assert 'mode="client";connect/endpoints=["tcp/PROXY:7448"]' in told[1].fix
 
 
+def test_a_proxy_that_waits_for_other_hubs_has_a_way_to_outside() -> None:
+    told = findings(ZenohStatus(ports="7448-7448", hub_listen=7447))
+    assert Severity.WARNING not in {finding.severity for finding in told}
+
+
 def test_a_hub_that_is_away_is_a_note() -> None:
     links = (
         ZenohLinkStatus("a:7447", True, hub=True),

@@ -65,7 +65,8 @@ def _outside(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
         elif link.hub and link.error not in _NOT_NOTED:
             text = f"not linked ({link.error}). The hub tries again"
             yield note("link", link_subject(link), text, how_to("zenoh hub"))
-    if not zenoh.links and zenoh.listen is None and not zenoh.link_listen:
+    listens = zenoh.listen is not None or zenoh.hub_listen is not None or zenoh.link_listen
+    if not zenoh.links and not listens:
         text = "no router outside is set, and the proxy listens for none. Nodes in containers "
         text += "reach only each other"
         yield warning("link", ROUTERS, text, how_to("zenoh outside"))
