@@ -217,9 +217,7 @@ class Zenoh:
             str(port) for port in (settings.zenoh_link_listen, at_hub) if port is not None
         )
         text = f"the certificate {reason}. If the proxy is known, look at rosproxy doctor there"
-        self._runtime.refusals.note(
-            "link_certificate", f"a connection to {ports}", text
-        )
+        self._runtime.refusals.note("link_certificate", f"a connection to {ports}", text)
 
     async def _look_at_policy(self) -> None:
         """Apply changes of the policy and of the containers at ports. Report denied names."""

@@ -53,7 +53,7 @@ def test_a_link_knows_since_when_it_is_up_or_down() -> None:
 
 def test_zenoh_reports_the_dialed_name_of_a_link_over_quic() -> None:
     ends = Ends(HostPort("0.0.0.0", 40000), HostPort("robot", 7447))
-    assert is_linked(PEER, (), [ends], None)
+    assert is_linked(PEER, (), [ends], ())
     link = Link(PEER, 1.0, protocol="quic")
     assert str(link) == "quic/robot:7447"
     assert str(Link(PEER, 1.0)) == "robot:7447"
