@@ -97,29 +97,46 @@ class PortDraws:
     """Draws ports that are free for TCP and UDP from a range, in order.
 
     So a freed port comes again only after all other ports: peers may still look for its former
-    program. The first port is random, because other processes may draw from the same range.
+    program. The first port is random. The process reserves each block of ports that it draws from:
+    another process that draws from this range, such as a second demonstration, uses other blocks.
     """
 
     def __init__(self, ports: range) -> None:
-        self.keep_to(ports)
-
-    def keep_to(self, ports: range) -> None:
-        """Draw from this range from now on."""
         self.ports = ports
         self._next = random.choice(ports)  # noqa: S311
+        self._reserved: set[int] = set()
 
     def draw(self, count: int) -> int:
-        """The first of `count` ports in a row."""
+        """The first of `count` ports in a row. Raises OSError if there are none."""
         kinds = socket.SOCK_STREAM, socket.SOCK_DGRAM
-        while True:
+        for _ in self.ports:
             if self._next + count > self.ports.stop:
                 self._next = self.ports.start
             row = range(self._next, self._next + count)
             self._next = row.stop
+            if not all(self._reserve(block) for block in {port // BLOCK for port in row}):
+                continue
             if all(is_free(port, kind=kind) for port in row for kind in kinds):
                 return row.start
+        raise OSError(f"no {count} ports in a row are free in {self.ports}")
+
+    def _reserve(self, block: int) -> bool:
+        """Reserve a block until this process ends. False if another process has the block."""
+        if block in self._reserved:
+            return True
+        reservation = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            reservation.bind(f"\0rosproxy-demo-ports-{block}")
+        except OSError:
+            reservation.close()
+            return False
+        reservation.detach()
+        self._reserved.add(block)
+        return True
 
 
+BLOCK = 100
+"""Ports that a process reserves together."""
 PORTS = PortDraws(range(15000, 32000))
 """Below the ephemeral range, from which the kernel chooses ports for clients."""
 free_ports = PORTS.draw

@@ -1,9 +1,12 @@
 """The fake master and nodes do what the tests of the proxy rely on, as ROS's own do."""
 
 import asyncio
+import random
+from operator import itemgetter
 
 import pytest
 
+from examples.demo.fake_http import BLOCK, PORTS, PortDraws
 from examples.demo.players import Listener, Refused, Talker
 from tests.integration.net import NODE, OTHER_NODE, OUTSIDE, rpc, until
 
@@ -11,6 +14,12 @@ TYPE = "std_msgs/String"
 A = "http://127.0.0.1:1/"
 B = "http://127.0.0.1:2/"
 NEW_NODE = "[/twin] Reason: new node registered with same name"
+
+
+def test_two_programs_draw_no_port_of_each_other(monkeypatch):
+    monkeypatch.setattr(random, "choice", itemgetter(0))
+    rows = [PortDraws(PORTS.ports).draw(8) for _ in range(2)]
+    assert len({row // BLOCK for row in rows}) == len(rows)
 
 
 async def state(master):
