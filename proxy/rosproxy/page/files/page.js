@@ -265,6 +265,7 @@ function showGraph(found, cause) {
   showLanes(places);
   showBoxes(lanes, lines, proxies, places, all, on);
   showWays(lines, places);
+  $("picture").classList.toggle("narrow", places.isNarrow);
   $("picture").classList.toggle("choosing", on.nodes.size + on.links.size > 0);
   const rest = left.reduce((sum, line) => sum + line.links.length, 0);
   put($("more-lines"), left.length ? `${left.length} more lines with ${rest} links are not drawn. Choose a box to see its lines.` : "");

@@ -14,6 +14,7 @@ const FEW_ROWS = 24; // of a lane that unfolds again: so a node that comes and g
 const MOST_PLACES = 24;
 const MOST_LINES = 60;
 const LEAST_WIDTH = 600;
+const NARROW = 900; // a row of a narrower picture has two lines of text
 const BOX = 26;
 const ROW = 22;
 const FIX = 16; // a second line of text in a row
@@ -203,7 +204,7 @@ function addLink(line, one, isOn) {
 // of the frames around them, and the way of each line.
 export function layout(lanes, lines, proxies, width) {
   const columns = columnsOf(width);
-  const places = { columns, boxes: new Map(), frames: new Map(), rows: new Map(), heads: new Map(), ways: new Map() };
+  const places = { columns, isNarrow: width < NARROW, boxes: new Map(), frames: new Map(), rows: new Map(), heads: new Map(), ways: new Map() };
   const [outside, host, inside] = lanes;
   const bottoms = [stack(outside, columns[0], 0, places)];
   const carriers = carriersOf(lines, proxies, places);
@@ -276,7 +277,7 @@ function stackRows(lines, carriers, places) {
     places.heads.set(via, { x: column.x + GAP, y: y + GAP, w: column.w - 2 * GAP, h: BOX });
     y += BOX + 2 * GAP;
     for (const line of own) {
-      const h = ROW + (hasFix(line) ? FIX : 0) + (isHairpin(line, places) ? GAP : 0);
+      const h = ROW + (hasFix(line) || places.isNarrow ? FIX : 0) + (isHairpin(line, places) ? GAP : 0);
       places.rows.set(line.id, { x: column.x + GAP, y, w: column.w - 2 * GAP, h });
       y += h + GAP;
     }
