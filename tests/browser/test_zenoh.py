@@ -173,8 +173,12 @@ def test_a_rule_is_told_at_its_pair_and_is_no_fault(lab: Lab, browser: Browser) 
     browser.open(URL)
     row(browser, "/chatter", State="ok", From=talker, To=listener)
     lab.post_policy({"name": "operator", "rules": ["deny publish /chatter"]})
-    denied = row(browser, "/chatter", State="not looked at", From=talker, To=listener)
-    assert denied["text"].startswith("hidden from outside by the policy: ")
+    cells = {"State": "not looked at", "From": talker, "To": listener}
+    hidden = "hidden from outside by the policy: "
+    wait_until(
+        "the page names the rule",
+        lambda: row(browser, "/chatter", **cells)["text"].startswith(hidden),
+    )
     assert trouble(browser) == NOTHING_WRONG
     lab.post_policy()
     row(browser, "/chatter", State="ok", From=talker, To=listener)
