@@ -18,6 +18,7 @@ from functools import partial
 from itertools import count, cycle
 from typing import Any, NamedTuple
 
+from rosproxy import __version__
 from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
@@ -249,7 +250,7 @@ def _of_ros2(link: PageLink, shared: int) -> PageLink:
 async def document_each_second(nodes: int) -> AsyncGenerator[dict[str, Any]]:
     """Yield the merged document of each second."""
     for second in count():
-        yield merged(documents(nodes, second), "0", "docker logs {}".format, places(nodes))
+        yield merged(documents(nodes, second), __version__, "docker logs {}".format, places(nodes))
         await asyncio.sleep(1.0)
 
 

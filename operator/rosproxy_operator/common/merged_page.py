@@ -48,6 +48,7 @@ from rosproxy.page.page_document import (
     within_bounds,
 )
 from rosproxy.page.zenoh_graph import HUB, NODE, ROUTER
+from rosproxy.telemetry.text import plural
 
 Json = dict[str, Any]
 PROXY = "proxy"
@@ -114,7 +115,7 @@ def merged(
     shown, kept = within_bounds(nodes, links)
     shown_findings = fair_choice(findings, itemgetter(0), MOST_FINDINGS)
     return {
-        "proxy": {"host": f"{len(documents)} proxies", "version": version},
+        "proxy": {"host": plural(len(documents), "proxy"), "version": version},
         "nodes": msgspec.to_builtins(shown),
         "links": msgspec.to_builtins(kept),
         "findings": msgspec.to_builtins([f for _, f in shown_findings]),

@@ -111,9 +111,11 @@ def size(count: float) -> str:
 
 
 def plural(count: int, noun: str) -> str:
-    """``1 port``, ``2 ports``, ``2 addresses``."""
+    """``1 port``, ``2 ports``, ``2 addresses``, ``2 proxies``, ``2 keys``."""
     if count == 1:
         return f"{count} {noun}"
+    if noun.endswith("y") and noun[-2] not in "aeo":
+        return f"{count} {noun[:-1]}ies"
     return f"{count} {noun}es" if noun.endswith("s") else f"{count} {noun}s"
 
 

@@ -152,3 +152,5 @@ def test_lists_and_plurals() -> None:
     assert plural(1, "port") == "1 port"
     assert plural(0, "port") == "0 ports"
     assert plural(2, "address") == "2 addresses"
+    assert plural(2, "proxy") == "2 proxies"
+    assert plural(2, "key") == "2 keys"

@@ -32,7 +32,7 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
     containers = len({container["name"] for container in status["containers"]})
     head = wrap(
         f"rosproxy-operator {clean(status['version'])}: {plural(containers, 'container')}, "
-        f"{proxies} {'proxy' if proxies == 1 else 'proxies'}, uplink network "
+        f"{plural(proxies, 'proxy')}, uplink network "
         f"{clean(status['uplink'])}",
         columns,
         "",

@@ -6,7 +6,7 @@
 import { causesOf, follow, titleOf } from "./findings.js";
 import { curveOf, emptyHistory, lastMinute, minuteText, record } from "./history.js";
 import { boxesOf, DIRECT, hasFix, joined, layout, linesOf, selection } from "./picture.js";
-import { age, apply, duration, frequency, hertz, labelOf, megabytes, rateOf, visibleLinks, visibleNodes, WORDS } from "./view.js";
+import { age, apply, duration, frequency, hertz, isKnown, labelOf, megabytes, rateOf, visibleLinks, visibleNodes, WORDS } from "./view.js";
 
 const AT_MOST_EVERY = 500;
 const MOST_ROWS = 400;
@@ -220,7 +220,7 @@ function tellRest(count) {
 function showRows(body, elements, heads, listed) {
   arrange(body, elements, new Map(listed.map((row) => [row.id, row])), ({ key }) => makeRow(heads, key), (row, { one, on, texts }) => {
     const kind = one.state || "unknown";
-    [WORDS[kind], ...texts].forEach((text, index) => put(row.cells[index], String(text)));
+    [WORDS[kind], ...texts].forEach((text, index) => putName(row.cells[index], String(text)));
     if (row.dataset.state !== kind) {
       row.dataset.state = kind;
       row.cells[0].className = `state ${kind}`;
@@ -332,9 +332,8 @@ function lineTexts(line, now) {
   const sum = rateOf(line.links.map((one) => one.link));
   const rate = sum.rate === undefined ? "" : `${megabytes(sum)} MB/s`;
   if (count > 1) return [what, rate, ""];
-  const measures = [frequency(link), rate,
-    link.carried || "", link.flows || link.since === undefined ? "" : age(link, now)];
-  return [what, measures.filter(Boolean).join(", "), ""];
+  const measures = link.flows || !isKnown(link.since) ? [frequency(link), rate] : [age(link, now)];
+  return [what, [...measures, link.carried].filter(Boolean).join(", "), ""];
 }
 
 function makeBox({ kind }) {
@@ -525,6 +524,12 @@ function putAt(element, { x, y, w, h }) {
 
 function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
+}
+
+// The same for a text with names, which may break after each slash.
+function putName(element, text) {
+  if (element.textContent === text) return;
+  element.replaceChildren(...text.split(/(?<=[^/]\/)/).flatMap((part) => [part, make("wbr")]).slice(0, -1));
 }
 
 start();

@@ -89,7 +89,7 @@ export function megabytes(link) {
   return `${atMost(link, rate)}${Number(rate.toPrecision(2))}`;
 }
 
-function isKnown(value) {
+export function isKnown(value) {
   return value !== undefined && value !== null;
 }
 
