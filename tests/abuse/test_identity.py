@@ -153,9 +153,8 @@ async def test_forged_addresses_of_others(apart, apart_master, make_node):
     asked = {header["callerid"] for victim in victims for header in victim.headers}
     assert asked <= {"/rosproxy"}  # the proxy only asks for the name
     assert apart_master.nodes[node.name].startswith(f"http://{APART_HOST}:{lease[1]}/")
-    assert not [
-        uri for uri in apart_master.nodes.values() for victim in victims if uri == victim.uri
-    ]
+    # Outside reaches the URI of /robot without the proxy, so such a registration may pass.
+    assert victims[0].uri not in apart_master.nodes.values()
 
 
 @pytest.mark.parametrize("kind", ["refusing", "silent"])
