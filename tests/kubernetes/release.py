@@ -56,7 +56,8 @@ def install() -> None:
 
 
 def install_again(**values: Any) -> None:
-    """Install the chart after `uninstall`, with these additional values."""
+    """Install the chart anew, with these additional values."""
+    uninstall()
     _apply("install", **values)
 
 
@@ -85,12 +86,13 @@ def other_image() -> str:
 
 
 def uninstall() -> None:
-    helm("uninstall", NAME, "--namespace", NAMESPACE, "--wait")
+    """Uninstall the release, if there is one."""
+    helm("uninstall", NAME, "--namespace", NAMESPACE, "--wait", "--ignore-not-found")
 
 
 def remove() -> None:
     """Remove the release completely, in any state."""
-    helm("uninstall", NAME, "--namespace", NAMESPACE, "--wait", "--ignore-not-found")
+    uninstall()
     api.delete("namespaces", "", NAMESPACE)
     wait_until(lambda: not api.get("namespaces", "", NAMESPACE), 60, f"{NAMESPACE} is gone")
 
