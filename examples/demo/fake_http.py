@@ -96,7 +96,7 @@ def is_free(port: int, address: str = "", kind: int = socket.SOCK_STREAM) -> boo
 class PortDraws:
     """Draws ports that are free for TCP and UDP from a range, in order.
 
-    So a freed port comes again only after all other ports: peers may still look for its former
+    So a freed port comes again only after many other ports: peers may still look for its former
     program. The first port is random. The process reserves each block of ports that it draws from:
     another process that draws from this range, such as a second demonstration, uses other blocks.
     """
@@ -121,9 +121,14 @@ class PortDraws:
         raise OSError(f"no {count} ports in a row are free in {self.ports}")
 
     def _reserve(self, block: int) -> bool:
-        """Reserve a block until this process ends. False if another process has the block."""
+        """Reserve a block until this process ends.
+
+        False if another process has the block, or if this process has MOST_BLOCKS.
+        """
         if block in self._reserved:
             return True
+        if len(self._reserved) == MOST_BLOCKS:
+            return False
         reservation = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
             reservation.bind(f"\0rosproxy-demo-ports-{block}")
@@ -137,6 +142,8 @@ class PortDraws:
 
 BLOCK = 100
 """Ports that a process reserves together."""
+MOST_BLOCKS = 16
+"""The highest number of blocks of a process: so there are blocks for ten processes."""
 PORTS = PortDraws(range(15000, 32000))
 """Below the ephemeral range, from which the kernel chooses ports for clients."""
 free_ports = PORTS.draw

@@ -6,7 +6,7 @@ from operator import itemgetter
 
 import pytest
 
-from examples.demo.fake_http import BLOCK, PORTS, PortDraws
+from examples.demo.fake_http import BLOCK, MOST_BLOCKS, PORTS, PortDraws
 from examples.demo.players import Listener, Refused, Talker
 from tests.integration.net import NODE, OTHER_NODE, OUTSIDE, rpc, until
 
@@ -20,6 +20,12 @@ def test_two_programs_draw_no_port_of_each_other(monkeypatch):
     monkeypatch.setattr(random, "choice", itemgetter(0))
     rows = [PortDraws(PORTS.ports).draw(8) for _ in range(2)]
     assert len({row // BLOCK for row in rows}) == len(rows)
+
+
+def test_a_program_leaves_ports_to_others():
+    draws = PortDraws(PORTS.ports)
+    drawn = {draws.draw(8) // BLOCK for _ in range(3 * MOST_BLOCKS * BLOCK // 8)}
+    assert len(drawn) <= MOST_BLOCKS
 
 
 async def state(master):
