@@ -87,7 +87,7 @@ def test_what_comes_and_goes_is_an_event(browser: Browser, tmp_path: Path) -> No
 def test_a_finding_is_shown_in_graph_and_table_and_leaves(browser: Browser, tmp_path: Path) -> None:
     with fleet(browser, tmp_path, 30):
         first = texts(browser, "#findings li:first-child span")
-        assert first[0] == "BROKEN: 3 at 172.18.0.2: /arm/driver_of_the_unit_0, …"
+        assert first[0] == "BROKEN: 3 at 172.18.0.2: /arm/driver_of_the_unit_0, behind ros1, …"
         assert first[-1].startswith("for over ")
         browser.run("document.querySelector('#findings .cause').click()")
         assert len(texts(browser, MARKED_BOXES)) == 3

@@ -22,13 +22,13 @@ export function causesOf({ nodes, links, findings }) {
     add(one.severity === "error" ? "broken" : "warning", "", { what: one.subject, text: one.text, fix: one.fix }, {});
   }
   for (const [id, node] of nodes) {
-    if (isWrong(node)) add(node.state, hostOf(node.address), { what: labelOf(id, node), text: node.text || "", fix: node.fix || "" }, { node: id }, [id, labelOf(id, node)]);
+    if (isWrong(node)) add(node.state, hostOf(node.address), { what: labelOf(id, node) + behind([node]), text: node.text || "", fix: node.fix || "" }, { node: id }, [id, labelOf(id, node)]);
   }
   for (const [id, link] of links) {
     if (!isWrong(link)) continue;
     const ends = [link.source, link.target].filter(Boolean);
     const labels = ends.map((end) => labelOf(end, nodes.get(end)));
-    const what = `${link.name} from ${labels.join(" to ")}`;
+    const what = `${link.name} from ${labels.join(" to ")}${behind(ends.map((end) => nodes.get(end)))}`;
     add(link.state, placeOf(link, ends, nodes), { what, text: link.text || "", fix: link.fix || "" }, { link: id }, [...ends, ...labels]);
   }
   return [...causes.values()].sort((a, b) => RANK[b.kind] - RANK[a.kind] || b.count - a.count);
@@ -36,6 +36,12 @@ export function causesOf({ nodes, links, findings }) {
 
 function isWrong({ state }) {
   return state === "broken" || state === "warning";
+}
+
+// The proxy of the node inside, on an operator's page: two robots may have nodes with the same names.
+function behind(ends) {
+  const inside = ends.find((one) => one?.proxy);
+  return inside ? `, behind ${inside.proxy}` : "";
 }
 
 // The place of the end that has the same problem, else of the end inside.

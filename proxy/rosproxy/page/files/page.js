@@ -332,7 +332,7 @@ function lineTexts(line, now) {
   const sum = rateOf(line.links.map((one) => one.link));
   const rate = sum.rate === undefined ? "" : `${megabytes(sum)} MB/s`;
   if (count > 1) return [what, rate, ""];
-  const measures = link.flows || !isKnown(link.since) ? [frequency(link), rate] : [age(link, now)];
+  const measures = link.flows || !isKnown(link.since) ? [frequency(link), rate] : [`last ${age(link, now)}`];
   return [what, [...measures, link.carried].filter(Boolean).join(", "), ""];
 }
 
