@@ -9,7 +9,6 @@ lists, then as much of each list as fits. Counters named ``left_out`` count the 
 """
 
 import json
-import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -38,7 +37,15 @@ _FIRST_TABLES = ("nodes", "inside", "outside", "sessions", "stand_ins", "udpros"
 """Tables, in the order in which an owner keeps the rows; rows of other tables come last."""
 _UNCOUNTED_LIST = "types"
 """The list whose entries ``left_out`` does not count: each entry belongs to a name."""
-_NOT_ASCII = re.compile(r"[^\x00-\x7f]+")
+_DELETE = b"\x7f"
+_ESCAPED = (
+    (_DELETE, 5),
+    (bytes(range(0xC2, 0xE0)), 4),
+    (bytes(range(0xE0, 0xF0)), 3),
+    (bytes(range(0xF0, 0xF5)), 8),
+)
+"""The first bytes of characters in UTF-8 that `encode` escapes, and by how many bytes each grows:
+``\\u`` with four digits takes six bytes, and a pair of these twelve."""
 Item = TypeVar("Item")
 Parent = TypeVar("Parent", bound=msgspec.Struct)
 Row = Any
@@ -49,7 +56,7 @@ VisitTable = Callable[[str, Sequence[Row], Callable[[Row], str]], tuple[Row, ...
 
 def bounded(status: ProxyStatus, most: int = MOST_BYTES) -> ProxyStatus:
     """The status with tables short enough for ``most`` bytes of JSON."""
-    excess = _size(status) - most
+    excess = encoded_size(status) - most
     if excess <= 0:
         return status
     entries = _entries(status)
@@ -90,10 +97,19 @@ def left_out(status: ProxyStatus) -> int:
 def encode(value: object) -> bytes:
     """A document or a part as JSON in ASCII, which is harmless on a terminal."""
     encoded = msgspec.json.encode(value)
-    if encoded.isascii():
+    if encoded.isascii() and _DELETE not in encoded:
         return encoded
-    # Only strings in JSON have characters that are not ASCII.
-    return _NOT_ASCII.sub(lambda run: json.dumps(run[0])[1:-1], encoded.decode()).encode()
+    # In one call of C code: nodes may choose names in which every second character is not ASCII.
+    return json.dumps(msgspec.json.decode(encoded), separators=(",", ":")).encode()
+
+
+def encoded_size(value: object) -> int:
+    """The number of bytes that `encode` returns, without the escaping."""
+    encoded = msgspec.json.encode(value)
+    if encoded.isascii() and _DELETE not in encoded:
+        return len(encoded)
+    every = len(encoded)
+    return every + sum(more * (every - len(encoded.translate(None, f))) for f, more in _ESCAPED)
 
 
 def fair_shares(wanted: Sequence[int], most: int) -> list[int]:
@@ -154,7 +170,7 @@ def _entries(status: ProxyStatus) -> list[_Entry]:
     entries: list[_Entry] = []
 
     def visit(name: str, rows: Sequence[Row], owner: Callable[[Row], str]) -> tuple[Row, ...]:
-        entries.extend(_Entry(name, owner(row), row, _size(row) + 1) for row in rows)
+        entries.extend(_Entry(name, owner(row), row, encoded_size(row) + 1) for row in rows)
         return tuple(rows)
 
     _visit_tables(status, visit)
@@ -230,7 +246,9 @@ def _fit(entries: Sequence[_Entry], room: int) -> None:
     """Shorten the rows of one owner, or leave rows out, until ``room`` bytes are enough."""
     ranks = {table: rank for rank, table in enumerate(_FIRST_TABLES)}
     ordered = sorted(entries, key=lambda entry: ranks.get(entry.table, len(ranks)))
-    bare_sizes = [_size(_shortened(entry.row, 0)) + 1 + _ROW_COUNTER_BYTES for entry in ordered]
+    bare_sizes = [
+        encoded_size(_shortened(entry.row, 0)) + 1 + _ROW_COUNTER_BYTES for entry in ordered
+    ]
     kept = sum(1 for used in accumulate(bare_sizes) if used <= room)
     for entry in ordered[kept:]:
         entry.is_left_out = True
@@ -251,7 +269,7 @@ def _shortened(row: Row, room: int) -> Row:
     for name in getattr(row, "__struct_fields__", ()):
         entries = getattr(row, name)
         if isinstance(entries, tuple):
-            sizes = accumulate(_size(entry) + 1 for entry in entries)
+            sizes = accumulate(encoded_size(entry) + 1 for entry in entries)
             used = list(takewhile(room.__ge__, sizes))
             lists[name] = entries[: len(used)]
             room -= used[-1] if used else 0
@@ -259,7 +277,3 @@ def _shortened(row: Row, room: int) -> Row:
     if not lists:
         return row
     return msgspec.structs.replace(row, **lists, left_out=row.left_out + left_out)
-
-
-def _size(value: object) -> int:
-    return len(encode(value))

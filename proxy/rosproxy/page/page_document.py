@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.admin.status_bounds import encode
+from rosproxy.admin.status_bounds import encoded_size
 from rosproxy.telemetry.text import brief
 
 ROBOT = "robot"
@@ -164,7 +164,7 @@ def within_bounds(
 def _fitting(rows: Iterable[tuple[str, Row]], room: int) -> Iterator[tuple[str, Row]]:
     """The first rows, with their keys, that together need at most ``room`` bytes as JSON."""
     for keyed in rows:
-        room -= len(encode(keyed))
+        room -= encoded_size(keyed)
         if room < 0:
             return
         yield keyed
