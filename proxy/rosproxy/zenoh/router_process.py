@@ -25,7 +25,7 @@ from typing import Any, TextIO
 import zenoh
 
 from rosproxy.zenoh.protocol.library_log import LEVELS
-from rosproxy.zenoh.protocol.liveliness import ALL_TOKENS, LONGEST_TOKEN, MOST_TOKENS
+from rosproxy.zenoh.protocol.liveliness import ALL_TOKENS, MOST_TOKENS, is_kept
 
 REPORT_INTERVAL_S = 1.0
 REOPEN_PAUSE_S = 0.5
@@ -49,14 +49,14 @@ class Tokens:
     def take(self, sample: Any) -> None:
         """Note that a token appears or ends. A thread of zenoh calls this."""
         key = str(sample.key_expr)
-        is_kept = key in self._keys
+        is_known = key in self._keys
         if sample.kind == zenoh.SampleKind.DELETE:
             self._keys.discard(key)
-            self.left_out = max(self.left_out - (not is_kept), 0)
-        elif len(self._keys) < MOST_TOKENS and len(key) <= LONGEST_TOKEN:
+            self.left_out = max(self.left_out - (not is_known), 0)
+        elif len(self._keys) < MOST_TOKENS and is_kept(key):
             self._keys.add(key)
         else:
-            self.left_out += not is_kept
+            self.left_out += not is_known
         self._changed = True
 
     def take_change(self) -> bool:

@@ -18,6 +18,7 @@ ALL_TOKENS = "@ros2_lv/**"
 LONGEST_TOKEN = 1024
 """Characters of a token. The proxy ignores longer tokens. A name of ROS 2 has at most 255
 characters, a type some tens."""
+_KEPT = re.compile(rf"[!#-\[\]-~]{{1,{LONGEST_TOKEN}}}")
 MOST_TOKENS = 8192
 """The highest number of tokens that the router process reports. A host with fifty nodes has some
 1,000."""
@@ -102,9 +103,18 @@ class ZenohNode(NamedTuple):
         return _node_key(self.domain, self.session, self.node_id, self.name)
 
 
+def is_kept(key: str) -> bool:
+    """Whether the router process reports a token: short, and of characters of names in ROS.
+
+    The characters take a byte each in JSON. Others take up to twelve bytes, so a report of
+    MOST_TOKENS could exceed its bound.
+    """
+    return _KEPT.fullmatch(key) is not None
+
+
 def parse_token(key: str) -> Entity | None:
-    """The entity of a token; None if the key is too long, or no token of rmw_zenoh."""
-    parts = key.split("/") if len(key) <= LONGEST_TOKEN else []
+    """The entity of a token; None if `is_kept` is false, or the key is no token of rmw_zenoh."""
+    parts = key.split("/") if is_kept(key) else []
     kind = _KINDS.get(parts[5]) if len(parts) in (_NODE_PARTS, _TOPIC_OR_SERVICE_PARTS) else None
     if kind is None or parts[0] != "@ros2_lv" or not all(parts):
         return None

@@ -2,19 +2,24 @@
 errors.
 """
 
+import json
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.zenoh.protocol.liveliness import (
     LONGEST_TOKEN,
+    MOST_TOKENS,
     Entity,
     EntityKind,
     ZenohNode,
+    is_kept,
     nodes_of,
     parse_token,
     ros_type,
 )
+from rosproxy.zenoh.protocol.report import LONGEST_REPORT
 
 ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -112,3 +117,20 @@ def test_entities_become_nodes() -> None:
         ),
         ZenohNode(5, ZID, "/talker", (), (), ()),
     )
+
+
+@given(st.text(), st.characters())
+def test_a_token_that_is_kept_is_short_in_json(key: str, letter: str) -> None:
+    """A report with all tokens fits into its bound, with room for the sessions."""
+    longest = f"{key}{letter}" + letter * (LONGEST_TOKEN - len(key) - 1)
+    for token in (key, letter, longest):
+        bytes_of_json = len(json.dumps(token)) + len(", ")
+        assert not is_kept(token) or bytes_of_json * MOST_TOKENS < 0.6 * LONGEST_REPORT
+
+
+@pytest.mark.parametrize("letter", ["\U0001f916", "\xe9", "\x01", '"', "\\", "\x7f", "\n"])
+def test_a_letter_that_takes_several_bytes_in_json_is_of_no_token(letter: str) -> None:
+    key = f"@ros2_lv/0/{ZID}/0/0/NN/%/%/talker"
+    assert is_kept(key)
+    assert not is_kept(key + letter)
+    assert parse_token(key + letter) is None
