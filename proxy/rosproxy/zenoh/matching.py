@@ -22,7 +22,7 @@ DURABILITY = "durability"
 """Values of `MismatchStatus.policy`. With DURABILITY, later messages pass nevertheless."""
 MOST_COMPARISONS = 10_000
 """Pairs of different entities in one comparison, which takes at most 0.1 s. Nodes with the same
-entities count once."""
+entities count once. A node may have several entities of a name (`_size`)."""
 MOST_MISMATCHES_OF_NAME = 100
 """Pairs of nodes of a topic or service that a comparison returns. All others are counted."""
 MOST_LISTED_VALUES = 3
@@ -126,7 +126,10 @@ def _grouped(side: _Side) -> _Groups:
 
 
 def _size(sides: tuple[_Groups, _Groups]) -> int:
-    return len(sides[0]) * len(sides[1])
+    """The cost to compare both sides: the pairs, each with the mean of its entities per node."""
+    writers, readers = sides
+    entities = sum(map(len, writers)) * len(readers) + sum(map(len, readers)) * len(writers)
+    return (entities + 1) // 2
 
 
 def _of_name(
