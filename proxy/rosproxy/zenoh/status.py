@@ -3,7 +3,8 @@
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from typing import Protocol
+from operator import attrgetter, itemgetter
+from typing import NamedTuple, Protocol
 
 from msgspec.structs import replace
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -38,9 +39,36 @@ MODES = ("client", "peer", "router")
 MOST_LISTED_MISMATCHES = 100
 """Mismatches that the status lists, with fair shares by the address inside. As many pairs that
 differ in durability alone are listed, too; further ones are not counted."""
+MOST_LISTED_NODES = 1500
+MOST_LISTED_SESSIONS = 1500
+"""Rows that the status lists, with fair shares by address. The live page shows as many nodes."""
 _PlacedSession = tuple[int | None, RouterSession, Ends]
 """A session with the port of its router, and with both ends. The port is None for the router for
 outside, the router of the links to other sites, and the hub: the nodes of all three are outside."""
+
+
+class Reading(NamedTuple):
+    """What the latest report and the latest tokens say, ready for the status.
+
+    ``names`` are the topics and services of nodes inside, and ``counts`` the numbers of nodes
+    inside and outside. The other fields have the listed rows. ``mismatches`` are also pairs that
+    differ in durability alone.
+    """
+
+    sessions: tuple[_PlacedSession, ...] = ()
+    hub_routers: tuple[Ends, ...] = ()
+    link_listens: bool = True
+    graph: TokenGraph = TokenGraph()
+    left_out: int = 0
+    comparison: Comparison = Comparison()
+    inside: frozenset[str] | None = None
+    nodes: tuple[ZenohNodeStatus, ...] = ()
+    rows: tuple[ZenohSessionStatus, ...] = ()
+    rows_left_out: int = 0
+    names: tuple[InsideName, ...] = ()
+    counts: tuple[int, int] = (0, 0)
+    mismatches: tuple[MismatchStatus, ...] = ()
+    mismatches_left_out: int = 0
 
 
 class RouterProcess(Protocol):
@@ -62,15 +90,9 @@ class ZenohState(Collector):
     ) -> None:
         self._settings = settings
         self._certificates = certificates
-        self._link_listens = True
         self._process = process
         self._now = now
-        self._sessions: tuple[_PlacedSession, ...] = ()
-        self._hub_routers: tuple[Ends, ...] = ()
-        self._graph = TokenGraph()
-        self._compared_with: frozenset[str] | None = None
-        self._comparison = Comparison()
-        self._left_out = 0
+        self._reading = Reading()
         hubs = dict.fromkeys(settings.zenoh_hub, True)
         peers = dict.fromkeys(settings.zenoh_peer, False)
         listeners = (settings.zenoh_listen, settings.zenoh_hub_listen)
@@ -84,24 +106,41 @@ class ZenohState(Collector):
 
         ``graph``: what the tokens announce; None if the tokens have not changed.
         """
-        self._sessions = tuple(self._sessions_of(report.routers))
+        self.show(self.read(report, graph))
+
+    def show(self, reading: Reading) -> None:
+        """Use a reading from now on."""
+        self._reading = reading
+
+    def read(self, report: Report, graph: TokenGraph | None) -> Reading:
+        """A reading, without any effect. For the most tokens this takes 0.3 s.
+
+        What depends on the sessions of nodes and on the tokens alone stays without a change.
+        """
+        former = self._reading
+        sessions = tuple(self._sessions_of(report.routers))
+        reading = former._replace(
+            sessions=sessions,
+            hub_routers=tuple(
+                ends
+                for port, session, _ in sessions
+                if port is None and session.whatami == "router"
+                for ends in all_ends_of(session)
+            ),
+        )
         if (port := self._settings.zenoh_link_listen) and report.routers:
             # The last router is the hub, which may listen by TLS, too.
             at = report.routers[-2:][0].locators
-            self._link_listens = any(locator.startswith(f"{port.protocol}/") for locator in at)
-        self._hub_routers = tuple(
-            ends
-            for port, session, _ in self._sessions
-            if port is None and session.whatami == "router"
-            for ends in all_ends_of(session)
-        )
+            listens = any(locator.startswith(f"{port.protocol}/") for locator in at)
+            reading = reading._replace(link_listens=listens)
         if graph is not None:
-            self._graph = graph
-            self._left_out = report.tokens_left_out + graph.left_out
-        inside = frozenset(s.peer for port, s, _ in self._sessions if port is not None)
-        if graph is not None or inside != self._compared_with:
-            self._comparison = compare(self._graph.entities, inside)
-            self._compared_with = inside
+            left_out = report.tokens_left_out + graph.left_out
+            reading = reading._replace(graph=graph, left_out=left_out)
+        inside = frozenset(s.peer for port, s, _ in sessions if port is not None)
+        if graph is not None or inside != former.inside:
+            comparison = compare(reading.graph.entities, inside)
+            reading = reading._replace(comparison=comparison, inside=inside)
+        return reading if graph is None and sessions == former.sessions else _with_rows(reading)
 
     def is_up(self, link: Link) -> bool:
         """Whether the routers run, and have a session with the peer of a link."""
@@ -110,63 +149,40 @@ class ZenohState(Collector):
         if link.protocol != "tcp":
             listen = frozenset([at_links.port] if at_links else [])
         return not self._process.failure and is_linked(
-            link.peer, link.addresses, self._hub_routers, listen
+            link.peer, link.addresses, self._reading.hub_routers, listen
         )
 
     @property
     def container_sessions(self) -> list[tuple[int, str]]:
         """The port and the address of each session with a container."""
-        return [(port, ends.remote.host) for port, _, ends in self._sessions if port is not None]
+        return [
+            (port, ends.remote.host) for port, _, ends in self._reading.sessions if port is not None
+        ]
 
-    def inside_names(self) -> list[InsideName]:
+    def inside_names(self) -> tuple[InsideName, ...]:
         """The topics and services of the nodes with a session at a port for containers."""
-        place_by_zid = {s.peer: (port, ends.remote.host) for port, s, ends in self._sessions}
-        names: list[InsideName] = []
-        for node in self._graph.nodes:
-            port, address = place_by_zid.get(node.session, (None, ""))
-            if port is None:
-                continue
-            for kind, of_kind in (
-                (RuleKind.PUBLISH, node.publishes),
-                (RuleKind.SUBSCRIBE, node.subscribes),
-                (RuleKind.SERVE, node.services),
-                (RuleKind.CALL, node.calls),
-            ):
-                names += [InsideName(port, address, node.name, kind, name) for name in of_kind]
-        return names
+        return self._reading.names
 
     def status(self, not_judged: Collection[tuple[int, str, str]] = ()) -> ZenohStatus:
         """The part of the status. ``not_judged``: the result of `RouterPolicy.not_judged`."""
         failure = self._process.failure
         if failure:  # all else is of a process that has ended
             return self._status_of_routers(failure)
-        by_zid = {session.peer: (port, session, ends) for port, session, ends in self._sessions}
-        placed = (_node_status(node, by_zid.get(node.session)) for node in self._graph.nodes)
-        nodes = tuple(
-            replace(n, not_judged=True) if (n.port, n.address, n.name) in not_judged else n
-            for n in placed
-        )
-        addresses = {node.key: node.address for node in nodes if node.port is not None}
-
-        def owner(pair: MismatchStatus) -> str:
-            return addresses.get(pair.writer, addresses.get(pair.reader, ""))
-
-        mismatches = self._comparison.mismatches
-        shown = fair_choice(mismatches, owner, MOST_LISTED_MISMATCHES)
-        late = fair_choice(self._comparison.late, owner, MOST_LISTED_MISMATCHES)
+        reading = self._reading
+        nodes = reading.nodes
+        if not_judged:
+            nodes = tuple(
+                replace(n, not_judged=True) if (n.port, n.address, n.name) in not_judged else n
+                for n in nodes
+            )
         return replace(
             self._status_of_routers(failure),
-            sessions=tuple(
-                ZenohSessionStatus(
-                    port, session.whatami, session.peer, str(ends.local), str(ends.remote)
-                )
-                for port, session, ends in self._sessions
-            ),
+            sessions=reading.rows,
             nodes=nodes,
-            left_out=self._left_out,
-            mismatches=(*shown, *late),
-            mismatches_left_out=self._comparison.left_out + len(mismatches) - len(shown),
-            not_compared=self._comparison.not_compared,
+            left_out=reading.left_out + reading.rows_left_out,
+            mismatches=reading.mismatches,
+            mismatches_left_out=reading.mismatches_left_out,
+            not_compared=reading.comparison.not_compared,
         )
 
     def _status_of_routers(self, failure: str) -> ZenohStatus:
@@ -175,7 +191,7 @@ class ZenohState(Collector):
             listen=self._settings.zenoh_listen,
             hub_listen=self._settings.zenoh_hub_listen,
             link_listen=str(self._settings.zenoh_link_listen or ""),
-            link_listens=self._link_listens,
+            link_listens=self._reading.link_listens,
             limits=tuple(map(str, self._settings.zenoh_limit)),
             certificates=self._certificates(),
             failure=failure,
@@ -206,15 +222,15 @@ class ZenohState(Collector):
         sessions = GaugeMetricFamily(
             "rosproxy_zenoh_sessions", "Sessions of the zenoh routers by mode.", labels=["mode"]
         )
-        modes = Counter(session.mode for session in status.sessions)
+        reading = Reading() if status.failure else self._reading
+        modes = Counter(session.whatami for _, session, _ in reading.sessions)
         for mode in MODES:
             sessions.add_metric([mode], modes[mode])
         nodes = GaugeMetricFamily(
             "rosproxy_zenoh_nodes", "Nodes of rmw_zenoh by side.", labels=["side"]
         )
-        inside = sum(1 for node in status.nodes if node.address)
-        nodes.add_metric(["inside"], inside)
-        nodes.add_metric(["outside"], len(status.nodes) - inside)
+        for side, count in zip(("inside", "outside"), reading.counts, strict=True):
+            nodes.add_metric([side], count)
         files = GaugeMetricFamily(
             "rosproxy_zenoh_certificate_expiry_seconds",
             "When a certificate for links to other sites expires, in seconds of Unix time.",
@@ -246,6 +262,52 @@ class ZenohState(Collector):
             hub=link.is_hub,
             protocol=link.protocol,
         )
+
+
+def _with_rows(reading: Reading) -> Reading:
+    """The reading with the rows of the status."""
+    by_zid = {session.peer: (port, session, ends) for port, session, ends in reading.sessions}
+    nodes = tuple(_node_status(node, by_zid.get(node.session)) for node in reading.graph.nodes)
+    sessions = [
+        ZenohSessionStatus(port, session.whatami, session.peer, str(ends.local), str(ends.remote))
+        for port, session, ends in reading.sessions
+    ]
+    hosts = [ends.remote.host for _, _, ends in reading.sessions]
+    rows = fair_choice(zip(sessions, hosts, strict=True), itemgetter(1), MOST_LISTED_SESSIONS)
+    listed = fair_choice(nodes, attrgetter("address"), MOST_LISTED_NODES)
+    addresses = {node.key: node.address for node in nodes if node.port is not None}
+    inside = sum(1 for node in nodes if node.address)
+
+    def owner(pair: MismatchStatus) -> str:
+        return addresses.get(pair.writer, addresses.get(pair.reader, ""))
+
+    comparison = reading.comparison
+    shown = fair_choice(comparison.mismatches, owner, MOST_LISTED_MISMATCHES)
+    late = fair_choice(comparison.late, owner, MOST_LISTED_MISMATCHES)
+    return reading._replace(
+        nodes=tuple(listed),
+        rows=tuple(row for row, _ in rows),
+        rows_left_out=len(nodes) - len(listed) + len(sessions) - len(rows),
+        names=tuple(_inside_names(nodes)),
+        counts=(inside, len(nodes) - inside),
+        mismatches=(*shown, *late),
+        mismatches_left_out=comparison.left_out + len(comparison.mismatches) - len(shown),
+    )
+
+
+def _inside_names(nodes: Iterable[ZenohNodeStatus]) -> Iterator[InsideName]:
+    """The topics and services of the nodes with a session at a port for containers."""
+    for node in nodes:
+        if node.port is None:
+            continue
+        for kind, of_kind in (
+            (RuleKind.PUBLISH, node.publishes),
+            (RuleKind.SUBSCRIBE, node.subscribes),
+            (RuleKind.SERVE, node.services),
+            (RuleKind.CALL, node.calls),
+        ):
+            for name in of_kind:
+                yield InsideName(node.port, node.address, node.name, kind, name)
 
 
 def _node_status(node: ZenohNode, placed: _PlacedSession | None) -> ZenohNodeStatus:

@@ -21,7 +21,7 @@ from rosproxy.app.policy_sources import PolicySources
 from rosproxy.net import sockets
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
-from rosproxy.zenoh import stack
+from rosproxy.zenoh import stack, status
 from rosproxy.zenoh.protocol.report import (
     Report,
     RouterReport,
@@ -256,6 +256,52 @@ async def test_tokens_are_read_while_the_event_loop_serves_others(make: Make) ->
     assert threading.get_ident() not in readers
 
 
+async def test_rows_and_pairs_are_made_while_the_event_loop_serves_others(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For 8,192 nodes, these took 0.3 s each second."""
+    makers = list[int]()
+
+    def seen(made: Callable[..., object]) -> Callable[..., object]:
+        def make_row(*arguments: object, **options: object) -> object:
+            makers.append(threading.get_ident())
+            return made(*arguments, **options)
+
+        return make_row
+
+    for maker in ("compare", "ZenohNodeStatus", "InsideName"):
+        monkeypatch.setattr(status, maker, seen(getattr(status, maker)))
+    zenoh = make()
+    zenoh.supervisor.failure = ""
+    await zenoh._take_report(inside_report())
+    assert len(makers) == 3
+    assert zenoh.extended_status(ProxyStatus()).zenoh
+    await zenoh._look_for_faults()
+    await zenoh._look_at_policy()
+    assert threading.get_ident() not in makers
+
+
+async def test_tokens_after_many_tokens_wait(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    zenoh = make()
+    zenoh.supervisor.failure = ""
+    times = iter([10.0, 10.5, 14.9, 15.1, 15.1])
+    monkeypatch.setattr(zenoh._runtime, "now", lambda: next(times))
+    await zenoh._take_report(Report(tokens=("@ros2_lv/0/bb/0/0/NN/%/%/robot",)))
+    await zenoh._take_report(Report(tokens=("@ros2_lv/0/bb/0/0/NN/%/%/other",)))
+    assert [node.name for node in zenoh.state.status().nodes] == ["/robot"]
+    await zenoh._take_report(Report())
+    assert [node.name for node in zenoh.state.status().nodes] == ["/other"]
+
+
+def inside_report() -> Report:
+    """A report with a node at a port for containers."""
+    ends = (SessionConnection(f"tcp/{HOST}:47448", "tcp/172.18.0.3:50000"),)
+    routers = (RouterReport("01", (RouterSession("aa", "peer", ends),)), RouterReport("02"))
+    start = "@ros2_lv/0/aa/0"
+    entity = f"{start}/1/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/RIHS01_0/::,10:,:,:,,"
+    return Report(routers, (f"{start}/0/NN/%/%/talker", entity))
+
+
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
     """A folder with the files of a link to another site."""
@@ -347,11 +393,7 @@ async def test_a_foreign_certificate_of_another_site_is_told(make: Make, files: 
 async def test_a_name_counts_as_not_judged_until_it_is_compared_with_the_rules(make: Make) -> None:
     zenoh = make(policy="deny publish /chatter")
     zenoh.supervisor.failure = ""
-    ends = (SessionConnection(f"tcp/{HOST}:47448", "tcp/172.18.0.3:50000"),)
-    routers = (RouterReport("01", (RouterSession("aa", "peer", ends),)), RouterReport("02"))
-    start = "@ros2_lv/0/aa/0"
-    entity = f"{start}/1/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/RIHS01_0/::,10:,:,:,,"
-    await zenoh._take_report(Report(routers, (f"{start}/0/NN/%/%/talker", entity)))
+    await zenoh._take_report(inside_report())
     zenoh._policy.access()
 
     def told() -> tuple[bool, int]:

@@ -15,7 +15,12 @@ from rosproxy.admin.status_document import (
 from rosproxy.zenoh.protocol.liveliness import graph_of
 from rosproxy.zenoh.protocol.report import Report, RouterReport, RouterSession, SessionConnection
 from rosproxy.zenoh.router_policy import InsideName
-from rosproxy.zenoh.status import MOST_LISTED_MISMATCHES, ZenohState
+from rosproxy.zenoh.status import (
+    MOST_LISTED_MISMATCHES,
+    MOST_LISTED_NODES,
+    MOST_LISTED_SESSIONS,
+    ZenohState,
+)
 from tests import certificates
 from tests.run_options import parse_settings
 
@@ -136,12 +141,34 @@ def test_the_list_of_mismatches_is_bounded() -> None:
     assert (len(status.mismatches), status.mismatches_left_out) == (MOST_LISTED_MISMATCHES, 3)
 
 
+def test_listed_nodes_and_sessions_are_bounded_with_fair_shares() -> None:
+    """With 8,192 nodes, the event loop took 0.2 s for a status."""
+    state = make_state(FakeProcess())
+    crowd = [f"@ros2_lv/0/bb/{number}/0/NN/%/%/robot" for number in range(MOST_LISTED_NODES + 7)]
+    many = tuple(
+        session(f"c{number}", "peer", "172.18.0.2:7448", f"172.18.0.9:{number + 1}")
+        for number in range(MOST_LISTED_SESSIONS + 5)
+    )
+    routers = (REPORT.routers[0], RouterReport("02", many), HUB)
+    state.take(Report(routers), graph_of((*TOKENS[:2], *crowd)))
+    status = state.status()
+    assert (len(status.nodes), len(status.sessions)) == (MOST_LISTED_NODES, MOST_LISTED_SESSIONS)
+    assert "172.18.0.3" in {node.address for node in status.nodes}
+    assert "172.18.0.3" in {listed.remote.partition(":")[0] for listed in status.sessions}
+    assert status.left_out == 8 + 7
+    registry = CollectorRegistry()
+    registry.register(state)
+    metrics = generate_latest(registry).decode()
+    assert f'rosproxy_zenoh_nodes{{side="outside"}} {len(crowd)}.0' in metrics
+    assert f'rosproxy_zenoh_sessions{{mode="peer"}} {len(many) + 1}.0' in metrics
+
+
 def test_names_of_nodes_inside_have_port_and_address() -> None:
     state = make_state(FakeProcess())
     assert state.container_sessions == [(7448, "172.18.0.3")]
-    assert state.inside_names() == [
-        InsideName(7448, "172.18.0.3", "/talker", RuleKind.PUBLISH, "/chatter")
-    ]
+    assert state.inside_names() == (
+        InsideName(7448, "172.18.0.3", "/talker", RuleKind.PUBLISH, "/chatter"),
+    )
 
 
 def test_tokens_stay_until_a_report_has_others() -> None:
