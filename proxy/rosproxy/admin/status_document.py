@@ -13,6 +13,7 @@ Times are in seconds, rates in bytes per second. ``sent`` are bytes from inside 
 """
 
 import json
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
 from types import UnionType
@@ -31,6 +32,12 @@ MOST_ROWS = 50_000
 """JSON objects at most in a document that a reader accepts.
 
 An object in a status has 21 bytes at least, so a status of 1 MiB has fewer objects.
+"""
+MOST_MISFITS = 1000
+"""JSON objects at most that a reader converts value by value, which takes 25 us each.
+
+In a status with more objects of which a value does not fit, the reader leaves out the rest of their
+lists. Another version of the proxy may have such objects, and an attacker that controls the proxy.
 """
 
 
@@ -511,21 +518,20 @@ def read_status(document: object) -> ProxyStatus:
     """
     if _has_too_many_rows(document):
         raise NotAStatus(f"a status of more than {MOST_ROWS} objects")
-    return _convert_leniently(document, ProxyStatus)
+    return _LenientReader().convert(document, ProxyStatus)
 
 
 def _has_too_many_rows(document: object) -> bool:
     rows = 0
-    pending = [document]
+    pending: list[Any] = [[document]]
     while pending:
         value = pending.pop()
         if isinstance(value, dict):
             rows += 1
             if rows > MOST_ROWS:
                 return True
-            pending.extend(value.values())
-        elif isinstance(value, list):
-            pending.extend(value)
+            value = value.values()
+        pending += [inner for inner in value if isinstance(inner, dict | list)]
     return False
 
 
@@ -535,34 +541,48 @@ def to_json(document: msgspec.Struct) -> dict[str, Any]:
     return plain
 
 
-def _convert_leniently(value: object, kind: type[Document]) -> Document:
-    """Convert a document; a value that does not fit becomes the default."""
-    # Nearly always everything fits, and a single call of C code is enough.
-    try:
-        return msgspec.convert(value, kind)
-    except _UNFIT:
-        raw_fields = value if isinstance(value, dict) else {}
-    fields = {}
-    for field in _fields(kind):
-        with suppress(KeyError, *_UNFIT):
-            fields[field.name] = _convert_field(raw_fields[field.encode_name], field.type)
-    return kind(**fields)
+class _LenientReader:
+    """Converts a document. A value that does not fit becomes the default of the field."""
+
+    def __init__(self) -> None:
+        self._misfits = 0
+
+    def convert(self, value: object, kind: type[Document]) -> Document:
+        """The struct of an object; the default if the value is no object."""
+        # Nearly always everything fits, and a single call of C code is enough.
+        try:
+            return msgspec.convert(value, kind)
+        except _UNFIT:
+            raw_fields = value if isinstance(value, dict) else {}
+        self._misfits += 1
+        fields = {}
+        for field in _fields(kind):
+            with suppress(KeyError, *_UNFIT):
+                fields[field.name] = self._field(raw_fields[field.encode_name], field.type)
+        return kind(**fields)
+
+    def _field(self, value: Any, kind: Any) -> Any:
+        """Convert a value to the type of a field. Raises ValidationError, UnicodeEncodeError.
+
+        Lists keep the items of the right kind: structs or texts.
+        """
+        inner = get_args(kind)[0] if get_origin(kind) in (UnionType, tuple) else kind
+        is_struct = isinstance(inner, type) and issubclass(inner, msgspec.Struct)
+        if is_struct and isinstance(value, dict) and get_origin(kind) is not tuple:
+            return self.convert(value, inner)
+        if get_origin(kind) is not tuple or not isinstance(value, list):
+            return msgspec.convert(value, kind)
+        if is_struct:
+            return tuple(self._structs(value, inner))
+        return tuple(item for item in value if isinstance(item, str))
+
+    def _structs(self, items: list[Any], kind: type[Document]) -> Iterator[Document]:
+        for item in items:
+            if self._misfits >= MOST_MISFITS:
+                return
+            if isinstance(item, dict):
+                yield self.convert(item, kind)
 
 
 _fields = cache(msgspec.structs.fields)
 """The fields of a struct. Without the cache, this call takes as long as a hundred conversions."""
-
-
-def _convert_field(value: Any, kind: Any) -> Any:
-    """Convert a value to the type of a field. Raises ValidationError.
-
-    Lists keep the items of the right kind: structs or texts.
-    """
-    inner = get_args(kind)[0] if get_origin(kind) in (UnionType, tuple) else kind
-    is_struct = isinstance(inner, type) and issubclass(inner, msgspec.Struct)
-    if is_struct and isinstance(value, dict) and get_origin(kind) is not tuple:
-        return _convert_leniently(value, inner)
-    if get_origin(kind) is not tuple or not isinstance(value, list):
-        return msgspec.convert(value, kind)
-    items = [item for item in value if isinstance(item, dict if is_struct else str)]
-    return tuple(_convert_leniently(item, inner) if is_struct else item for item in items)
