@@ -1,5 +1,7 @@
 """Reports on proxies: the part of a proxy's ``/status`` that the operator uses."""
 
+from itertools import islice
+
 from msgspec.structs import replace
 
 from rosproxy.admin.status_document import (
@@ -8,6 +10,8 @@ from rosproxy.admin.status_document import (
     ZenohLinkStatus,
     ZenohStatus,
 )
+from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_PEERS
+from rosproxy.telemetry.problems import MOST_PROBLEMS
 from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, problem_subject
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
@@ -44,6 +48,7 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
     for inside in nodes_inside(status):
         topics.update(inside.publishes + inside.subscribes)
     up = master.up or "1" not in status.settings.ros
+    problems = [f"{p.subject}: {p.text}" for p in status.problems if _is_reported(p)]
     return ProxyReport(
         answered=True,
         master_up=up,
@@ -58,7 +63,8 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
         },
         topics=frozenset(topics),
         refusal=refusal,
-        problems=tuple(short(f"{p.subject}: {p.text}") for p in status.problems if _is_reported(p)),
+        # A proxy has no more problems than these. Each becomes a finding, and some an Event.
+        problems=tuple(map(short, problems[-MOST_PROBLEMS:])),
         range_probe=replace(status.range_probe, age=0.0) if status.range_probe else None,
         unregistered_addresses=inside_addresses(status) - nodes.keys() - participants.keys(),
         zenoh=_zenoh_report(status) if status.zenoh else None,
@@ -67,11 +73,13 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
 
 def _zenoh_report(status: ProxyStatus) -> ZenohReport:
     zenoh = status.zenoh or ZenohStatus()
+    peers = (link for link in zenoh.links if not link.hub)
+    hubs = (link for link in zenoh.links if link.hub)
     return ZenohReport(
         nodes=tuple(sorted({node.name for node in nodes_inside(status)})),
         sessions=sum(1 for session in zenoh.sessions if session.port is not None),
-        peers={short(link.peer): _fault(link) for link in zenoh.links if not link.hub},
-        hubs={short(link.peer): _fault(link) for link in zenoh.links if link.hub},
+        peers={short(link.peer): _fault(link) for link in islice(peers, MOST_ZENOH_PEERS)},
+        hubs={short(link.peer): _fault(link) for link in islice(hubs, MOST_ZENOH_HUBS)},
     )
 
 

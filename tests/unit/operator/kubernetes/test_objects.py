@@ -8,6 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import RangeProbeStatus, read_status
+from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_PEERS
+from rosproxy.telemetry.problems import MOST_PROBLEMS
 from rosproxy_operator.kubernetes.proxies.proxy_report import RECENT_S, no_answer, report
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.checks import host_problem
@@ -321,6 +323,20 @@ def test_what_a_proxy_answers():
     )
     assert proxy_report.range_probe == RangeProbeStatus(False, "refused", "missed")
     assert report(read_status({})).range_probe is None
+
+
+def test_a_proxy_that_answers_too_much_causes_no_more_findings_than_another():
+    """Each of 4,500 problems became a finding, and each fault of a peer an Event, 100 a second."""
+    problems = [{"subject": f"zenoh peer h{number}", "holds": True} for number in range(4500)]
+    links = [
+        {"peer": f"h{number}:1", "hub": hub} for number in range(4500) for hub in (True, False)
+    ]
+    answer = report(read_status({"problems": problems, "zenoh": {"links": links}}))
+    assert len(answer.problems) == MOST_PROBLEMS
+    assert answer.problems[-1].startswith("zenoh peer h4499: ")
+    assert answer.zenoh is not None
+    assert len(answer.zenoh.peers) == MOST_ZENOH_PEERS
+    assert len(answer.zenoh.hubs) == MOST_ZENOH_HUBS
 
 
 def test_a_proxy_without_its_master():
