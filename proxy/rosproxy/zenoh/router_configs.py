@@ -11,7 +11,8 @@ routers of other sites that connect to the proxy have one more router of this ki
 Links to other sites have a router of their own, which dials the hub (`rosproxy.zenoh.link_router`).
 
 The values come from rmw_zenohd (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_ROUTER_CONFIG.json5).
-Exceptions are the addresses, the bound of sessions, and the delay for scouting, which is off.
+Exceptions are the addresses, the bound of sessions, the queue for declarations, and the delay for
+scouting, which is off.
 """
 
 import base64
@@ -46,6 +47,9 @@ _COMMON: dict[str, Any] = {
     "timestamping/enabled": True,
     "transport/link/tx/keep_alive": 2,
     "transport/link/tx/lease": 60_000,
+    # Buffers of 64 KiB. All routers share the threads of one process. With two, the default of
+    # zenoh, a burst of declarations can block all these threads for some seconds.
+    "transport/link/tx/queue/size/control": 16,
     "transport/shared_memory/enabled": False,
     "transport/unicast/accept_pending": MOST_SESSIONS,
     "transport/unicast/accept_timeout": 60_000,

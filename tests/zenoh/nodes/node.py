@@ -1,8 +1,8 @@
 """A replacement for a node of rmw_zenoh: session, keys and liveliness tokens.
 
-`python node.py KIND NAME TOPIC`, where KIND is pub, shout, sub, latch, late, serve, call, probe
-or graph. Prints a line for each event, and runs until killed. NODE_TYPE: another type, as in keys.
-NODE_PERIOD_S: the time between two messages.
+`python node.py KIND NAME TOPIC`, where KIND is pub, shout, sub, latch, late, serve, call, probe,
+graph or crowd. Prints a line for each event, and runs until killed. NODE_TYPE: another type, as in
+keys. NODE_PERIOD_S: the time between two messages. NODE_TOKENS, NODE_LETTER: see `crowd`.
 """
 
 import os
@@ -60,6 +60,19 @@ def serve(session: Any, key: str, name: str) -> Any:
     return session.declare_queryable(key, lambda query: query.reply(key, f"answer of {name}"))
 
 
+def crowd(session: Any, _: str, name: str) -> list[Any]:
+    """Declare NODE_TOKENS tokens of topics, whose names end in NODE_LETTER, 800 times."""
+    start = f"@ros2_lv/0/{session.info.zid()}/0"
+    end = f"{800 * os.environ['NODE_LETTER']}/{TYPE}/{HASH}/::"
+    tokens = []
+    for number in range(int(os.environ["NODE_TOKENS"])):
+        key = f"{start}/{number}/MP/%/%/{name}/%t{number:04d}{end}"
+        tokens.append(session.liveliness().declare_token(key))
+        time.sleep(0.001)  # a full queue would end the session
+    say("declared")
+    return tokens
+
+
 def watch_graph(session: Any, _: str, __: str) -> Any:
     return session.liveliness().declare_subscriber("@ros2_lv/0/**", graph_change, history=True)
 
@@ -109,6 +122,7 @@ DECLARES = {
     "sub": subscribe,
     "serve": serve,
     "graph": watch_graph,
+    "crowd": crowd,
     "latch": latch,
     "late": subscribe_late,
 }
