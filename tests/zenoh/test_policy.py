@@ -226,3 +226,20 @@ def test_the_rules_follow_a_container_to_another_port(lab: Lab) -> None:
     late = lab.node(VERSION, "out", "sub", "p/denied")
     subscriber.wait_for_count("^got ", 3, BACK_WITHIN_S)
     assert "got" not in late.output()
+
+
+def test_a_peer_that_is_the_proxy_itself_opens_no_way_past_the_rules(lab: Lab) -> None:
+    """In about half of the runs, the hub came to the container's router as a node."""
+    port = PORTS["c1"]
+    addresses = ("127.0.0.1", lab.topology.places["px"].address)
+    peers = [word for address in addresses for word in ("--zenoh-peer", f"{address}:{port}")]
+    lab.start_proxy(*peers, "--policy", RULES, with_robot=False)
+    for role in PORTS:
+        lab.redirect(role)
+    allowed, denied = (Pair(lab, VERSION, "c1", "c2", f"p/{end}") for end in reversed(ENDS))
+    allowed.wait()
+    faults = {f"{address}:{port}": "the proxy itself" for address in addresses}
+    wait_until("the fault is told", lambda: {k.peer: k.error for k in lab.zenoh().links} == faults)
+    denied.source.wait_for("^said")
+    allowed.wait()
+    assert not denied.has_received

@@ -58,6 +58,11 @@ _LINK_FAULTS = {
         _CHECK_PEER,
     ),
     LinkFault.UNREACHABLE: ("there is no route to this address", _CHECK_PEER),
+    LinkFault.ITSELF: (
+        "the address leads to a router of this proxy, where the rules for containers would not "
+        "hold. The proxy does not connect there",
+        "give the address of a router outside",
+    ),
     LinkFault.NO_SESSION: (
         "a program accepts connections there, but zenoh opens no session. The program is no zenoh "
         "router, or two peers lead to the same router",

@@ -5,12 +5,12 @@ Both report the sessions, but not why there is no session with a peer. So the pr
 to such a peer.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.zenoh.protocol.report import Ends
+from rosproxy.zenoh.protocol.report import Ends, RouterReport, all_ends_of
 
 
 class LinkFault(Enum):
@@ -21,6 +21,7 @@ class LinkFault(Enum):
     REFUSED = "refused"
     SILENT = "silent"
     UNREACHABLE = "unreachable"
+    ITSELF = "the proxy itself"
     NO_SESSION = "no session"
     NO_QUIC_SESSION = "no session over UDP"
     NO_TLS = "no TLS"
@@ -102,6 +103,26 @@ class Link:
             self.since = now
         self.fault = fault
         return True
+
+
+def own_peers(links: Iterable[Link], routers: Sequence[RouterReport]) -> set[HostPort]:
+    """The peers at which the hub, the last router, has reached another router of the proxy.
+
+    The hub dials these routers by sockets, and access control distinguishes it from nodes by that.
+    So at such a peer, the hub would be a node without rules. zenoh looks up the names of peers by
+    itself: if no link has the address, all peers with the port count.
+    """
+    own = {router.zid for router in routers}
+    hub = routers[-1:]
+    sessions = (session for router in hub for session in router.sessions if session.peer in own)
+    reached = [ends.remote for session in sessions for ends in all_ends_of(session)]
+    at_port = [link for link in links if any(link.peer.port == end.port for end in reached)]
+    found = {
+        link.peer
+        for link in at_port
+        if any(end.host == link.peer.host or end.host in link.addresses for end in reached)
+    }
+    return found or {link.peer for link in at_port}
 
 
 def is_linked(

@@ -18,6 +18,8 @@ from rosproxy.admin.requests import EnforcementCounts, PortProbe
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.binding import setting_error_if_taken
 from rosproxy.net import sockets
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.interfaces import is_own
 from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
@@ -26,7 +28,7 @@ from rosproxy.telemetry.text import listed
 from rosproxy.zenoh import findings
 from rosproxy.zenoh.certificates import CLIENTS, SERVERS, Unusable, check_credentials
 from rosproxy.zenoh.link_probe import try_link
-from rosproxy.zenoh.links import Link
+from rosproxy.zenoh.links import Link, LinkFault, own_peers
 from rosproxy.zenoh.policy.access_control import access_control
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy.zenoh.protocol.liveliness import graph_of
@@ -85,6 +87,7 @@ class Zenoh:
         self._awaiting = bool(settings.await_policy)
         self._tokens: Sequence[str] | None = None
         self._tokens_due = 0.0
+        self._own_peers = frozenset[HostPort]()
         self.supervisor = RouterSupervisor(runtime.tasks, self._take_report, self._refuse)
         self.state = ZenohState(settings, self.supervisor, runtime.now, self._sites.certificates)
 
@@ -126,6 +129,10 @@ class Zenoh:
         """Start the routers with the present policy. Raises RoutersFailed."""
         self._access = self._policy.access()
         self._awaiting = False
+        for link in self.state.links:
+            if self._may_be_own(link):
+                link.addresses = tuple(await resolve(link.peer.host))
+                self._note_own(link)
         await self.supervisor.start(self._configs(self._access))
 
     async def stop(self) -> None:
@@ -207,6 +214,8 @@ class Zenoh:
     async def _take_report(self, report: Report) -> None:
         # In a thread, because many tokens would hold up all other traffic of the proxy.
         self.state.show(await asyncio.to_thread(self._read, report))
+        own = own_peers(self._links_to_peers, report.routers) if self._plan.directory else set()
+        self._leave_out(own)
         for link in self.state.links:
             if self.state.is_up(link) and link.note(None, self._runtime.now()):
                 log.info("zenoh link up: %s", link)
@@ -246,12 +255,41 @@ class Zenoh:
     async def _look_at_files(self) -> None:
         """Restart the router of the links to other sites after a change of its files."""
         if self._sites.look() and not self._awaiting:
-            async with self._applying:
-                await self.supervisor.use(self._configs(self._access))
+            await self._use_again()
 
     def _configs(self, access: Mapping[int, object]) -> list[RouterConfig]:
         """The configurations of all routers. Raises ValueError as `RouterPlan.configs` does."""
-        return self._plan.configs(access, self._sites.config(self._plan.hub_socket))
+        peers = [peer for peer in self._plan.peers if peer not in self._own_peers]
+        plan = replace_plan(self._plan, peers=peers)
+        return plan.configs(access, self._sites.config(plan.hub_socket))
+
+    @property
+    def _links_to_peers(self) -> list[Link]:
+        return [link for link in self.state.links if not link.is_hub and link.protocol == "tcp"]
+
+    def _may_be_own(self, link: Link) -> bool:
+        """Whether a peer has a port of the routers that hold the rules for containers."""
+        return link in self._links_to_peers and link.peer.port in self._plan.all_ports
+
+    def _note_own(self, link: Link) -> bool:
+        """Note a peer with an address of this machine. Return whether the peer is new."""
+        is_new = link.peer not in self._own_peers
+        if is_new and self._may_be_own(link) and any(map(is_own, link.addresses)):
+            self._own_peers |= {link.peer}
+            return True
+        return False
+
+    def _leave_out(self, peers: set[HostPort]) -> None:
+        """Let the hub dial these peers no more, because they lead to the proxy itself."""
+        if peers - self._own_peers:
+            self._own_peers |= peers
+            log.error("zenoh peers lead to the proxy itself: %s", listed(map(str, peers)))
+            # In a task, because the change waits for the next report.
+            self._runtime.tasks.spawn(self._use_again(), "leaving out zenoh peers")
+
+    async def _use_again(self) -> None:
+        async with self._applying:
+            await self.supervisor.use(self._configs(self._access))
 
     def _check_policy(self) -> None:
         """Raise SettingError for rules that the routers cannot enforce."""
@@ -279,8 +317,12 @@ class Zenoh:
         """Look up the addresses of a peer, and record why the link to the peer is down."""
         # If the name does not resolve now, the former addresses stay.
         link.addresses = tuple(await resolve(link.peer.host)) or link.addresses
+        if self._note_own(link):
+            await self._use_again()
         fault = None
-        if not self.state.is_up(link):
+        if link.peer in self._own_peers and link in self._links_to_peers:
+            fault = LinkFault.ITSELF
+        elif not self.state.is_up(link):
             fault = await try_link(link, self._client_for(link))
         if self.supervisor.failure:  # the routers do not run, so the fault of the link is unknown
             return

@@ -53,6 +53,20 @@ for line in sys.stdin:
         told.write(line)
     print(json.dumps({"revision": json.loads(line)["revision"]}), flush=True)
 """
+LEADS_BACK = """
+import json, sys
+for line in sys.stdin:
+    with open(sys.argv[1], "a") as told:
+        told.write(line)
+    given = json.loads(line)
+    hub = {"zid": "02", "sessions": []}
+    for endpoint in json.loads(given["routers"][-1]["connect/endpoints"]):
+        if endpoint == "tcp/192.0.2.7:47448":
+            ends = {"src": "tcp/172.18.0.2:50000", "dst": endpoint}
+            hub["sessions"].append({"peer": "01", "whatami": "router", "links": [ends]})
+    print(json.dumps({"revision": given["revision"], "routers": [{"zid": "01"}, hub]}), flush=True)
+"""
+"""The hub reaches another router of the proxy at a peer, as through the address of a Service."""
 Make = Callable[..., Zenoh]
 AUTHORITY = certificates.Authority()
 
@@ -164,6 +178,38 @@ async def test_posted_rules_are_in_force_when_the_proxy_answers(
     assert ["access_control" in router for router, _ in routers] == [False, True, False]
     assert not any("access_control" in hub for _, hub in routers)
     assert "*/camera/*/*" in routers[1][0]["access_control"]
+
+
+def peers_of_hub(line: dict[str, Any]) -> list[str]:
+    endpoints = json.loads(line["routers"][-1]["connect/endpoints"])
+    return [endpoint for endpoint in endpoints if endpoint.startswith("tcp/")]
+
+
+async def test_the_hub_does_not_dial_routers_of_the_proxy_as_peers(
+    make: Make, tmp_path: Path, lines: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At such a port the hub counted as a node, for which no rules hold."""
+    monkeypatch.setattr("rosproxy.zenoh.findings.LINK_GRACE_S", 0.0)
+    peers = (f"{HOST}:47448", "localhost:47448", PEER)
+    zenoh = with_confirming_process(make(zenoh_peer=peers), tmp_path)
+    await zenoh.start()
+    assert peers_of_hub(lines()[0]) == [f"tcp/{PEER}:7447"]
+    problems = zenoh._runtime.problems
+    subject = f"zenoh peer {HOST}:47448"
+    await until(lambda: subject in {p.subject for p in problems.all()}, "the fault is told")
+    texts = {problem.subject: problem.text for problem in problems.all()}
+    assert texts[subject].startswith("the address leads to a router of this proxy")
+
+
+async def test_a_peer_that_turns_out_to_be_the_proxy_is_left_out(
+    make: Make, tmp_path: Path, lines: Lines
+) -> None:
+    zenoh = make(zenoh_peer=("192.0.2.7:47448", PEER))
+    zenoh.supervisor.program = (sys.executable, "-c", LEADS_BACK, str(tmp_path / "told"))
+    await zenoh.start()
+    await until(lambda: len(lines()) == 2, "the routers have other configurations")
+    assert peers_of_hub(lines()[0]) == ["tcp/192.0.2.7:47448", f"tcp/{PEER}:7447"]
+    assert peers_of_hub(lines()[1]) == [f"tcp/{PEER}:7447"]
 
 
 async def test_rules_of_a_changed_file_come_into_force(

@@ -3,8 +3,8 @@
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.zenoh.links import Link, LinkFault, alert_fault, is_linked, verify_fault
-from rosproxy.zenoh.protocol.report import Ends
+from rosproxy.zenoh.links import Link, LinkFault, alert_fault, is_linked, own_peers, verify_fault
+from rosproxy.zenoh.protocol.report import Ends, RouterReport, RouterSession, SessionConnection
 
 PEER = HostPort("robot", 7447)
 ADDRESSES = ("192.0.2.7", "fd00::7")
@@ -77,3 +77,22 @@ def test_alerts_of_tls_tell_why_a_peer_refuses_the_certificate(
 
 def test_an_unknown_result_of_a_check_is_a_fault_of_the_certificate() -> None:
     assert verify_fault(26) is LinkFault.PEER_INVALID
+
+
+@pytest.mark.parametrize(
+    ("zid", "dst", "expected"),
+    [
+        ("01", "tcp/192.0.2.7:7447", {PEER}),
+        ("01", "tcp/10.96.0.9:7447", {PEER}),  # zenoh has found another address
+        ("01", "tcp/192.0.2.7:7448", set()),
+        ("01", "unixsock-stream//run/7448", set()),
+        ("04", "tcp/192.0.2.7:7447", set()),  # a router outside
+    ],
+)
+def test_a_peer_at_which_the_hub_reaches_a_router_of_the_proxy(
+    zid: str, dst: str, expected: set[HostPort]
+) -> None:
+    links = [Link(PEER, 0.0, addresses=ADDRESSES), Link(HostPort("robot", 7450), 0.0)]
+    session = RouterSession(zid, "router", (SessionConnection("tcp/172.18.0.2:5", dst),))
+    assert own_peers(links, [RouterReport("01"), RouterReport("02", (session,))]) == expected
+    assert not own_peers(links, [])
