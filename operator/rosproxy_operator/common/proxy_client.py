@@ -35,6 +35,8 @@ MOST_PAGE_BYTES = 8 * 1024 * 1024
 """Bytes of a page document at most. The nodes and links of the document have up to 5 MiB."""
 PAGE_TIMEOUT_S = 12.0
 """Seconds for a page document. A proxy takes up to 10 s for the first document (`page.routes`)."""
+LONGEST_VERSION = 64
+"""Characters of the version of a status at most. The client sends the version back in a URL."""
 MASTER_CALL_TIMEOUT_S = 40.0
 """Seconds for a call for which the proxy first calls the master, which may take 30 s."""
 _KEEP_ALIVE = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 3, socket.TCP_KEEPCNT: 3}
@@ -102,7 +104,7 @@ class ProxyClient:
         answer = _read(text, admin)
         version = answer.get("version")
         status = answer.get("status")
-        if not isinstance(version, str):
+        if not isinstance(version, str) or len(version) > LONGEST_VERSION:
             raise _no_rosproxy(admin)
         try:
             return version, read_status(status)

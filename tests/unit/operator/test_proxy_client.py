@@ -114,6 +114,15 @@ async def test_an_answer_to_update_is_short(evil: Evil, client: ProxyClient) -> 
         await client.send_containers(evil.admin, "token", {})
 
 
+async def test_a_long_version_is_not_sent_back(evil: Evil, client: ProxyClient) -> None:
+    """Each question for changes had a URL of 2.7 MB, and took the event loop 0.1 s."""
+    versions = iter(["x" * 16, "%" * 900_000])
+    evil.answer = lambda: web.json_response({"version": next(versions), "status": {"settings": {}}})
+    assert await client.changes(evil.admin, "token", "", 0.0) == ("x" * 16, ProxyStatus())
+    with pytest.raises(ProxyError, match="not from a rosproxy"):
+        await client.changes(evil.admin, "token", "", 0.0)
+
+
 @pytest.mark.parametrize(
     "text", ['{"settings": {"udp": "\\ud800"}}', '{"settings": {"\\ud800": 1}}']
 )
