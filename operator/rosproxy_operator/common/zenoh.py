@@ -16,7 +16,8 @@ SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"
 MOST_ENDPOINTS = 32
 """The most endpoints that the operator reads from a variable."""
 _WAIT = "connect/timeout_ms=-1"
-_ENDPOINT = re.compile(r"[\"']([a-z]+)/([^\"'/?#;]{1,300})[^\"']*[\"']")
+# No part can take characters of the next, so a variable without the last quote takes no longer.
+_ENDPOINT = re.compile(r"[\"']([a-z]+)/([^\"'/?#;]{1,300})(?:[/?#;][^\"']*)?[\"']")
 _ROUTER = re.compile(r"(^|[\s/;&])(rmw_)?zenohd($|[\s;&])")
 
 

@@ -178,20 +178,23 @@ def _routers_of_variable(member: Member, observed: HostState) -> Iterator[_Route
     container = member.container
     if container.is_zenoh_router:
         return
-    for protocol, address in connect_endpoints(container.variables.get(OVERRIDE, "")):
+    endpoints = connect_endpoints(container.variables.get(OVERRIDE, ""))
+    neighbours = _neighbours(member, observed) if endpoints else {}
+    for protocol, address in endpoints:
         host = address.host
         if protocol == "tcp" and not is_loopback(host) and host not in _PROXIES:
-            yield _Router(address, f"variable {OVERRIDE}", _neighbour(host, member, observed))
+            yield _Router(address, f"variable {OVERRIDE}", neighbours.get(host))
 
 
-def _neighbour(host: str, member: Member, observed: HostState) -> Container | None:
-    """Return the container with this name or address on a network of the member, or None."""
+def _neighbours(member: Member, observed: HostState) -> dict[str, Container]:
+    """Return the containers on the networks of a member, by name and address; the first counts."""
+    neighbours: dict[str, Container] = {}
     for container in observed.containers:
         for attachment in container.attachments:
-            names = {attachment.address, *map(str.lower, attachment.names)}
-            if attachment.network in member.networks and host in names:
-                return container
-    return None
+            if attachment.network in member.networks:
+                for name in (attachment.address, *map(str.lower, attachment.names)):
+                    neighbours.setdefault(name, container)
+    return neighbours
 
 
 def _has_router(owner: Container, observed: HostState) -> bool:
