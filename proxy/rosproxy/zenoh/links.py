@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.net.addresses import HostPort, is_address
 from rosproxy.zenoh.protocol.report import Ends, RouterReport, all_ends_of
 
 
@@ -110,7 +110,7 @@ def own_peers(links: Iterable[Link], routers: Sequence[RouterReport]) -> set[Hos
 
     The hub dials these routers by sockets, and access control distinguishes it from nodes by that.
     So at such a peer, the hub would be a node without rules. zenoh looks up the names of peers by
-    itself: if no link has the address, all peers with the port count.
+    itself. So if no link has the address, all names with the port count whose link is down.
     """
     own = {router.zid for router in routers}
     hub = routers[-1:]
@@ -122,7 +122,7 @@ def own_peers(links: Iterable[Link], routers: Sequence[RouterReport]) -> set[Hos
         for link in at_port
         if any(end.host == link.peer.host or end.host in link.addresses for end in reached)
     }
-    return found or {link.peer for link in at_port}
+    return found or {link.peer for link in at_port if link.fault and not is_address(link.peer.host)}
 
 
 def is_linked(

@@ -214,11 +214,13 @@ class Zenoh:
     async def _take_report(self, report: Report) -> None:
         # In a thread, because many tokens would hold up all other traffic of the proxy.
         self.state.show(await asyncio.to_thread(self._read, report))
-        own = own_peers(self._links_to_peers, report.routers) if self._plan.directory else set()
-        self._leave_out(own)
         for link in self.state.links:
             if self.state.is_up(link) and link.note(None, self._runtime.now()):
                 log.info("zenoh link up: %s", link)
+        if (
+            self._plan.directory
+        ):  # without, the hub dials its routers by TCP, and there are no rules
+            self._leave_out(own_peers(self._links_to_peers, report.routers))
 
     def _read(self, report: Report) -> Reading:
         """A reading of a report. After many tokens, the next tokens wait.

@@ -93,6 +93,8 @@ def test_a_peer_at_which_the_hub_reaches_a_router_of_the_proxy(
     zid: str, dst: str, expected: set[HostPort]
 ) -> None:
     links = [Link(PEER, 0.0, addresses=ADDRESSES), Link(HostPort("robot", 7450), 0.0)]
+    # Other peers at this port stay: an address that zenoh did not reach, and a link that is up.
+    links += [Link(HostPort("10.0.0.5", 7447), 0.0), Link(HostPort("up", 7447), 0.0, fault=None)]
     session = RouterSession(zid, "router", (SessionConnection("tcp/172.18.0.2:5", dst),))
     assert own_peers(links, [RouterReport("01"), RouterReport("02", (session,))]) == expected
     assert not own_peers(links, [])
