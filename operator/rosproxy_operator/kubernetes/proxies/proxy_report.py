@@ -107,4 +107,5 @@ def unreadable(last: ProxyReport, error: str) -> ProxyReport:
 
 def short(text: str) -> str:
     """Return a text from a proxy, cleaned and cut so that the operator may show the text."""
-    return bounded(clean(text), _MOST_TEXT_CHARACTERS)
+    # Cut first, with a character more for the ellipsis: to clean a megabyte takes 0.3 s.
+    return bounded(clean(text[: _MOST_TEXT_CHARACTERS + 1]), _MOST_TEXT_CHARACTERS)

@@ -7,7 +7,7 @@ from typing import TypeGuard
 import msgspec
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.telemetry.text import clean, plural, shorten
+from rosproxy.telemetry.text import brief, plural, shorten
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.zenoh import OVERRIDE, client_override, tcp_endpoint
 from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
@@ -243,7 +243,9 @@ def _ros(state: RosProxyOnNode, limit: int, former: Json) -> dict[str, object]:
         zenoh = state.answer.zenoh
         found = {name for group in state.answer.nodes.values() for name in group}
         names = sorted({*found, *(zenoh.nodes if zenoh else ())})
-        shown = [shorten(clean(name), _MOST_NAME_CHARACTERS) for name in names[:limit]]
+        # `brief` cuts before it cleans: to clean a megabyte takes 0.3 s.
+        brief_names = (brief(name, 3 * _MOST_NAME_CHARACTERS) for name in names[:limit])
+        shown = [shorten(name, _MOST_NAME_CHARACTERS) for name in brief_names]
         by_address = state.answer.participants
         counted = {"participants": sum(map(len, by_address.values()))} if by_address else {}
         count = len(state.answer.topics)

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from rosproxy.admin.status_document import RangeProbeStatus, read_status
 from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_PEERS
 from rosproxy.telemetry.problems import MOST_PROBLEMS
+from rosproxy.telemetry.text import clean
+from rosproxy_operator.kubernetes.proxies import proxy_report as reports
 from rosproxy_operator.kubernetes.proxies.proxy_report import RECENT_S, no_answer, report
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.checks import host_problem
@@ -337,6 +339,22 @@ def test_a_proxy_that_answers_too_much_causes_no_more_findings_than_another():
     assert answer.zenoh is not None
     assert len(answer.zenoh.peers) == MOST_ZENOH_PEERS
     assert len(answer.zenoh.hubs) == MOST_ZENOH_HUBS
+
+
+def test_a_long_text_of_a_proxy_is_cut_before_it_is_cleaned(monkeypatch):
+    """To clean a text of 1 MiB took 0.3 s of the event loop."""
+    cleaned = []
+
+    def note(text):
+        cleaned.append(text)
+        return clean(text)
+
+    monkeypatch.setattr(reports, "clean", note)
+    for character, end in (("\x80", "\\x8…"), ("x", "xxx…")):
+        text = reports.short(1000 * character)
+        assert (len(text), text[-4:]) == (300, end)
+    assert max(map(len, cleaned)) == 301
+    assert reports.short(300 * "x") == 300 * "x"
 
 
 def test_a_proxy_without_its_master():
