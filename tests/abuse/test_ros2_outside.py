@@ -132,7 +132,7 @@ def ports_for_discovery(abused: Abused) -> list[int]:
 
 def named(number: int) -> bytes:
     """The announcement of a writer, with a topic name that takes four times its bytes."""
-    name = b"rt/" + f"\U0001f600{number:05d}".encode() + b"x" * 1000 + b"\0" * 4
+    name = b"rt/" + f"\U0001f600{number:05d}".encode() + b"x" * 240 + b"\0" * 4
     parameters = [
         (Pid.ENDPOINT_GUID, EVIL_PREFIX + number.to_bytes(3, "big") + b"\3"),
         (Pid.TOPIC_NAME, struct.pack("<I", len(name)) + name),

@@ -71,8 +71,9 @@ LONGEST_SPDP_DATAGRAM_BYTES = 8192
 """Bytes of a datagram in which a participant announces itself. The proxy keeps this datagram. Some
 participants send 1,500 bytes."""
 _FOREIGN_ANNOUNCEMENT = "the datagram announces another participant than its sender"
-LONGEST_TOPIC_BYTES = 1024
-"""Bytes of a topic's name. Names of ROS 2 have at most 255."""
+LONGEST_TOPIC_BYTES = 255
+"""Bytes of a topic's name, without the zero byte at its end. Fast DDS cuts longer names, or refuses
+these (CDRMessage.hpp, readString). Names of ROS 2 are not longer."""
 MOST_PARAMETERS_OF_ALL = 4096
 """Parameters of all announcements in a datagram. The announcement of a reader or writer has 25
 parameters in 600 bytes, so a datagram of 64 KiB has 2,700."""
@@ -294,16 +295,30 @@ def _announcement(datagram: bytes, sample: Sample) -> Announcement:
         raise RtpsError("an announcement is not a parameter list")
     parameters = parameters or ParameterList(sample.is_little_endian, ())
     _require_own(datagram, sample, parameters)
-    topics = parameters.all(Pid.TOPIC_NAME)
-    # The policy judges the first topic, and a receiver may use another one.
-    if len(topics) > 1:
-        raise RtpsError("an announcement names more than one topic")
+    _require_clear_topic(datagram, parameters)
     is_endpoint = sample.writer in _KINDS
     if is_endpoint and not ended and not parameters.text(datagram, Pid.TOPIC_NAME):
         raise RtpsError("a reader or writer has no topic")
-    if topics and topics[0].value.end - topics[0].value.start > LONGEST_TOPIC_BYTES:
-        raise RtpsError(f"the name of a topic has more than {LONGEST_TOPIC_BYTES} bytes")
     return Announcement(BuiltinWriter(sample.writer), sample, parameters, inline, ended)
+
+
+def _require_clear_topic(datagram: bytes, parameters: ParameterList) -> None:
+    """Raise RtpsError if receivers may read another topic than the one that the policy judges.
+
+    Fast DDS reads a topic up to the first zero byte, also beyond the length of the string and of
+    the parameter (CDRMessage.hpp, readString).
+    """
+    topics = parameters.all(Pid.TOPIC_NAME)
+    if len(topics) > 1:
+        raise RtpsError("an announcement names more than one topic")
+    for topic in topics:
+        size = parameters.number(datagram, Pid.TOPIC_NAME) or 0
+        end = topic.value.start + 4 + size
+        if not 0 < size <= LONGEST_TOPIC_BYTES + 1:
+            text = f"the name of a topic has {size} bytes with its zero byte, not 1 to "
+            raise RtpsError(f"{text}{LONGEST_TOPIC_BYTES + 1}")
+        if end > topic.value.end or datagram[end - 1]:
+            raise RtpsError("the name of a topic does not end with a zero byte")
 
 
 def _require_own(datagram: bytes, sample: Sample, parameters: ParameterList | None) -> None:

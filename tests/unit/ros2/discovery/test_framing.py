@@ -114,3 +114,37 @@ def test_an_unaligned_submessage_may_be_the_last(size: int) -> None:
     for sent in crossing(denying(), said):
         assert sent[-1].datagram.endswith(bytes(size))
         assert b"rt/public" in sent[-1].datagram
+
+
+def text_topic(size: int, text: bytes) -> bytes:
+    value = struct.pack("<I", size) + text
+    return parameter(Pid.TOPIC_NAME, value + bytes(-len(value) % 4))
+
+
+WITHOUT_END = text_topic(4, b"rt/secret")
+"""Fast DDS reads a topic up to a zero byte, and ignores the length (CDRMessage.hpp, readString)."""
+BEYOND = text_topic(200, b"rt/secret") + parameter(0x8000, bytes(200))
+"""Fast DDS checks the length against the message alone."""
+TOO_LONG = text_topic(258, b"rt/" + b"a" * 254)
+"""Fast DDS cuts a topic after 255 bytes, or refuses the topic (fixed_size_string.hpp)."""
+
+
+@pytest.mark.parametrize("statuses", [(), (3,)])
+@pytest.mark.parametrize("name", [WITHOUT_END, BEYOND, TOO_LONG])
+def test_a_topic_that_two_read_differently_is_not_passed(
+    name: bytes, statuses: tuple[int, ...]
+) -> None:
+    domain = denying()
+    told = [(Pid.STATUS_INFO, bytes([0, 0, 0, status])) for status in statuses]
+    qos = parameter_list(told) if told else b""
+    content = bytes([0, 3, 0, 0]) + name + parameter(1, b"")
+    for count, sent in enumerate(crossing(domain, data(content, qos=qos, writer=SEDP_WRITERS)), 1):
+        assert sent == []
+        assert domain.refused.count == count
+
+
+def test_the_longest_topic_of_fast_dds_passes() -> None:
+    name = b"rt/" + b"a" * 252
+    said = announced(text_topic(256, name) + parameter(1, b""))
+    for sent in crossing(denying(), said):
+        assert name in sent[-1].datagram
