@@ -31,7 +31,7 @@ from rosproxy.ros2.protocol.rtps import (
     SubmessageId,
     apply,
 )
-from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
+from rosproxy.ros2.rewriting.discovery import ContentCounts, DiscoveryMessage, read_discovery
 
 LONGEST_ANNOUNCEMENT_BYTES = 60_000
 """Bytes of the longest announcement that the proxy accepts in fragments. Real announcements
@@ -245,11 +245,14 @@ class FragmentStore:
     def _gather_all(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> set[_Key]:
         """Gather the fragments of a message, and return the announcements that are whole now.
 
-        All announcements that a message completes count as one announcement, because the proxy
-        reads all of them in one step. Raises RtpsError.
+        All announcements that a message completes count as one announcement, and as part of the
+        datagram, because the proxy reads all of them in one step. Raises RtpsError.
         """
         completed = set[_Key]()
         size = 0
+        contents = ContentCounts()
+        for announcement in message.announcements:
+            contents.add(announcement)
         for sample, frags in message.fragments:
             gathered = self._gather(port, message, sample, frags)
             if gathered is not None:
@@ -257,7 +260,7 @@ class FragmentStore:
                 if size > LONGEST_ANNOUNCEMENT_BYTES:
                     text = f"more than {LONGEST_ANNOUNCEMENT_BYTES} bytes"
                     raise RtpsError(f"the datagram completes announcements of {text}")
-                _complete(gathered, message, sample, rewrite)
+                _complete(gathered, message, sample, rewrite, contents)
                 completed.add(_key(port, sample))
         return completed
 
@@ -324,11 +327,21 @@ def _key(port: int, sample: Sample) -> _Key:
 
 
 def _complete(
-    gathered: _PendingSample, message: DiscoveryMessage, sample: Sample, rewrite: Rewrite
+    gathered: _PendingSample,
+    message: DiscoveryMessage,
+    sample: Sample,
+    rewrite: Rewrite,
+    contents: ContentCounts,
 ) -> None:
-    """Rewrite an announcement of which all fragments have come. Raises RtpsError."""
+    """Rewrite an announcement of which all fragments have come. Raises RtpsError.
+
+    ``contents`` counts what the announcements of the datagram contain.
+    """
     payload = b"".join(gathered.fragments[number] for number in sorted(gathered.fragments))
-    edited = rewrite(read_discovery(_as_data(message.datagram, sample, payload)))
+    whole = read_discovery(_as_data(message.datagram, sample, payload))
+    for announcement in whole.announcements:
+        contents.add(announcement)
+    edited = rewrite(whole)
     # `rewrite` has turned a hidden announcement into a GAP (`withheld`).
     hidden = edited[HEADER_BYTES] == SubmessageId.GAP
     gathered.whole = b"" if hidden else edited[_PAYLOAD_AT:]

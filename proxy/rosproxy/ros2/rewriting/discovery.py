@@ -14,6 +14,7 @@ announcement again and again.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from enum import IntEnum
 
 import msgspec
@@ -149,6 +150,23 @@ class Announcement(msgspec.Struct, frozen=True):
                 yield parameter.pid, host_port
 
 
+@dataclass(slots=True)
+class ContentCounts:
+    """The numbers of parameters and locators in all announcements that a datagram leads to."""
+
+    parameters: int = 0
+    locators: int = 0
+
+    def add(self, announcement: Announcement) -> None:
+        """Count an announcement. Raises RtpsError if there are too many parameters or locators."""
+        self.parameters += len(announcement.parameters.parameters)
+        self.locators += announcement.locator_count
+        if self.parameters > MOST_PARAMETERS_OF_ALL:
+            raise RtpsError(f"the datagram has more than {MOST_PARAMETERS_OF_ALL} parameters")
+        if self.locators > MOST_LOCATORS_OF_ALL:
+            raise RtpsError(f"the datagram has more than {MOST_LOCATORS_OF_ALL} locators")
+
+
 class DiscoveryMessage(msgspec.Struct, frozen=True):
     """A message of a participant, with the announcements in the message.
 
@@ -271,16 +289,10 @@ def _announcements(datagram: bytes, builtin_samples: Iterable[Sample]) -> tuple[
     Raises RtpsError if an announcement is malformed, or if all together have too many parameters.
     """
     announcements = list[Announcement]()
-    parameter_count = 0
-    locator_count = 0
+    contents = ContentCounts()
     for sample in builtin_samples:
         announcement = _announcement(datagram, sample)
-        parameter_count += len(announcement.parameters.parameters)
-        locator_count += announcement.locator_count
-        if parameter_count > MOST_PARAMETERS_OF_ALL:
-            raise RtpsError(f"the datagram has more than {MOST_PARAMETERS_OF_ALL} parameters")
-        if locator_count > MOST_LOCATORS_OF_ALL:
-            raise RtpsError(f"the datagram has more than {MOST_LOCATORS_OF_ALL} locators")
+        contents.add(announcement)
         announcements.append(announcement)
     return tuple(announcements)
 

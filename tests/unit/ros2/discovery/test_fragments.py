@@ -14,7 +14,13 @@ from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import RtpsError, SubmessageId, submessages
-from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, rewritten
+from rosproxy.ros2.rewriting.discovery import (
+    MOST_LOCATORS_OF_ALL,
+    MOST_PARAMETERS_OF_ALL,
+    DiscoveryMessage,
+    read_discovery,
+    rewritten,
+)
 from tests.unit.ros2.protocol.messages import PREFIX, data, fragment, message, payload, submessage
 
 LOCATOR = HostPort("172.30.0.5", 7411)
@@ -236,6 +242,34 @@ def test_a_datagram_has_so_many_fragments_and_no_more() -> None:
     data_frag = fragment(bytes(128), 1, 128, 300)
     with pytest.raises(RtpsError):
         through(FragmentStores(), message(*[data_frag] * (fragments.MOST_FRAGMENTS + 1)))
+
+
+@pytest.mark.parametrize(
+    ("told", "count"),
+    [
+        ([(0x1234, b"")] * 200, MOST_PARAMETERS_OF_ALL),
+        ([(Pid.UNICAST_LOCATOR, bytes(24))] * 30, MOST_LOCATORS_OF_ALL),
+    ],
+)
+def test_what_a_datagram_completes_has_so_many_parts_and_no_more(
+    told: list[tuple[int, bytes]], count: int
+) -> None:
+    """64 last fragments of announcements with 227 parameters took 59 ms, in 4.4 kB."""
+    store = FragmentStores()
+    whole = payload(told)
+    first = len(whole) // 128 * 128
+    numbers = range(1, count // len(told) + 2)
+    assert len(numbers) <= fragments.MOST_FRAGMENTS
+    assert len(numbers) * len(whole) <= fragments.LONGEST_ANNOUNCEMENT_BYTES
+    for number in numbers:
+        begun = fragment(whole[:first], 1, 128, len(whole), sequence=number)
+        assert not through(store, message(begun))
+    last = [
+        fragment(whole[first:], first // 128 + 1, 128, len(whole), sequence=number)
+        for number in numbers
+    ]
+    with pytest.raises(RtpsError, match="more than"):
+        through(store, message(*last))
 
 
 def test_all_announcements_that_a_datagram_completes_count_as_one() -> None:
