@@ -44,6 +44,8 @@ Each datagram may be forged. So these rules hold:
 from collections import Counter
 from collections.abc import Collection, Sequence
 
+from msgspec.structs import replace
+
 from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.announcements.to_inside import AnnouncementsToInside, ForInside
 from rosproxy.ros2.discovery.announcements.to_outside import AnnouncementsToOutside, ForOutside
@@ -69,7 +71,6 @@ from rosproxy.ros2.ports.locator_ports import LocatorPorts, NamedBy
 from rosproxy.ros2.ports.mappings import PortMappings
 from rosproxy.ros2.ports.stand_ins import LocatorStandIns, StandInUser
 from rosproxy.ros2.protocol.addressing import (
-    addressed_to_all,
     carries_samples,
     destinations,
     may_be_discovery,
@@ -92,6 +93,7 @@ from rosproxy.ros2.registry.participants import (
 from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
     credited_messages,
+    participant_alone,
     read_messages,
     require_rewritable,
 )
@@ -623,9 +625,10 @@ class Domain:
             sent += self._port_reminders(insider, mapping_count, now)
         if not is_new and len(insider.mappings) > mapping_count:
             insider.separation_due_from = now  # Fast DDS outside accepts no new locators
-        # An announcement may name the discovery participant as its destination. `addressed_to_all`
-        # makes the announcement a message for all participants outside.
-        sent += self.to_outside.of_inside(insider, addressed_to_all(exported), now)
+        # The proxy repeats the announcement, also after a change of the policy. So readers and
+        # writers in the message must not be part of it.
+        alone = participant_alone(replace(message, datagram=exported))
+        sent += self.to_outside.of_inside(insider, alone, now)
         if is_new:
             sent += self.to_inside.of_outside(self.outside.by_prefix.values(), [insider], now)
         sent += self.proxy_participants.question_to_inside(

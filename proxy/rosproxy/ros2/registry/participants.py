@@ -202,9 +202,9 @@ class Participant:
     """A participant on either side.
 
     ``address`` is the source of its announcements. ``until`` is the time at which the participant
-    counts as gone, unless it announces itself again. ``announcement`` is its last SPDP datagram.
-    For a participant inside, this is the rewritten datagram for outside. For a participant outside,
-    this is the received datagram, without other submessages (`participant_alone`). ``next_number``
+    counts as gone, unless it announces itself again. ``announcement`` is its last SPDP datagram,
+    without other submessages (`participant_alone`). For a participant inside, this is the rewritten
+    datagram for outside. For a participant outside, this is the received datagram. ``next_number``
     is the sequence number after that of the announcement. ``endpoints`` are by entity id, and
     ``mappings`` by locator. ``graph_writer`` is the entity id of the writer of GRAPH_TOPIC.
     """

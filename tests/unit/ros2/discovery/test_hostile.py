@@ -32,6 +32,7 @@ from rosproxy.ros2.registry.participants import (
 from rosproxy.ros2.rewriting import discovery
 from rosproxy.ros2.sources.rates import BURST
 from tests.unit.ros2.discovery.domains import (
+    HOST,
     INSIDE,
     LAN_RELAY,
     NEAR,
@@ -95,6 +96,21 @@ def test_the_policy_judges_submessages_behind_an_announcement() -> None:
     for sent in (told, ended):
         assert b"chatter" not in sent
     assert not domain.inside.by_prefix
+
+
+def test_what_stands_behind_an_announcement_does_not_outlast_a_change_of_the_policy() -> None:
+    """The proxy announces a participant anew after the change, with what was allowed before."""
+    allowed = True
+    domain = make_domain(judge=lambda *_: allowed)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    behind = data(payload([TOPIC]), writer=SEDP_WRITERS)
+    domain.heard_inside(spdp(A, INSIDE) + behind, INSIDE, NOW)
+    allowed = False
+    sent = domain.apply_policy(NOW)
+    sent += domain.continue_pending(NOW + SEPARATION_S + 1)
+    announced = spdp(A, HOST)
+    assert [told for told in to(sent, ROBOT) if len(told) == len(announced)]
+    assert not any(b"chatter" in told for told in to(sent, ROBOT))
 
 
 @pytest.mark.parametrize("count", [1, 2])
