@@ -100,7 +100,7 @@ class LocatorStandIns:
 
     def _close(self, outsider: OutsideParticipant, locator: HostPort) -> None:
         mapping = outsider.mappings.pop(locator)
-        outsider.announcement_inside = None
+        outsider.announcements_inside.clear()
         remaining = [user for user in self.by_port.pop(mapping.port) if user[1] is not mapping]
         if remaining:
             self.by_port[mapping.port] = remaining

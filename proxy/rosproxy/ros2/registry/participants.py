@@ -371,8 +371,8 @@ class OutsideParticipant(Participant):
     the participant has named the discovery participant, or a participant inside. The factor
     `ANSWERED_FACTOR` then applies to received bytes. ``has_come_in`` means that discovery of the
     participant has arrived at a port of the range. ``is_announced`` means that the proxy announces
-    the participant inside. ``announcement_inside`` is the rewritten announcement, after the proxy's
-    address for which it was rewritten. ``met_at`` and ``heard_at`` are the times of the first and
+    the participant inside. ``announcements_inside`` are the rewritten announcements, by the proxy's
+    address for which each was rewritten. ``met_at`` and ``heard_at`` are the times of the first and
     the last announcement.
     """
 
@@ -381,7 +381,7 @@ class OutsideParticipant(Participant):
     has_answered: bool = False
     has_come_in: bool = False
     is_announced: bool = False
-    announcement_inside: tuple[str, bytes] | None = None
+    announcements_inside: dict[str, bytes] = field(default_factory=dict)
     credit: int = 0
     met_at: float = 0.0
     heard_at: float = 0.0

@@ -73,6 +73,25 @@ def test_an_announcement_is_rewritten_once_for_all_inside(monkeypatch: pytest.Mo
     assert calls["read_discovery"] == 1
 
 
+@pytest.mark.parametrize(("padding", "repeated"), [(0, 0), (5000, 2)])
+def test_an_announcement_is_rewritten_once_for_each_network(
+    monkeypatch: pytest.MonkeyPatch, padding: int, repeated: int
+) -> None:
+    """With two networks, 256 announcements were rewritten for each new participant: 24 ms.
+
+    The proxy keeps long announcements for a single network.
+    """
+    domain = met()
+    near = {INSIDE: NEAR, OTHER: ELSEWHERE}
+    domain.settings.proxy_address_for = near.__getitem__
+    calls = count_calls(monkeypatch, "read_discovery")
+    announced = spdp(B, ROBOT, 9100, padding=padding)
+    domain.heard_outside(announced, ROBOT, NOW)
+    assert calls["read_discovery"] == 2
+    domain.heard_outside(announced, ROBOT, NOW)
+    assert calls["read_discovery"] == 2 + repeated
+
+
 def test_a_change_of_policy_reads_no_announcement_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reading 256 long announcements again for 50 participants inside took 29 seconds."""
     domain = met()

@@ -23,6 +23,7 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant, TrafficKind
 from rosproxy.ros2.rewriting.announced_participant import note_endpoints
 from rosproxy.ros2.rewriting.discovery import (
+    LONGEST_SPDP_DATAGRAM_BYTES,
     Announcement,
     DiscoveryMessage,
     read_discovery,
@@ -186,13 +187,17 @@ class AnnouncementsToInside:
         """The announcement of a participant for receivers that reach the proxy at ``near``.
 
         The result is kept for all these receivers, because rewriting many parameters takes a
-        millisecond. Raises RtpsError.
+        millisecond. Of all results, at most LONGEST_SPDP_DATAGRAM_BYTES are kept. Raises RtpsError.
         """
-        if outsider.announcement_inside is None or outsider.announcement_inside[0] != near:
+        kept = outsider.announcements_inside
+        datagram = kept.get(near)
+        if datagram is None:
             for_inside = ForInside(self.outside, outsider, near)
-            message = read_discovery(outsider.announcement)
-            outsider.announcement_inside = near, for_inside.rewritten(message)
-        return outsider.announcement_inside[1]
+            datagram = for_inside.rewritten(read_discovery(outsider.announcement))
+            if sum(map(len, kept.values())) + len(datagram) > LONGEST_SPDP_DATAGRAM_BYTES:
+                kept.clear()
+            kept[near] = datagram
+        return datagram
 
 
 def _user_data_hosts(message: DiscoveryMessage) -> Iterator[str]:

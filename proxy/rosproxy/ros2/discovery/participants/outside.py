@@ -242,6 +242,6 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         announcement = participant_alone(message)
         if announcement != outsider.announcement:
             outsider.announcement = announcement
-            outsider.announcement_inside = None
+            outsider.announcements_inside.clear()
         if message.of_participant is not None:
             outsider.next_number = message.of_participant.sample.sequence + 1
