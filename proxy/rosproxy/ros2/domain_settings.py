@@ -49,6 +49,9 @@ MOST_ANNOUNCED_UNPROVEN = 64
 inside."""
 MOST_MAPPINGS = 16
 """Ports of the range for a participant. Fast DDS announces three locators for an address."""
+MOST_DATAGRAMS_PER_PART = 512
+"""Datagrams after which a part of the regular work of a domain ends: some milliseconds. What goes
+to all peers may exceed this number: with four peers, 129 datagrams for each participant."""
 
 Judge = Callable[[RuleKind, str, str], bool]
 """Returns whether the policy allows a name. The arguments are the kind of rule, the name, and the

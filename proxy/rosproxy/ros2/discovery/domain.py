@@ -42,7 +42,8 @@ Each datagram may be forged. So these rules hold:
 """
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from itertools import islice
 
 from msgspec.structs import replace
 
@@ -59,6 +60,7 @@ from rosproxy.ros2.discovery.participants.prefix_owners import PrefixOwners
 from rosproxy.ros2.discovery.proxy_participants import ProxyParticipants
 from rosproxy.ros2.discovery.rediscovery import Rediscovery
 from rosproxy.ros2.domain_settings import (
+    MOST_DATAGRAMS_PER_PART,
     DomainSettings,
     LanRelayLink,
     Outgoing,
@@ -102,7 +104,7 @@ from rosproxy.ros2.sources.claimed_addresses import claim_fault
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing, cost
 
 MOST_ENDED_PER_CALL = 64
-"""Participants of a side that `Domain.expire` ends in one call. Calls come twice a second."""
+"""Participants of a side that `Domain.expire` ends in one call."""
 
 _Passing = tuple[list[bytes], list[Outgoing]]
 """Datagrams to pass on, and datagrams to send back."""
@@ -149,6 +151,8 @@ class Domain:
         discovery_participant = DiscoveryParticipant(discovery_prefix)
         self.owners = PrefixOwners(settings, inside, outside, former_ports, proofs)
         self.rediscovery = Rediscovery(settings, inside, outside, self.to_inside)
+        self._questions: Iterator[Outgoing] = iter(())
+        self._has_questions = False
         self.fragments = fragments = FragmentStores()
         self.proxy_participants = ProxyParticipants(
             settings, discovery_participant, inside, outside, former_ports, fragments, proofs
@@ -160,12 +164,12 @@ class Domain:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a rediscovery has further parts for `go_on`.
+        """Whether `go_on` has further parts of the work to do.
 
         Hundreds of participants may have to rediscover hundreds of others. So the proxy does the
         work in parts.
         """
-        return self.rediscovery.is_busy
+        return self._has_questions or self.rediscovery.is_busy
 
     def heard_inside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """Handle a datagram from inside, at the multicast group or at the well-known port."""
@@ -341,17 +345,17 @@ class Domain:
 
         Calls come twice a second. Between these calls, `go_on` does the parts of the work.
         """
-        sent = self.former_ports.repeated_questions(now)
-        for insider in list(self.inside.by_prefix.values()):
-            try:
-                sent += self.rediscovery.proceed(insider, now)
-            except RtpsError as error:  # continue with the other participants
-                sent += self._drop("malformed", insider.address, str(error))
-        return sent + self.rediscovery.next_datagrams(now)
+        self._questions = self.former_ports.repeated_questions(now)
+        self.rediscovery.look_for_due()
+        return self.go_on(now)
 
     def go_on(self, now: float) -> list[Outgoing]:
-        """Do the next part of a rediscovery; see `is_busy`. A part takes some milliseconds."""
-        return self.rediscovery.next_datagrams(now)
+        """Do the next part of the work; see `is_busy`. A part takes some milliseconds."""
+        questions = list(islice(self._questions, MOST_DATAGRAMS_PER_PART))
+        self._has_questions = len(questions) == MOST_DATAGRAMS_PER_PART
+        if self._has_questions:
+            return questions
+        return questions + self.rediscovery.next_datagrams(now)
 
     def admit(self, prefix: bytes, now: float) -> list[Outgoing]:
         """Serve a participant inside that has waited because of its former ports.
@@ -425,7 +429,8 @@ class Domain:
     def expire(self, now: float) -> list[Outgoing]:
         """End participants whose lease duration is over. Return the datagrams for outside.
 
-        Inside gets no dispose messages. A call ends at most `MOST_ENDED_PER_CALL` of each side.
+        Inside gets no dispose messages. A call ends at most `MOST_ENDED_PER_CALL` of each side, and
+        no further one inside after `MOST_DATAGRAMS_PER_PART`.
 
         A participant on two networks may have lost the network on which the proxy served the
         participant. After the end of its lease duration, the proxy accepts its announcement on the
@@ -434,6 +439,8 @@ class Domain:
         sent = list[Outgoing]()
         insiders = [p for p in self.inside.by_prefix.values() if p.until < now]
         for insider in insiders[:MOST_ENDED_PER_CALL]:
+            if len(sent) >= MOST_DATAGRAMS_PER_PART:
+                break
             sent += self.disposal.end_inside(insider)
         outsiders = [p for p in self.outside.by_prefix.values() if p.until < now]
         for outsider in outsiders[:MOST_ENDED_PER_CALL]:

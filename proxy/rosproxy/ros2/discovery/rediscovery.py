@@ -22,16 +22,17 @@ So the proxy makes a few dispose messages and announcements at a time (`next_dat
 addresses inside take turns.
 """
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from itertools import islice
 from math import inf
+from typing import Final
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announcements.to_inside import AnnouncementsToInside
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
 from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
-from rosproxy.ros2.domain_settings import DomainSettings, Outgoing
+from rosproxy.ros2.domain_settings import MOST_DATAGRAMS_PER_PART, DomainSettings, Outgoing
 from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.rtps import RtpsError
 from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant
@@ -43,6 +44,7 @@ MOST_VERDICTS_PER_PART = 32
 """Verdicts that the policy judges again at a time. With 1,000 rules a verdict takes 0.7 ms."""
 MOST_PAIRS_PER_PART = 32
 """Pairs of a participant inside and one outside that are handled at a time. A pair takes 0.1 ms."""
+_NO_VERDICT: Final = "no verdict is left"
 LAN_RELAY_TIMEOUT_S = 30.0
 """Seconds for which a separation waits for the LAN relay. If no participant is on its LAN, the
 relay sends nothing."""
@@ -57,6 +59,8 @@ class Rediscovery:
     outside: OutsideParticipants
     to_inside: AnnouncementsToInside
     lan_relay_heard: bool = False
+    _due: deque[InsideParticipant] = field(default_factory=deque)
+    """Participants inside that `proceed` has to look at."""
     _waiting: dict[str, dict[bytes, Iterator[list[Outgoing]]]] = field(default_factory=dict)
     """Work for participants inside, by their address and prefix. A step of an iterator makes the
     datagrams of a pair of participants."""
@@ -84,17 +88,22 @@ class Rediscovery:
 
     @property
     def is_busy(self) -> bool:
-        """Whether verdicts, dispose messages or announcements wait."""
-        return self._has_verdicts or bool(self._waiting)
+        """Whether participants, verdicts, dispose messages or announcements wait."""
+        return self._has_verdicts or bool(self._due) or bool(self._waiting)
+
+    def look_for_due(self) -> None:
+        """Start to look for separations that are due or over. Calls come twice a second."""
+        self._due = deque(self.inside.by_prefix.values())
 
     def next_datagrams(self, now: float) -> list[Outgoing]:
         """The datagrams of the next part of the work, for outside and inside."""
         self._now = now
-        verdicts = list(islice(self._review, MOST_VERDICTS_PER_PART))
-        self._has_verdicts = len(verdicts) == MOST_VERDICTS_PER_PART
-        sent = [out for insider in filter(None, verdicts) for out in self._separate_known(insider)]
+        sent = list[Outgoing]()
+        while self._due and len(sent) < MOST_DATAGRAMS_PER_PART:
+            sent += self._proceed_known(self._due.popleft())
+        sent += self._next_verdicts(MOST_DATAGRAMS_PER_PART - len(sent))
         for _ in range(MOST_PAIRS_PER_PART):
-            if not self._waiting:
+            if not self._waiting or len(sent) >= MOST_DATAGRAMS_PER_PART:
                 break
             sent += self._next_pair()
         return sent
@@ -141,6 +150,24 @@ class Rediscovery:
         for insider in insiders:
             if insider.dispose_message_times is not None:
                 insider.dispose_message_times.pop(prefix, None)
+
+    def _proceed_known(self, insider: InsideParticipant) -> list[Outgoing]:
+        """`proceed` with a participant, unless the participant has gone."""
+        if self.inside.by_prefix.get(insider.prefix) is not insider:
+            return []
+        return self.proceed(insider, self._now)
+
+    def _next_verdicts(self, most: int) -> list[Outgoing]:
+        """Judge the next verdicts, until changed verdicts lead to at least ``most`` datagrams."""
+        sent = list[Outgoing]()
+        judged = 0
+        while self._has_verdicts and judged < MOST_VERDICTS_PER_PART and len(sent) < most:
+            insider = next(self._review, _NO_VERDICT)
+            self._has_verdicts = insider is not _NO_VERDICT
+            if isinstance(insider, InsideParticipant):
+                sent += self._separate_known(insider)
+            judged += 1
+        return sent
 
     def _separate_known(self, insider: InsideParticipant) -> list[Outgoing]:
         """Separate a participant and forget its verdicts, unless the participant has gone."""

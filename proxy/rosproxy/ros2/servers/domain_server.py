@@ -228,7 +228,10 @@ class DomainServer:
         self._release()
         self._admit_waiting()
         self._send_and_go_on(self.domain.continue_pending(self._now()))
-        self._send(self.domain.expire(self._now()))
+        # An end goes to all ports of the peers. So the proxy forwards in between.
+        while ended := self.domain.expire(self._now()):
+            self._send(ended)
+            await asyncio.sleep(0)
         self._sync_stand_ins()
         self._report_changes()
 

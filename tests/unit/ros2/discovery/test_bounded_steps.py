@@ -12,7 +12,13 @@ from rosproxy.ros2.discovery.rediscovery import (
     MOST_VERDICTS_PER_PART,
     SEPARATION_S,
 )
-from rosproxy.ros2.domain_settings import MOST_MAPPINGS, Outgoing
+from rosproxy.ros2.domain_settings import (
+    MOST_DATAGRAMS_PER_PART,
+    MOST_MAPPINGS,
+    MOST_PER_ADDRESS,
+    PARTICIPANTS_TRIED,
+    Outgoing,
+)
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_prefix
@@ -105,6 +111,60 @@ def test_a_change_of_the_policy_is_applied_in_parts() -> None:
     assert not any(insider.is_separated for insider in domain.inside.by_prefix.values())
     most = MOST_PAIRS_PER_PART + 3 * (INSIDE_COUNT + 1)  # three for outside, of each inside
     assert max(map(len, parting + meeting)) <= most
+
+
+PEERS = [f"10.0.0.{number}" for number in range(9, 13)]
+PORTS_OF_ALL = 1 + len(PEERS) * PARTICIPANTS_TRIED
+"""The datagrams for outside with which a participant is announced, or ends."""
+
+
+def among_peers(policy: Policy) -> Domain:
+    """A domain with the peers `PEERS`, one participant outside, and many inside."""
+    domain = make_domain(peers=PEERS, judge=policy, ports=LONG_RANGE)
+    domain.settings.peers = tuple(HostPort(peer, 0) for peer in PEERS)
+    domain.heard_outside(spdp(outside(0), ROBOT), ROBOT, NOW)
+    for number in range(INSIDE_COUNT):
+        domain.heard_inside(spdp(inside(number), INSIDE, 7000 + 2 * number), INSIDE, NOW)
+    (stand_in,) = domain.stand_ins.by_port
+    for prefix in domain.inside.by_prefix:
+        domain.at_stand_in(stand_in, sedp(prefix, INSIDE, 7000), INSIDE, NOW)
+    return domain
+
+
+def test_a_part_has_few_datagrams_for_the_peers() -> None:
+    """With 128 inside and 4 peers, one step sent 17,568 datagrams in 122 ms."""
+    policy = Policy()
+    domain = among_peers(policy)
+    policy.allows = False
+    parting = parts(domain, domain.apply_policy(NOW), NOW)
+    later = NOW + SEPARATION_S
+    meeting = parts(domain, domain.continue_pending(later), later)
+    assert not any(insider.is_separated for insider in domain.inside.by_prefix.values())
+    for every in (parting, meeting):
+        assert sum(map(len, every)) >= INSIDE_COUNT * PORTS_OF_ALL
+        assert max(map(len, every)) < MOST_DATAGRAMS_PER_PART + PORTS_OF_ALL
+
+
+def test_a_call_ends_few_participants_among_many_peers() -> None:
+    """With 4 peers, one step sent 8,256 datagrams in 48 ms."""
+    domain = among_peers(Policy())
+    left = INSIDE_COUNT
+    while sent := domain.expire(NOW + 100):
+        assert len(sent) < MOST_DATAGRAMS_PER_PART + PORTS_OF_ALL
+        left -= len(sent) // PORTS_OF_ALL
+        assert len(domain.inside.by_prefix) == left
+    assert not left
+
+
+def test_questions_about_former_ports_are_repeated_in_parts() -> None:
+    """With 512 waiting participants, one step took 35 ms twice a second."""
+    domain = make_domain(ports=LONG_RANGE, port_store_key=b"key")
+    for number in range(4 * MOST_PER_ADDRESS):
+        address = f"172.30.0.{10 + number // MOST_PER_ADDRESS}"
+        domain.heard_inside(spdp(inside(number), address, 7000 + 2 * number), address, 0.1)
+    every = parts(domain, domain.continue_pending(0.5), 0.5)
+    assert max(map(len, every)) <= MOST_DATAGRAMS_PER_PART
+    assert sum(map(len, every)) == 4 * 4 * MOST_PER_ADDRESS
 
 
 def test_addresses_take_turns() -> None:
