@@ -11,6 +11,7 @@ with the letters RTPS.
 
 from collections.abc import Iterable, Iterator
 from ipaddress import IPv6Address, ip_address
+from itertools import islice
 
 from rosproxy.net.addresses import plain_address
 from rosproxy.ros2.protocol.rtps import RtpsError
@@ -34,13 +35,13 @@ def unwrapped(data: bytes) -> tuple[str, bytes]:
 
 
 def address_lists(addresses: Iterable[str]) -> Iterator[bytes]:
-    """Yield lists of addresses, a list for each datagram.
+    """Yield lists of addresses, a list for each datagram, and make each list when it is taken.
 
     Raises ValueError if an item is not an address.
     """
-    packed = list(map(_packed, addresses))
-    for start in range(0, len(packed), MOST_LISTED):
-        yield LIST_MAGIC + b"".join(packed[start : start + MOST_LISTED])
+    remaining = iter(addresses)
+    while listed := list(islice(remaining, MOST_LISTED)):
+        yield LIST_MAGIC + b"".join(map(_packed, listed))
 
 
 def listed_addresses(content: bytes) -> list[str] | None:
