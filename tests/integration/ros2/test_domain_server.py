@@ -21,7 +21,11 @@ from rosproxy.ros2.protocol.relay_envelope import MOST_LISTED
 from rosproxy.ros2.protocol.rtps import FAST_DDS, HEADER_BYTES, VERSION, source_prefix
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
-from rosproxy.ros2.servers.domain_server import ADMISSION_TIMEOUT_S, DomainServer
+from rosproxy.ros2.servers.domain_server import (
+    ADMISSION_TIMEOUT_S,
+    DATAGRAMS_PER_TURN,
+    DomainServer,
+)
 from rosproxy.ros2.sources.fair_queue import DiscoveryQueue
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing
 from tests.integration.net import PATIENCE, until
@@ -338,3 +342,22 @@ async def test_the_lan_relay_is_told_of_proven_addresses_in_turns(
         lists.append(0)
     assert sum(lists) == 4
     assert max(lists) == 1
+
+
+async def test_a_datagram_that_leads_to_many_ends_the_turn_of_its_socket(
+    server: DomainServer,
+) -> None:
+    """Eleven answers proved eleven addresses of a machine: no message passed for 0.16 s."""
+    many = [Outgoing(HostPort(OUTSIDE, 9), b"announced")] * DATAGRAMS_PER_TURN
+    taken = list[bytes]()
+
+    def take(datagram: bytes, *_: object) -> list[Outgoing]:
+        taken.append(datagram)
+        return many
+
+    with participant(INSIDE) as receiver, participant(OUTSIDE) as sender:
+        for number in range(3):
+            sender.sendto(bytes([number]), receiver.getsockname())
+        for turn in range(1, 4):
+            server._take_in(receiver, take, lambda *_: False)
+            assert len(taken) == turn
