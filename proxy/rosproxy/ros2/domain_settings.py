@@ -46,7 +46,8 @@ MOST_PER_UNPROVEN = 16
 """Participants at an unproven address outside."""
 MOST_ANNOUNCED_UNPROVEN = 64
 """Participants outside at unproven addresses up to which the proxy announces such participants
-inside."""
+inside. Also participants inside that have not answered, up to which the proxy serves further such
+participants."""
 MOST_MAPPINGS = 16
 """Ports of the range for a participant. Fast DDS announces three locators for an address."""
 MOST_DATAGRAMS_PER_PART = 512

@@ -477,7 +477,7 @@ class Domain:
             return self._end_inside(message, source, now)
         is_new = prefix not in self.inside.by_prefix
         if is_new and (
-            self.ports.is_restoring(now) or self.mappings.must_answer_first(prefix, source)
+            self.ports.is_restoring(now) or self.inside.must_answer_first(prefix, source)
         ):
             return self._wait(message, source, now)
         return self._serve_inside(message, source, now)
@@ -603,8 +603,8 @@ class Domain:
         """Handle the announcement of a participant inside, and announce the participant outside."""
         prefix = message.prefix
         is_new = prefix not in self.inside.by_prefix
-        if is_new and self.mappings.must_answer_first(prefix, source):
-            # The proxy announces the participant with all ports or not at all, because Fast DDS
+        if is_new and self.inside.must_answer_first(prefix, source):
+            # The proxy serves the participant with all ports or not at all, because Fast DDS
             # accepts no new locators of a known participant. The participant will announce itself
             # again.
             return self.proxy_participants.question_to_announced(message, source)

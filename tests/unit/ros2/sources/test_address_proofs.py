@@ -338,16 +338,26 @@ def test_forged_sources_inside_keep_nobody_from_being_announced() -> None:
     assert len(domain.inside.by_prefix[A].mappings) == 2
 
 
+def test_forged_sources_inside_leave_an_allowance_for_others() -> None:
+    """With 2,000 announcements a second, a new participant was not served for 40 s."""
+    domain = make_domain(ports=LONG_RANGE)
+    domain.settings.peers = tuple(HostPort(f"10.0.0.{number}", 0) for number in range(9, 13))
+    for number in range(2000):
+        address = f"172.30.0.{10 + number % 200}"
+        domain.heard_inside(spdp(named(number), address, 7000 + 2 * number), address, NOW)
+    assert len(domain.inside.by_prefix) == MOST_ANNOUNCED_UNPROVEN
+    for question in questions(domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW), INSIDE):
+        domain.heard_inside(answer(question, A), INSIDE, NOW)
+    settle(domain, NOW + ANSWER_TIMEOUT_S)
+    assert A in domain.inside.by_prefix
+
+
 def test_who_gives_its_place_up_inside_is_ended_outside() -> None:
-    domain = make_domain()
-    prove(domain, INSIDE)
-    participants = {}
-    for number in range(MOST_INSIDE_UNPROVEN):
-        participant = named(number)
-        address = f"172.30.{number // 200 + 1}.{number % 200 + 1}"
-        participants[participant] = address
-        announcement = spdp(participant, address, 7410)
-        domain.inside.meet(read_discovery(announcement), address, NOW)
+    domain = make_domain(ports=LONG_RANGE)
+    for number in range(MOST_PER_ADDRESS):
+        announcement = spdp(named(number), OTHER, 7410 + 2 * number)
+        domain.inside.meet(read_discovery(announcement), OTHER, NOW)
+    prove(domain, OTHER, prefixes=[named(900)])
     told = domain.heard_inside(spdp(named(900), OTHER), OTHER, NOW)
     (ended,) = [d for d in to(told, ROBOT) if read_discovery(d).announcements[0].ended]
     assert source_prefix(ended) == named(0)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from rosproxy.ros2.discovery.participants.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.domain_settings import (
+    MOST_ANNOUNCED_UNPROVEN,
     MOST_INSIDE,
     MOST_INSIDE_UNPROVEN,
     MOST_PER_ADDRESS,
@@ -83,6 +84,19 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         if has_answered:
             return fairer_place(self._answering(True), MOST_INSIDE, source, str)
         return oldest_unproven(self._answering(False), MOST_INSIDE_UNPROVEN)
+
+    def must_answer_first(self, prefix: bytes, source: str) -> bool:
+        """Whether the proxy serves a new participant only after an answer.
+
+        This is so if few ports are free, or if many participants have not answered. A forger may
+        have invented these, and each would be announced to all peers and to all neighbours. The
+        unproven sources share an allowance, and nothing would be left of it for others.
+        """
+        if self.mappings.must_answer_first(prefix, source):
+            return True
+        may_be_many = len(self.by_prefix) >= MOST_ANNOUNCED_UNPROVEN
+        has_to_answer = may_be_many and not self.proofs.has_answered(source, prefix)
+        return has_to_answer and len(self._answering(False)) >= MOST_ANNOUNCED_UNPROVEN
 
     def over_limit(self) -> list[InsideParticipant]:
         """The participants that end because more have answered than may have a place."""
