@@ -138,6 +138,13 @@ FIXES = {
         "RosProxy. If the finding stays, delete the pods of both proxies, and check that no other "
         "pod has the labels of a proxy",
     ),
+    "zenoh files": Fix(
+        "write new files in place of the files. The proxy notices new files by itself",
+        "write new files into the directory of the operator's --zenoh-link-certificates. The proxy "
+        "notices new files by itself",
+        "put a new certificate into the Secret of spec.link.secretName. The proxies notice new "
+        "files by themselves",
+    ),
     "zenoh nodes": Fix(
         "set for the nodes in containers: RMW_IMPLEMENTATION=rmw_zenoh_cpp and "
         """ZENOH_CONFIG_OVERRIDE='mode="client";connect/endpoints=["tcp/PROXY:{port}"];"""

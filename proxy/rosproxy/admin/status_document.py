@@ -386,7 +386,17 @@ class ZenohLinkStatus(msgspec.Struct, frozen=True):
     @property
     def title(self) -> str:
         """The peer, for a link to another site with the protocol."""
-        return self.peer if self.protocol == "tcp" else f"{self.protocol}/{self.peer}"
+        return f"{self.protocol}/{self.peer}" if self.is_to_site else self.peer
+
+    @property
+    def is_to_site(self) -> bool:
+        """Whether the link leads to the proxy of another site."""
+        return self.protocol != "tcp"
+
+    @property
+    def is_to_router(self) -> bool:
+        """Whether the link leads to a router outside (``--zenoh-peer``)."""
+        return not self.hub and not self.is_to_site
 
 
 class ZenohCertificateStatus(msgspec.Struct, frozen=True):
@@ -394,12 +404,14 @@ class ZenohCertificateStatus(msgspec.Struct, frozen=True):
 
     ``error``: why the file of now can't be used. ``starts_in``: the seconds until the certificate
     is valid. ``ends_in``: the seconds until its end, negative after the end; None for a key.
+    ``hub``: the certificate of ``--zenoh-hub-certificate``, and ``file`` is the option.
     """
 
     file: str = ""
     error: str = ""
     starts_in: Seconds = 0.0
     ends_in: float | None = None
+    hub: bool = False
 
 
 class ZenohSessionStatus(msgspec.Struct, frozen=True):

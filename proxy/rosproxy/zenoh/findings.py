@@ -17,7 +17,7 @@ from rosproxy.admin.status_document import (
 )
 from rosproxy.fixes import how_to
 from rosproxy.net.addresses import parse_host_port
-from rosproxy.telemetry.text import brief, duration, listed, plural, quoted
+from rosproxy.telemetry.text import brief, listed, plural, quoted
 from rosproxy.zenoh.links import CERTIFICATE_FAULTS, LinkFault
 from rosproxy.zenoh.matching import DURABILITY, TYPE, TYPE_HASH
 
@@ -26,8 +26,8 @@ PEER = "peer"
 """The mode of a session whose router passes no data on to other peers of this router."""
 LINK_GRACE_S = 5.0
 """Seconds in which a link has to come up before it counts as a fault."""
-CERTIFICATE_WARNING_S = 14 * 86400.0
-"""Seconds before the end of a certificate from which the doctor warns."""
+WARNING_DAYS = (1, 3, 7, 14)
+"""Days before the end of a certificate at which a warning begins, or changes."""
 MOST_LIMIT_COMPARISONS = 20_000
 """Pairs of a topic and a limit that are compared. A pair takes half a microsecond."""
 NO_TYPE_HASH = "TypeHashNotSupported"
@@ -124,7 +124,6 @@ _SITE_FAULTS = {
     ),
 }
 """Texts for links to other sites that differ from those for other links."""
-_RENEW = "write new files in place of the files. The proxy notices new files by itself"
 
 
 def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
@@ -151,18 +150,23 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
 
 
 def _certificate(certificate: ZenohCertificateStatus) -> DoctorFinding | None:
-    """What is wrong with a file for links to other sites; None if it is right."""
-    subject = f"zenoh file {certificate.file}"
+    """What is wrong with a file for links to other sites, or with the certificate of hubs.
+
+    None if it is right.
+    """
+    subject = "zenoh certificate of hubs" if certificate.hub else f"zenoh file {certificate.file}"
     left = certificate.ends_in
+    renew = how_to("zenoh certificate" if certificate.hub else "zenoh files")
     if certificate.error:
-        return error("certificate", subject, certificate.error, _RENEW)
+        return error("certificate", subject, certificate.error, renew)
     if certificate.starts_in:
-        text = f"not valid before another {duration(certificate.starts_in)} have passed"
-        return error("certificate", subject, text, "check the clock of this host")
+        return error("certificate", subject, "is not valid yet", "check the clock of this host")
     if left is not None and left <= 0:
-        return error("certificate", subject, f"expired {duration(-left)} ago", _RENEW)
-    if left is not None and left < CERTIFICATE_WARNING_S:
-        return warning("certificate", subject, f"expires in {duration(left)}", _RENEW)
+        return error("certificate", subject, "has expired", renew)
+    # The text changes seldom: each new text is another line of the log.
+    days = next((d for d in WARNING_DAYS if left is not None and left < d * 86400.0), None)
+    if days is not None:
+        return warning("certificate", subject, f"expires within {plural(days, 'day')}", renew)
     return None
 
 

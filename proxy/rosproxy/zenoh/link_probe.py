@@ -14,9 +14,6 @@ HANDSHAKE_TIMEOUT_S = 5.0
 ALERT_TIMEOUT_S = 2.0
 """Seconds in which a peer refuses the certificate of the proxy, if the peer refuses it."""
 
-HANDSHAKE_TIMEOUT_S = 5.0
-"""Seconds for the handshake of TLS with a hub."""
-
 
 async def try_link(link: Link, tls: ssl.SSLContext | None = None) -> LinkFault:
     """Return why there is no session with the peer of a link, as far as a connection shows.

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import logging
 import ssl
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace as replace_plan
 from importlib import metadata
@@ -15,7 +16,7 @@ from rosproxy.admin.admin_server import Action
 from rosproxy.admin.common_status import with_hidden
 from rosproxy.admin.doctor_finding import DoctorFinding
 from rosproxy.admin.requests import EnforcementCounts, PortProbe
-from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.admin.status_document import ProxyStatus, ZenohCertificateStatus
 from rosproxy.binding import setting_error_if_taken
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
@@ -26,7 +27,7 @@ from rosproxy.setting_kinds import SettingError
 from rosproxy.settings import Settings
 from rosproxy.telemetry.text import listed
 from rosproxy.zenoh import findings
-from rosproxy.zenoh.certificates import CLIENTS, SERVERS, Unusable, check_credentials
+from rosproxy.zenoh.certificates import CLIENTS, SERVERS, Checked, Unusable, check_credentials
 from rosproxy.zenoh.link_probe import try_link
 from rosproxy.zenoh.links import Link, LinkFault, own_peers
 from rosproxy.zenoh.policy.access_control import access_control
@@ -58,6 +59,7 @@ TOKEN_SHARE = 0.1
 POLICY_INTERVAL_S = 0.5
 """Seconds between checks of the policy, and of the sessions at the ports for containers."""
 _ROS_OPTION = "--ros zenoh"
+HUB_CERTIFICATE = "--zenoh-hub-certificate"
 
 
 class Zenoh:
@@ -79,7 +81,7 @@ class Zenoh:
             hubs=settings.zenoh_hub,
             certificate=settings.zenoh_hub_certificate,
         )
-        self._hub_client: ssl.SSLContext | None = None
+        self._of_hub: Checked | None = None
         runtime.policy.checks.append(self._check_layers)
         self._policy = RouterPolicy(runtime.policy, settings.zenoh_ports, settings.zenoh_listen)
         self._access: dict[int, object] = {}
@@ -89,7 +91,7 @@ class Zenoh:
         self._tokens_due = 0.0
         self._own_peers = frozenset[HostPort]()
         self.supervisor = RouterSupervisor(runtime.tasks, self._take_report, self._refuse)
-        self.state = ZenohState(settings, self.supervisor, runtime.now, self._sites.certificates)
+        self.state = ZenohState(settings, self.supervisor, runtime.now, self._certificates)
 
     async def start(self) -> None:
         """Start the routers and the periodic checks. Raises SettingError.
@@ -98,7 +100,7 @@ class Zenoh:
         """
         _check_package()
         _check_ports(self._settings)
-        self._hub_client = _hub_client(self._settings)
+        self._of_hub = _hub_certificate(self._settings)
         self._plan = replace_plan(self._plan, directory=make_socket_directory())
         self._check_policy()
         self._sites.check()
@@ -177,7 +179,7 @@ class Zenoh:
         """
         _check_package()
         _check_ports(self._settings)
-        _hub_client(self._settings)
+        _hub_certificate(self._settings)
         self._check_policy()
         self._sites.check()
         return ()
@@ -259,6 +261,25 @@ class Zenoh:
         if self._sites.look() and not self._awaiting:
             await self._use_again()
 
+    def _certificates(self) -> tuple[ZenohCertificateStatus, ...]:
+        """The state of the certificate for hubs, and of each certificate for links."""
+        files = self._sites.certificates()
+        if self._of_hub is None:
+            return files
+        life = self._of_hub.certificate
+        ca = self._of_hub.ca
+        now = time.time()
+        begin = max(life.begin, ca.begin)
+        return (
+            ZenohCertificateStatus(
+                file=HUB_CERTIFICATE,
+                starts_in=max(begin - now, 0.0),
+                ends_in=min(life.end, ca.end) - now,
+                hub=True,
+            ),
+            *files,
+        )
+
     def _configs(self, access: Mapping[int, object]) -> list[RouterConfig]:
         """The configurations of all routers. Raises ValueError as `RouterPlan.configs` does."""
         peers = [peer for peer in self._plan.peers if peer not in self._own_peers]
@@ -337,7 +358,7 @@ class Zenoh:
     def _client_for(self, link: Link) -> ssl.SSLContext | None:
         """What proves the proxy to the peer of a link; None for a link without TLS."""
         if link.is_hub:
-            return self._hub_client
+            return self._of_hub.client if self._of_hub else None
         return self._sites.files.client if link.protocol == "tls" and self._sites.files else None
 
     async def _look_for_faults(self) -> None:
@@ -378,17 +399,17 @@ def _check_package() -> None:
         raise SettingError(_ROS_OPTION, text) from None
 
 
-def _hub_client(settings: Settings) -> ssl.SSLContext | None:
-    """What proves the proxy to other hubs; None without a certificate.
+def _hub_certificate(settings: Settings) -> Checked | None:
+    """The certificate that proves the proxy to other hubs; None without a certificate.
 
     Raises SettingError for a bad certificate.
     """
     if settings.zenoh_hub_certificate is None:
         return None
     try:
-        return check_credentials(settings.zenoh_hub_certificate, (CLIENTS, SERVERS)).client
+        return check_credentials(settings.zenoh_hub_certificate, (CLIENTS, SERVERS))
     except Unusable as error:
-        raise SettingError("--zenoh-hub-certificate", str(error)) from None
+        raise SettingError(HUB_CERTIFICATE, str(error)) from None
 
 
 def _check_ports(settings: Settings) -> None:

@@ -233,7 +233,8 @@ class ZenohState(Collector):
             nodes.add_metric([side], count)
         files = GaugeMetricFamily(
             "rosproxy_zenoh_certificate_expiry_seconds",
-            "When a certificate for links to other sites expires, in seconds of Unix time.",
+            "When a certificate for links to other sites, or to other hubs, expires, in seconds of "
+            "Unix time.",
             labels=["file"],
         )
         for file in status.certificates:

@@ -426,6 +426,26 @@ async def test_new_files_restart_the_router_of_links_alone(
     assert not zenoh._sites.look(), "nothing has changed"
 
 
+async def test_the_certificate_of_hubs_is_told_before_its_end(
+    make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = AUTHORITY.write(tmp_path / "hub", HOST, ends=10 * certificates.DAY)
+    parts = (certificates.KEY, certificates.CERTIFICATE, certificates.CA)
+    text = "".join((folder / name).read_text() for name in parts)
+    zenoh = make(zenoh_hub_listen=47449, zenoh_hub_certificate=text)
+    await zenoh.start()
+    problems = zenoh._runtime.problems
+    await until(lambda: "zenoh certificate of hubs" in caplog.text, lambda: caplog.text)
+    (problem,) = problems.all()
+    assert problem.text.startswith("expires within 14 days. Fix: give all proxies of the graph a")
+    (life,) = zenoh.state.status().certificates
+    assert life.ends_in
+    metrics = {metric.name: metric for metric in zenoh.state.collect()}
+    (sample,) = metrics["rosproxy_zenoh_certificate_expiry_seconds"].samples
+    assert sample.labels == {"file": "--zenoh-hub-certificate"}
+    assert sample.value > life.ends_in
+
+
 async def test_a_foreign_certificate_of_another_site_is_told(make: Make, files: Path) -> None:
     zenoh = linked(make, files, zenoh_link_listen="tls/47449")
     zenoh._refuse("is of a CA that this proxy does not trust")

@@ -240,4 +240,4 @@ def test_a_link_to_another_site_says_why_it_is_down() -> None:
     file = ZenohCertificateStatus("/c/tls.crt", ends_in=86400.0)
     (finding,) = made(certificates=(file,))["findings"]
     assert finding["subject"] == "zenoh file /c/tls.crt"
-    assert finding["text"] == "expires in 1 d"
+    assert finding["text"] == "expires within 3 days"

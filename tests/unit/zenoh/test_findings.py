@@ -13,10 +13,10 @@ from rosproxy.admin.status_document import (
     ZenohStatus,
 )
 from rosproxy.zenoh.findings import (
-    CERTIFICATE_WARNING_S,
     LINK_GRACE_S,
     MOST_LIMIT_COMPARISONS,
     MOST_REPORTED_MISMATCHES,
+    WARNING_DAYS,
     faults,
     first_mismatches,
     shared_limits,
@@ -100,7 +100,7 @@ def test_peers_of_two_containers_at_a_port_are_told() -> None:
 
 
 SITE = ZenohLinkStatus("cloud.example:7447", True, "", 60.0, protocol="tls")
-FILE = ZenohCertificateStatus("/run/certificates/tls.crt", ends_in=CERTIFICATE_WARNING_S + 1.0)
+FILE = ZenohCertificateStatus("/run/certificates/tls.crt", ends_in=WARNING_DAYS[-1] * 86400.0 + 1.0)
 
 
 @pytest.mark.parametrize(
@@ -133,9 +133,11 @@ def test_a_link_to_another_site_says_why_it_is_down(fault: LinkFault, text: str,
 @pytest.mark.parametrize(
     ("file", "severity", "text"),
     [
-        (replace(FILE, ends_in=13.5 * 86400), Severity.WARNING, "expires in 13 d 12 h"),
-        (replace(FILE, ends_in=-7200.0), Severity.ERROR, "expired 2 h ago"),
-        (replace(FILE, starts_in=3600.0), Severity.ERROR, "not valid before another 1 h have"),
+        (replace(FILE, ends_in=13.5 * 86400), Severity.WARNING, "expires within 14 days"),
+        (replace(FILE, ends_in=6.5 * 86400), Severity.WARNING, "expires within 7 days"),
+        (replace(FILE, ends_in=3600.0), Severity.WARNING, "expires within 1 day"),
+        (replace(FILE, ends_in=-7200.0), Severity.ERROR, "has expired"),
+        (replace(FILE, starts_in=3600.0), Severity.ERROR, "is not valid yet"),
         (replace(FILE, error="can't be read: No such file"), Severity.ERROR, "can't be read: No"),
     ],
 )
@@ -146,6 +148,15 @@ def test_a_certificate_is_told_before_its_end_and_after(
     assert finding.severity is severity
     assert finding.subject == "zenoh file /run/certificates/tls.crt"
     assert finding.text.startswith(text)
+
+
+def test_the_certificate_of_hubs_is_told_before_its_end() -> None:
+    file = ZenohCertificateStatus("--zenoh-hub-certificate", ends_in=10 * 86400.0, hub=True)
+    (finding,) = faults(replace(GOOD, certificates=(file,)))
+    assert finding.severity is Severity.WARNING
+    assert finding.subject == "zenoh certificate of hubs"
+    assert finding.text == "expires within 14 days"
+    assert "a valid --zenoh-hub-certificate" in finding.fix
     assert finding.fix
 
 
