@@ -9,6 +9,7 @@ from scripts.custom_resource_docs import custom_resource
 from rosproxy.access.rules import LONGEST_GLOB
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.settings import MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
 from rosproxy_operator.common.policy import MOST_RULES_OF_AUTHOR
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.cluster import (
@@ -20,6 +21,7 @@ from rosproxy_operator.kubernetes.resources.cluster import (
 )
 from rosproxy_operator.kubernetes.resources.model import Name, Pod
 from rosproxy_operator.kubernetes.resources.spec import (
+    MOST_LINK_RULES,
     MOST_NAME_CHARACTERS,
     MOST_PORTS,
     RULE_KINDS,
@@ -153,6 +155,12 @@ def test_bounds_of_a_policy_are_the_operators() -> None:
         assert SPEC[path]["maxLength"] == LONGEST_GLOB
 
 
+def test_bounds_of_links_are_the_operators() -> None:
+    assert SPEC["spec.link.to"]["maxItems"] == MOST_ZENOH_LINKS
+    assert SPEC["spec.link.limits"]["maxItems"] == MOST_ZENOH_LIMITS
+    assert SPEC["spec.link.policy"]["maxItems"] == MOST_LINK_RULES
+
+
 def test_rules_have_messages() -> None:
     rules = [rule for schema in (SCHEMA, *SPEC.values(), SCHEMA["properties"]["spec"])
              for rule in schema.get("x-kubernetes-validations", [])]  # fmt: skip
@@ -184,8 +192,11 @@ def test_status_is_in_the_definition() -> None:
     )
     stamp = "2026-01-01T00:00:00Z"
     status = status_of(own, states, (), Addresses("192.0.2.9", "http://robot:11311"), stamp)
-    zenoh = rosproxy({**body, "spec": {"ros": "zenoh", "listen": {"type": "NodePort"}}})
-    routers = ProxyReport(True, True, zenoh=ZenohReport(("/talker",), 1))
+    link = {"to": ["tls/cloud"], "secretName": "link"}
+    spec = {"ros": "zenoh", "listen": {"type": "NodePort"}, "link": link}
+    zenoh = rosproxy({**body, "spec": spec})
+    sites = {"tls/cloud:7447": ""}
+    routers = ProxyReport(True, True, zenoh=ZenohReport(("/talker",), 1, sites=sites))
     of_zenoh = (RosProxyOnNode("n", "", ports, proxy, (pod,), routers),)
     addresses = Addresses("192.0.2.9", "", HostPort("192.0.2.1", 31000))
     other_status = status_of(zenoh, of_zenoh, (), addresses, stamp)

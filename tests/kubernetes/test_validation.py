@@ -71,6 +71,26 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         {"ros": "zenoh", "listen": {"type": "NodePort", "loadBalancerClass": "a.example/b"}},
         "loadBalancerClass is for type: LoadBalancer",
     ),
+    "ROS 2 with a link": (
+        {"ros": 2, "link": {"to": ["tls/cloud"], "secretName": "a"}},
+        "link is for rmw_zenoh",
+    ),
+    "a link without a certificate": ({"ros": "zenoh", "link": {"to": ["tls/cloud"]}}, "secretName"),
+    "a link without TLS": (
+        {"ros": "zenoh", "link": {"to": ["tcp/cloud"], "secretName": "a"}},
+        "spec.link.to[0]",
+    ),
+    "a limit without a rate": (
+        {"ros": "zenoh", "link": {"to": ["tls/cloud"], "secretName": "a", "limits": ["/camera"]}},
+        "spec.link.limits[0]",
+    ),
+    "a link with a rule of parameters": (
+        {
+            "ros": "zenoh",
+            "link": {"to": ["tls/cloud"], "secretName": "a", "policy": ["deny get-param /a"]},
+        },
+        "spec.link.policy[0]",
+    ),
     "no domain": ({"ros": 2, "domain": 233}, "domain"),
     "no peer": ({"ros": 2, "peers": ["a b"]}, "peers[0]"),
     "few ports for ROS 2": ({"ros": 2, "ports": 4, "multicast": True}, "too low for ROS 2"),
@@ -110,6 +130,9 @@ def test_rules_of_a_policy_are_taken(net: Namespace) -> None:
      {"ros": "zenoh"},
      {"ros": "zenoh", "listen": {"type": "NodePort", "nodePort": 31447, "annotations": {"a": "b"}}},
      {"ros": "zenoh", "listen": {"type": "LoadBalancer", "loadBalancerClass": "a.example/b"}},
+     {"ros": "zenoh", "link": {"to": ["tls/cloud", "quic/[fd00::7]:7448"], "secretName": "a.b",
+                               "limits": ["/camera/*=0.5Hz"],
+                               "policy": ["allow publish /a by /b", "deny serve *"]}},
      {"ros": "zenoh", "peers": ["robot:7447", "[fd00::7]"], "podEgress": "Proxy"}],
 )  # fmt: skip
 def test_versions_of_ros_are_taken(spec: dict[str, Any], net: Namespace) -> None:

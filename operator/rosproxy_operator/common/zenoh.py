@@ -1,4 +1,4 @@
-"""Reads the endpoints of rmw_zenoh from a container's variable, and the router from the command.
+"""Endpoints of rmw_zenoh in variables and commands of containers, and settings of links.
 
 ``ZENOH_CONFIG_OVERRIDE`` has ``key=value`` pairs, separated by semicolons (rmw_zenoh,
 zenoh_utils.cpp). An endpoint is ``protocol/host:port``.
@@ -6,15 +6,23 @@ zenoh_utils.cpp). An endpoint is ``protocol/host:port``.
 
 import re
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from rosproxy.access.rules import Rule, format_rules
 from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
-from rosproxy.setting_kinds import ZENOH_PORT, read_zenoh_peer
+from rosproxy.setting_kinds import ZENOH_PORT, read_site_link, read_zenoh_peer
 
 OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
 SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"
 MOST_ENDPOINTS = 32
 """The most endpoints that the operator reads from a variable."""
+LINK_DIRECTORY = "/etc/rosproxy/link"
+"""The directory in a proxy's container with the files of the links to other sites."""
+LINK_FILES = {"zenoh_certificate": "tls.crt", "zenoh_key": "tls.key", "zenoh_ca": "ca.crt"}
+"""The names of these files, by field of the proxy's `Settings`.
+
+A Secret of type kubernetes.io/tls has the first two names. cert-manager adds the third.
+"""
 _WAIT = "connect/timeout_ms=-1"
 # No part can take characters of the next, so a variable without the last quote takes no longer.
 _ENDPOINT = re.compile(r"[\"']([a-z]+)/([^\"'/?#;]{1,300})(?:[/?#;][^\"']*)?[\"']")
@@ -69,6 +77,33 @@ def read_router_name(text: str) -> str:
     if is_loopback(router.host):
         raise ValueError("a loopback address, which means the proxy itself")
     return str(router)
+
+
+def read_link_name(text: str) -> str:
+    """Parse and return a link to another site: ``tls/host:port``, in lower case.
+
+    Raises ValueError.
+    """
+    link = read_site_link(text.lower())
+    if is_loopback(link.peer.host):
+        raise ValueError(f"{str(link)!r} is a loopback address, which means the proxy itself")
+    return str(link)
+
+
+def link_settings(
+    to: Iterable[str], limits: Iterable[str], rules: tuple[Rule, ...], listen: str = ""
+) -> dict[str, Any]:
+    """Return the settings of a proxy with links to other sites, by field of `Settings`.
+
+    ``to`` and ``listen`` are as for ``--zenoh-link`` and ``--zenoh-link-listen``.
+    """
+    return {
+        "zenoh_link": tuple(to),
+        "zenoh_link_listen": listen or None,
+        **{field: f"{LINK_DIRECTORY}/{name}" for field, name in LINK_FILES.items()},
+        "zenoh_limit": tuple(limits),
+        "zenoh_link_policy": format_rules(rules),
+    }
 
 
 def connect_endpoints(override: str) -> list[Endpoint]:

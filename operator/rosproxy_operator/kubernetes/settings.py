@@ -104,9 +104,9 @@ class Bounds(msgspec.Struct, frozen=True):
     peers: Annotated[
         tuple[str, ...],
         Option(
-            "ROS 2, also with rmw_zenoh: hosts that `spec.peers` may name, for example "
-            "`192.0.2.*` or `[fd00::*]`. A pattern without letters, or in brackets, matches "
-            "addresses only. Repeatable.",
+            "ROS 2, also with rmw_zenoh: hosts that `spec.peers` and `spec.link.to` may name, for "
+            "example `192.0.2.*` or `[fd00::*]`. A pattern without letters, or in brackets, "
+            "matches addresses only. Repeatable.",
             option_values.GLOB,
             name="--allow-peer",
             repeatable=True,

@@ -128,6 +128,18 @@ KUBERNETES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         },
     ),
     "zenoh": ({"policy": POLICY}, {"ros": "zenoh", "peers": ["robot"]}),
+    "zenoh link": (
+        {},
+        {
+            "ros": "zenoh",
+            "link": {
+                "to": ["tls/cloud"],
+                "secretName": "link",
+                "limits": ["/camera/image=2Hz"],
+                "policy": ["deny publish /secret"],
+            },
+        },
+    ),
     # The fingerprint has the former range for outgoing connections: `manifests._FORMER_LOCAL_PORTS`
     "high ports": (
         {"ephemeral": PortRange(61000, 65535)},

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from rosproxy.net.addresses import HostPort, is_address, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.setting_kinds import read_peer
+from rosproxy.setting_kinds import read_peer, read_site_link
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.port_ranges import within
 from rosproxy_operator.kubernetes.resources.checks import quoted
@@ -110,10 +110,13 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
 def _violations_of_versions(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
     """Yield the violations in the fields for DDS, for rmw_zenoh, and for all but rmw_zenoh."""
     if spec.ros2:
-        yield from _peer_violations(spec.ros2.peers, spec, settings.bounds)
+        yield from _peer_violations("spec.peers", spec.ros2.peers, spec, settings.bounds)
         yield from _ros2_violations(spec.ros2, settings.bounds)
     if spec.zenoh:  # has neither hostPorts nor a data plane
-        yield from _peer_violations(spec.zenoh.peers, spec, settings.bounds)
+        yield from _peer_violations("spec.peers", spec.zenoh.peers, spec, settings.bounds)
+        links = spec.zenoh.link.to if spec.zenoh.link else ()
+        sites = [str(read_site_link(link).peer) for link in links]
+        yield from _peer_violations("spec.link.to", sites, spec, settings.bounds)
         yield from _zenoh_violations(spec.zenoh, settings)
         return
     yield from _port_violations(spec, settings.bounds)
@@ -142,8 +145,10 @@ def _zenoh_violations(spec: ZenohSpec, settings: ClusterSettings) -> Iterator[st
         )
 
 
-def _peer_violations(peers: Iterable[str], spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
-    """Yield the violations in ``spec.peers``.
+def _peer_violations(
+    field: str, peers: Iterable[str], spec: RosProxySpec, bounds: Bounds
+) -> Iterator[str]:
+    """Yield the violations in ``spec.peers``, or in the hosts of ``spec.link.to``.
 
     If the RosProxy itself gives addresses for a host name, these count instead of the host name.
     """
@@ -155,7 +160,7 @@ def _peer_violations(peers: Iterable[str], spec: RosProxySpec, bounds: Bounds) -
         uris = [slave_uri(HostPort(parse_address(host) or host, 1)) for host in hosts]
         if not all(is_allowed_master(uri, patterns) for uri in uris):
             fix = f"Choose a peer that fits {_any_of(bounds.peers)}"
-            yield _refusal("spec.peers", peer, fix, "allow.peers")
+            yield _refusal(field, peer, fix, "allow.peers")
 
 
 def _bracketed(pattern: str) -> str:

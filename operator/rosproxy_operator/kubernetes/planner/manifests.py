@@ -12,10 +12,12 @@ from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.policy import POLICY_WAIT_S, as_variable
 from rosproxy_operator.common.port_ranges import LOCAL_PORTS, first_fitting, local_ports
 from rosproxy_operator.common.ros2 import discovery_port
+from rosproxy_operator.common.zenoh import LINK_DIRECTORY, LINK_FILES, link_settings
 from rosproxy_operator.kubernetes.planner.proxy_ports import STAND_INS, fixed_ports
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     Json,
+    LinkSpec,
     ListenSpec,
     MasterSpec,
     Name,
@@ -70,6 +72,7 @@ _TAINTS = (
 
 ``AddOrUpdateDaemonPodTolerations`` in k8s.io/kubernetes, pkg/controller/daemon/util.
 """
+LINK_VOLUME = "link"
 _FORMER_LOCAL_PORTS = (*LOCAL_PORTS, PortRange(12000, 30000))
 """The ranges of former operators, for the fingerprint. The last range has ports of stand-ins."""
 
@@ -371,7 +374,23 @@ def _spec(site: ProxySite, settings: ClusterSettings, local_ports: PortRange) ->
         "securityContext": {**pod_security_context(settings), "sysctls": sysctls},
         **({"hostAliases": aliases} if aliases else {}),
         **(hub if spec.zenoh else {}),
+        **({"volumes": [_link_volume(link)]} if (link := _link_of(spec)) else {}),
     }
+
+
+def _link_of(spec: RosProxySpec) -> LinkSpec | None:
+    return spec.zenoh.link if spec.zenoh else None
+
+
+def _link_volume(link: LinkSpec) -> Json:
+    """The volume with the files of the links.
+
+    The volume is optional, so that a proxy without its Secret starts and says which file is
+    missing. The kubelet adds files to the volume later.
+    """
+    items = [{"key": name, "path": name} for name in LINK_FILES.values()]
+    secret = {"secretName": link.secret, "items": items, "optional": True}
+    return {"name": LINK_VOLUME, "secret": secret}
 
 
 def pod_security_context(settings: ClusterSettings) -> dict[str, Any]:
@@ -439,6 +458,7 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
     always = ("port_range", "master_port", "cleanup_after", "slave_control")
     variables = environment("kubernetes", _settings_fields(site, settings), always)
     forwards = spec.proxy.data_plane == "kernel"
+    mount = {"name": LINK_VOLUME, "mountPath": LINK_DIRECTORY, "readOnly": True}
     return {
         "name": CONTAINER,
         "image": image_of(site.rosproxy, settings),
@@ -446,6 +466,7 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
         "env": [{"name": name, "value": value} for name, value in variables.items()],
         "ports": _container_ports(site, site.own_ports),
         "resources": dict(spec.resources or {}),
+        **({"volumeMounts": [mount]} if _link_of(spec) else {}),
         "livenessProbe": _probe("/healthz", 10),
         "readinessProbe": _probe("/readyz", 2),
         "lifecycle": {"preStop": {"exec": {"command": ["sleep", str(_LINGER_S)]}}},
@@ -527,6 +548,7 @@ def _zenoh_settings_fields(site: ProxySite, spec: ZenohSpec) -> Mapping[str, Any
         "zenoh_hub_listen": HUB_PORT,
         "zenoh_hub_certificate": site.hub_certificate,
         "zenoh_listen": OUTSIDE_PORT if spec.listen else None,
+        **(link_settings(spec.link.to, spec.link.limits, spec.link.rules) if spec.link else {}),
     }
 
 

@@ -10,7 +10,7 @@ from rosproxy.admin.status_document import (
     ZenohLinkStatus,
     ZenohStatus,
 )
-from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_PEERS
+from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
 from rosproxy.telemetry.problems import MOST_PROBLEMS
 from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, problem_subject
 from rosproxy.telemetry.text import clean
@@ -73,12 +73,14 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
 
 def _zenoh_report(status: ProxyStatus) -> ZenohReport:
     zenoh = status.zenoh or ZenohStatus()
-    peers = (link for link in zenoh.links if not link.hub)
+    peers = (link for link in zenoh.links if link.is_to_router)
+    sites = (link for link in zenoh.links if link.is_to_site)
     hubs = (link for link in zenoh.links if link.hub)
     return ZenohReport(
         nodes=tuple(sorted({node.name for node in nodes_inside(status)})),
         sessions=sum(1 for session in zenoh.sessions if session.port is not None),
         peers={short(link.peer): _fault(link) for link in islice(peers, MOST_ZENOH_PEERS)},
+        sites={short(link.title): _fault(link) for link in islice(sites, MOST_ZENOH_LINKS)},
         hubs={short(link.peer): _fault(link) for link in islice(hubs, MOST_ZENOH_HUBS)},
     )
 

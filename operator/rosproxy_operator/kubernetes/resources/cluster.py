@@ -151,13 +151,15 @@ class ZenohReport(msgspec.Struct, frozen=True):
 
     ``nodes`` are the names of ROS nodes in pods, ``sessions`` counts their sessions. ``peers`` and
     ``hubs`` have the routers outside and the hubs of other nodes as ``host:port``, with the error
-    of the link; an empty error for a link that is up.
+    of the link; an empty error for a link that is up. ``sites`` has the links to other sites in the
+    same way, as ``tls/host:port``.
     """
 
     nodes: tuple[str, ...] = ()
     sessions: int = 0
     peers: Mapping[str, str] = {}
     hubs: Mapping[str, str] = {}
+    sites: Mapping[str, str] = {}
 
 
 class ProxyReport(msgspec.Struct, frozen=True):

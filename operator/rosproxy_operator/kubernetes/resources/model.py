@@ -8,6 +8,7 @@ from typing import Any, Literal
 import msgspec
 
 from rosproxy.access.layers import PolicyLayer
+from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec
@@ -94,14 +95,29 @@ class ListenSpec(msgspec.Struct, frozen=True):
     annotations: Mapping[str, str] = {}
 
 
+class LinkSpec(msgspec.Struct, frozen=True):
+    """The links of a RosProxy for rmw_zenoh to other sites.
+
+    ``to`` are proxies of other sites, as ``tls/host:port``. ``secret`` is the name of the Secret
+    with the certificate of this site. ``limits`` are rates, as ``/camera/*=2Hz``.
+    """
+
+    to: tuple[str, ...]
+    secret: str
+    limits: tuple[str, ...] = ()
+    rules: tuple[Rule, ...] = ()
+
+
 class ZenohSpec(msgspec.Struct, frozen=True):
     """The fields of a RosProxy for rmw_zenoh. ``peers`` are routers outside, as ``host:port``.
 
-    With ``listen`` None, no port leads from outside to the proxies.
+    With ``listen`` None, no port leads from outside to the proxies. With ``link`` None, the proxies
+    have no links to other sites.
     """
 
     peers: tuple[str, ...] = ()
     listen: ListenSpec | None = None
+    link: LinkSpec | None = None
 
 
 class Advertise(Enum):

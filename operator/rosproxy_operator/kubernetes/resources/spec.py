@@ -12,15 +12,17 @@ from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from rosproxy.access.layers import PolicyLayer, PolicyMode
-from rosproxy.access.rules import Rule, RuleAction, RuleKind
+from rosproxy.access.rules import Rule, RuleAction, RuleKind, parse_rule
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.settings import LEAST_PORTS_PER_DOMAIN
+from rosproxy.setting_kinds import read_topic_limit
+from rosproxy.settings import LEAST_PORTS_PER_DOMAIN, MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
+from rosproxy.zenoh.link_router import check_limits
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.policy import excess_reason
 from rosproxy_operator.common.ros2 import LAST_DOMAIN, LEAST_PORTS, MOST_PEERS, read_peer_name
-from rosproxy_operator.common.zenoh import read_router_name
+from rosproxy_operator.common.zenoh import read_link_name, read_router_name
 from rosproxy_operator.kubernetes.resources.checks import (
     int_at,
     is_label,
@@ -28,6 +30,7 @@ from rosproxy_operator.kubernetes.resources.checks import (
     is_label_value,
     is_subdomain,
     port_range,
+    quoted,
     submap,
     submaps,
     text_at,
@@ -39,6 +42,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
     InvalidRosProxy,
     Json,
+    LinkSpec,
     ListenSpec,
     ListenType,
     MasterSpec,
@@ -64,6 +68,8 @@ from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, words
 OWN_PORTS = 32
 """The default of ``spec.ports``."""
 MOST_PORTS = 500
+MOST_LINK_RULES = 64
+"""Rules of ``spec.link.policy`` at most."""
 MOST_NAME_CHARACTERS = 46
 """Characters of a RosProxy's name. With more, a proxy's name would not fit in a host name."""
 _FIELDS_BY_VERSION = {"1": ("master", WISHES["udp"].field), "2": ("domain", "multicast")}
@@ -210,10 +216,10 @@ def _check_versions(field: Field, for_ros: tuple[str, ...]) -> None:
             _check_absent(field[name], ros, for_ros)
     if for_ros == ("1",):
         _check_absent(field["peers"], "2", for_ros)
-    listen = field["listen"]
-    if "zenoh" not in for_ros and listen.value is not None:
-        fix = "Remove the field, or set spec.ros: zenoh"
-        raise listen.error(f"is for rmw_zenoh, but spec.ros is {for_ros[0]}", fix)
+    for name in ("listen", "link") if "zenoh" not in for_ros else ():
+        if field[name].value is not None:
+            fix = "Remove the field, or set spec.ros: zenoh"
+            raise field[name].error(f"is for rmw_zenoh, but spec.ros is {for_ros[0]}", fix)
 
 
 def _check_absent(field: Field, ros: str, for_ros: tuple[str, ...]) -> None:
@@ -230,10 +236,15 @@ def _check_zenoh(field: Field, spec: RosProxySpec) -> None:
     unused += [f for f, name in wishes if getattr(spec.proxy, name) != getattr(OWN_SPEC, name)]
     if unused:
         raise _at(field, unused[0]).error("has no effect with spec.ros: zenoh", "Remove the field")
+    _check_zenoh_rules(field["policy"]["rules"], spec.policy)
+
+
+def _check_zenoh_rules(field: Field, layers: tuple[PolicyLayer, ...]) -> None:
+    """Raise InvalidField for rules that the routers of rmw_zenoh can't enforce."""
     try:
-        check_layers(spec.policy)
+        check_layers(layers)
     except ValueError as error:
-        raise InvalidField(f"{field['policy']['rules'].path}: {error}") from None
+        raise InvalidField(f"{field.path}: {error}") from None
 
 
 def _ros2_spec(field: Field) -> Ros2Spec:
@@ -246,7 +257,58 @@ def _ros2_spec(field: Field) -> Ros2Spec:
 
 
 def _zenoh_spec(field: Field) -> ZenohSpec:
-    return ZenohSpec(_peers(field, read_router_name), _given(field["listen"], _listen))
+    return ZenohSpec(
+        _peers(field, read_router_name),
+        _given(field["listen"], _listen),
+        _given(field["link"], _link),
+    )
+
+
+def _link(field: Field) -> LinkSpec:
+    """Return the links to other sites."""
+    secret = field["secretName"]
+    if not is_subdomain(secret.text()):
+        fix = "Copy the name from kubectl get secrets"
+        raise secret.error("can't be the name of a Secret", fix)
+    to = _entries(field["to"], MOST_ZENOH_LINKS, read_link_name)
+    if not to:
+        fix = "Write the other sites, such as tls/cloud.example:7447, or remove spec.link"
+        raise field["to"].error("is empty", fix)
+    rules = _entries(field["policy"], MOST_LINK_RULES, _read_rule)
+    _check_zenoh_rules(field["policy"], (PolicyLayer(field["policy"].path, rules),))
+    return LinkSpec(
+        to=tuple(dict.fromkeys(to)),
+        secret=secret.text(),
+        limits=_entries(field["limits"], MOST_ZENOH_LIMITS, _read_limit),
+        rules=rules,
+    )
+
+
+def _entries(field: Field, most: int, read: Callable[[str], _Value]) -> tuple[_Value, ...]:
+    """Return the entries of a list, in the order of the list, as ``read`` returns each."""
+    entries = field.items()
+    if len(entries) > most:
+        raise field.error("has too many entries", f"Write at most {most}")
+    try:
+        return tuple(read(entry.text()) for entry in entries)
+    except ValueError as error:
+        raise InvalidField(f"{field.path}: {error}") from None
+
+
+def _read_limit(text: str) -> str:
+    """Return a limit of a link. Raises ValueError."""
+    limit = read_topic_limit(text)
+    if not _GLOB.fullmatch(limit.glob):  # blanks separate limits in the variable of the proxy
+        raise ValueError(f"{quoted(text)} has a blank or a semicolon")
+    check_limits([limit])
+    return str(limit)
+
+
+def _read_rule(text: str) -> Rule:
+    """Return a rule of a link. Raises ValueError."""
+    if ";" in text:  # separates rules in the variable of the proxy
+        raise ValueError(f"{quoted(text)} has a semicolon. Write each rule as an entry of its own")
+    return parse_rule(text)
 
 
 def _listen(field: Field) -> ListenSpec:

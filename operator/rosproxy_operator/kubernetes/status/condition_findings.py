@@ -18,6 +18,7 @@ _BAD_STATUS = {
     "MasterReachable": "False",
     "PortsReachable": "False",
     "PeersReachable": "False",
+    "SitesReachable": "False",
     "Listening": "False",
     "PortsAllocated": "False",
     "Ready": "False",

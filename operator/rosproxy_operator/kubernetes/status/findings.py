@@ -40,11 +40,17 @@ SILENT = "ProxyUnreachable"
 NO_MASTER = "MasterUnreachable"
 NO_WAY_IN = "PortsUnreachable"
 NO_PEER = "PeerUnreachable"
+NO_SITE = "SiteUnreachable"
 WARNS = "ProxyWarns"
 REFUSES = "PolicyRefused"
 _MOST_TEXT_CHARACTERS = 600
-_OF_ZENOH_LINKS = {"zenoh peer ": NO_PEER, "zenoh hub ": "HubRefused"}
-"""The reason for a problem about a link of the hub, by its beginning (rosproxy.zenoh.findings)."""
+_OF_ZENOH = {
+    "zenoh peer ": NO_PEER,
+    "zenoh hub ": "HubRefused",
+    "zenoh link ": NO_SITE,
+    "zenoh file ": "LinkCertificate",
+}
+"""The reason for a problem of rmw_zenoh, by its beginning (rosproxy.zenoh.findings)."""
 _UNRESOLVED = "can't be resolved"
 """Part of the error of a proxy about a host name (rosproxy.net.http_client)."""
 
@@ -200,7 +206,7 @@ def _answered(
 
 def _told(rosproxy: RosProxy, subject: str, problem: str) -> ClusterFinding:
     """The finding for a problem that a proxy reports."""
-    reason = next((r for begin, r in _OF_ZENOH_LINKS.items() if problem.startswith(begin)), "")
+    reason = next((r for begin, r in _OF_ZENOH.items() if problem.startswith(begin)), "")
     if reason:
         return finding(rosproxy, reason, bounded(problem, _MOST_TEXT_CHARACTERS), subject=subject)
     return ClusterFinding(subject, problem, fatal=False, reason=WARNS, of=rosproxy.id)

@@ -45,6 +45,9 @@ _BY_REASON = {
     "ProxyUnreachable": "allow connections from the operator's pods to port "
     f"{ADMIN_PORT} of pods with the label {PROXY_OF}={{of.name}}; read kubectl -n {{of.namespace}} "
     "get networkpolicies",
+    "SiteUnreachable": f"do as the message says, or correct spec.link: {_EDIT}",
+    "LinkCertificate": "put a new certificate into the Secret of spec.link.secretName, as the "
+    "message says",
     "ProxyWarns": "read the findings of the proxies' doctors below",
     "UnknownName": "correct the name where the message says; for a pod, run the command in the "
     "message",

@@ -23,6 +23,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     InvalidRosProxy,
     Json,
     RosProxy,
+    ZenohSpec,
 )
 from rosproxy_operator.kubernetes.resources.names import (
     ADMIN_PORT,
@@ -37,6 +38,7 @@ from rosproxy_operator.kubernetes.status.findings import (
     EXHAUSTED,
     NO_MASTER,
     NO_PEER,
+    NO_SITE,
     NO_WAY_IN,
     node_findings,
     proxy_subject,
@@ -49,6 +51,7 @@ MASTER = "MasterReachable"
 DEGRADED = "Degraded"
 WAY_IN = "PortsReachable"
 PEERS = "PeersReachable"
+SITES = "SitesReachable"
 LISTENING = "Listening"
 MOST_MESSAGE_CHARACTERS = 1024
 """Characters of a message at most."""
@@ -70,7 +73,7 @@ _NO_PODS = "NoPods"
 _KEEPS_PODS_OUT = ("Ambiguous", "HostNetwork", "NodeLeftOut", "NotWired")
 """Reasons of findings about pods that get no proxy."""
 _NO_PROXY = "no proxy runs, so this is not known"
-_OF_ZENOH = ("sessions", "peers")
+_OF_ZENOH = ("sessions", "peers", "links")
 """Fields of ``perNode`` about rmw_zenoh that only the proxy of the node knows."""
 
 
@@ -129,7 +132,7 @@ def status_of(
         *([_allocated(wanted, problems)] if not spec.zenoh else []),
         *([_reached(states, problems, former)] if spec.ros1 else []),
         *([_way_in(states, problems, former)] if not spec.zenoh else []),
-        *([_linked(states, problems, former)] if spec.zenoh and spec.zenoh.peers else []),
+        *_links(spec.zenoh or ZenohSpec(), states, problems, former),
         *_listening(rosproxy, wanted, addresses.outside),
         _degraded(problems),
     )
@@ -262,9 +265,13 @@ def _ros(state: RosProxyOnNode, limit: int, former: Json) -> dict[str, object]:
 
 
 def _sessions(zenoh: ZenohReport) -> dict[str, object]:
-    """The sessions of nodes in pods, and how many links to routers outside are up, of all."""
-    up = sum(not fault for fault in zenoh.peers.values())
-    return {"sessions": zenoh.sessions, "peers": f"{up}/{len(zenoh.peers)}"}
+    """The sessions of nodes in pods, and how many links to outside are up, of all."""
+    sites = {"links": _up_of_all(zenoh.sites)} if zenoh.sites else {}
+    return {"sessions": zenoh.sessions, "peers": _up_of_all(zenoh.peers), **sites}
+
+
+def _up_of_all(faults: Mapping[str, str]) -> str:
+    return f"{sum(not fault for fault in faults.values())}/{len(faults)}"
 
 
 def _linked_nodes(of: RosProxy, states: Sequence[RosProxyOnNode]) -> Mapping[str, set[str]]:
@@ -473,25 +480,46 @@ def _way_in(
     return Condition(WAY_IN, "Unknown", reason, ". ".join(lines))
 
 
-def _linked(
-    states: Sequence[RosProxyOnNode], problems: Sequence[ClusterFinding], former: Json
-) -> Condition:
-    """The condition PeersReachable; the former condition if a proxy has not answered yet."""
-    lines = [_one_line(problem) for problem in problems if problem.reason == NO_PEER]
-    if lines:
-        return Condition(PEERS, "False", NO_PEER, ". ".join(lines))
+def _links(
+    spec: ZenohSpec,
+    states: Sequence[RosProxyOnNode],
+    problems: Sequence[ClusterFinding],
+    former: Json,
+) -> Iterator[Condition]:
+    """The conditions PeersReachable and SitesReachable, each if the spec names peers or sites.
+
+    A condition stays as before if a proxy has not answered yet.
+    """
     proxies = [state for state in states if _may_answer(state)]
-    if not proxies:
-        return Condition(PEERS, "Unknown", "NoProxies", _NO_PROXY)
     answers = {s.name: s.answer.zenoh for s in proxies if _has_answered(s.answer)}
-    if len(answers) < len(proxies):
-        return _previous(PEERS, former)
-    peers = ((name, zenoh.peers) for name, zenoh in answers.items() if zenoh)
-    down = [f"node {name}: {p}" for name, every in peers for p, fault in every.items() if fault]
+    reports = {name: zenoh or ZenohReport() for name, zenoh in answers.items()}
+    peers = {name: zenoh.peers for name, zenoh in reports.items()}
+    sites = {name: zenoh.sites for name, zenoh in reports.items()}
+    for condition, reason, target, asked, faults in (
+        (PEERS, NO_PEER, "router of spec.peers", spec.peers, peers),
+        (SITES, NO_SITE, "site of spec.link.to", spec.link, sites),
+    ):
+        lines = [_one_line(problem) for problem in problems if problem.reason == reason]
+        if not asked:
+            continue
+        if lines:
+            yield Condition(condition, "False", reason, ". ".join(lines))
+        elif not proxies:
+            yield Condition(condition, "Unknown", "NoProxies", _NO_PROXY)
+        elif len(reports) < len(proxies):
+            yield _previous(condition, former)
+        else:
+            yield _linked(condition, target, faults)
+
+
+def _linked(condition: str, target: str, faults: Mapping[str, Mapping[str, str]]) -> Condition:
+    """A condition about links without problems. ``faults``: by node and by the peer of the link."""
+    down = [
+        f"node {node}: {peer}" for node, every in faults.items() for peer in every if every[peer]
+    ]
     if down:
-        return Condition(PEERS, "Unknown", "Linking", f"not linked yet: {', '.join(down)}")
-    text = "every proxy is linked with every router of spec.peers"
-    return Condition(PEERS, "True", "Reached", text)
+        return Condition(condition, "Unknown", "Linking", f"not linked yet: {', '.join(down)}")
+    return Condition(condition, "True", "Reached", f"every proxy is linked with every {target}")
 
 
 def _listening(

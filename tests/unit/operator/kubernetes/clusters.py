@@ -51,6 +51,7 @@ CHANGES: tuple[dict[str, Any], ...] = (
     {"ros": "1,2", "multicast": True},
     {"ros": "zenoh", "peers": ["robot"]},
     {"ros": "zenoh", "listen": {"type": "NodePort"}},
+    {"ros": "zenoh", "link": {"to": ["tls/cloud"], "secretName": "link", "limits": ["/a=2Hz"]}},
     {"ros": 1},
 )
 LABELS = ({names.INJECT: "true"}, {names.INJECT: "robot", "app": "x"}, {names.INJECT: "arm"},
@@ -67,7 +68,7 @@ def mended(spec: Object) -> Object:
             ("master", "multicast", "domain", "advertise", "cleanupAfterSeconds")
         )
         return spec | absent | {"ports": 32, "portWindow": window}
-    spec = spec | {"listen": None}
+    spec = spec | {"listen": None, "link": None}
     if "1" not in ros:
         spec = spec | {"master": None}
     elif not spec["master"]:
