@@ -113,7 +113,7 @@ def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: Pla
         "ros": key.ros,
         "domain": key.domain,
         "peers": list(domain.peers) if domain else [],
-        "links": {link.peer: link.up for link in zenoh.links} if zenoh else {},
+        "links": {link.title: link.up for link in zenoh.links} if zenoh else {},
         "lan_relay": lan_relay.container.state if lan_relay else None,
         "master_uri": key.master_uri,
         "master_address": (status.master.address if status else None) or "",

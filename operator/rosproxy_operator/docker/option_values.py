@@ -5,8 +5,9 @@ from pathlib import Path
 
 from rosproxy.net.addresses import is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.setting_kinds import Number, Text, read_address, read_master_uri
+from rosproxy.setting_kinds import LINK_PROTOCOLS, Number, Text, read_address, read_master_uri
 from rosproxy_operator.common.ros2 import read_peer_name
+from rosproxy_operator.common.zenoh import read_link_name
 
 MOST_PORTS = 1000
 """Most ports of a proxy. For each port, the engine needs rules and, by default, a process."""
@@ -19,6 +20,8 @@ LEAST_PIDS = 256
 """Threads and processes that a proxy needs for a hundred connections."""
 LEAST_SECRET_CHARACTERS = 32
 """Least characters of a secret in a file."""
+MOST_PATH_CHARACTERS = 4096
+"""Characters of a path at most (PATH_MAX)."""
 _MEMORY = re.compile(r"([0-9]{1,15})([bkmg]?)b?")
 _UNITS = {"": 1, "b": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
 _NETWORK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -40,6 +43,28 @@ def read_host_pattern(text: str) -> str:
             f"{text[:40]!r} is not of the form HOST or HOST:PORT, such as robot*:11311"
         )
     return f"{match['host']}:{match['port'] or '*'}"
+
+
+def read_link_pattern(text: str) -> str:
+    """Return a pattern of links as ``tls/host:port`` in lower case. Raises ValueError."""
+    protocol, _, host = text.strip().lower().partition("/")
+    try:
+        if protocol in LINK_PROTOCOLS:
+            return f"{protocol}/{read_host_pattern(host)}"
+    except ValueError:
+        pass  # the message below has an example for links
+    example = "tls/HOST or tls/HOST:PORT, such as tls/*.example:7447"
+    raise ValueError(f"{text[:40]!r} is not of the form {example}")
+
+
+def read_host_directory(text: str) -> str:
+    """Return the path of a directory of the Docker host. Raises ValueError.
+
+    The directory need not exist here: the operator may run in a container.
+    """
+    if text and (not text.startswith("/") or len(text) > MOST_PATH_CHARACTERS):
+        raise ValueError(f"{text[:40]!r} is not a full path, such as /etc/rosproxy/link")
+    return text
 
 
 def read_name_pattern(text: str) -> str:
@@ -130,6 +155,9 @@ PORTS = Number("N", 1, MOST_PORTS)
 SHARED_MASTER_URI = Text("URI", read_shared_master_uri)
 HOST_PATTERN = Text("HOST[:PORT]", read_host_pattern)
 NAME_PATTERN = Text("HOST", read_name_pattern)
+LINK_NAME = Text("tls/HOST[:PORT]", read_link_name)
+LINK_PATTERN = Text("tls/HOST[:PORT]", read_link_pattern)
+HOST_DIRECTORY = Text("DIR", read_host_directory)
 PEER_NAME = Text("HOST[:PORT]", read_peer_name)
 LAN = Text("ADDRESS|none", read_lan)
 MEMORY = Text("SIZE", read_memory)

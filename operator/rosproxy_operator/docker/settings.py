@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from rosproxy import setting_kinds as kinds
-from rosproxy.access.layers import PolicyLayer
+from rosproxy.access.layers import PolicyLayer, check_bounds
+from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import (
@@ -17,9 +18,13 @@ from rosproxy.setting_kinds import (
     Option,
     SettingError,
     SlaveControl,
+    TopicLimit,
     make_settings,
     time,
 )
+from rosproxy.settings import MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
+from rosproxy.zenoh.link_router import check_limits
+from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.images import IMAGE
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds, make_proxy_bounds
@@ -240,6 +245,66 @@ class PlanSettings:
             default="the advertised address, else the address on the default route",
         ),
     ] = ""
+    zenoh_link: Annotated[
+        tuple[str, ...],
+        Option(
+            "rmw_zenoh: proxy [at another site](../guide/zenoh.md#a-link-with-the-operator-for-"
+            "docker) to which the proxy of this host connects with TLS, for example "
+            "`tls/cloud.example:7447`. `quic/…` uses QUIC. Without a port: 7447. Repeatable.",
+            option_values.LINK_NAME,
+            variables=("ROSPROXY_ZENOH_LINKS",),
+            repeatable=True,
+            default="none",
+            note="separated by spaces",
+        ),
+    ] = ()
+    allow_link: Annotated[
+        tuple[str, ...],
+        Option(
+            "rmw_zenoh: proxy at another site that the label `rosproxy.zenoh-link` may name, for "
+            "example `tls/*.example:7447`. `*` and `?` are wildcards. An entry without a port "
+            "allows any port. `--zenoh-link` is always allowed. Repeatable.",
+            option_values.LINK_PATTERN,
+            repeatable=True,
+            default="none",
+            note="separated by spaces",
+        ),
+    ] = ()
+    zenoh_link_certificates: Annotated[
+        str,
+        Option(
+            "rmw_zenoh: directory of the Docker host with the certificate of this site "
+            "(`tls.crt`), its key (`tls.key`), and the CAs of the other sites (`ca.crt`). Needed "
+            "for links. The proxy's user, 10001, has to be able to read the files.",
+            option_values.HOST_DIRECTORY,
+            default="none: no links",
+        ),
+    ] = ""
+    zenoh_limit: Annotated[
+        tuple[TopicLimit, ...],
+        Option(
+            "rmw_zenoh: most messages a second that leave by the links, of a topic or of several "
+            "topics together, for example `/camera/image=2Hz`. The first limit that matches a "
+            "topic counts. Repeatable.",
+            kinds.TOPIC_LIMIT,
+            variables=("ROSPROXY_ZENOH_LIMITS",),
+            repeatable=True,
+            default="none",
+            note="separated by spaces",
+        ),
+    ] = ()
+    zenoh_link_policy: Annotated[
+        tuple[tuple[Rule, ...], ...],
+        Option(
+            "rmw_zenoh: [rules](policy.md) about the topics and services that pass the links, for "
+            "example `allow publish /status; deny publish *`. All nodes of this host count as "
+            "inside. Repeatable.",
+            kinds.POLICY_RULES,
+            repeatable=True,
+            default="everything passes",
+            note="rules separated by `;`",
+        ),
+    ] = ()
     expose_by_default: Annotated[
         bool,
         Option(
@@ -260,6 +325,11 @@ class PlanSettings:
         ),
     ] = "0-rosproxy"
 
+    @property
+    def link_rules(self) -> tuple[Rule, ...]:
+        """The rules of ``--zenoh-link-policy``."""
+        return tuple(rule for given in self.zenoh_link_policy for rule in given)
+
 
 def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
     """Return the settings from the values of the command line's options, by name.
@@ -278,4 +348,27 @@ def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
         raise SettingError(
             "--port-window", f"{window} has {len(window)} ports, fewer than --ports {ports}"
         )
+    _check_links(settings)
     return settings
+
+
+def _check_links(settings: PlanSettings) -> None:
+    """Raise SettingError for links that the proxy would refuse at its start."""
+    if (settings.zenoh_link or settings.allow_link) and not settings.zenoh_link_certificates:
+        text = "missing; links between sites need a directory with tls.crt, tls.key and ca.crt"
+        raise SettingError("--zenoh-link-certificates", text)
+    for option, count, most in (
+        ("--zenoh-link", len(settings.zenoh_link), MOST_ZENOH_LINKS),
+        ("--zenoh-limit", len(settings.zenoh_limit), MOST_ZENOH_LIMITS),
+    ):
+        if count > most:
+            raise SettingError(option, f"given {count} times; give it at most {most} times")
+    layers = (PolicyLayer("--zenoh-link-policy", settings.link_rules),)
+    try:
+        check_limits(settings.zenoh_limit)
+    except ValueError as error:
+        raise SettingError("--zenoh-limit", str(error)) from None
+    try:
+        check_layers(check_bounds(layers))
+    except ValueError as error:
+        raise SettingError("--zenoh-link-policy", str(error)) from None

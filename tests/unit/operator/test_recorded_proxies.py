@@ -17,6 +17,7 @@ import pytest
 
 from rosproxy.access.rules import parse_rules
 from rosproxy.leases.ports import PortRange
+from rosproxy.setting_kinds import TopicLimit
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import ProxyBounds
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
@@ -36,6 +37,7 @@ POLICY = administrators_policy([parse_rules("deny publish /camera/*; deny call *
 BOUNDS = ProxyBounds(16, 8, 100, 50)
 ROS1 = {"rosproxy.master-uri": "http://robot:11312"}
 ROS2 = {"rosproxy.ros": "2", "rosproxy.domain": "7"}
+ZENOH = {"rosproxy.ros": "2", "rosproxy.rmw": "zenoh"}
 RICH = {
     "rosproxy.ports": "40",
     "rosproxy.data-plane": "kernel",
@@ -77,6 +79,17 @@ DOCKER: dict[str, tuple[dict[str, Any], list[dict[str, str]]]] = {
         [{**ROS1, "rosproxy.ros": "1,2"}, {**ROS1, "rosproxy.direction": "out"}],
     ),
     "ros2": ({"allow_data_plane": ("kernel",)}, [{**RICH, **ROS2, **PEERS}]),
+    "zenoh": ({"policy": POLICY}, [{**ZENOH, "rosproxy.peers": "robot"}]),
+    "zenoh link": (
+        {
+            "zenoh_link": ("tls/home:7447",),
+            "allow_link": ("tls/cloud:*",),
+            "zenoh_link_certificates": "/etc/rosproxy/link",
+            "zenoh_limit": (TopicLimit("/camera/image", 2.0),),
+            "zenoh_link_policy": (parse_rules("deny publish /secret"),),
+        },
+        [{**ZENOH, "rosproxy.zenoh-link": "tls/cloud"}],
+    ),
     "ros2 merged": (
         {"ros2_peer": ("arm",), "proxy_bounds": BOUNDS, "policy": POLICY},
         [{**ROS2, **PEERS}, {**ROS2, "rosproxy.peers": "robot cam", "rosproxy.data-plane": "auto"}],

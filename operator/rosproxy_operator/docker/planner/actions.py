@@ -76,8 +76,9 @@ class Create(_CreateContainer, frozen=True):
     """Create the container of a proxy, in the network namespace of the container ``sandbox``.
 
     ``replaces`` is the name of the former container, or empty. ``policy`` has the layers from
-    labels. ``peers`` are hosts for ROS 2, and routers for rmw_zenoh (`Member.peers`). ``lan_relay``
-    is the address and port of the LAN relay, for ROS 2.
+    labels. ``peers`` are hosts for ROS 2, and routers for rmw_zenoh (`Member.peers`). ``links`` are
+    proxies at other sites, for rmw_zenoh. ``lan_relay`` is the address and port of the LAN relay,
+    for ROS 2.
     """
 
     sandbox: str
@@ -87,6 +88,7 @@ class Create(_CreateContainer, frozen=True):
     policy: tuple[PolicyLayer, ...] = ()
     peers: tuple[str, ...] = ()
     lan_relay: HostPort | None = None
+    links: tuple[str, ...] = ()
 
     def _details(self) -> str:
         instead = f", instead of {self.replaces}" if self.replaces else ""

@@ -327,6 +327,7 @@ def _proxy_steps(
         policy=context.label_policy,
         peers=context.desired.peers,
         lan_relay=context.lan_relay,
+        links=context.desired.links,
     )
     observed = context.observed
     expected = proxy_fingerprint(action, context.settings, observed.image_id, observed.secret)

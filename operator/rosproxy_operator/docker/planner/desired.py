@@ -54,6 +54,7 @@ def desire(
                 own,
                 proxy_spec(key, considered, settings),
                 _peers(key, considered, observed, settings),
+                _links(key, considered, settings),
             )
         )
     problems = [
@@ -91,6 +92,12 @@ def _peers(
         gateway = observed.gateway(settings.uplink) or THIS_HOST
         return tuple(sorted(peer.replace(THIS_HOST, gateway) for peer in peers))
     return tuple(sorted({*settings.ros2_peer, *peers})) if key.is_ros2 else ()
+
+
+def _links(key: Key, members: Iterable[Member], settings: PlanSettings) -> tuple[str, ...]:
+    """Return the links to other sites from the labels and of the operator."""
+    links = {link for member in members for link in member.links}
+    return tuple(sorted({*settings.zenoh_link, *links})) if key == ZENOH else ()
 
 
 def _networks(members: Iterable[Member]) -> frozenset[str]:

@@ -1,17 +1,18 @@
-"""Bound the number of peers that a proxy for ROS 2 or rmw_zenoh gets from labels.
+"""Bound the number of peers, and of links to other sites, that a proxy gets from labels.
 
-A proxy gets all peers in one variable, and Linux starts no program with a variable of 128 KiB
-(MAX_ARG_STRLEN). If the labels of a proxy's containers name too many peers, the operator ignores
-the labels with the most peers. So a container with many peers takes nothing from other containers.
+A proxy for ROS 2 or rmw_zenoh gets all peers in one variable, and Linux starts no program with a
+variable of 128 KiB (MAX_ARG_STRLEN). If the labels of a proxy's containers name too many peers, the
+operator ignores the labels with the most peers. So a container with many peers takes nothing from
+other containers. The same holds for links.
 """
 
 from collections import defaultdict
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from rosproxy.settings import MOST_ZENOH_PEERS
+from rosproxy.settings import MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels.readers import PEERS
+from rosproxy_operator.docker.planner.labels.readers import LINK, PEERS
 from rosproxy_operator.docker.planner.model import ZENOH, Key, Member
 from rosproxy_operator.docker.settings import PlanSettings
 
@@ -26,24 +27,59 @@ def with_bounded_peers(
 
     Peers of the operator's option --ros2-peer do not count.
     """
-    named: dict[Key, frozenset[str]] = defaultdict(frozenset)
-    ignored: list[Member] = []
-    # Living containers first: the peers of an exited container count for the grace only (`desire`).
-    order = sorted(members, key=lambda m: (not m.container.alive, len(m.peers), m.container.name))
-    for member in order:
-        peers = named[member.key] | member.peers
-        peers -= frozenset(settings.ros2_peer if member.key.is_ros2 else ())
-        if len(peers) > _most(member.key):
-            ignored.append(member)
-        else:
-            named[member.key] = peers
+
+    def peers(member: Member) -> frozenset[str]:
+        return member.peers - frozenset(settings.ros2_peer if member.key.is_ros2 else ())
+
+    ignored = _ignored(members, peers, _most)
     return (
         tuple(replace(m, peers=frozenset()) if m in ignored else m for m in members),
-        tuple(
-            Problem(f"container {member.container.name}", _ignored_text(member.key), fatal=False)
-            for member in ignored
-            if member.container.alive
-        ),
+        _problems(ignored, _ignored_peers),
+    )
+
+
+def with_bounded_links(
+    members: Collection[Member], settings: PlanSettings
+) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
+    """Return the members and the problems. Members with too many links come back without links.
+
+    The proxy has the links of the operator's option --zenoh-link in any case.
+    """
+
+    def links(member: Member) -> frozenset[str]:
+        return member.links - frozenset(settings.zenoh_link)
+
+    ignored = _ignored(members, links, lambda _: MOST_ZENOH_LINKS - len({*settings.zenoh_link}))
+    return (
+        tuple(replace(m, links=frozenset()) if m in ignored else m for m in members),
+        _problems(ignored, _ignored_links),
+    )
+
+
+def _ignored(
+    members: Collection[Member],
+    names: Callable[[Member], frozenset[str]],
+    most: Callable[[Key], int],
+) -> list[Member]:
+    """Return the members with too many names for their proxy."""
+    named: dict[Key, frozenset[str]] = defaultdict(frozenset)
+    ignored: list[Member] = []
+    # Living containers first: the names of an exited container count for the grace only (`desire`).
+    order = sorted(members, key=lambda m: (not m.container.alive, len(names(m)), m.container.name))
+    for member in order:
+        together = named[member.key] | names(member)
+        if len(together) > most(member.key):
+            ignored.append(member)
+        else:
+            named[member.key] = together
+    return ignored
+
+
+def _problems(ignored: Collection[Member], text: Callable[[Key], str]) -> tuple[Problem, ...]:
+    return tuple(
+        Problem(f"container {member.container.name}", text(member.key), fatal=False)
+        for member in ignored
+        if member.container.alive
     )
 
 
@@ -51,10 +87,18 @@ def _most(key: Key) -> int:
     return MOST_ZENOH_PEERS if key == ZENOH else MOST_PEERS_OF_PROXY
 
 
-def _ignored_text(key: Key) -> str:
+def _ignored_peers(key: Key) -> str:
     """Return why the peers of a container are ignored, and the fix."""
     common = "" if key == ZENOH else ", or start the operator with --ros2-peer for common peers"
     return (
         f"label {PEERS} is ignored: a proxy takes at most {_most(key)} peers from all labels of "
         f"its containers, and ignores the labels with the most peers. Name fewer peers{common}"
+    )
+
+
+def _ignored_links(_: Key) -> str:
+    """Return why the links of a container are ignored, and the fix."""
+    return (
+        f"label {LINK} is ignored: a proxy has at most {MOST_ZENOH_LINKS} links, and ignores the "
+        "labels with the most links. Name fewer links"
     )

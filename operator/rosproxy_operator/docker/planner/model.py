@@ -307,6 +307,8 @@ class Member:
         policy: Rules for the nodes of this container alone.
         peers: ROS 2: the hosts outside to which the proxy announces participants. rmw_zenoh: the
             routers to which the proxy connects.
+        links: rmw_zenoh: the proxies at other sites to which the proxy connects, as
+            ``tls/host:port``.
         redirect: The value of the label ``rosproxy.redirect``; None without the label.
         redirected: The addresses and ports that the operator redirects to the proxy, in the
             container's network namespace: of the master, or of the routers that nodes of rmw_zenoh
@@ -321,6 +323,7 @@ class Member:
     wishes: Wishes = field(default_factory=dict)
     policy: tuple[Rule, ...] = ()
     peers: frozenset[str] = frozenset()
+    links: frozenset[str] = frozenset()
     redirect: bool | None = None
     redirected: tuple[HostPort, ...] = ()
 
@@ -332,7 +335,8 @@ class Desired:
     If ``live`` is false, no live container needs the proxy. Until the grace ends, the operator then
     only disconnects the sandbox from networks. ``ports`` is the least number of ports. ``members``
     are the live containers. ``peers`` are the hosts or routers of all members (`Member`) and, for
-    DDS, of the operator's option.
+    DDS, of the operator's option. ``links`` are the links of all members and of the operator's
+    option.
     """
 
     key: Key
@@ -342,3 +346,4 @@ class Desired:
     members: tuple[Member, ...] = ()
     spec: ProxySpec = OWN_SPEC
     peers: tuple[str, ...] = ()
+    links: tuple[str, ...] = ()

@@ -27,6 +27,7 @@ from rosproxy_operator.docker.planner.model import ZENOH
 from rosproxy_operator.docker.planner.specs import (
     FORMER_LAN_RELAY,
     HELPER_USER,
+    LINK_MOUNT,
     NFT,
     PROXY_COMMAND,
     ROLE_FLUSH,
@@ -53,10 +54,10 @@ _NAME_ENDINGS = r"(-\d+)?(-old(-\d+)?)?"
 (`duplicates.free_name`), or ``-old`` if another container takes over
 (`container_steps.former_name`)."""
 _FIELDS_NEVER_SET = (
-    *("Privileged", "Binds", "Mounts", "VolumesFrom", "Devices", "DeviceRequests", "GroupAdd"),
+    *("Privileged", "Binds", "VolumesFrom", "Devices", "DeviceRequests", "GroupAdd"),
     *("PidMode", "UTSMode", "UsernsMode"),
 )
-"""Fields of the HostConfig that the operator never sets."""
+"""Fields of the HostConfig that the operator never sets. Only a proxy may have ``Mounts``."""
 _OWN_IPC = (None, "", "private", "shareable")
 """Values that engines set as IpcMode by default."""
 _COMMANDS = {
@@ -116,7 +117,7 @@ def forgery_reason(own: OwnLabels, name: str, creation: CreationFacts, image_id:
         return f"the command is not {' '.join(command)}"
     wrong_fields = {
         ROLE_SANDBOX: _wrong_sandbox_fields(own, creation.host),
-        ROLE_PROXY: _wrong_proxy_fields(creation.host),
+        ROLE_PROXY: _wrong_proxy_fields(own, creation.host),
         ROLE_LAN_RELAY: _wrong_lan_relay_fields(creation.host),
         ROLE_REDIRECT: _wrong_redirect_fields(own, creation.host),
         ROLE_FLUSH: _wrong_flush_fields(creation.host),
@@ -138,6 +139,8 @@ def _wrong_fields(host: Mapping[str, Any]) -> Iterator[str]:
     if host.get("CapDrop") != ["ALL"]:
         yield "CapDrop"
     yield from (name for name in _FIELDS_NEVER_SET if host.get(name))
+    if host.get("Mounts"):
+        yield "Mounts"
     if host.get("IpcMode") not in _OWN_IPC:
         yield "IpcMode"
 
@@ -212,8 +215,11 @@ def _wrong_helper_fields(
         yield "Sysctls"
 
 
-def _wrong_proxy_fields(host: Mapping[str, Any]) -> Iterator[str]:
-    yield from _wrong_fields(host)
+def _wrong_proxy_fields(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
+    # No label says whether the proxy has links, and the option may name another directory by now.
+    mounts = [{key: mount.get(key) for key in LINK_MOUNT} for mount in host.get("Mounts") or ()]
+    has_links = own.key == ZENOH and mounts == [LINK_MOUNT]
+    yield from _wrong_fields({**host, "Mounts": None} if has_links else host)
     if not has_kernel_privileges(host):
         if host.get("CapAdd"):
             yield "CapAdd"

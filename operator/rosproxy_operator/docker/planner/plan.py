@@ -21,7 +21,7 @@ from rosproxy_operator.docker.planner.container_steps import (
 )
 from rosproxy_operator.docker.planner.desired import desire
 from rosproxy_operator.docker.planner.flush import flush_steps
-from rosproxy_operator.docker.planner.label_peers import with_bounded_peers
+from rosproxy_operator.docker.planner.label_peers import with_bounded_links, with_bounded_peers
 from rosproxy_operator.docker.planner.label_policy import with_bounded_rules
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
 from rosproxy_operator.docker.planner.labels.zenoh import with_bounded_containers
@@ -143,13 +143,14 @@ def _within_bounds(
 ) -> tuple[tuple[Member, ...], list[Problem]]:
     """Return the members that the proxies can serve, and the problems of the limits.
 
-    A member with too many peers stays, without peers. A living member that loses its peers or its
-    proxy gets a problem.
+    A member with too many peers or links stays, without these. A living member that loses its
+    peers, its links or its proxy gets a problem.
     """
     members, rule_problems = with_bounded_rules(members, settings)
     members, peer_problems = with_bounded_peers(members, settings)
+    members, link_problems = with_bounded_links(members, settings)
     members, zenoh_problems = with_bounded_containers(members)
-    return members, [*rule_problems, *peer_problems, *zenoh_problems]
+    return members, [*rule_problems, *peer_problems, *link_problems, *zenoh_problems]
 
 
 def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
@@ -282,5 +283,5 @@ def _seconds_to_changes(
     for member in docker_plan.members:
         sandboxes = [s.container for s in observed.sandboxes_of(member.key)]
         joined = any(c.networks & member.networks for c in sandboxes if c.state != "removing")
-        if not member.container.alive and (joined or member.wishes or member.peers):
+        if not member.container.alive and (joined or member.wishes or member.peers or member.links):
             yield settings.grace - (now - memory.exited[member.container.id])

@@ -23,6 +23,7 @@ from rosproxy_operator.common.ros2 import (
     relay_secret,
     well_known_ports,
 )
+from rosproxy_operator.common.zenoh import LINK_DIRECTORY, link_settings
 from rosproxy_operator.docker.planner.actions import (
     Create,
     CreateFlush,
@@ -77,6 +78,8 @@ _KERNEL_CONFIG = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:fa
 
 no-new-privileges is set to false explicitly, because an engine may have true as the default.
 """
+LINK_MOUNT: Mapping[str, Any] = {"Type": "bind", "Target": LINK_DIRECTORY, "ReadOnly": True}
+"""The mount of a proxy with links to other sites, without the directory of the host."""
 _ROLES = {
     CreateSandbox: ROLE_SANDBOX,
     Create: ROLE_PROXY,
@@ -392,6 +395,7 @@ def container_config(
             **(_KERNEL_CONFIG if action.spec.data_plane == "kernel" else {}),
             "Init": False,
             **{name: limit for name, limit in limits.items() if limit},
+            **({"Mounts": [_link_mount(settings)]} if action.links else {}),
             "NetworkMode": f"container:{action.sandbox}",
         },
     }
@@ -414,6 +418,7 @@ def _settings_fields(
             "zenoh_peer": action.peers,
             "await_policy": POLICY_WAIT_S,
             "policy_layers": as_variable((*settings.policy, *action.policy)),
+            **_link_fields(action, settings),
         }
     return {
         "master_uri": key.master_uri,
@@ -433,6 +438,22 @@ def _settings_fields(
         "ros2_lan_relay": action.lan_relay,
         "ros2_lan_relay_secret": _relay_secret(key, secret) if action.lan_relay else None,
     }
+
+
+def _link_fields(action: Create, settings: PlanSettings) -> dict[str, Any]:
+    """The settings of a proxy with links to other sites; empty without links."""
+    if not action.links:
+        return {}
+    return link_settings(action.links, map(str, settings.zenoh_limit), settings.link_rules)
+
+
+def _link_mount(settings: PlanSettings) -> dict[str, Any]:
+    """The mount with the files of the links.
+
+    The engine refuses a directory that does not exist. With ``Binds``, the engine would create the
+    directory.
+    """
+    return {**LINK_MOUNT, "Source": settings.zenoh_link_certificates}
 
 
 def _relay_secret(key: Key, secret: str) -> str:

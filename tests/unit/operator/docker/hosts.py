@@ -88,7 +88,11 @@ class Hosts(Invariants):
         peers = pick(("", "robot", "arm:7448"), m)
         box = self.engine.add(
             f"zenoh{next(self.engine.ids)}",
-            labels={"rosproxy.enable": "true", "rosproxy.peers": peers},
+            labels={
+                "rosproxy.enable": "true",
+                "rosproxy.peers": peers,
+                "rosproxy.zenoh-link": pick(("", "tls/cloud", "tls/evil"), n // 2 + m),
+            },
             variables=variables,
             is_router=n % 5 == 4,
             mode=f"container:{pick(homes, m).id}" if homes and n % 4 == 3 else "",

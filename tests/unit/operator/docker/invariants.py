@@ -37,6 +37,8 @@ SETTINGS = PlanSettings(
     grace=10.0,
     max_ports=3,
     allow_data_plane=("auto", "kernel", "splice"),
+    allow_link=("tls/cloud:*",),
+    zenoh_link_certificates="/etc/rosproxy/link",
 )
 EPHEMERAL = PortRange(11414, 11500)
 INNER = "inner"
@@ -243,7 +245,8 @@ class Invariants:
         told = {peer for member in members for peer in member.peers}
         peers = tuple(sorted(told)) if key.ros != "1" else ()
         spec = proxy_spec(key, members, SETTINGS)
-        return Create("", key, PortRange(0, 0), "", spec, peers=peers)
+        links = tuple(sorted({link for member in members for link in member.links}))
+        return Create("", key, PortRange(0, 0), "", spec, peers=peers, links=links)
 
     def check_key(self, key: Key, wanted: set[str], made: Create) -> None:
         every = [(box, own) for box, own in self.own() if own.key == key]

@@ -49,6 +49,7 @@ def test_the_defaults() -> None:
         ("--admin-bind", "none", "'none' is not of the form 127.0.0.1:11313"),
         ("--allow-master", "a b", "'a b' is not of the form HOST or HOST:PORT"),
         ("--allow-peer", "a/b", "'a/b' is not of the form HOST or HOST:PORT"),
+        ("--allow-link", "a/b", "'a/b' is not of the form tls/HOST or tls/HOST:PORT"),
         ("--max-ports", "1001", "1001 is not in the range 1<=x<=1000; for example 100"),
         ("--allow-data-plane", "fast", "'fast' is not one of"),
         ("--slave-control", "none", "'none' is not one of"),

@@ -14,7 +14,7 @@ from fnmatch import fnmatchcase
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.setting_kinds import DataPlane, read_peer
+from rosproxy.setting_kinds import DataPlane, read_peer, read_site_link
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.spec import WISHES
@@ -100,6 +100,14 @@ def _is_allowed_peer(peer: str, settings: PlanSettings) -> bool:
 def is_allowed_router(router: HostPort, settings: PlanSettings) -> bool:
     """Return whether the proxy for rmw_zenoh may connect to a router outside."""
     return not settings.allow_peer or _matches(router, settings.allow_peer)
+
+
+def is_allowed_link(link: str, settings: PlanSettings) -> bool:
+    """Return whether the label of a container may ask for a link to another site."""
+    site = read_site_link(link)
+    patterns = (pattern.partition("/") for pattern in settings.allow_link)
+    allowed = tuple(pattern for protocol, _, pattern in patterns if protocol == site.protocol)
+    return link in settings.zenoh_link or _matches(site.peer, allowed)
 
 
 def _matches(target: HostPort, patterns: tuple[str, ...]) -> bool:

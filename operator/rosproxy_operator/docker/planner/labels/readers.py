@@ -11,8 +11,10 @@ from urllib.parse import urlsplit
 from rosproxy.access.rules import Rule, parse_rules
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
+from rosproxy.settings import MOST_ZENOH_LINKS
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.ros2 import MOST_PEERS
+from rosproxy_operator.common.zenoh import read_link_name
 from rosproxy_operator.docker.option_values import MOST_PORTS
 from rosproxy_operator.docker.planner.labels import bounds
 from rosproxy_operator.docker.planner.model import Container, HostState, Key, Network
@@ -32,10 +34,11 @@ DOMAIN = "rosproxy.domain"
 PEERS = "rosproxy.peers"
 REDIRECT = "rosproxy.redirect"
 RMW = "rosproxy.rmw"
+LINK = "rosproxy.zenoh-link"
 LABELS = (
     *(ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK),
     *(wish.label for wish in WISHES.values()),
-    *(POLICY, ROS, RMW, DOMAIN, PEERS, REDIRECT),
+    *(POLICY, ROS, RMW, DOMAIN, PEERS, REDIRECT, LINK),
 )
 
 ALIAS = "rosproxy"
@@ -125,13 +128,22 @@ def wishes(
 
 def peers(labels: Labels, read: Callable[[str], Peer]) -> list[Peer]:
     """Return the hosts outside in the label, parsed by ``read``; empty without the label."""
-    names = [name for name in re.split(r"[,\s]+", labels.get(PEERS, "")) if name]
-    if len(names) > MOST_PEERS:
-        raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts. Name fewer hosts")
+    return _hosts(PEERS, labels, MOST_PEERS, read)
+
+
+def links(labels: Labels) -> list[str]:
+    """Return the links to other sites in the label; empty without the label."""
+    return _hosts(LINK, labels, MOST_ZENOH_LINKS, read_link_name)
+
+
+def _hosts(label: str, labels: Labels, most: int, read: Callable[[str], Peer]) -> list[Peer]:
+    names = [name for name in re.split(r"[,\s]+", labels.get(label, "")) if name]
+    if len(names) > most:
+        raise UnusableLabel(f"label {label} names more than {most} hosts. Name fewer hosts")
     try:
         return [*map(read, names)]
     except ValueError as error:
-        raise UnusableLabel(f"label {PEERS}: {error}") from None
+        raise UnusableLabel(f"label {label}: {error}") from None
 
 
 def policy(labels: Labels) -> tuple[Rule, ...]:

@@ -26,6 +26,7 @@ from rosproxy_operator.docker.planner.labels.readers import (
     ADVERTISE_HOST,
     ALIAS,
     DOMAIN,
+    LINK,
     MASTER_URI,
     PEERS,
     PORTS,
@@ -41,9 +42,14 @@ from rosproxy_operator.proxy_spec.spec import WISHES
 
 _ROS1_LABELS = (MASTER_URI, REDIRECT, *(w.label for w in WISHES.values() if w.ros == "1"))
 _ROS2_LABELS = (RMW, DOMAIN, PEERS)
+_NOT_DDS_LABELS = (LINK,)
 _NOT_ZENOH_LABELS = (
     *(DOMAIN, PORTS, ADVERTISE_HOST, MASTER_URI),
     *(wish.label for wish in WISHES.values()),
+)
+_OF_ZENOH = (
+    "the label is for rmw_zenoh, the container is not. Remove the label, or set "
+    f"RMW_IMPLEMENTATION=rmw_zenoh_cpp in the container (or the label {RMW}=zenoh)"
 )
 UNKNOWN_VERSION = "no label and no variable states the ROS version"
 
@@ -181,7 +187,9 @@ def _ignored(ros_versions: Collection[str]) -> dict[str, str]:
         ignored |= dict.fromkeys(_ROS1_LABELS, _of_another_version("1"))
     if "zenoh" in ros_versions:
         ignored[DOMAIN] = without_effect
-    elif "2" not in ros_versions:
+    else:
+        ignored |= dict.fromkeys(_NOT_DDS_LABELS, _OF_ZENOH)
+    if not {"2", "zenoh"} & {*ros_versions}:
         ignored |= dict.fromkeys(_ROS2_LABELS, _of_another_version("2"))
     return ignored
 

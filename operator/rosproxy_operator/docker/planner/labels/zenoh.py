@@ -1,4 +1,4 @@
-"""Read what a container with rmw_zenoh asks for: routers for the proxy, and the redirect.
+"""Read what a container with rmw_zenoh asks for: routers and links for the proxy, and the redirect.
 
 The label ``rosproxy.peers`` and the variable ZENOH_CONFIG_OVERRIDE of the container name routers.
 The proxy connects to these routers. If the container itself runs a router, the proxy connects to
@@ -17,9 +17,10 @@ from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, router_port
 from rosproxy_operator.docker.planner.labels import readers
-from rosproxy_operator.docker.planner.labels.bounds import is_allowed_router
+from rosproxy_operator.docker.planner.labels.bounds import is_allowed_link, is_allowed_router
 from rosproxy_operator.docker.planner.labels.readers import (
     ALIAS,
+    LINK,
     PEERS,
     POLICY,
     REDIRECT,
@@ -84,11 +85,16 @@ def zenoh_member(
     allowed = [r for r in (*_routers_of_label(labels), *own) if _is_allowed(r, settings)]
     refused = [r for r in (*_routers_of_label(labels), *own) if r not in allowed]
     peers = {router.peer for router in allowed}
+    links = readers.links(labels)
+    allowed_links = frozenset(link for link in links if is_allowed_link(link, settings))
+    member = replace(member, links=allowed_links)
+    refused_links = [link for link in links if link not in allowed_links]
     if container.is_zenoh_router:
         port = router_port(container.variables.get(OVERRIDE, ""))
         peers.add(str(HostPort(owner.name, port)))
     member = replace(member, peers=frozenset(peers))
-    warnings = [*_refusal_warnings(refused), *_protocol_warnings(container)]
+    warnings = [*_refusal_warnings(refused), *_link_warnings(refused_links, settings)]
+    warnings += _protocol_warnings(container)
     if _has_router(owner, observed):
         return member, warnings
     outside = [router for router in own if router in allowed and not router.neighbour]
@@ -223,6 +229,17 @@ def _refusal_warnings(refused: Iterable[_Router]) -> Iterator[str]:
             f"{router.named_by} names {quoted(router.peer)}, which the operator does not allow. "
             "The proxy does not connect there. To allow this router, start the operator with "
             f"--allow-peer {router.peer}"
+        )
+
+
+def _link_warnings(refused: Iterable[str], settings: PlanSettings) -> Iterator[str]:
+    has_files = settings.zenoh_link_certificates
+    directory = "" if has_files else " --zenoh-link-certificates DIRECTORY"
+    for link in refused:
+        yield (
+            f"label {LINK} names {quoted(link)}, which the operator does not allow. The proxy does "
+            "not connect there. To allow this link, start the operator with "
+            f"--allow-link {link}{directory}"
         )
 
 
