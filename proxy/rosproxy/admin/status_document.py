@@ -417,7 +417,8 @@ class ZenohCertificateStatus(msgspec.Struct, frozen=True):
 class ZenohSessionStatus(msgspec.Struct, frozen=True):
     """A session of a router of the proxy: both addresses, and the ``mode`` of the other end.
 
-    ``port``: the port of the router; None: the hub. ``mode``: client, peer or router.
+    ``port``: the port of a router for containers; None: another router. ``mode``: client, peer or
+    router. ``link``: the router is the one of the links to other sites.
     """
 
     port: Count | None = None
@@ -425,6 +426,7 @@ class ZenohSessionStatus(msgspec.Struct, frozen=True):
     zid: str = ""
     local: str = ""
     remote: str = ""
+    link: bool = False
 
 
 class ZenohNodeStatus(msgspec.Struct, frozen=True):

@@ -58,7 +58,9 @@ def _summary(zenoh: ZenohStatus) -> str:
 
 
 def _router(session: ZenohSessionStatus, zenoh: ZenohStatus) -> str:
-    """The router of a session: the hub, or the router at a port."""
+    """The router of a session: the hub, the router of links to other sites, or that at a port."""
+    if session.link:
+        return "link"
     local = parse_host_port(session.local)
     for_outside = zenoh.listen if local and local.port == zenoh.listen else None
     port = session.port or for_outside

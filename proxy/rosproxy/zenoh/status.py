@@ -3,7 +3,7 @@
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from typing import NamedTuple, Protocol
 
 from msgspec.structs import replace
@@ -42,21 +42,32 @@ differ in durability alone are listed, too; further ones are not counted."""
 MOST_LISTED_NODES = 1500
 MOST_LISTED_SESSIONS = 1500
 """Rows that the status lists, with fair shares by address. The live page shows as many nodes."""
-_PlacedSession = tuple[int | None, RouterSession, Ends]
-"""A session with the port of its router, and with both ends. The port is None for the router for
-outside, the router of the links to other sites, and the hub: the nodes of all three are outside."""
+
+
+class _PlacedSession(NamedTuple):
+    """A session with the port of its router, and with both ends.
+
+    The port is None for the router for outside, the router of the links to other sites, and the
+    hub: the nodes of all three are outside. ``at_link``: the second of these three.
+    """
+
+    port: int | None
+    session: RouterSession
+    ends: Ends
+    at_link: bool
 
 
 class Reading(NamedTuple):
     """What the latest report and the latest tokens say, ready for the status.
 
-    ``names`` are the topics and services of nodes inside, and ``counts`` the numbers of nodes
-    inside and outside. The other fields have the listed rows. ``mismatches`` are also pairs that
-    differ in durability alone.
+    ``routers`` are the ends of the sessions with other routers, and whether each is of the router
+    of the links. ``names`` are the topics and services of nodes inside, and ``counts`` the numbers
+    of nodes inside and outside. The other fields have the listed rows. ``mismatches`` are also
+    pairs that differ in durability alone.
     """
 
     sessions: tuple[_PlacedSession, ...] = ()
-    hub_routers: tuple[Ends, ...] = ()
+    routers: tuple[tuple[bool, Ends], ...] = ()
     link_listens: bool = True
     graph: TokenGraph = TokenGraph()
     left_out: int = 0
@@ -121,11 +132,11 @@ class ZenohState(Collector):
         sessions = tuple(self._sessions_of(report.routers))
         reading = former._replace(
             sessions=sessions,
-            hub_routers=tuple(
-                ends
-                for port, session, _ in sessions
-                if port is None and session.whatami == "router"
-                for ends in all_ends_of(session)
+            routers=tuple(
+                (placed.at_link, ends)
+                for placed in sessions
+                if placed.port is None and placed.session.whatami == "router"
+                for ends in all_ends_of(placed.session)
             ),
         )
         if (port := self._settings.zenoh_link_listen) and report.routers:
@@ -136,7 +147,7 @@ class ZenohState(Collector):
         if graph is not None:
             left_out = report.tokens_left_out + graph.left_out
             reading = reading._replace(graph=graph, left_out=left_out)
-        inside = frozenset(s.peer for port, s, _ in sessions if port is not None)
+        inside = frozenset(s.session.peer for s in sessions if s.port is not None)
         if graph is not None or inside != former.inside:
             comparison = compare(reading.graph.entities, inside)
             reading = reading._replace(comparison=comparison, inside=inside)
@@ -146,18 +157,17 @@ class ZenohState(Collector):
         """Whether the routers run, and have a session with the peer of a link."""
         at_links = self._settings.zenoh_link_listen
         listen = self._listen
-        if link.protocol != "tcp":
+        to_site = link.protocol != "tcp"
+        if to_site:
             listen = frozenset([at_links.port] if at_links else [])
-        return not self._process.failure and is_linked(
-            link.peer, link.addresses, self._reading.hub_routers, listen
-        )
+        routers = (ends for at_link, ends in self._reading.routers if at_link is to_site)
+        return not self._process.failure and is_linked(link.peer, link.addresses, routers, listen)
 
     @property
     def container_sessions(self) -> list[tuple[int, str]]:
         """The port and the address of each session with a container."""
-        return [
-            (port, ends.remote.host) for port, _, ends in self._reading.sessions if port is not None
-        ]
+        sessions = self._reading.sessions
+        return [(s.port, s.ends.remote.host) for s in sessions if s.port is not None]
 
     def inside_names(self) -> tuple[InsideName, ...]:
         """The topics and services of the nodes with a session at a port for containers."""
@@ -223,7 +233,7 @@ class ZenohState(Collector):
             "rosproxy_zenoh_sessions", "Sessions of the zenoh routers by mode.", labels=["mode"]
         )
         reading = Reading() if status.failure else self._reading
-        modes = Counter(session.whatami for _, session, _ in reading.sessions)
+        modes = Counter(placed.session.whatami for placed in reading.sessions)
         for mode in MODES:
             sessions.add_metric([mode], modes[mode])
         nodes = GaugeMetricFamily(
@@ -248,11 +258,12 @@ class ZenohState(Collector):
         for_outside = [] if self._settings.zenoh_listen is None else [None]
         for_links = [None] if self._settings.has_site_links else []
         ports = [*self._settings.zenoh_ports.ports(), *for_outside, *for_links, None]
-        for port, router in zip(ports, routers, strict=False):
+        at_link = len(ports) - 2 if for_links else None
+        for index, (port, router) in enumerate(zip(ports, routers, strict=False)):
             for session in router.sessions:
                 ends = ends_of(session)
                 if ends and session.peer not in own:
-                    yield port, session, ends
+                    yield _PlacedSession(port, session, ends, index == at_link)
 
     def _link(self, link: Link) -> ZenohLinkStatus:
         return ZenohLinkStatus(
@@ -267,14 +278,9 @@ class ZenohState(Collector):
 
 def _with_rows(reading: Reading) -> Reading:
     """The reading with the rows of the status."""
-    by_zid = {session.peer: (port, session, ends) for port, session, ends in reading.sessions}
+    by_zid = {placed.session.peer: placed for placed in reading.sessions}
     nodes = tuple(_node_status(node, by_zid.get(node.session)) for node in reading.graph.nodes)
-    sessions = [
-        ZenohSessionStatus(port, session.whatami, session.peer, str(ends.local), str(ends.remote))
-        for port, session, ends in reading.sessions
-    ]
-    hosts = [ends.remote.host for _, _, ends in reading.sessions]
-    rows = fair_choice(zip(sessions, hosts, strict=True), itemgetter(1), MOST_LISTED_SESSIONS)
+    sessions = fair_choice(reading.sessions, attrgetter("ends.remote.host"), MOST_LISTED_SESSIONS)
     listed = fair_choice(nodes, attrgetter("address"), MOST_LISTED_NODES)
     addresses = {node.key: node.address for node in nodes if node.port is not None}
     inside = sum(1 for node in nodes if node.address)
@@ -287,8 +293,8 @@ def _with_rows(reading: Reading) -> Reading:
     late = fair_choice(comparison.late, owner, MOST_LISTED_MISMATCHES)
     return reading._replace(
         nodes=tuple(listed),
-        rows=tuple(row for row, _ in rows),
-        rows_left_out=len(nodes) - len(listed) + len(sessions) - len(rows),
+        rows=tuple(map(_session_status, sessions)),
+        rows_left_out=len(nodes) - len(listed) + len(reading.sessions) - len(sessions),
         names=tuple(_inside_names(nodes)),
         counts=(inside, len(nodes) - inside),
         mismatches=(*shown, *late),
@@ -311,9 +317,16 @@ def _inside_names(nodes: Iterable[ZenohNodeStatus]) -> Iterator[InsideName]:
                 yield InsideName(node.port, node.address, node.name, kind, name)
 
 
+def _session_status(placed: _PlacedSession) -> ZenohSessionStatus:
+    port, session, ends, at_link = placed
+    return ZenohSessionStatus(
+        port, session.whatami, session.peer, str(ends.local), str(ends.remote), at_link
+    )
+
+
 def _node_status(node: ZenohNode, placed: _PlacedSession | None) -> ZenohNodeStatus:
     """A node. ``placed``: the session of the node with a router of the proxy; None: none."""
-    port, session, ends = placed or (None, None, None)
+    port, session, ends = placed[:3] if placed else (None, None, None)
     return ZenohNodeStatus(
         node.name,
         node.domain,

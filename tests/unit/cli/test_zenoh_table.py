@@ -65,6 +65,12 @@ def test_proxies_on_other_hosts_stand_apart() -> None:
 
 def test_links_to_other_sites_have_their_protocol() -> None:
     links = (ZenohLinkStatus("cloud:7447", True, since=3.0, protocol="tls"),)
-    zenoh = ZenohStatus(ports="7448-7448", links=links, link_listen="quic/7449")
+    session = ZenohSessionStatus(
+        None, "router", "ab", "172.18.0.2:40000", "192.0.2.9:7447", link=True
+    )
+    zenoh = ZenohStatus(
+        ports="7448-7448", links=links, link_listen="quic/7449", sessions=(session,)
+    )
     shown = render(ProxyStatus(settings=StatusSettings(ros=("zenoh",)), zenoh=zenoh), 200)
+    assert "\n192.0.2.9:7447  router  172.18.0.2:40000  link" in shown
     assert "; port quic/7449 for other sites; links to outside: tls/cloud:7447 up for" in shown

@@ -261,7 +261,7 @@ def test_a_link_to_another_site_is_a_session_of_its_router(protocol: str, remote
     status = state.status()
     (link,) = status.links
     assert link.title == f"{protocol}/cloud.example:7447"
-    assert [session.port for session in status.sessions] == [None]
+    assert [(session.port, session.link) for session in status.sessions] == [(None, True)]
     assert (status.link_listen, status.link_listens) == (f"{protocol}/7449", True)
     assert status.limits == ("/camera/*=2Hz",)
     assert [file.file for file in status.certificates] == ["/c/tls.crt"]
@@ -270,6 +270,16 @@ def test_a_link_to_another_site_is_a_session_of_its_router(protocol: str, remote
     shown = generate_latest(registry).decode()
     assert f'rosproxy_zenoh_link_up{{peer="{protocol}/cloud.example:7447"}}' in shown
     assert 'rosproxy_zenoh_certificate_expiry_seconds{file="/c/tls.crt"}' in shown
+
+
+def test_a_session_of_the_hub_is_no_link_to_another_site() -> None:
+    """`--zenoh-peer` and `--zenoh-link` may name the same host and port."""
+    state = sites_state(FakeProcess())
+    at_hub = SessionConnection("tcp/172.18.0.2:50000", "tcp/192.0.2.9:7447")
+    hub = RouterReport("03", (RouterSession("09", "router", (at_hub,)),))
+    state.take(Report((RouterReport("01"), RouterReport("02"), hub)), None)
+    assert not state.is_up(state.links[0])
+    assert [session.link for session in state.status().sessions] == [False]
 
 
 def test_a_port_for_other_sites_may_fail_to_open() -> None:
