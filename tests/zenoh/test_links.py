@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from datetime import timedelta
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -107,6 +108,8 @@ def test_messages_calls_and_the_graph_pass_a_link(lab: Lab, protocol: str, versi
         ("cloud", "expired", "the certificate of the other proxy, or its CA, has expired"),
         ("cloud", "name", "is for another host name"),
         ("robot", "foreign", "it is of a CA that the other proxy does not trust"),
+        ("cloud", "same name", "is of a CA that this proxy does not trust"),
+        ("robot", "same name", "it is of a CA that the other proxy does not trust"),
         ("robot", "expired", "refuses the certificate of this proxy as expired"),
     ],
 )
@@ -114,8 +117,9 @@ def test_a_link_that_is_refused_says_why(lab: Lab, side: str, fault: str, told: 
     sites = Sites(lab)
     names = {"cloud": ("other.example" if fault == "name" else CLOUD,), "robot": ()}[side]
     bad = sites.files("bad", *names, ends=PAST if fault == "expired" else 90 * DAY)
-    if fault == "foreign":
-        Authority("another CA").write(bad, *names)
+    if fault in ("foreign", "same name"):
+        other = Authority("another CA") if fault == "foreign" else Authority()
+        other.write(bad, *names)
         (bad / certificates.CA).write_bytes(sites.authority.pem)
     sites.start_cloud(bad if side == "cloud" else None)
     sites.start_robot(bad if side == "robot" else None)
@@ -172,6 +176,41 @@ def test_certificates_are_renewed_while_messages_flow(lab: Lab) -> None:
     assert told == [*range(told[0], told[-1] + 1)], "a neighbour has lost messages"
     assert lab.zenoh().restarts == lab.zenoh("out").restarts == 0
     assert publisher.returncode is None
+
+
+def test_two_hubs_with_a_link_each_pass_each_message_once(lab: Lab) -> None:
+    """As on two nodes of a cluster: the hubs on px and c2 are linked, and each with the cloud."""
+    sites = Sites(lab)
+    sites.start_cloud()
+    second = lab.topology.places["c2"].address
+    hub = ("--zenoh-hub-listen", str(ROUTER_PORT))
+    sites.start_robot(None, *hub, "--zenoh-hub", second)
+    link = ("--zenoh-link", f"tls/{CLOUD}", *written(sites.files("second")))
+    lab.start_proxy_on("c2", "--bind", second, *hub, *link)
+    for role, count in (("px", 2), ("c2", 1)):
+        linked = partial(all_up, lab, role, count)
+        wait_until(f"the links of {role} are up", linked, 30)
+    override = f'mode="client";connect/endpoints=["tcp/{second}:{PORTS["c1"]}"]'
+    behind_second = lab.node(VERSION, "c2", "sub", ZENOH_CONFIG_OVERRIDE=override)
+    in_cloud = sites.in_cloud("sub")
+    back = sites.at_robot("sub", "map")
+    sites.at_robot("pub")
+    sites.in_cloud("pub", "map")
+    for receiver in (behind_second, in_cloud, back):
+        flows(receiver)
+    for receiver in (behind_second, in_cloud, back):
+        receiver.wait_for_count("^got hello ", 50, 30, since=receiver.mark())
+        got = messages(receiver)
+        assert got == [*range(got[0], got[-1] + 1)], "a message was lost or came twice"
+    at_link = [s for s in lab.zenoh().sessions if s.mode == "router"]
+    assert sorted(session.link for session in at_link) == [False, True]
+    assert not lab.status().problems
+
+
+def all_up(lab: Lab, role: str, count: int) -> bool:
+    """Whether a proxy has so many links, and all of them are up."""
+    links = lab.zenoh(role).links
+    return len(links) == count and all(link.up for link in links)
 
 
 @pytest.mark.parametrize("side", ["robot", "cloud"])

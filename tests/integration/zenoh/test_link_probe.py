@@ -98,10 +98,18 @@ def foreign(folder: Path) -> None:
     (folder / CA).write_bytes(AUTHORITY.pem)
 
 
+def same_name(folder: Path) -> None:
+    """A CA with the name of the right CA, and another key."""
+    Authority().write(folder, "cloud.example")
+    (folder / CA).write_bytes(AUTHORITY.pem)
+
+
 @pytest.mark.parametrize(
     ("there", "here", "fault"),
     [
         (cloud, cloud, LinkFault.NO_SESSION),
+        (same_name, cloud, LinkFault.PEER_FOREIGN),
+        (cloud, same_name, LinkFault.OWN_FOREIGN),
         (other_name, cloud, LinkFault.PEER_OTHER_NAME),
         (expired, cloud, LinkFault.PEER_EXPIRED),
         (too_early, cloud, LinkFault.PEER_TOO_EARLY),

@@ -64,6 +64,7 @@ def test_zenoh_reports_the_dialed_name_of_a_link_over_quic() -> None:
     [
         ("SSLV3_ALERT_CERTIFICATE_EXPIRED", LinkFault.OWN_EXPIRED),
         ("TLSV1_ALERT_UNKNOWN_CA", LinkFault.OWN_FOREIGN),
+        ("TLSV1_ALERT_DECRYPT_ERROR", LinkFault.OWN_FOREIGN),
         ("SSLV3_ALERT_BAD_CERTIFICATE", LinkFault.OWN_REFUSED),
         ("TLSV13_ALERT_CERTIFICATE_REQUIRED", LinkFault.OWN_REFUSED),
         ("TLSV1_ALERT_INTERNAL_ERROR", LinkFault.NO_SESSION),
