@@ -2,7 +2,9 @@
 
 import itertools
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from tests.docker.engine import wait_until
 from tests.docker.inside import Container
@@ -48,3 +50,41 @@ class Node:
         return max(
             map(int, re.findall(r"^got hello (\d+)$", self.log.read(), re.MULTILINE)), default=-1
         )
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Another site: a machine with a proxy that listens for links, and nodes beside the proxy.
+
+    ``start`` starts a program in the machine's container, ``root`` is the machine's file system.
+    """
+
+    start: Callable[..., object]
+    root: Path
+
+    @staticmethod
+    def options(files: Path) -> tuple[str, ...]:
+        """Options of ``docker run`` for the proxy's image. ``files``: certificate, key and CA."""
+        nodes = Path(__file__).parents[1] / "zenoh/nodes"
+        volumes = ("--volume", f"{files}:/link:ro", "--volume", f"{nodes}:/nodes:ro")
+        return ("--user", "0", "--entrypoint", "", *volumes)
+
+    def start_proxy(self) -> None:
+        """Start the proxy, and wait until it listens."""
+        files = (
+            "--zenoh-certificate /link/tls.crt --zenoh-key /link/tls.key --zenoh-ca /link/ca.crt"
+        )
+        listen = "--zenoh-ports 7448-7448 --zenoh-link-listen tls/7447"
+        log = self._run("proxy", f"rosproxy run --ros zenoh {listen} {files}")
+        wait_until(lambda: "listening: " in log.read(), 30, log.read)
+
+    def node(self, name: str, kind: str, topic: str) -> Node:
+        """Start a node."""
+        override = 'connect/endpoints=["tcp/127.0.0.1:7448"]'
+        words = f"env ZENOH_CONFIG_OVERRIDE='{override}' {' '.join(NODE)} {kind} {name} {topic}"
+        return Node(name, self._run(name, words))
+
+    def _run(self, name: str, words: str) -> Log:
+        path = self.root / f"tmp/{name}.log"
+        self.start("sh", "-c", f"PYTHONUNBUFFERED=1 exec {words} >/tmp/{name}.log 2>&1")
+        return Log(lambda: path.read_text() if path.exists() else "")

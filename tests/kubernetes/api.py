@@ -31,7 +31,7 @@ GROUPS = {
 PLURALS = {
     "Pod": "pods", "Service": "services", "RosProxy": "rosproxies", "Namespace": "namespaces",
     "Deployment": "deployments", "ResourceQuota": "resourcequotas", "LimitRange": "limitranges",
-    "Endpoints": "endpoints",
+    "Endpoints": "endpoints", "Secret": "secrets",
 }  # fmt: skip
 
 

@@ -178,6 +178,17 @@ def test_certificates_are_renewed_while_messages_flow(lab: Lab) -> None:
     assert publisher.returncode is None
 
 
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_a_certificate_may_have_an_address_in_place_of_a_name(lab: Lab, protocol: str) -> None:
+    sites = Sites(lab, protocol)
+    address = lab.topology.places["out"].address
+    sites.start_cloud(sites.files("cloud", address))
+    link = ("--zenoh-link", f"{protocol}/{address}", *written(sites.files("client")))
+    lab.start_proxy(*link, with_robot=False)
+    sites.wait_for_link()
+    assert not lab.status().problems
+
+
 def test_two_hubs_with_a_link_each_pass_each_message_once(lab: Lab) -> None:
     """As on two nodes of a cluster: the hubs on px and c2 are linked, and each with the cloud."""
     sites = Sites(lab)
