@@ -50,8 +50,9 @@ def participants_by_address(status: ProxyStatus) -> Mapping[str, tuple[Participa
 
 
 def nodes_inside(status: ProxyStatus) -> tuple[ZenohNodeStatus, ...]:
-    """Return the nodes of rmw_zenoh that are connected to a proxy, without nodes outside."""
-    return tuple(node for node in (status.zenoh.nodes if status.zenoh else ()) if node.address)
+    """Return the nodes of rmw_zenoh at the ports of a proxy for containers or pods."""
+    nodes = status.zenoh.nodes if status.zenoh else ()
+    return tuple(node for node in nodes if node.port is not None)
 
 
 def leases(status: ProxyStatus) -> Leases:

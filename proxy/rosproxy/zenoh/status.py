@@ -283,7 +283,7 @@ def _with_rows(reading: Reading) -> Reading:
     sessions = fair_choice(reading.sessions, attrgetter("ends.remote.host"), MOST_LISTED_SESSIONS)
     listed = fair_choice(nodes, attrgetter("address"), MOST_LISTED_NODES)
     addresses = {node.key: node.address for node in nodes if node.port is not None}
-    inside = sum(1 for node in nodes if node.address)
+    inside = sum(1 for node in nodes if node.port is not None)
 
     def owner(pair: MismatchStatus) -> str:
         return addresses.get(pair.writer, addresses.get(pair.reader, ""))

@@ -82,6 +82,12 @@ def make_state(process: FakeProcess) -> ZenohState:
     return state
 
 
+def metrics_of(state: ZenohState) -> list[str]:
+    registry = CollectorRegistry()
+    registry.register(state)
+    return generate_latest(registry).decode().splitlines()
+
+
 def test_sessions_at_the_port_for_outside_are_outside() -> None:
     given = {"ros": ("zenoh",), "zenoh_ports": "7448-7448", "zenoh_listen": 7447}
     state = ZenohState(parse_settings(given), FakeProcess(), lambda: 10.0)
@@ -94,6 +100,11 @@ def test_sessions_at_the_port_for_outside_are_outside() -> None:
     assert ports == {NODE_ZID: None, "bb": 7448, "04": None}
     assert state.container_sessions == [(7448, "172.18.0.3")]
     assert not state.inside_names()
+    nodes = [line for line in metrics_of(state) if line.startswith("rosproxy_zenoh_nodes")]
+    assert nodes == [
+        'rosproxy_zenoh_nodes{side="inside"} 1.0',
+        'rosproxy_zenoh_nodes{side="outside"} 1.0',
+    ]
 
 
 def test_sessions_have_both_addresses_and_their_router() -> None:
@@ -156,9 +167,7 @@ def test_listed_nodes_and_sessions_are_bounded_with_fair_shares() -> None:
     assert "172.18.0.3" in {node.address for node in status.nodes}
     assert "172.18.0.3" in {listed.remote.partition(":")[0] for listed in status.sessions}
     assert status.left_out == 8 + 7
-    registry = CollectorRegistry()
-    registry.register(state)
-    metrics = generate_latest(registry).decode()
+    metrics = metrics_of(state)
     assert f'rosproxy_zenoh_nodes{{side="outside"}} {len(crowd)}.0' in metrics
     assert f'rosproxy_zenoh_sessions{{mode="peer"}} {len(many) + 1}.0' in metrics
 
@@ -195,9 +204,7 @@ def test_hubs_are_links_that_may_be_away() -> None:
     state = ZenohState(parse_settings(options), FakeProcess(), lambda: 10.0)
     told = [(link.peer, link.hub) for link in state.status().links]
     assert told == [("192.0.2.7:7447", True), ("robot:7447", False), ("hub:7448", True)]
-    registry = CollectorRegistry()
-    registry.register(state)
-    lines = generate_latest(registry).decode().splitlines()
+    lines = metrics_of(state)
     assert [line for line in lines if line.startswith("rosproxy_zenoh_link_up{")] == [
         'rosproxy_zenoh_link_up{peer="robot:7447"} 0.0'
     ]
@@ -214,9 +221,7 @@ def test_every_connection_of_a_session_counts() -> None:
 
 
 def test_metrics() -> None:
-    registry = CollectorRegistry()
-    registry.register(make_state(FakeProcess()))
-    lines = generate_latest(registry).decode().splitlines()
+    lines = metrics_of(make_state(FakeProcess()))
     for line in (
         "rosproxy_zenoh_routers_up 1.0",
         "rosproxy_zenoh_restarts_total 2.0",
@@ -265,9 +270,7 @@ def test_a_link_to_another_site_is_a_session_of_its_router(protocol: str, remote
     assert (status.link_listen, status.link_listens) == (f"{protocol}/7449", True)
     assert status.limits == ("/camera/*=2Hz",)
     assert [file.file for file in status.certificates] == ["/c/tls.crt"]
-    registry = CollectorRegistry()
-    registry.register(state)
-    shown = generate_latest(registry).decode()
+    shown = "\n".join(metrics_of(state))
     assert f'rosproxy_zenoh_link_up{{peer="{protocol}/cloud.example:7447"}}' in shown
     assert 'rosproxy_zenoh_certificate_expiry_seconds{file="/c/tls.crt"}' in shown
 

@@ -115,14 +115,12 @@ def status_of(
     time for conditions that change, in RFC 3339.
     """
     former = rosproxy.status
-    shown = _shown_nodes(states)
-    most_names = min(MOST_NAMES, MOST_NAMES_OF_ALL // max(len(shown), 1))
-    linked = _linked_nodes(rosproxy, states) if rosproxy.spec.zenoh else {}
-    lines = [_line(rosproxy, state, linked, most_names) for state in shown]
-    ros_nodes = sum(int_at(line, "rosNodes") for line in lines)
+    lines = _lines(rosproxy, states)
+    counts = _Counts(former, lines, states)
+    ros_nodes = counts.total("rosNodes")
     wanted = [state for state in states if state.pods]
     spec = rosproxy.spec
-    participant_count = sum(int_at(line, "participants") for line in lines)
+    participant_count = counts.total("participants")
     served = [plural(ros_nodes, "ROS node")] if spec.ros1 or spec.zenoh else []
     if spec.ros2:
         served.append(f"{plural(participant_count, 'participant')} of domain {spec.ros2.number}")
@@ -141,7 +139,7 @@ def status_of(
         "message": _message(ready, problems),
         **_addressed(rosproxy, addresses),
         **({"domain": spec.ros2.number, "participants": participant_count} if spec.ros2 else {}),
-        **({"sessions": sum(int_at(n, "sessions") for n in lines)} if spec.zenoh else {}),
+        **({"sessions": counts.total("sessions")} if spec.zenoh else {}),
         "nodes": len(wanted),
         "proxies": f"{sum(map(_serving, wanted))}/{len(wanted)}",
         "rosNodes": ros_nodes,
@@ -152,6 +150,29 @@ def status_of(
         "perNode": lines,
         "conditions": _conditions(judged, former, rosproxy.generation, stamp),
     }
+
+
+class _Counts:
+    """The counts in the lines of ``perNode``, and of the nodes for which there is no line."""
+
+    def __init__(
+        self, former: Json, lines: Sequence[Json], states: Sequence[RosProxyOnNode]
+    ) -> None:
+        shown = {line["name"] for line in lines}
+        hidden = [state for state in states if state.name not in shown]
+        self._former = former
+        self._lines = [*lines, *(_ros(state, 0, former) for state in hidden)]
+        proxies = [state for state in hidden if state.proxy is not None]
+        self._is_complete = all(_has_answered(state.answer) for state in proxies)
+
+    def total(self, field: str) -> int:
+        """The sum of a field of all nodes.
+
+        At least the former sum while the proxy of a node without a line has not answered: the
+        former status has no line of that node either.
+        """
+        total = sum(int_at(line, field) for line in self._lines)
+        return total if self._is_complete else max(total, int_at(self._former, field))
 
 
 def participants(observed: ClusterSnapshot) -> dict[int, int]:
@@ -214,6 +235,14 @@ def _shown_nodes(states: Sequence[RosProxyOnNode]) -> list[RosProxyOnNode]:
     """
     ranked = sorted(states, key=lambda state: (not state.pods, state.proxy is None, state.name))
     return sorted(ranked[:MOST_NODES], key=lambda state: state.name)
+
+
+def _lines(rosproxy: RosProxy, states: Sequence[RosProxyOnNode]) -> list[dict[str, object]]:
+    """The entries of ``perNode``."""
+    shown = _shown_nodes(states)
+    most_names = min(MOST_NAMES, MOST_NAMES_OF_ALL // max(len(shown), 1))
+    linked = _linked_nodes(rosproxy, states) if rosproxy.spec.zenoh else {}
+    return [_line(rosproxy, state, linked, most_names) for state in shown]
 
 
 def _line(

@@ -270,9 +270,23 @@ def test_a_large_cluster_is_told_in_bounds():
     assert len(rosproxy_status["perNode"]) == MOST_NODES
     assert all(line["pods"] for line in rosproxy_status["perNode"])
     assert all(line["rosNodes"] == 80 for line in rosproxy_status["perNode"])
+    assert rosproxy_status["rosNodes"] == 80 * (MOST_NODES + 50)
     assert rosproxy_status["nodes"] == MOST_NODES + 50
     assert all(len(c["message"]) <= MOST_MESSAGE_CHARACTERS for c in rosproxy_status["conditions"])
     assert len(json.dumps(rosproxy_status)) < 700_000
+
+
+def test_the_sum_stays_while_the_proxy_of_a_node_without_a_line_has_not_answered():
+    def states(last: ProxyReport | None):
+        every = [state(f"node{i:03}", answer=answer("/a")) for i in range(MOST_NODES)]
+        return [*every, state("other", answer=last)]
+
+    first = status(*states(answer("/a", "/b")))
+    assert first["rosNodes"] == MOST_NODES + 2
+    restarted = status(*states(None), of=rosproxy(status=first))
+    assert restarted["rosNodes"] == MOST_NODES + 2
+    now = status(*states(answer("/a")), of=rosproxy(status=restarted))
+    assert now["rosNodes"] == MOST_NODES + 1
 
 
 def test_so_many_names_of_a_node_are_told():

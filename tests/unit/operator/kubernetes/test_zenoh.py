@@ -636,7 +636,8 @@ STATUS = ProxyStatus(
             ZenohSessionStatus(None, "router", "b", "10.244.1.200:5001", "192.0.2.7:7447"),
         ),
         nodes=(
-            ZenohNodeStatus("/talker", 0, "10.244.1.9", ("/chatter",), ("/clock",)),
+            ZenohNodeStatus("/talker", 0, "10.244.1.9", ("/chatter",), ("/clock",), port=7448),
+            ZenohNodeStatus("/laptop", 0, "192.0.2.50", ("/joy",)),
             ZenohNodeStatus("/robot", 0, "", ("/scan",)),
         ),
     ),
