@@ -488,6 +488,14 @@ class Settings:
             default="none",
         ),
     ] = ""
+    zenoh_await_files: Annotated[
+        bool,
+        Option(
+            "rmw_zenoh: start also while a file of the links can't be used, and make the links "
+            "when it can. The operators set this option, so that a missing certificate costs the "
+            "links alone."
+        ),
+    ] = False
     zenoh_limit: Annotated[
         tuple[TopicLimit, ...],
         Option(

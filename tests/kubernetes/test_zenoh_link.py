@@ -117,10 +117,20 @@ def test_pods_of_two_nodes_are_linked_to_another_site(
     assert uids(of) == before, "a new certificate recreates no proxy"
 
 
-def test_a_missing_secret_is_told(net: Namespace) -> None:
-    link = {"to": [f"tls/{ADDRESS}"], "secretName": "absent"}
+def test_a_missing_secret_is_told_and_may_come_later(
+    net: Namespace, cloud: Cloud, authority: Authority, tmp_path: Path
+) -> None:
+    link = {"to": [f"tls/{ADDRESS}"], "secretName": "link"}
     of = rosproxy(net.name, ros="zenoh", link=link)
     wait_for_service(net)
-    node(net, "pub", "chatter", "node1")
-    condition = of.wait_for("Degraded", "True", "ProxyStuck", START)
-    assert "/etc/rosproxy/link/tls.crt can't be read" in condition["message"]
+    talker = node(net, "pub", "late", "node1")
+    near = node(net, "sub", "late", "node1")
+    far = cloud.node("late", "sub", "late")
+    near.wait_for(GOT, 5, START)
+    condition = of.wait_for("Degraded", "True", "LinkCertificate", START)
+    assert "zenoh file /etc/rosproxy/link/tls.crt: can't be read" in condition["message"]
+    assert not far.has(GOT)
+    assert not talker.has("Traceback")
+    api.create(secret(net.name, authority.write(tmp_path / "late")))
+    far.wait_for(GOT, 5, RENEWED)
+    of.wait_for("SitesReachable", "True", seconds=60)

@@ -178,6 +178,27 @@ def test_certificates_are_renewed_while_messages_flow(lab: Lab) -> None:
     assert publisher.returncode is None
 
 
+def test_the_files_may_come_after_the_start(lab: Lab) -> None:
+    sites = Sites(lab)
+    sites.start_cloud()
+    sites.volume.mkdir()
+    sites.start_robot(sites.volume, "--zenoh-await-files")
+    in_cloud = sites.in_cloud("sub")
+    local = lab.node(VERSION, "c2", "sub")
+    sites.at_robot("pub")
+    flows(local)
+    wait_until("the missing file is told", lambda: lab.status().problems, 30)
+    (problem,) = lab.status().problems
+    assert problem.subject == f"zenoh file {sites.volume / certificates.CERTIFICATE}"
+    assert "got" not in in_cloud.output()
+    certificates.mount(sites.volume, sites.files("late"))
+    flows(in_cloud)
+    sites.wait_for_link()
+    wait_until("nothing is wrong", lambda: not lab.status().problems, 30)
+    told = messages(local)
+    assert told == [*range(told[0], told[-1] + 1)], "a neighbour has lost messages"
+
+
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
 def test_a_certificate_may_have_an_address_in_place_of_a_name(lab: Lab, protocol: str) -> None:
     sites = Sites(lab, protocol)

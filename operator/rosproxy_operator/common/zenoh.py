@@ -101,6 +101,7 @@ def link_settings(
         "zenoh_link": tuple(to),
         "zenoh_link_listen": listen or None,
         **{field: f"{LINK_DIRECTORY}/{name}" for field, name in LINK_FILES.items()},
+        "zenoh_await_files": True,
         "zenoh_limit": tuple(limits),
         "zenoh_link_policy": format_rules(rules),
     }

@@ -135,7 +135,7 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
         yield error("routers", ROUTERS, text, fix)
         return
     yield from filter(None, map(_certificate, zenoh.certificates))
-    if not zenoh.link_listens:
+    if not zenoh.link_listens and not any(file.error for file in zenoh.certificates):
         text = "accepts no connections. Another program has the port, or zenoh can't use the key: "
         text += "zenoh knows RSA from 2,048 bits on, ECDSA with P-256 and P-384, and Ed25519"
         fix = "ss -ltunp shows whether another program has the port. Otherwise make another key"

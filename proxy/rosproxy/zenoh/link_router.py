@@ -36,8 +36,14 @@ class LinkPlan:
     limits: Sequence[TopicLimit]
     policy: Sequence[PolicyLayer]
 
-    def config(self, credentials: Credentials, hub_socket: str) -> RouterConfig:
-        """The configuration of the router. Raises ValueError as `check_layers` does."""
+    def config(self, credentials: Credentials | None, hub_socket: str) -> RouterConfig:
+        """The configuration of the router. Raises ValueError as `check_layers` does.
+
+        Without credentials, the router has no links yet.
+        """
+        to_hub = f"{hub_socket}{_HUB_RETRY}"
+        if credentials is None:
+            return router_config([], [to_hub])
         listen = self.listen
         at = [f"{listen.protocol}/{HostPort(self.bind, listen.port)}"] if listen else []
         own: dict[str, object] = {
@@ -53,7 +59,7 @@ class LinkPlan:
             own["access_control"] = access
         if self.limits:
             own["downsampling"] = [_downsampling(self.limits)]
-        return router_config(at, [f"{hub_socket}{_HUB_RETRY}", *map(str, self.dialed)], own)
+        return router_config(at, [to_hub, *map(str, self.dialed)], own)
 
 
 def check_limits(limits: Sequence[TopicLimit]) -> None:

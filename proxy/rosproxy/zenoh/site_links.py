@@ -30,12 +30,13 @@ log = logging.getLogger(__name__)
 CHECK_INTERVAL_S = 1.0
 """Time between two checks whether a file has changed, in seconds."""
 STAY = "The files that were read before stay in use"
+NO_LINKS = "Until the file is right, the proxy has no links to other sites"
 
 
 class SiteLinks:
     """The plan of the links, and the files of the last read without a fault.
 
-    ``files`` is None before `read`, and without links to other sites.
+    ``files`` is None without links to other sites, and before all files could be used.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -53,7 +54,10 @@ class SiteLinks:
         self._is_fault_old = False
 
     def check(self) -> None:
-        """Check limits and rules, and read the files. Raises SettingError."""
+        """Check limits and rules, and read the files. Raises SettingError.
+
+        With ``--zenoh-await-files``, a file that can't be used is a fault for the status instead.
+        """
         if not self._settings.has_site_links:
             return
         with _setting_error("--zenoh-limit"):
@@ -63,11 +67,16 @@ class SiteLinks:
         try:
             self._read()
         except UnusableFile as error:
-            raise SettingError(error.option, str(error)) from None
+            if not self._settings.zenoh_await_files:
+                raise SettingError(error.option, str(error)) from None
+            self._fault = error
+            self._is_fault_old = True
 
     def config(self, hub_socket: str) -> RouterConfig | None:
         """The configuration of the router with the links; None without links."""
-        return self._plan.config(self.files.credentials, hub_socket) if self.files else None
+        if not self._settings.has_site_links:
+            return None
+        return self._plan.config(self.files.credentials if self.files else None, hub_socket)
 
     def look(self) -> bool:
         """Read the files again after a change or a fault. Return whether the contents differ.
@@ -95,15 +104,14 @@ class SiteLinks:
 
     def certificates(self) -> tuple[ZenohCertificateStatus, ...]:
         """The state of each certificate, for the status."""
-        if self.files is None:
-            return ()
+        lifetimes = self.files.lifetimes if self.files else {}
         now = time.time()
         faults = {}
         if self._fault and self._is_fault_old:
-            faults[self._fault.path] = f"{self._fault.text}. {STAY}"
+            faults[self._fault.path] = f"{self._fault.text}. {STAY if self.files else NO_LINKS}"
         rows = []
-        for path in dict.fromkeys([*self.files.lifetimes, *faults]):
-            life = self.files.lifetimes.get(path)
+        for path in dict.fromkeys([*lifetimes, *faults]):
+            life = lifetimes.get(path)
             rows.append(
                 ZenohCertificateStatus(
                     file=path,

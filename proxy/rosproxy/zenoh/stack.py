@@ -340,6 +340,8 @@ class Zenoh:
         """Look up the addresses of a peer, and record why the link to the peer is down."""
         # If the name does not resolve now, the former addresses stay.
         link.addresses = tuple(await resolve(link.peer.host)) or link.addresses
+        if link.protocol != "tcp" and self._sites.files is None:
+            return  # the status has the fault of the file
         if self._note_own(link):
             await self._use_again()
         fault = None

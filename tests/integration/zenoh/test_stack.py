@@ -22,6 +22,7 @@ from rosproxy.net import sockets
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
 from rosproxy.zenoh import stack, status
+from rosproxy.zenoh.links import LinkFault
 from rosproxy.zenoh.protocol.report import (
     Report,
     RouterReport,
@@ -377,6 +378,39 @@ async def test_links_that_can_not_be_are_refused_at_the_start(
     for start in (zenoh.start, zenoh.try_ports):
         with pytest.raises(SettingError, match=complaint):
             await start()
+
+
+async def test_without_its_files_a_proxy_of_an_operator_runs_without_links(
+    make: Make,
+    files: Path,
+    tmp_path: Path,
+    lines: Lines,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A Secret may come later."""
+    monkeypatch.setattr(stack, "CHECK_INTERVAL_S", 0.05)
+    volume = tmp_path / "volume"
+    volume.mkdir()
+    zenoh = with_confirming_process(linked(make, volume, zenoh_await_files=True), tmp_path)
+    assert not await zenoh.try_ports()
+    await zenoh.start()
+    problems = zenoh._runtime.problems
+
+    def told() -> str:
+        return "; ".join(f"{problem.subject}: {problem.text}" for problem in problems.all())
+
+    await until(lambda: "the proxy has no links to other sites" in told(), told)
+    assert told().startswith(f"zenoh file {volume / certificates.CERTIFICATE}: can't be read: No")
+    await zenoh._look_at_links()
+    (link,) = zenoh.state.links
+    assert link.fault is LinkFault.NOT_TRIED
+    certificates.mount(volume, files)
+    await until(lambda: len(lines()) == 2, "the routers have the files")
+    before, after = (line["routers"] for line in lines())
+    assert [one == other for one, other in zip(before, after, strict=True)] == [True, False, True]
+    assert "127.0.2.7" not in str(before[1])
+    assert "tls/127.0.2.7:7447" in after[1]["connect/endpoints"]
+    await until(lambda: not told(), told)
 
 
 async def test_links_need_a_directory_for_sockets(

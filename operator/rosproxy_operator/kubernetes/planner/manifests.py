@@ -385,8 +385,8 @@ def _link_of(spec: RosProxySpec) -> LinkSpec | None:
 def _link_volume(link: LinkSpec) -> Json:
     """The volume with the files of the links.
 
-    The volume is optional, so that a proxy without its Secret starts and says which file is
-    missing. The kubelet adds files to the volume later.
+    The volume is optional, so that a proxy without its Secret serves its pods without links, and
+    says which file is missing. The kubelet adds files to the volume later.
     """
     items = [{"key": name, "path": name} for name in LINK_FILES.values()]
     secret = {"secretName": link.secret, "items": items, "optional": True}
