@@ -132,7 +132,7 @@ def test_rules_of_a_policy_are_taken(net: Namespace) -> None:
      {"ros": "zenoh", "listen": {"type": "LoadBalancer", "loadBalancerClass": "a.example/b"}},
      {"ros": "zenoh", "link": {"to": ["tls/cloud", "quic/[fd00::7]:7448"], "secretName": "a.b",
                                "limits": ["/camera/*=0.5Hz"],
-                               "policy": ["allow publish /a by /b", "deny serve *"]}},
+                               "policy": ["allow publish /a", "deny serve *"]}},
      {"ros": "zenoh", "peers": ["robot:7447", "[fd00::7]"], "podEgress": "Proxy"}],
 )  # fmt: skip
 def test_versions_of_ros_are_taken(spec: dict[str, Any], net: Namespace) -> None:
