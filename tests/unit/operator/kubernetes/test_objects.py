@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import RangeProbeStatus, read_status
-from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_PEERS
+from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
 from rosproxy.telemetry.problems import MOST_PROBLEMS
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.kubernetes.proxies import proxy_report as reports
@@ -330,15 +330,15 @@ def test_what_a_proxy_answers():
 def test_a_proxy_that_answers_too_much_causes_no_more_findings_than_another():
     """Each of 4,500 problems became a finding, and each fault of a peer an Event, 100 a second."""
     problems = [{"subject": f"zenoh peer h{number}", "holds": True} for number in range(4500)]
-    links = [
-        {"peer": f"h{number}:1", "hub": hub} for number in range(4500) for hub in (True, False)
-    ]
+    kinds: list[dict[str, object]] = [{}, {"hub": True}, {"protocol": "tls"}]
+    links = [{"peer": f"h{number}:1", **kind} for number in range(4500) for kind in kinds]
     answer = report(read_status({"problems": problems, "zenoh": {"links": links}}))
     assert len(answer.problems) == MOST_PROBLEMS
     assert answer.problems[-1].startswith("zenoh peer h4499: ")
     assert answer.zenoh is not None
     assert len(answer.zenoh.peers) == MOST_ZENOH_PEERS
     assert len(answer.zenoh.hubs) == MOST_ZENOH_HUBS
+    assert len(answer.zenoh.sites) == MOST_ZENOH_LINKS
 
 
 def test_a_long_text_of_a_proxy_is_cut_before_it_is_cleaned(monkeypatch):
