@@ -172,14 +172,14 @@ def _certificate(certificate: ZenohCertificateStatus) -> DoctorFinding | None:
 
 def link_subject(link: ZenohLinkStatus) -> str:
     """The subject of findings about a link."""
-    kind = "hub" if link.hub else "peer" if link.protocol == "tcp" else "link"
+    kind = "hub" if link.hub else "link" if link.is_to_site else "peer"
     return f"zenoh {kind} {link.title}"
 
 
 def _link_fault(link: ZenohLinkStatus) -> DoctorFinding:
     known = {fault.value: texts for fault, texts in _LINK_FAULTS.items()}
     text, fix = known.get(link.error, (link.error or "no session", _CHECK_PEER))
-    if link.protocol != "tcp":
+    if link.is_to_site:
         text, fix = _SITE_FAULTS.get(link.error, (text, fix))
     elif link.hub:
         fix = how_to("zenoh certificate")

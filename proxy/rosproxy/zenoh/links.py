@@ -93,7 +93,17 @@ class Link:
 
     def __str__(self) -> str:
         """The peer, for a link to another site with the protocol."""
-        return str(self.peer) if self.protocol == "tcp" else f"{self.protocol}/{self.peer}"
+        return f"{self.protocol}/{self.peer}" if self.is_to_site else str(self.peer)
+
+    @property
+    def is_to_site(self) -> bool:
+        """Whether the link leads to the proxy of another site."""
+        return self.protocol != "tcp"
+
+    @property
+    def is_to_router(self) -> bool:
+        """Whether the link leads to a router outside (``--zenoh-peer``)."""
+        return not self.is_hub and not self.is_to_site
 
     def note(self, fault: LinkFault | None, now: float) -> bool:
         """Note the state of the link. Return whether the state or the fault has changed."""

@@ -219,10 +219,10 @@ class Zenoh:
         for link in self.state.links:
             if self.state.is_up(link) and link.note(None, self._runtime.now()):
                 log.info("zenoh link up: %s", link)
-        if (
-            self._plan.directory
-        ):  # without, the hub dials its routers by TCP, and there are no rules
-            self._leave_out(own_peers(self._links_to_peers, report.routers))
+        # Without the directory, the hub dials its routers by TCP, and there are no rules.
+        if self._plan.directory:
+            to_routers = [link for link in self.state.links if link.is_to_router]
+            self._leave_out(own_peers(to_routers, report.routers))
 
     def _read(self, report: Report) -> Reading:
         """A reading of a report. After many tokens, the next tokens wait.
@@ -286,13 +286,9 @@ class Zenoh:
         plan = replace_plan(self._plan, peers=peers)
         return plan.configs(access, self._sites.config(plan.hub_socket))
 
-    @property
-    def _links_to_peers(self) -> list[Link]:
-        return [link for link in self.state.links if not link.is_hub and link.protocol == "tcp"]
-
     def _may_be_own(self, link: Link) -> bool:
         """Whether a peer has a port of the routers that hold the rules for containers."""
-        return link in self._links_to_peers and link.peer.port in self._plan.all_ports
+        return link.is_to_router and link.peer.port in self._plan.all_ports
 
     def _note_own(self, link: Link) -> bool:
         """Note a peer with an address of this machine. Return whether the peer is new."""
@@ -340,12 +336,12 @@ class Zenoh:
         """Look up the addresses of a peer, and record why the link to the peer is down."""
         # If the name does not resolve now, the former addresses stay.
         link.addresses = tuple(await resolve(link.peer.host)) or link.addresses
-        if link.protocol != "tcp" and self._sites.files is None:
+        if link.is_to_site and self._sites.files is None:
             return  # the status has the fault of the file
         if self._note_own(link):
             await self._use_again()
         fault = None
-        if link.peer in self._own_peers and link in self._links_to_peers:
+        if link.is_to_router and link.peer in self._own_peers:
             fault = LinkFault.ITSELF
         elif not self.state.is_up(link):
             fault = await try_link(link, self._client_for(link))

@@ -157,10 +157,9 @@ class ZenohState(Collector):
         """Whether the routers run, and have a session with the peer of a link."""
         at_links = self._settings.zenoh_link_listen
         listen = self._listen
-        to_site = link.protocol != "tcp"
-        if to_site:
+        if link.is_to_site:
             listen = frozenset([at_links.port] if at_links else [])
-        routers = (ends for at_link, ends in self._reading.routers if at_link is to_site)
+        routers = (ends for at_link, ends in self._reading.routers if at_link is link.is_to_site)
         return not self._process.failure and is_linked(link.peer, link.addresses, routers, listen)
 
     @property
