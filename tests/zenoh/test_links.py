@@ -350,3 +350,34 @@ def test_rules_for_links_leave_the_site_alone(lab: Lab) -> None:
     assert "answer" not in probe.output()
     graph.wait_for(f"^listed {publishers['status'].title} MP ", timeout=30)
     assert f"listed {publishers['private'].title} " not in graph.output()
+
+
+def test_a_link_to_the_proxy_itself_opens_no_way_past_the_rules(lab: Lab) -> None:
+    """Only the hub and the router of the links speak TLS."""
+    sites = Sites(lab)
+    host = lab.topology.places["px"].address
+    own = sites.files("own", host)
+    hub_port = ROUTER_PORT + 10
+    site_port = ROUTER_PORT + 11
+    parts = (certificates.KEY, certificates.CERTIFICATE, certificates.CA)
+    pem = "".join((own / part).read_text() for part in parts)
+    ports = [*PORTS.values(), hub_port, site_port]
+    lab.start_proxy(
+        *("--zenoh-hub-listen", str(hub_port), "--zenoh-hub-certificate", pem),
+        *("--zenoh-link-listen", f"tls/{site_port}", *written(own)),
+        *(word for port in ports for word in ("--zenoh-link", f"tls/{host}:{port}")),
+        *("--policy", "deny publish /denied"),
+        with_robot=False,
+    )
+    for role in PORTS:
+        lab.redirect(role)
+    received = {name: lab.node(VERSION, "c2", "sub", name) for name in ("allowed", "denied")}
+    sent = {name: sites.at_robot("pub", name) for name in received}
+    flows(received["allowed"])
+    faults = ["no TLS"] * len(PORTS) + ["no session"] * 2
+    wait_until("the faults are told", lambda: [k.error for k in lab.zenoh().links] == faults, 30)
+    sent["denied"].wait_for("^said")
+    flows(received["allowed"])
+    told = messages(received["allowed"])
+    assert told == [*range(told[0], told[-1] + 1)], "messages came twice"
+    assert "got" not in received["denied"].output()

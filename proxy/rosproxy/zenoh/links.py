@@ -121,6 +121,8 @@ def own_peers(links: Iterable[Link], routers: Sequence[RouterReport]) -> set[Hos
     The hub dials these routers by sockets, and access control distinguishes it from nodes by that.
     So at such a peer, the hub would be a node without rules. zenoh looks up the names of peers by
     itself. So if no link has the address, all names with the port count whose link is down.
+
+    A link to another site leads to no such router: these routers speak neither TLS nor QUIC.
     """
     own = {router.zid for router in routers}
     hub = routers[-1:]
