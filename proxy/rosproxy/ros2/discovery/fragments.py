@@ -1,14 +1,17 @@
-"""Announcements in fragments: hold the fragments until all have come, then rewrite and pass on.
+"""Announcements in fragments: gather the fragments, and pass on whole announcements alone.
 
 A long announcement of a reader or writer comes in several DATA_FRAG, of one or several datagrams.
 Cyclone DDS makes fragments of 1,344 bytes. A locator may begin in one fragment and end in the next.
-So the proxy holds the datagrams until the announcement is whole, and rewrites the announcement like
-any other. Then each fragment gets its part of the result. Fragments that the writer repeats later
-pass at once.
+So the proxy holds the fragments until the announcement is whole. Then the proxy makes a message
+with this announcement in one DATA, and rewrites and judges the message like any other.
+
+The proxy passes on no DATA_FRAG of a builtin writer. Otherwise a participant could join fragments
+of different announcements with the same sequence number: the sender chooses which fragments reach
+the participant. The policy would have judged each announcement, but not the joined one.
 
 If a reader requests an announcement again, the writer sends the first fragment alone, and waits for
-requests for the others. But the reader has not received the first fragment, which the proxy holds,
-and requests nothing. So the proxy requests the other fragments on behalf of the reader.
+requests for the others. But the reader never receives a fragment, and requests nothing. So the
+proxy requests the other fragments on behalf of the reader.
 
 Each participant has a store. So a participant can't displace the fragments of another one, until
 all stores together are too large. Then the proxy drops the largest store first.
@@ -19,45 +22,51 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import msgspec
-
-from rosproxy.ros2.protocol.reliable import nack_frag, withheld
+from rosproxy.ros2.protocol.addressing import says_something
+from rosproxy.ros2.protocol.reliable import nack_frag
 from rosproxy.ros2.protocol.rtps import (
     HEADER_BYTES,
+    INFO_DST,
+    PREFIX_BYTES,
     Fragments,
-    Overwrite,
     RtpsError,
     Sample,
     SubmessageId,
-    apply,
+    info_dst,
+    submessages,
 )
-from rosproxy.ros2.rewriting.discovery import ContentCounts, DiscoveryMessage, read_discovery
+from rosproxy.ros2.rewriting.discovery import (
+    BuiltinWriter,
+    ContentCounts,
+    DiscoveryMessage,
+    read_discovery,
+)
 
 LONGEST_ANNOUNCEMENT_BYTES = 60_000
 """Bytes of the longest announcement that the proxy accepts in fragments. Real announcements
-have a few thousand."""
+have a few thousand. A datagram holds 65,507 bytes, and Fast DDS receives at most 65,500."""
 SHORTEST_FRAGMENT_BYTES = 128
 """Bytes of the shortest fragment that the proxy accepts. Real fragments have over 1,000."""
+MOST_BYTES_IN_FRONT = 1024
+"""The highest number of bytes before an announcement in the proxy's message: the header, the
+destination, the time and the inline QoS. Real announcements need about 100."""
 MOST_BYTES = 1024 * 1024
-"""The highest number of bytes of a participant's announcements in a store, and of its waiting
-datagrams. Beyond either bound, the store drops the oldest."""
+"""The highest number of bytes of a participant's announcements in a store. Beyond this number, the
+store drops the oldest."""
 MOST_BYTES_OF_ALL = 16 * 1024 * 1024
 """The highest number of bytes of all stores together."""
 MOST_FRAGMENTS = 64
 """The highest number of DATA_FRAG in a datagram. A datagram of 64 KB holds fewer than 50 of Cyclone
 DDS."""
-OVERHEAD_BYTES = 1024
-"""Bytes that are added to the length of each announcement, and of each DATA_FRAG that waits."""
+OVERHEAD_BYTES = 1024 + MOST_BYTES_IN_FRONT
+"""Bytes that are added to the length of each announcement in a store."""
 
 Rewrite = Callable[[DiscoveryMessage], bytes]
 """Rewrites the whole announcements in a message. The length of the message stays."""
 
-_PAYLOAD_AT = HEADER_BYTES + 24
-"""Offset of the payload of a DATA without inline QoS that is the first submessage of a message."""
-
-_Key = tuple[int, bytes, int, int]
-"""Identifies an announcement: port of the proxy, GUID prefix, entity id of the writer, sequence
-number."""
+_Key = tuple[int, bytes, bytes, int, int]
+"""Identifies an announcement: port of the proxy, destination, GUID prefix, entity id of the writer,
+sequence number."""
 
 
 class PassedFragments(NamedTuple):
@@ -67,45 +76,57 @@ class PassedFragments(NamedTuple):
     questions: list[bytes]
 
 
+class _Part(NamedTuple):
+    """A DATA_FRAG of a message.
+
+    ``info_dst`` and ``info_ts`` are the submessages that state its destination and its time. Both
+    are empty if the message states none.
+    """
+
+    info_dst: bytes
+    info_ts: bytes
+    sample: Sample
+    fragments: Fragments
+
+
 @dataclass(slots=True)
 class _PendingSample:
     """The fragments of a sample, by their numbers.
 
     ``total`` is the bytes of the sample, and ``size`` the bytes of each fragment but the last.
-    ``whole`` is the rewritten payload when all fragments have come; empty if the announcement is
-    hidden.
+    ``front`` is the beginning of the message with the whole sample, up to the payload. The first
+    fragment determines this part.
     """
 
     total: int
     size: int
+    front: bytes = b""
     fragments: dict[int, bytes] = field(default_factory=dict)
-    whole: bytes | None = None
 
     @property
     def cost(self) -> int:
         """The bytes that the sample counts for."""
         return self.total + OVERHEAD_BYTES
 
-
-class _WaitingDatagram(msgspec.Struct, frozen=True):
-    """A datagram that waits, rewritten except for the fragments.
-
-    ``port`` is the port of the proxy at which the datagram came.
-    """
-
-    port: int
-    fragments: tuple[tuple[Sample, Fragments], ...]
-    datagram: bytes
+    @property
+    def count(self) -> int:
+        """The number of fragments of the sample."""
+        return -(-self.total // self.size)
 
     @property
-    def cost(self) -> int:
-        """The bytes that the datagram counts for."""
-        return len(self.datagram) + len(self.fragments) * OVERHEAD_BYTES
+    def is_whole(self) -> bool:
+        """Whether all fragments have come."""
+        return len(self.fragments) == self.count
 
     @property
-    def keys(self) -> set[_Key]:
-        """The keys of the announcements of which the datagram has fragments."""
-        return {_key(self.port, sample) for sample, _ in self.fragments}
+    def missing(self) -> list[int]:
+        """The numbers of the fragments that have not come."""
+        return [number for number in range(1, self.count + 1) if number not in self.fragments]
+
+    @property
+    def message(self) -> bytes:
+        """The message with the whole sample."""
+        return self.front + b"".join(self.fragments[number] for number in sorted(self.fragments))
 
 
 @dataclass(slots=True)
@@ -132,16 +153,15 @@ class FragmentStores:
         store = self.by_prefix.setdefault(message.prefix, FragmentStore())
         before = store.size
         try:
-            # Before the store gathers these fragments, or each would count as repeated.
-            missing = store.missing(port, message)
-            released = store.rewritten(port, message, rewrite)
+            joined, missing = store.gather(port, message)
         finally:
             # The store may have kept some fragments of a malformed message, too.
             self.size += store.size - before
             while self.size > MOST_BYTES_OF_ALL:
                 self.forget(max(self.by_prefix, key=lambda prefix: self.by_prefix[prefix].size))
         return PassedFragments(
-            released, [self._question(message, reader, *pair) for pair in missing]
+            _passed(message, joined, rewrite),
+            [self._question(message, reader, *pair) for pair in missing],
         )
 
     def _question(
@@ -164,188 +184,101 @@ class FragmentStores:
 
 @dataclass(slots=True)
 class FragmentStore:
-    """The announcements of a participant that came in fragments, and the datagrams that wait.
+    """The announcements of a participant of which some fragments have come.
 
-    The waiting datagrams have ascending numbers. ``_waiting_by_key`` has the numbers of the
-    datagrams with fragments of an announcement.
+    ``size`` is the bytes of the announcements.
     """
 
+    size: int = 0
     _samples: dict[_Key, _PendingSample] = field(default_factory=dict)
-    _waiting_datagrams: dict[int, _WaitingDatagram] = field(default_factory=dict)
-    _waiting_by_key: dict[_Key, set[int]] = field(default_factory=dict)
-    _last_number: int = 0
-    _sample_bytes: int = 0
-    _waiting_bytes: int = 0
 
-    @property
-    def size(self) -> int:
-        """The bytes of the announcements, and of the datagrams that wait."""
-        return self._sample_bytes + self._waiting_bytes
+    def gather(
+        self, port: int, message: DiscoveryMessage
+    ) -> tuple[list[bytes], list[tuple[Sample, list[int]]]]:
+        """Gather the fragments of a message.
 
-    def missing(self, port: int, message: DiscoveryMessage) -> list[tuple[Sample, list[int]]]:
-        """The samples of which a fragment came again, and the numbers of the missing fragments."""
-        missing_by_key = dict[_Key, tuple[Sample, list[int]]]()
-        for sample, frags in message.fragments:
-            key = _key(port, sample)
-            gathered = self._samples.get(key)
-            is_repeated = gathered and gathered.whole is None and frags.first in gathered.fragments
-            if gathered and is_repeated and key not in missing_by_key:
-                count = -(-gathered.total // gathered.size)
-                missing = [n for n in range(1, count + 1) if n not in gathered.fragments]
-                if missing:
-                    missing_by_key[key] = sample, missing
-        return list(missing_by_key.values())
-
-    def rewritten(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> list[bytes]:
-        """Gather the fragments of a message, and return the rewritten datagrams that may pass now.
-
-        See `FragmentStores.rewritten`.
+        Return the messages with the announcements that are whole now. Return also the samples of
+        which a fragment came again, with the numbers of their missing fragments. Raises RtpsError.
         """
         if len(message.fragments) > MOST_FRAGMENTS:
             raise RtpsError(f"the datagram has more than {MOST_FRAGMENTS} fragments")
-        # This rewrites the whole announcements of the datagram; `_filled` rewrites the fragments.
-        arrived = _WaitingDatagram(port, message.fragments, rewrite(message))
-        completed = self._gather_all(port, message, rewrite)
-        released = [self._filled(datagram) for datagram in self._released(completed)]
-        if self._is_whole(arrived):  # also if the fragments repeat whole announcements
-            return [*released, self._filled(arrived)]
-        self._hold(arrived)
-        return released
+        parts = list(_parts(message))
+        by_key = {_key(port, part): part.sample for part in parts}
+        repeated = [_key(port, part) for part in parts if self._has(port, part)]
+        for part in parts:
+            self._gather(port, message, part)
+        # The store may have dropped an announcement to make room for the next one.
+        kept = {key: self._samples[key] for key in by_key if key in self._samples}
+        whole = {key: pending for key, pending in kept.items() if pending.is_whole}
+        size = sum(pending.total for pending in whole.values())
+        if size > LONGEST_ANNOUNCEMENT_BYTES:
+            text = f"more than {LONGEST_ANNOUNCEMENT_BYTES} bytes"
+            raise RtpsError(f"the datagram completes announcements of {text}")
+        for key in whole:
+            self._drop(key)
+        missing = {key: self._samples[key].missing for key in repeated if key in self._samples}
+        return (
+            [pending.message for pending in whole.values()],
+            [(by_key[key], numbers) for key, numbers in missing.items()],
+        )
 
-    def _released(self, completed: Iterable[_Key]) -> list[_WaitingDatagram]:
-        """The waiting datagrams whose announcements are all whole now, in order of arrival.
+    def _has(self, port: int, part: _Part) -> bool:
+        pending = self._samples.get(_key(port, part))
+        return pending is not None and part.fragments.first in pending.fragments
 
-        ``completed`` are the announcements that have just become whole.
-        """
-        numbers = set[int]().union(*(self._waiting_by_key.get(key, ()) for key in completed))
-        whole = [n for n in sorted(numbers) if self._is_whole(self._waiting_datagrams[n])]
-        return [self._let_go(number) for number in whole]
+    def _gather(self, port: int, message: DiscoveryMessage, part: _Part) -> None:
+        """Gather the fragments of a DATA_FRAG. Raises RtpsError."""
+        sample = part.sample
+        if sample.writer == BuiltinWriter.PARTICIPANTS:
+            # The proxy has to notice each announcement and each end of a participant. Cyclone DDS
+            # refuses such fragments as well (ddsi_receive.c, handle_DataFrag).
+            raise RtpsError("a participant announces itself in fragments")
+        pending = self._pending(_key(port, part), part.fragments)
+        payloads = dict(_payloads(message.datagram, sample, part.fragments))
+        if 1 in payloads:
+            pending.front = _front(message.datagram, part)
+        pending.fragments.update(payloads)
 
-    def _hold(self, datagram: _WaitingDatagram) -> None:
-        """Let a datagram wait. Drop the oldest datagrams beyond MOST_BYTES."""
-        self._last_number += 1
-        self._waiting_datagrams[self._last_number] = datagram
-        self._waiting_bytes += datagram.cost
-        for key in datagram.keys:
-            self._waiting_by_key.setdefault(key, set()).add(self._last_number)
-        while self._waiting_bytes > MOST_BYTES:
-            self._let_go(next(iter(self._waiting_datagrams)))
-
-    def _let_go(self, number: int) -> _WaitingDatagram:
-        """Take a datagram out of those that wait."""
-        datagram = self._waiting_datagrams.pop(number)
-        self._waiting_bytes -= datagram.cost
-        for key in datagram.keys:
-            numbers = self._waiting_by_key[key]
-            numbers.discard(number)
-            if not numbers:
-                del self._waiting_by_key[key]
-        return datagram
-
-    def _gather_all(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> set[_Key]:
-        """Gather the fragments of a message, and return the announcements that are whole now.
-
-        All announcements that a message completes count as one announcement, and as part of the
-        datagram, because the proxy reads all of them in one step. Raises RtpsError.
-        """
-        completed = set[_Key]()
-        size = 0
-        contents = ContentCounts()
-        for announcement in message.announcements:
-            contents.add(announcement)
-        for sample, frags in message.fragments:
-            gathered = self._gather(port, message, sample, frags)
-            if gathered is not None:
-                size += gathered.total
-                if size > LONGEST_ANNOUNCEMENT_BYTES:
-                    text = f"more than {LONGEST_ANNOUNCEMENT_BYTES} bytes"
-                    raise RtpsError(f"the datagram completes announcements of {text}")
-                _complete(gathered, message, sample, rewrite, contents)
-                completed.add(_key(port, sample))
-        return completed
-
-    def _gather(
-        self, port: int, message: DiscoveryMessage, sample: Sample, frags: Fragments
-    ) -> _PendingSample | None:
-        """Gather the fragments of a DATA_FRAG. Return the sample if all its fragments have come.
-
-        Raises RtpsError.
-        """
-        gathered = self._gathered(port, sample, frags)
-        payloads = dict(_payloads(message.datagram, sample, frags))
-        if gathered.whole is not None:
-            return None
-        gathered.fragments.update(payloads)
-        is_complete = len(gathered.fragments) == -(-frags.total // frags.size)
-        return gathered if is_complete else None
-
-    def _gathered(self, port: int, sample: Sample, frags: Fragments) -> _PendingSample:
-        """The gathered fragments of a sample.
+    def _pending(self, key: _Key, fragments: Fragments) -> _PendingSample:
+        """The fragments of a sample.
 
         Raises RtpsError if the size is outside the limits, or differs from that of a former
         fragment.
         """
-        if (
-            frags.size < SHORTEST_FRAGMENT_BYTES
-            or not 0 < frags.total <= LONGEST_ANNOUNCEMENT_BYTES
-        ):
-            text = f"an announcement has {frags.total} bytes in fragments of {frags.size} bytes"
+        total = fragments.total
+        size = fragments.size
+        if size < SHORTEST_FRAGMENT_BYTES or not 0 < total <= LONGEST_ANNOUNCEMENT_BYTES:
+            text = f"an announcement has {total} bytes in fragments of {size} bytes"
             raise RtpsError(f"{text}, which is outside the limits")
-        gathered = self._samples.get(_key(port, sample))
-        if gathered is None:
-            gathered = self._samples[_key(port, sample)] = _PendingSample(frags.total, frags.size)
-            self._sample_bytes += gathered.cost
-            while self._sample_bytes > MOST_BYTES:
-                self._sample_bytes -= self._samples.pop(next(iter(self._samples))).cost
-        if (gathered.total, gathered.size) != (frags.total, frags.size):
+        pending = self._samples.get(key)
+        if pending is None:
+            pending = self._samples[key] = _PendingSample(total, size)
+            self.size += pending.cost
+            while self.size > MOST_BYTES:
+                self._drop(next(iter(self._samples)))
+        if (pending.total, pending.size) != (total, size):
             raise RtpsError("the fragments of an announcement differ in size")
-        return gathered
+        return pending
 
-    def _whole(self, port: int, sample: Sample) -> bytes | None:
-        gathered = self._samples.get(_key(port, sample))
-        return gathered.whole if gathered else None
-
-    def _is_whole(self, datagram: _WaitingDatagram) -> bool:
-        return all(self._whole(datagram.port, s) is not None for s, _ in datagram.fragments)
-
-    def _filled(self, datagram: _WaitingDatagram) -> bytes:
-        """The datagram with its parts of the rewritten announcements."""
-        edits = list[Overwrite]()
-        for sample, frags in datagram.fragments:
-            whole = self._whole(datagram.port, sample)
-            if not whole:
-                edits.append(withheld(sample))
-            elif sample.payload:
-                start = (frags.first - 1) * frags.size
-                size = sample.payload.end - sample.payload.start
-                edits.append(Overwrite(sample.payload.start, whole[start : start + size]))
-        return apply(datagram.datagram, edits)
+    def _drop(self, key: _Key) -> None:
+        self.size -= self._samples.pop(key).cost
 
 
-def _key(port: int, sample: Sample) -> _Key:
-    return port, sample.prefix, sample.writer, sample.sequence
+def _key(port: int, part: _Part) -> _Key:
+    return port, part.info_dst, part.sample.prefix, part.sample.writer, part.sample.sequence
 
 
-def _complete(
-    gathered: _PendingSample,
-    message: DiscoveryMessage,
-    sample: Sample,
-    rewrite: Rewrite,
-    contents: ContentCounts,
-) -> None:
-    """Rewrite an announcement of which all fragments have come. Raises RtpsError.
-
-    ``contents`` counts what the announcements of the datagram contain.
-    """
-    payload = b"".join(gathered.fragments[number] for number in sorted(gathered.fragments))
-    whole = read_discovery(_as_data(message.datagram, sample, payload))
-    for announcement in whole.announcements:
-        contents.add(announcement)
-    edited = rewrite(whole)
-    # `rewrite` has turned a hidden announcement into a GAP (`withheld`).
-    hidden = edited[HEADER_BYTES] == SubmessageId.GAP
-    gathered.whole = b"" if hidden else edited[_PAYLOAD_AT:]
-    gathered.fragments.clear()
+def _parts(message: DiscoveryMessage) -> Iterator[_Part]:
+    """Yield the DATA_FRAG of a message."""
+    by_start = {sample.body.start: (sample, fragments) for sample, fragments in message.fragments}
+    to = stamp = b""
+    for kind, _, body in submessages(message.datagram):
+        if kind == INFO_DST:
+            to = info_dst(message.datagram[body.start : body.start + PREFIX_BYTES])
+        elif kind == SubmessageId.INFO_TS:
+            stamp = message.datagram[body.start - 4 : body.end]
+        elif body.start in by_start:
+            yield _Part(to, stamp, *by_start[body.start])
 
 
 def _payloads(datagram: bytes, sample: Sample, frags: Fragments) -> Iterator[tuple[int, bytes]]:
@@ -366,10 +299,41 @@ def _payloads(datagram: bytes, sample: Sample, frags: Fragments) -> Iterator[tup
         offset += size
 
 
-def _as_data(datagram: bytes, sample: Sample, payload: bytes) -> bytes:
-    """The message that carries the whole payload of a sample in a DATA."""
-    payload_flag = 0x08 if sample.is_key_only else 0x04
-    head = struct.pack("<BBHHH", SubmessageId.DATA, 0x01 | payload_flag, 0, 0, 16)
-    head += struct.pack(">II", sample.reader, sample.writer)
-    head += struct.pack("<iI", sample.sequence >> 32, sample.sequence & 0xFFFFFFFF)
-    return datagram[:HEADER_BYTES] + head + payload
+def _front(datagram: bytes, part: _Part) -> bytes:
+    """The beginning of the message with the whole sample of a DATA_FRAG, up to the payload.
+
+    Raises RtpsError if this part is too long.
+    """
+    sample = part.sample
+    order, little = ("<", 0x01) if sample.is_little_endian else (">", 0)
+    qos = sample.inline_qos
+    inline = datagram[qos.start : qos.end] if qos else b""
+    flags = little | (0x02 if qos else 0) | (0x08 if sample.is_key_only else 0x04)
+    fixed = struct.pack(">II", sample.reader, sample.writer)
+    fixed += struct.pack(order + "iI", sample.sequence >> 32, sample.sequence & 0xFFFFFFFF)
+    size = 4 + len(fixed) + len(inline) + part.fragments.total
+    head = datagram[:HEADER_BYTES] + part.info_dst + part.info_ts
+    if len(head) + len(inline) + 24 > MOST_BYTES_IN_FRONT:
+        text = f"more than {MOST_BYTES_IN_FRONT} bytes"
+        raise RtpsError(f"{text} are in front of an announcement in fragments")
+    return (
+        head + struct.pack(order + "BBHHH", SubmessageId.DATA, flags, size, 0, 16) + fixed + inline
+    )
+
+
+def _passed(message: DiscoveryMessage, joined: Iterable[bytes], rewrite: Rewrite) -> list[bytes]:
+    """The rewritten datagrams of a message with fragments. Raises RtpsError.
+
+    These are the messages ``joined`` with the announcements that are whole now, and the rest of the
+    message without its fragments. The rest may have heartbeats, so it comes last. All announcements
+    count as part of the datagram, because the proxy reads all of them in one step.
+    """
+    whole = list(map(read_discovery, joined))
+    contents = ContentCounts()
+    for each in (message, *whole):
+        for announcement in each.announcements:
+            contents.add(announcement)
+    rest = rewrite(message) if message.announcements else message.datagram
+    for sample, _ in reversed(message.fragments):
+        rest = rest[: sample.body.start - 4] + rest[sample.body.end :]
+    return [*map(rewrite, whole), *([rest] if says_something(rest) else [])]

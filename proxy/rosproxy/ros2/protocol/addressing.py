@@ -100,6 +100,11 @@ def is_destination(datagram: bytes, prefix: bytes) -> bool:
     return any(datagram[start : start + PREFIX_BYTES] == prefix for start in info_dst)
 
 
+def says_something(datagram: bytes) -> bool:
+    """Whether a message has more than submessages that qualify others. Raises RtpsError."""
+    return any(kind not in _NAMELESS for kind, _, _ in submessages(datagram))
+
+
 def destinations(datagram: bytes) -> set[bytes]:
     """The GUID prefixes of all participants that a message is for; empty if a part is for all.
 

@@ -6,8 +6,8 @@ other submessages unchanged: heartbeats, acknowledgements, and submessages of a 
 
 The proxy never encodes a received message anew. This module returns positions, and an edit
 (`Overwrite`) keeps the length of the datagram. So all bytes outside the edits stay, also those of
-unknown versions and vendors. There is one exception: `by_source` splits a message of several
-participants into a message for each.
+unknown versions and vendors. There are two exceptions: `by_source` splits a message of several
+participants into a message for each, and `FragmentStores` joins the fragments of a sample.
 
 The numbers are bytes:
 
@@ -228,7 +228,7 @@ def by_source(datagram: bytes) -> list[bytes]:
     source_prefix(datagram)
     header = datagram[:HEADER_BYTES]
     start = HEADER_BYTES
-    info_dst = b""
+    named = b""
     messages = list[bytes]()
     for submessage_id, _, body in submessages(datagram):
         if submessage_id == _INFO_SRC:
@@ -237,18 +237,18 @@ def by_source(datagram: bytes) -> list[bytes]:
                 messages.append(header + datagram[start : body.start - 4])
             source_offset = body.start + 4
             header = (
-                MAGIC + datagram[source_offset : source_offset + VERSION_TO_PREFIX_BYTES] + info_dst
+                MAGIC + datagram[source_offset : source_offset + VERSION_TO_PREFIX_BYTES] + named
             )
             start = body.end
         elif submessage_id == INFO_DST:
             # Only the prefix: an INFO_DST may be longer, and each part repeats this submessage.
-            info_dst = _info_dst(datagram[body.start : body.start + PREFIX_BYTES])
+            named = info_dst(datagram[body.start : body.start + PREFIX_BYTES])
     if not messages and start == HEADER_BYTES:
         return [datagram]
     return [*messages, header + datagram[start:]] if start < len(datagram) else messages
 
 
-def _info_dst(prefix: bytes) -> bytes:
+def info_dst(prefix: bytes) -> bytes:
     """The submessage that names the destination of the next submessages."""
     return struct.pack("<BBH", INFO_DST, _LITTLE, PREFIX_BYTES) + prefix
 

@@ -123,7 +123,7 @@ def test_a_peers_discovery_in_fragments_is_policed() -> None:
     port = data_port(domain)
     first, second = in_fragments(B)
     assert domain.at_range_port(port, first, ROBOT, NOW) == []
-    assert kinds(domain.at_range_port(port, second, ROBOT, NOW)) == [GAP, GAP]
+    assert kinds(domain.at_range_port(port, second, ROBOT, NOW)) == [GAP]
 
 
 def test_fragments_at_both_ports_of_a_participant_do_not_make_a_whole() -> None:
@@ -213,7 +213,7 @@ def test_what_inside_announces_at_a_stand_in_for_user_data_is_policed(vendor: by
     assert kinds(domain.at_stand_in(port, announced, INSIDE, NOW)) == [GAP]
     first, second = in_fragments(A)
     assert domain.at_stand_in(port, first, INSIDE, NOW) == []
-    assert kinds(domain.at_stand_in(port, second, INSIDE, NOW)) == [GAP, GAP]
+    assert kinds(domain.at_stand_in(port, second, INSIDE, NOW)) == [GAP]
     said = message(USER[20:], prefix=A)
     assert domain.at_stand_in(port, said, INSIDE, NOW) == [Outgoing(HostPort(ROBOT, 7411), said)]
 

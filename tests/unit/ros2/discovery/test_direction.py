@@ -147,8 +147,7 @@ def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
     assert domain.at_stand_in(20_000, elsewhere, INSIDE, NOW) == []
 
 
-def test_each_fragment_goes_to_the_reader_that_it_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The last fragment releases the fragments for all readers."""
+def test_joined_fragments_go_to_the_reader_that_these_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "rosproxy.ros2.ports.stand_ins.order_for", lambda key, ports: iter([20_000])
     )
@@ -168,7 +167,7 @@ def test_each_fragment_goes_to_the_reader_that_it_names(monkeypatch: pytest.Monk
         reader: [out.target.port for out in sent if destination(out.datagram) == reader]
         for reader in readers
     }
-    assert to_each == {readers[0]: [7420, 7420], readers[1]: [7430, 7430]}
+    assert to_each == {readers[0]: [7420], readers[1]: [7430]}
 
 
 def test_who_is_not_named_has_not_been_met(monkeypatch: pytest.MonkeyPatch) -> None:
