@@ -41,8 +41,9 @@ Each datagram may be forged. So these rules hold:
   the proxy charges only the datagrams that it sends in consequence.
 """
 
-from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import islice
 
 from msgspec.structs import replace
@@ -151,6 +152,7 @@ class Domain:
         discovery_participant = DiscoveryParticipant(discovery_prefix)
         self.owners = PrefixOwners(settings, inside, outside, former_ports, proofs)
         self.rediscovery = Rediscovery(settings, inside, outside, self.to_inside)
+        self._steps = deque[Callable[[], list[Outgoing]]]()
         self._questions: Iterator[Outgoing] = iter(())
         self._has_questions = False
         self.fragments = fragments = FragmentStores()
@@ -169,7 +171,7 @@ class Domain:
         Hundreds of participants may have to rediscover hundreds of others. So the proxy does the
         work in parts.
         """
-        return self._has_questions or self.rediscovery.is_busy
+        return bool(self._steps) or self._has_questions or self.rediscovery.is_busy
 
     def heard_inside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """Handle a datagram from inside, at the multicast group or at the well-known port."""
@@ -346,16 +348,20 @@ class Domain:
         Calls come twice a second. Between these calls, `go_on` does the parts of the work.
         """
         self._questions = self.former_ports.repeated_questions(now)
+        self._has_questions = True
         self.rediscovery.look_for_due()
         return self.go_on(now)
 
     def go_on(self, now: float) -> list[Outgoing]:
         """Do the next part of the work; see `is_busy`. A part takes some milliseconds."""
-        questions = list(islice(self._questions, MOST_DATAGRAMS_PER_PART))
-        self._has_questions = len(questions) == MOST_DATAGRAMS_PER_PART
+        sent = self._next_steps()
+        if len(sent) >= MOST_DATAGRAMS_PER_PART:
+            return sent
+        sent += islice(self._questions, MOST_DATAGRAMS_PER_PART - len(sent))
+        self._has_questions = len(sent) == MOST_DATAGRAMS_PER_PART
         if self._has_questions:
-            return questions
-        return questions + self.rediscovery.next_datagrams(now)
+            return sent
+        return sent + self.rediscovery.next_datagrams(now)
 
     def admit(self, prefix: bytes, now: float) -> list[Outgoing]:
         """Serve a participant inside that has waited because of its former ports.
@@ -390,12 +396,8 @@ class Domain:
             self.proxy_participants.discovery_participant.dispose_message()
         )
         self.settings.hosts = hosts
-        for insider in self.inside.by_prefix.values():
-            try:
-                sent += self.rediscovery.move(insider)
-            except RtpsError as error:  # continue with the other participants
-                sent += self._drop("malformed", insider.address, str(error))
-        return sent + self.rediscovery.next_datagrams(now)
+        self._do_later(self._move, self.inside.by_prefix.values())
+        return sent + self.go_on(now)
 
     def retire(self, now: float) -> list[Outgoing]:
         """Let the participants of both sides forget each other, because no proxy takes over now.
@@ -403,12 +405,9 @@ class Domain:
         A proxy may start later and serve the participants that still live. Both sides discover
         each other then only if they have forgotten each other (`Rediscovery`).
         """
-        sent = list[Outgoing]()
         self.former_ports.forget({insider.address for insider in self.inside.by_prefix.values()})
-        for insider in list(self.inside.by_prefix.values()):
-            self.disposal.forget_inside(insider)  # before the work that remains to be done
-            sent += self.rediscovery.separate(insider)
-        return sent + self.rediscovery.next_datagrams(now)
+        self._do_later(self._retire, self.inside.by_prefix.values())
+        return self.go_on(now)
 
     def standing(self, source: str) -> Standing:
         """The standing of a source, on which its allowance for discovery depends."""
@@ -449,15 +448,46 @@ class Domain:
         return sent
 
     def end_participants_at(self, addresses: Collection[str]) -> list[Outgoing]:
-        """End the participants whose inside address is gone. Return the datagrams for outside.
+        """End the participants whose inside address is gone. Return the first datagrams.
 
-        Without this, outside would keep these participants until the end of their lease durations.
+        `go_on` ends the other participants; see `is_busy`. Without this, outside would keep these
+        participants until the end of their lease durations.
         """
         self.former_ports.forget(addresses)
+        leavers = [p for p in self.inside.by_prefix.values() if p.address in addresses]
+        self._do_later(self.disposal.end_inside, leavers)
+        return self._next_steps()
+
+    def _do_later(
+        self,
+        step: Callable[[InsideParticipant], list[Outgoing]],
+        insiders: Iterable[InsideParticipant],
+    ) -> None:
+        """Let `go_on` do a step for each participant inside, unless the participant has gone."""
+        self._steps += [partial(self._step_known, step, insider) for insider in insiders]
+
+    def _next_steps(self) -> list[Outgoing]:
+        """Do the next steps, until these lead to MOST_DATAGRAMS_PER_PART."""
         sent = list[Outgoing]()
-        for leaver in [p for p in self.inside.by_prefix.values() if p.address in addresses]:
-            sent += self.disposal.end_inside(leaver)
+        while self._steps and len(sent) < MOST_DATAGRAMS_PER_PART:
+            sent += self._steps.popleft()()
         return sent
+
+    def _step_known(
+        self, step: Callable[[InsideParticipant], list[Outgoing]], insider: InsideParticipant
+    ) -> list[Outgoing]:
+        is_known = self.inside.by_prefix.get(insider.prefix) is insider
+        return step(insider) if is_known else []
+
+    def _move(self, insider: InsideParticipant) -> list[Outgoing]:
+        try:
+            return self.rediscovery.move(insider)
+        except RtpsError as error:  # continue with the other participants
+            return self._drop("malformed", insider.address, str(error))
+
+    def _retire(self, insider: InsideParticipant) -> list[Outgoing]:
+        self.disposal.forget_inside(insider)  # before the work that remains to be done
+        return self.rediscovery.separate(insider)
 
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         prefix = message.prefix

@@ -202,9 +202,9 @@ class DomainServer:
 
     def end(self, addresses: Collection[str]) -> int:
         """End the participants at addresses that are gone. Return the number of participants."""
-        before = len(self.domain.inside.by_prefix)
-        self._send(self.domain.end_participants_at(addresses))
-        return before - len(self.domain.inside.by_prefix)
+        count = sum(p.address in addresses for p in self.domain.inside.by_prefix.values())
+        self._send_and_go_on(self.domain.end_participants_at(addresses))
+        return count
 
     def retire(self) -> int:
         """End all participants inside, because no proxy takes over.

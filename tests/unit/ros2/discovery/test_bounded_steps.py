@@ -1,7 +1,10 @@
 """Many participants inside discover many outside: a few at a time, and all in the end."""
 
 from collections import Counter
+from functools import partial
 from itertools import chain
+
+import pytest
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortMap, PortRange
@@ -165,6 +168,33 @@ def test_questions_about_former_ports_are_repeated_in_parts() -> None:
     every = parts(domain, domain.continue_pending(0.5), 0.5)
     assert max(map(len, every)) <= MOST_DATAGRAMS_PER_PART
     assert sum(map(len, every)) == 4 * 4 * MOST_PER_ADDRESS
+
+
+@pytest.mark.parametrize("change", ["move", "retire", "end"])
+def test_a_change_for_all_participants_is_made_in_parts(change: str) -> None:
+    """With 128 inside and 4 peers, one step sent over 16,000 datagrams."""
+    domain = among_peers(Policy())
+    changes = {
+        "move": partial(domain.move_to, ("10.0.0.5",), NOW),
+        "retire": partial(domain.retire, NOW),
+        "end": partial(domain.end_participants_at, {INSIDE}),
+    }
+    every = parts(domain, changes[change](), NOW)
+    assert max(map(len, every)) < MOST_DATAGRAMS_PER_PART + 2 * PORTS_OF_ALL
+    of_inside = [out for out in chain(*every) if inside(0)[:11] in out.datagram]
+    assert len(of_inside) == INSIDE_COUNT * PORTS_OF_ALL
+    assert len(domain.inside.by_prefix) == (INSIDE_COUNT if change == "move" else 0)
+
+
+def test_a_participant_that_has_gone_before_its_part_is_left_out() -> None:
+    domain = among_peers(Policy())
+    *_, last = domain.inside.by_prefix.values()
+    sent = domain.end_participants_at({INSIDE})
+    assert domain.is_busy
+    domain.disposal.forget_inside(last)
+    sent += finished(domain, [])
+    assert len(sent) == (INSIDE_COUNT - 1) * PORTS_OF_ALL
+    assert not any(last.prefix in out.datagram for out in sent)
 
 
 def test_addresses_take_turns() -> None:
