@@ -14,10 +14,15 @@ from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.addressing import may_be_discovery
 from rosproxy.ros2.protocol.parameters import FastDdsPid
 from rosproxy.ros2.protocol.ros_names import ros_node
-from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_vendor
+from rosproxy.ros2.protocol.rtps import RtpsError, by_source, samples, source_vendor
 from rosproxy.ros2.registry.matching import Comparison, compare
 from rosproxy.ros2.registry.participants import EndpointKind, Participant
-from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, rewritten
+from rosproxy.ros2.rewriting.discovery import (
+    BuiltinWriter,
+    DiscoveryMessage,
+    read_discovery,
+    rewritten,
+)
 from tests.unit.ros2.discovery.domains import HOST, NOW, B, make_domain, spdp
 from tests.unit.ros2.recorded import PUBLISHER, SUBSCRIBER, VENDORS, Datagram, recorded
 
@@ -157,6 +162,25 @@ def test_two_that_meet_through_the_proxy(vendor: str) -> None:
     assert all(inet_aton(PUBLISHER) not in datagram for datagram in outwards)
     assert not domain.inside.by_prefix  # both have ended
     assert not domain.outside.by_prefix
+
+
+def test_fragments_of_cyclone_dds_go_on_as_a_whole() -> None:
+    domain = make_domain(peers=(SUBSCRIBER,), lan_relay=None)
+    sent = [out for datagram in recorded("cyclone") for out in passed(domain, datagram)]
+    outwards = [out.datagram for out in sent if out.target.host == SUBSCRIBER]
+    (found,) = [
+        (sample, datagram)
+        for datagram in outwards
+        for sample in samples(datagram)
+        if sample.writer == BuiltinWriter.PUBLICATIONS and not sample.is_key_only
+    ]
+    (sample, datagram) = found
+    assert sample.fragments is None
+    assert sample.payload
+    total = {f.total for message in messages("cyclone") for _, f in message.fragments}
+    assert {sample.payload.end - sample.payload.start} == total
+    (announcement,) = read_discovery(datagram).announcements
+    assert announcement.topic(datagram) == "rt/chatter"
 
 
 def _endpoints(participants: Iterable[Participant]) -> set[tuple[EndpointKind, str]]:

@@ -11,7 +11,9 @@ the participant. The policy would have judged each announcement, but not the joi
 
 If a reader requests an announcement again, the writer sends the first fragment alone, and waits for
 requests for the others. But the reader never receives a fragment, and requests nothing. So the
-proxy requests the other fragments on behalf of the reader.
+proxy requests the missing fragments on behalf of the reader. If those that have come were for all
+readers, the proxy requests all fragments: Cyclone DDS sends requested fragments to one reader alone
+(ddsi_receive.c, handle_NackFrag).
 
 Each participant has a store. So a participant can't displace the fragments of another one, until
 all stores together are too large. Then the proxy drops the largest store first.
@@ -70,7 +72,7 @@ sequence number."""
 
 
 class PassedFragments(NamedTuple):
-    """Datagrams to pass on, and requests for missing fragments to send back."""
+    """Datagrams to pass on, and requests for fragments to send back."""
 
     forwarded: list[bytes]
     questions: list[bytes]
@@ -79,8 +81,8 @@ class PassedFragments(NamedTuple):
 class _Part(NamedTuple):
     """A DATA_FRAG of a message.
 
-    ``info_dst`` and ``info_ts`` are the submessages that state its destination and its time. Both
-    are empty if the message states none.
+    ``info_dst`` and ``info_ts`` are the submessages that state its destination and its time. Each
+    is empty if the message states none. Without a destination, the DATA_FRAG is for all readers.
     """
 
     info_dst: bytes
@@ -118,10 +120,11 @@ class _PendingSample:
         """Whether all fragments have come."""
         return len(self.fragments) == self.count
 
-    @property
-    def missing(self) -> list[int]:
-        """The numbers of the fragments that have not come."""
-        return [number for number in range(1, self.count + 1) if number not in self.fragments]
+    def to_request(self, part: _Part) -> Sequence[int]:
+        """The numbers of the fragments to request, if a part comes again."""
+        numbers = range(1, self.count + 1)
+        is_for_all = not part.info_dst
+        return numbers if is_for_all else [n for n in numbers if n not in self.fragments]
 
     @property
     def message(self) -> bytes:
@@ -153,7 +156,7 @@ class FragmentStores:
         store = self.by_prefix.setdefault(message.prefix, FragmentStore())
         before = store.size
         try:
-            joined, missing = store.gather(port, message)
+            joined, repeated = store.gather(port, message)
         finally:
             # The store may have kept some fragments of a malformed message, too.
             self.size += store.size - before
@@ -161,14 +164,15 @@ class FragmentStores:
                 self.forget(max(self.by_prefix, key=lambda prefix: self.by_prefix[prefix].size))
         return PassedFragments(
             _passed(message, joined, rewrite),
-            [self._question(message, reader, *pair) for pair in missing],
+            [self._question(message, reader, *part) for part in repeated],
         )
 
     def _question(
-        self, message: DiscoveryMessage, reader: bytes, sample: Sample, missing: Sequence[int]
+        self, message: DiscoveryMessage, reader: bytes, sample: Sample, numbers: Sequence[int]
     ) -> bytes:
+        """The request for fragments of a sample with these numbers."""
         self._question_count += 1
-        fields = sample.writer, sample.sequence, missing, self._question_count
+        fields = sample.writer, sample.sequence, numbers, self._question_count
         return nack_frag(reader, message.prefix, *fields)
 
     def forget(self, prefix: bytes) -> None:
@@ -194,20 +198,20 @@ class FragmentStore:
 
     def gather(
         self, port: int, message: DiscoveryMessage
-    ) -> tuple[list[bytes], list[tuple[Sample, list[int]]]]:
+    ) -> tuple[list[bytes], list[tuple[Sample, Sequence[int]]]]:
         """Gather the fragments of a message.
 
-        Return the messages with the announcements that are whole now. Return also the samples of
-        which a fragment came again, with the numbers of their missing fragments. Raises RtpsError.
+        Return the messages with the announcements that are whole now. Return also the samples that
+        are not whole and of which a fragment came again, with the numbers of the fragments to
+        request. Raises RtpsError.
         """
         if len(message.fragments) > MOST_FRAGMENTS:
             raise RtpsError(f"the datagram has more than {MOST_FRAGMENTS} fragments")
         parts = list(_parts(message))
-        by_key = {_key(port, part): part.sample for part in parts}
+        by_key = {_key(port, part): part for part in parts}
         repeated = [_key(port, part) for part in parts if self._has(port, part)]
         for part in parts:
             self._gather(port, message, part)
-        # The store may have dropped an announcement to make room for the next one.
         kept = {key: self._samples[key] for key in by_key if key in self._samples}
         whole = {key: pending for key, pending in kept.items() if pending.is_whole}
         size = sum(pending.total for pending in whole.values())
@@ -216,10 +220,11 @@ class FragmentStore:
             raise RtpsError(f"the datagram completes announcements of {text}")
         for key in whole:
             self._drop(key)
-        missing = {key: self._samples[key].missing for key in repeated if key in self._samples}
+        # The store may also have dropped an announcement to make room for the next one.
+        again = {by_key[key]: self._samples[key] for key in repeated if key in self._samples}
         return (
             [pending.message for pending in whole.values()],
-            [(by_key[key], numbers) for key, numbers in missing.items()],
+            [(part.sample, pending.to_request(part)) for part, pending in again.items()],
         )
 
     def _has(self, port: int, part: _Part) -> bool:
@@ -274,7 +279,8 @@ def _parts(message: DiscoveryMessage) -> Iterator[_Part]:
     to = stamp = b""
     for kind, _, body in submessages(message.datagram):
         if kind == INFO_DST:
-            to = info_dst(message.datagram[body.start : body.start + PREFIX_BYTES])
+            prefix = message.datagram[body.start : body.start + PREFIX_BYTES]
+            to = info_dst(prefix) if any(prefix) else b""
         elif kind == SubmessageId.INFO_TS:
             stamp = message.datagram[body.start - 4 : body.end]
         elif body.start in by_start:

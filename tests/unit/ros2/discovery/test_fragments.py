@@ -41,6 +41,7 @@ LOCATOR = HostPort("172.30.0.5", 7411)
 MAPPED = HostPort("10.0.0.1", 45001)
 PORT = 45000
 READER = b"reader's pre"
+OTHER = b"other reader"
 HEARTBEAT = submessage(0x07, 0, bytes(28))
 TIME = submessage(0x09, 0, bytes(8))
 fragment = partial(fragment_of_any, writer=BuiltinWriter.PUBLICATIONS)
@@ -172,12 +173,15 @@ def test_each_destination_has_its_own_fragments() -> None:
         fragment(whole[:128], 1, 128, len(whole)),
         fragment(whole[128:], 2, 128, len(whole)),
     )
-    readers = (READER, bytes(12), b"another read")
+    readers = (READER, OTHER)
     for reader in readers:
         assert through(store, message(submessage(0x0E, 0, reader), parts[0])) == []
     for reader in readers:
         (joined,) = through(store, message(submessage(0x0E, 0, reader), parts[1]))
         assert joined[20:36] == submessage(0x0E, 0, reader)
+    assert through(store, message(parts[0])) == []
+    (joined,) = through(store, to(bytes(12), parts[1]))
+    assert destination(joined) is None
 
 
 def test_what_is_in_front_of_an_announcement_is_bounded() -> None:
@@ -205,7 +209,14 @@ def test_each_way_has_its_own_fragments() -> None:
         assert passed == ([message(HEARTBEAT)], [])
 
 
-def test_a_repeated_fragment_makes_the_proxy_ask_for_the_others() -> None:
+def requested(question: bytes) -> list[int]:
+    """The numbers of the fragments in a request."""
+    (body,) = [b for kind, _, b in submessages(question) if kind == SubmessageId.NACK_FRAG]
+    base, count, bits = struct.unpack_from("<III", question, body.start + 16)
+    return [base + at for at in range(count) if bits >> (31 - at) & 1]
+
+
+def test_a_repeated_fragment_makes_the_proxy_request_all() -> None:
     """Cyclone DDS answers a request for a sample with the first fragment alone."""
     store = FragmentStores()
     sent = cut(described(100), 128, sequence=7)
@@ -219,7 +230,43 @@ def test_a_repeated_fragment_makes_the_proxy_ask_for_the_others() -> None:
     (body,) = [body for kind, _, body in submessages(asked) if kind == SubmessageId.NACK_FRAG]
     reader, writer = struct.unpack_from(">II", asked, body.start)
     assert (reader, writer) == (0x000003C7, 0x000003C2)
-    assert struct.unpack_from("<iIIII", asked, body.start + 8) == (0, 7, 2, 3, 0b101 << 29)
+    assert struct.unpack_from("<iI", asked, body.start + 8) == (0, 7)
+    assert requested(asked) == [1, 2, 3, 4]  # Cyclone DDS sends these to one reader alone
+
+
+def test_the_proxy_requests_missing_fragments_if_others_were_for_the_same_reader() -> None:
+    store = FragmentStores()
+    whole = described(100)
+    parts = [fragment(whole[at : at + 128], 1 + at // 128, 128, len(whole)) for at in (0, 256)]
+    sent = [read_discovery(to(READER, part)) for part in parts]
+    for datagram in sent:
+        assert store.rewritten(PORT, datagram, READER, led) == ([], [])
+    _, (asked,) = store.rewritten(PORT, sent[0], READER, led)
+    assert requested(asked) == [2, 4]
+
+
+@pytest.mark.parametrize("is_for_all", [True, False])
+@pytest.mark.parametrize("lost", range(4))
+def test_a_reader_gets_a_sample_of_which_a_fragment_was_lost(is_for_all: bool, lost: int) -> None:
+    """Cyclone DDS answers a request for a sample with the first fragment, for all or for this
+    reader, and a request for fragments with fragments for this reader.
+    """
+    store = FragmentStores()
+    whole = described(100)
+    chunks = [whole[at : at + 128] for at in range(0, len(whole), 128)]
+    parts = [fragment(chunk, number, 128, len(whole)) for number, chunk in enumerate(chunks, 1)]
+    for index, part in enumerate(parts):
+        assert index == lost or through(store, message(part)) == []
+    first = message(parts[0]) if is_for_all else to(READER, parts[0])
+    for _ in range(2):
+        passed, questions = store.rewritten(PORT, read_discovery(first), READER, led)
+        if passed or questions:
+            break
+    for question in questions:
+        for number in requested(question):
+            passed += through(store, to(READER, parts[number - 1]))
+    (joined,) = passed
+    assert [kind for kind, _, _ in submessages(joined)][-1] == SubmessageId.DATA
 
 
 @pytest.mark.parametrize(
@@ -315,9 +362,6 @@ def judged(told: DiscoveryMessage) -> bytes:
         return announces_denied(announcement, told.datagram)
 
     return rewritten(told, lambda pid, locator: MAPPED, is_hidden)
-
-
-OTHER = b"other reader"
 
 
 def to(reader: bytes, part: bytes) -> bytes:
