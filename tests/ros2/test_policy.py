@@ -74,17 +74,23 @@ def test_a_service_is_denied_from_the_start(lab: Lab) -> None:
     assert "reply" not in asking.output()
 
 
+@pytest.mark.parametrize(
+    ("inside", "outside", "size"),
+    [("cyclone", "jazzy", 6000), ("jazzy", "cyclone", 6000), ("cyclone", "cyclone", 50_000)],
+)
 @pytest.mark.parametrize(("source", "sink"), [("c1", "out"), ("out", "c1")])
-def test_announcements_in_fragments_are_read(lab: Lab, source: str, sink: str) -> None:
+def test_announcements_in_fragments_are_read(
+    lab: Lab, source: str, sink: str, inside: str, outside: str, size: int
+) -> None:
     """Cyclone DDS sends what is longer than 1,344 bytes in several datagrams."""
     kind = "publish" if source == "c1" else "subscribe"
     rules(lab, f"deny {kind} /secret")
-    vendors = {"c1": "cyclone", "out": "jazzy"}
-    long = {"user_data": 6000}
+    vendors = {"c1": inside, "out": outside}
+    long = {role: {"user_data": size} for role in vendors if vendors[role] == "cyclone"}
     for topic in ("/secret", "/open"):
-        lab.node(vendors[source], source, "pub", topic=topic, **(long if source == "c1" else {}))
-    secret = lab.node(vendors[sink], sink, "sub", topic="/secret", **(long if sink == "c1" else {}))
-    public = lab.node(vendors[sink], sink, "sub", topic="/open", **(long if sink == "c1" else {}))
+        lab.node(vendors[source], source, "pub", topic=topic, **long.get(source, {}))
+    secret = lab.node(vendors[sink], sink, "sub", topic="/secret", **long.get(sink, {}))
+    public = lab.node(vendors[sink], sink, "sub", topic="/open", **long.get(sink, {}))
     gets(public, 20)
     assert "got" not in secret.output()
 
@@ -94,3 +100,6 @@ def test_announcements_in_fragments_are_read(lab: Lab, source: str, sink: str) -
 
     # The proxy itself asks again for a fragment that was lost.
     wait_until("the proxy knows both", lambda: told() >= {"/secret", "/open"})
+    rules(lab, "# allowed again")
+    gets(secret)
+    gets(public)
