@@ -1,7 +1,6 @@
 """Tries to connect to a router outside with which the proxy has no session."""
 
 import asyncio
-import contextlib
 import socket
 import ssl
 
@@ -61,7 +60,6 @@ async def _try_tls(sock: socket.socket, host: str, tls: ssl.SSLContext) -> LinkF
     except OSError:  # also TimeoutError: the peer waits for the first message of zenoh
         pass
     finally:
-        writer.close()
-        with contextlib.suppress(OSError):
+        if not writer.is_closing():  # Python 3.11 fails to abort a closed transport
             writer.transport.abort()
     return LinkFault.NO_SESSION

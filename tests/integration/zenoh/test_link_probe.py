@@ -4,6 +4,7 @@ import contextlib
 import socket
 import ssl
 import threading
+from asyncio.sslproto import _SSLProtocolTransport
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -68,6 +69,18 @@ def serve(listening: socket.socket, tls: ssl.SSLContext | None) -> None:
 @pytest.fixture(autouse=True)
 def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_probe, "ALERT_TIMEOUT_S", 0.3)
+
+
+@pytest.fixture(autouse=True)
+def transports_of_python_3_11_2(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python 3.11.2 of Debian fails to abort a closed transport of TLS; later versions do not."""
+
+    def abort(transport: _SSLProtocolTransport) -> None:
+        assert transport._ssl_protocol is not None
+        aborted(transport)
+
+    aborted = _SSLProtocolTransport.abort
+    monkeypatch.setattr(_SSLProtocolTransport, "abort", abort)
 
 
 Write = Callable[[Path], object]
