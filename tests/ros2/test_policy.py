@@ -6,6 +6,14 @@ import pytest
 
 from tests.ros.processes import Process, wait_until
 from tests.ros2.lab import Lab
+from tests.ros2.machines import PORTS
+
+PEER = (
+    "<CycloneDDS><Domain><Discovery><Peers>"
+    f'<Peer address="10.77.0.1:{PORTS.first}"/>'
+    "</Peers></Discovery></Domain></CycloneDDS>"
+)
+"""Without it, Cyclone DDS outside does not find the proxy: Cyclone DDS has no well-known ports."""
 
 
 def rules(lab: Lab, *texts: str) -> None:
@@ -87,10 +95,15 @@ def test_announcements_in_fragments_are_read(
     rules(lab, f"deny {kind} /secret")
     vendors = {"c1": inside, "out": outside}
     long = {role: {"user_data": size} for role in vendors if vendors[role] == "cyclone"}
+
+    def start(role: str, kind: str, topic: str) -> Process:
+        env = {"CYCLONEDDS_URI": PEER} if role == "out" else None
+        return lab.node(vendors[role], role, kind, topic=topic, env=env, **long.get(role, {}))
+
     for topic in ("/secret", "/open"):
-        lab.node(vendors[source], source, "pub", topic=topic, **long.get(source, {}))
-    secret = lab.node(vendors[sink], sink, "sub", topic="/secret", **long.get(sink, {}))
-    public = lab.node(vendors[sink], sink, "sub", topic="/open", **long.get(sink, {}))
+        start(source, "pub", topic)
+    secret = start(sink, "sub", "/secret")
+    public = start(sink, "sub", "/open")
     gets(public, 20)
     assert "got" not in secret.output()
 
