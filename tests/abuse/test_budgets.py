@@ -6,7 +6,17 @@ from contextlib import AsyncExitStack, suppress
 
 from examples.demo.fake_http import value
 from rosproxy.ros1.protocol.xmlrpc.document import INVALID_PARAMS, PARSE_ERROR
-from tests.integration.net import NODE, OTHER_NODE, OUTSIDE, connect, exchange, post, rpc, xml
+from tests.integration.net import (
+    NODE,
+    OTHER_NODE,
+    OUTSIDE,
+    connect,
+    exchange,
+    post,
+    rpc,
+    until,
+    xml,
+)
 
 DOCUMENTS = 48 * 1024 * 1024
 """Bytes of documents: 32 MiB by --max-buffered, and a single parsed document."""
@@ -107,6 +117,16 @@ async def test_readers_that_never_read_a_large_parameter(abused, node, master):
             reply = await exchange(abused.master, post(xml("getParam", "/n", "/big")), NODE)
             assert len(reply.body) > 20 * MB
             assert (await rpc(lease, "getPid", "/n"))[2] == node.pid
+
+
+async def test_another_program_makes_the_parameter_of_leases_large(abused, node, master):
+    await abused.publish(node)
+    kept = dict(master.params)
+    (name,) = kept
+    with abused.watched():
+        master.params[name] = "x" * 60 * MB
+        await until(lambda: master.params == kept, "the parameter is restored")
+        assert abused.status()["master"]["up"]
 
 
 async def test_a_large_parameter_that_is_set_slowly_by_many(abused, node, master):

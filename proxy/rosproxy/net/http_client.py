@@ -214,7 +214,8 @@ class HttpClient:
         head = self._head(path, host, len(body))
         with TimeLimit(self._time_limits, within):
             async with self._places:
-                connection, stream, _ = await self._ask(peer, head, body)
+                connection, stream, size = await self._ask(peer, head, body)
+                self._require(size, longest or self._longest, connection)
                 return await self._read_whole(peer, connection, stream, longest or self._longest)
 
     async def pass_on(
@@ -337,10 +338,14 @@ class HttpClient:
     ) -> bytes | LongReply:
         if size is None or size <= LONG_BODY_BYTES:
             return await self._read_whole(peer, connection, stream, self._longest)
-        if size > self._longest:
-            self._drop(connection)
-            raise TooLong(self._longest)
+        self._require(size, self._longest, connection)
         return LongReply(size, stream, partial(self._finish_long, peer, connection, stream))
+
+    def _require(self, size: int | None, longest: int, connection: ClientConnection) -> None:
+        """Raise TooLong for a body of which the header tells that it is longer."""
+        if size is not None and size > longest:
+            self._drop(connection)
+            raise TooLong(longest)
 
     def _drop(self, connection: ClientConnection) -> None:
         self._used.discard(connection)

@@ -9,6 +9,7 @@ from examples.demo.fake_http import value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode, Header
 from rosproxy.ros1.protocol.tcpros import encode_header
+from rosproxy.ros1.protocol.xmlrpc.limits import LEASES
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import HOST, NODE, OTHER_NODE, looks, refuses, rpc, until
 from tests.integration.proxy import Proxy
@@ -39,7 +40,12 @@ async def test_the_parameter_goes_with_the_last_lease(
     await until(lambda: not master.params, "the parameter is deleted")
 
 
-@pytest.mark.parametrize("written", ["", "nonsense", "1 /127.0.2.99:1/\n", 7, ["x"], None])
+TOO_LONG = ("x" * (LEASES.size + 1), [1] * LEASES.elements)
+
+
+@pytest.mark.parametrize(
+    "written", ["", "nonsense", "1 /127.0.2.99:1/\n", 7, ["x"], None, *TOO_LONG]
+)
 async def test_foreign_changes_of_the_parameter_are_undone(
     proxy: Proxy, master: FakeMaster, node: FakeNode, written: object
 ) -> None:
@@ -51,7 +57,7 @@ async def test_foreign_changes_of_the_parameter_are_undone(
     await until(lambda: master.params == kept, "the parameter is restored")
 
 
-@pytest.mark.parametrize("written", ["", "nonsense\n" * 1000, 7, ["x"], {"a": "b"}])
+@pytest.mark.parametrize("written", ["", "nonsense\n" * 1000, 7, ["x"], {"a": "b"}, *TOO_LONG])
 async def test_a_node_that_nothing_is_remembered_of_registers_again(
     proxy: Proxy, master: FakeMaster, node: FakeNode, written: object
 ) -> None:

@@ -163,13 +163,16 @@ class MasterClient:
         with _FailuresOf(f"master {self.master_uri}"):
             return await self._master.pass_on(target, path, name, body, MASTER_TIMEOUT_S)
 
-    async def call_master(self, method: str, *params: Any) -> Any:
-        """Call the master and return the value. Raises Unreachable, MasterError."""
+    async def call_master(self, method: str, *params: Any, limits: Limits = OWN_REPLY) -> Any:
+        """Call the master and return the value. Raises Unreachable, MasterError.
+
+        Unreachable with ANSWERED includes a reply that exceeds ``limits``.
+        """
         started = time.monotonic()
         call = xmlrpc.dump_call(method, CALLER_ID, *params)
-        reply = await self.post_to_master(call, OWN_REPLY)
+        reply = await self.post_to_master(call, limits)
         self._metrics.master_round_trip.observe(time.monotonic() - started)
-        return read_value(method, reply, OWN_REPLY)
+        return read_value(method, reply, limits)
 
     async def multicall(self, calls: Sequence[tuple[str, list[Any]]]) -> list[Any]:
         """Make many calls ``(method, params)`` by ``system.multicall``; return the values.

@@ -10,9 +10,11 @@ leases have to go. Contents and format: `rosproxy.ros1.registry.remembered_lease
 import asyncio
 from collections.abc import Mapping
 
-from rosproxy.ros1.clients.master_client import MasterError
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.xmlrpc.limits import LEASES
 from rosproxy.ros1.registry import remembered_leases
+from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.registry.remembered_leases import RememberedLease
 
 REFUSED = (
@@ -67,10 +69,16 @@ class LeaseMemory:
         await self.write()
 
     async def _read(self) -> object:
+        """The value of the parameter; "" if not set, None if longer than any leases."""
+        upstream = self._context.upstream
         try:
-            return await self._context.upstream.call_master("getParam", self.parameter)
-        except MasterError:  # the parameter is not set
+            return await upstream.call_master("getParam", self.parameter, limits=LEASES)
+        except MasterError:
             return ""
+        except Unreachable as error:
+            if error.probe is not ProbeResult.ANSWERED:
+                raise
+            return None
 
     async def _write(self, text: str) -> None:
         upstream = self._context.upstream

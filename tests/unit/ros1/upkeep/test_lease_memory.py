@@ -14,7 +14,7 @@ from tests.unit.builders import add_node, make_addressing
 class RefusingMaster:
     """A master without the parameter, which refuses to keep the parameter."""
 
-    async def call_master(self, method: str, *_: object) -> object:
+    async def call_master(self, method: str, *_: object, **__: object) -> object:
         raise MasterError(f"{method} is refused")
 
 

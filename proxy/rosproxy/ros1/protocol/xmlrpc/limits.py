@@ -37,6 +37,9 @@ BUS_STATS = Limits(4 * 1024 * 1024, 10_000)
 """The counts of a node: twelve elements for each topic with two connections."""
 PID_REPLY = Limits(4 * 1024 * 1024, 100)
 """The pid of a node, for which the proxy asks again and again, or a refusal: five elements."""
+LEASES = Limits(4 * 1024 * 1024, 100)
+"""The value of the parameter with the leases: a text with 40 bytes for each node, or whatever
+another program has written to the parameter."""
 OWN_REPLY = Limits(64 * 1024 * 1024, 500_000)
 """The master's reply to a call of the proxy itself: the graph of all nodes, with ten elements for
 each topic and for each service."""
