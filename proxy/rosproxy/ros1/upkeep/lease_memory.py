@@ -69,7 +69,7 @@ class LeaseMemory:
         await self.write()
 
     async def _read(self) -> object:
-        """The value of the parameter; "" if not set, None if longer than any leases."""
+        """The value of the parameter; "" if not set, None if too long for leases."""
         upstream = self._context.upstream
         try:
             return await upstream.call_master("getParam", self.parameter, limits=LEASES)
