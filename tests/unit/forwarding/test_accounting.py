@@ -107,6 +107,18 @@ def test_peers_are_those_of_the_nodes_own_address() -> None:
     assert first.fast_peers == second.fast_peers == {}
 
 
+def test_a_node_that_has_lost_its_port_has_no_peers() -> None:
+    """Otherwise the proxy does not look whether the peers have connected again."""
+    registry, book, [endpoint] = a_book(holders=1)
+    port = endpoint.fast_port
+    assert port is not None
+    registry.remove(endpoint)
+    book.note_peers(dict([connection(endpoint, port)]))  # read before the node was removed
+    assert endpoint.fast_peers
+    book.note_owners(registry)
+    assert not endpoint.fast_peers
+
+
 def test_what_comes_in_and_is_not_answered_twice_in_a_row_is_silent() -> None:
     silence = accounting.UnansweredPorts()
     assert silence.look({1: Counts(0, 60), 2: Counts(0, 60), 3: Counts(5, 60)}, 10.0) == []

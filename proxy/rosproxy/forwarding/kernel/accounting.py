@@ -94,10 +94,14 @@ class KernelAccounts:
         self._counted_at = 0.0
 
     def note_owners(self, endpoints: LeaseHolders[LeaseHolder]) -> None:
-        """Update the owners from the fast ports of all endpoints."""
-        remaining = {p: e for p, e in self.owners.items() if endpoints.by_port.get(e.port) is e}
+        """Update the owners from the fast ports of all endpoints. A former owner has no peers."""
+        before = self.owners
+        remaining = {p: e for p, e in before.items() if endpoints.by_port.get(e.port) is e}
         self.owners = remaining | {e.fast_port: e for e in endpoints if e.fast_port is not None}
         holders = set(self.owners.values())
+        for former in set(before.values()) - holders:
+            # A reading of the connections may have ended after the former owner gave its port back.
+            former.fast_peers = {}
         self._accounts = {e: account for e, account in self._accounts.items() if e in holders}
 
     def owns(self, endpoint: LeaseHolder) -> bool:
