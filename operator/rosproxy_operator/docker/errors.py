@@ -9,6 +9,7 @@ _PORT_TAKEN = re.compile(
 )
 _PORT = re.compile(r"(?:[0-9.]+|\[[0-9A-Fa-f:]*\]|::):([0-9]{1,5})\b")
 _FOREIGN_ADDRESS = re.compile(r"(\S+): bind: cannot assign requested address")
+_MISSING_DIRECTORY = re.compile(r"bind source path does not exist: (\S.*)")
 _IDS = re.compile(r"\b[0-9a-f]{64}\b")
 _ENGINE_WORDS = re.compile(r"endpoint|network|container")
 """Words in the engine's own refusals. A proxy in front of the engine does not write these words."""
@@ -62,6 +63,11 @@ def refusal(status: int, text: str, request: str) -> EngineError:
     if foreign := _FOREIGN_ADDRESS.search(message):
         message = (
             f"--publish-address: {foreign[1].rpartition(':')[0]} is not an address of this host"
+        )
+    elif missing := _MISSING_DIRECTORY.search(message):  # the only mount of a proxy
+        message = (
+            f"--zenoh-link-certificates: {missing[1]} does not exist on the Docker host. Create "
+            "the directory, with tls.crt, tls.key and ca.crt"
         )
     elif status in (401, 403, 404, 405) and not _ENGINE_WORDS.search(message):
         message = (

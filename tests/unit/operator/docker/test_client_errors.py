@@ -64,6 +64,15 @@ def test_an_address_that_is_not_this_hosts() -> None:
     assert str(error) == "--publish-address: 203.0.113.5 is not an address of this host"
 
 
+def test_a_directory_that_does_not_exist() -> None:
+    text = (
+        'invalid mount config for type "bind": bind source path does not exist: /etc/rosproxy/site'
+    )
+    assert str(refusal(400, text, "POST /containers/create")).startswith(
+        "--zenoh-link-certificates: /etc/rosproxy/site does not exist on the Docker host. Create"
+    )
+
+
 @pytest.mark.parametrize(
     "text", ["No such container: nope", "network nope not found", "No such image: nope:latest"]
 )
