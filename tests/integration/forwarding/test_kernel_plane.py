@@ -319,6 +319,32 @@ async def test_what_a_killed_process_left_goes_on_until_it_is_known_whose_it_is(
     await later.context.tasks.cancel()
 
 
+async def test_what_a_killed_process_left_ends_where_a_topic_may_be_denied(bench: Bench) -> None:
+    """The table says nothing about topics, and the policy may have changed since."""
+    await bench.forwarded()
+    await bench.forwarded(1)
+    later = Bench(tools=bench.tools)
+    await later.plane.start()
+    later.plane.cut_former(lambda port, host: port == 45002 and host == NODE)
+    selector = "--mark", Marks(11311).port_selector(45002)
+    await until(lambda: later.tools.forgotten == [(False, selector), (True, selector)])
+    assert later.tools.forwards == {45003: (NODE, 50000)}
+    later.plane.recovered([])
+    await later.forwarded()  # the policy allows the topics again
+    await later.context.tasks.cancel()
+
+
+async def test_a_lost_fast_port_is_cut_once(bench: Bench) -> None:
+    endpoint = await bench.forwarded()
+    fast_ports.give_back(bench.context.registry.pool, endpoint)
+    bench.plane.syncer.note_change(endpoint)
+    await bench.plane.syncer.wait_until_unforwarded(45002)
+    assert endpoint in bench.plane.owners
+    bench.plane.cut(endpoint)
+    assert endpoint not in bench.plane.owners
+    await until(lambda: bool(bench.tools.forgotten))
+
+
 async def test_forwards_that_nobody_claims_are_removed(bench: Bench) -> None:
     await bench.forwarded()
     later = Bench(tools=bench.tools)

@@ -104,6 +104,11 @@ class KernelAccounts:
             former.fast_peers = {}
         self._accounts = {e: account for e, account in self._accounts.items() if e in holders}
 
+    def forget_lost_ports(self, endpoint: LeaseHolder) -> None:
+        """Forget the ports of an endpoint, except its fast port: their connections have ended."""
+        lost = set(self.ports_of(endpoint)) - {endpoint.fast_port}
+        self.owners = {port: owner for port, owner in self.owners.items() if port not in lost}
+
     def owns(self, endpoint: LeaseHolder) -> bool:
         """Whether an endpoint had a fast port at the last call of `note_owners`."""
         return any(owner is endpoint for owner in self.owners.values())

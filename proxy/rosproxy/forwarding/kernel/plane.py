@@ -21,7 +21,7 @@ from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.decisions import Forwards
 from rosproxy.forwarding.kernel.nft import Counts, Near
 from rosproxy.forwarding.kernel.preflight import find_obstacle
-from rosproxy.forwarding.kernel.syncer import SUBJECT, Clock, ForwardSyncer
+from rosproxy.forwarding.kernel.syncer import SUBJECT, Clock, ForwardSyncer, IsDenied
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.leases import fast_ports
 from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
@@ -124,6 +124,24 @@ class KernelPlane:
         if self.syncer.usable and ports:
             work = self.syncer.cut([(port, ipv6) for port in ports])
             self._tasks.spawn(work, f"cutting {endpoint.label}")
+            self._accounts.forget_lost_ports(endpoint)
+
+    def cut_former(self, is_denied: IsDenied) -> None:
+        """Have the kernel end what a killed process left, as far as ``is_denied`` says.
+
+        The table of that process says nothing about topics. The policy may have changed since.
+        """
+        if self.syncer.usable:
+            work = self.syncer.cut_former(is_denied)
+            self._tasks.spawn(work, "cutting connections from before the start")
+
+    @property
+    def owners(self) -> set[LeaseHolder]:
+        """The endpoints with a fast port, or with connections through a port that they have lost.
+
+        As of the last change or reading.
+        """
+        return set(self._accounts.owners.values())
 
     async def look(self) -> None:
         """Read the kernel's counters and connections, and correct the forwards."""

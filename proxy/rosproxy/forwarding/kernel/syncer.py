@@ -35,6 +35,8 @@ log = logging.getLogger(__name__)
 
 Clock = Callable[[], float]
 """Seconds of the monotonic clock."""
+IsDenied = Callable[[int, str | None], bool]
+"""Whether a port may lead to a denied topic. Gets the port and the host of its target, or None."""
 SUBJECT = "data plane"
 LOST_TABLE_RETRY_S = 30.0
 """Seconds between attempts to make a lost table again."""
@@ -82,6 +84,8 @@ class ForwardSyncer:
         self._wake = asyncio.Event()
         self._synced = asyncio.Event()
         self._changed: set[LeaseHolder] = set()
+        self._denied: set[int] = set()
+        """Ports whose forwards, from before the start, have to end."""
         self._all_changed = True
         self._host = HostForwarding()
         self._pauses = decisions.Pauses()
@@ -225,6 +229,22 @@ class ForwardSyncer:
             families = itertools.product(ports, (False, True))
             await self._table.forget(families, "SYN_SENT")
 
+    async def cut_former(self, is_denied: IsDenied) -> None:
+        """End forwards and connections from before the start, as far as ``is_denied`` says.
+
+        If a port has an owner, the owner's topics are known, and the port stays (`cut`).
+        """
+        self._accounts.note_owners(self._endpoints)
+        former = self._table.former
+        unowned = former.keys() - self._accounts.owners.keys()
+        denied = {port for port in unowned if is_denied(port, former[port])}
+        if denied:
+            for port in denied:
+                del former[port]
+            self._denied |= denied
+            self._all_changed = True
+            await self.cut([*itertools.product(sorted(denied), (False, True))])
+
     async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
         """End the connections through ports, which are pairs of a port and True for IPv6."""
         # Before the cut: an old forward would take new connections of the same peers.
@@ -293,7 +313,9 @@ class ForwardSyncer:
             self._problems.add(self.subject, text, holds=True)  # until the table is regained
 
     def _wanted(self) -> dict[int, HostPort]:
-        current = self._table.forwards
+        denied = self._denied
+        self._denied = set()
+        current = {p: t for p, t in self._table.forwards.items() if p not in denied}
         changed = self._changed
         self._changed = set()
         if self._all_changed or not self.recovered:

@@ -20,7 +20,8 @@ class KernelTable:
     """A table of the proxy in the kernel; this class itself has no connection tracking.
 
     ``forwards``: the table's forwards, as of the last change or read. ``counted``: ports whose
-    traffic the table counts, also after the end of a forward.
+    traffic the table counts, also after the end of a forward. ``former``: the ports that `begin`
+    has found in the table, with the host of the target; None if the forward had ended.
     """
 
     has_connections = False
@@ -33,6 +34,7 @@ class KernelTable:
         self.tools = tools
         self.forwards: Forwards = {}
         self.counted: set[int] = set()
+        self.former: dict[int, str | None] = {}
         self._surroundings = Surroundings()
 
     async def begin(self, surroundings: Callable[[Forwards], Surroundings]) -> None:
@@ -46,6 +48,8 @@ class KernelTable:
             log.debug("the kernel has no table of a former process: %s", error)
             former = TableState()
         self.counted = set(former.counters)
+        self.former = dict.fromkeys(former.counters)
+        self.former |= {port: target.host for port, target in former.forwards.items()}
         await self.make(former.forwards, surroundings(former.forwards))
 
     async def make(self, wanted: Forwards, surroundings: Surroundings) -> None:

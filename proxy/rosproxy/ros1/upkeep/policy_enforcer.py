@@ -17,6 +17,7 @@ import asyncio
 import logging
 from dataclasses import dataclass, field
 
+from rosproxy.access.access_policy import OFFER_KINDS
 from rosproxy.admin.requests import EnforcementCounts
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
@@ -71,7 +72,7 @@ class PolicyEnforcer:
             cut = self._cut_relays() + self._stand_ins.udpros.cut_denied()
             cut += self._withdraw_fast_ports()
             try:
-                await self._recovery.ensure()
+                await self._know_nodes()
                 has_changed = version != self._enforced_version
                 hidden, shown = await self._registrar.apply_policy(has_changed)
             except (Unreachable, MasterError):
@@ -83,6 +84,18 @@ class PolicyEnforcer:
             text = "policy applied: %d registrations hidden, %d shown, %d connections cut"
             log.info(text, hidden, shown, cut)
         return enforced
+
+    async def _know_nodes(self) -> None:
+        """Wait for the recovery, and cut what the kernel forwards for unknown nodes.
+
+        Raises Unreachable.
+        """
+        try:
+            await self._recovery.ensure()
+        except Unreachable:
+            self._plane.cut_former(self._may_be_denied)
+            raise
+        self._plane.cut_former(self._may_be_denied)
 
     def _cut_relays(self) -> int:
         """End the relays that the policy denies. Return their number.
@@ -118,9 +131,21 @@ class PolicyEnforcer:
         # publishers to this node again.
         if count:
             self._leases.watch(self._context.registry)
+        owners = self._plane.owners
         for endpoint in self._context.registry:
-            if endpoint.fast_port is not None and not policy.may_bypass(endpoint):
+            has_port = endpoint.fast_port is not None or endpoint in owners
+            if has_port and not policy.may_bypass(endpoint):
                 count += endpoint.fast_connections
-                self._plane.cut(endpoint)
                 self._leases.withdraw_fast_port(endpoint)
+                self._plane.cut(endpoint)
         return count
+
+    def _may_be_denied(self, port: int, host: str | None) -> bool:
+        """Whether the policy may deny a topic at a port that the kernel forwarded before the start.
+
+        ``host`` is the address to which the port led; None if unknown.
+        """
+        policy = self._context.policy
+        if port in self._context.settings.ports.listen:
+            return policy.rules.may_deny(OFFER_KINDS, (), host)
+        return not policy.inside_may_bypass()
