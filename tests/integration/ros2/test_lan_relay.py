@@ -6,6 +6,7 @@ reason a test tells whether the proof was good.
 
 import asyncio
 import socket
+import struct
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import closing, contextmanager
@@ -23,7 +24,7 @@ from rosproxy.ros2.lan_relay.relay import LanRelay, LanRelaySettings
 from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S
 from rosproxy.ros2.protocol.relay_envelope import address_lists
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
-from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.protocol.rtps import SubmessageId, source_prefix
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
 from rosproxy.ros2.sources.rates import Standing
@@ -257,6 +258,26 @@ async def test_unproven_sources_share_one_allowance(
         return relay.from_lan > SHARED
 
     await until(is_carried, "the relay carries what a proven address announces")
+
+
+async def test_each_announcement_in_a_datagram_counts(
+    boundary: Boundary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A datagram of 7 KiB led to 128 datagrams to the proxy, and cost as much as 29."""
+    monkeypatch.setattr(sources, "UNPROVEN_PER_SECOND", 0.0)
+    monkeypatch.setattr(sources, "UNPROVEN_BURST", float(SHARED))
+    relay = boundary.start_relay()
+    announcements = [spdp(bytes([number]) * 12, LAPTOP) for number in range(FORGED)]
+    with closing(bind(LAPTOP, 0)) as laptop:
+        send_through(laptop, LAPTOP, loop=True)
+        laptop.sendto(announcements[0] + b"".join(map(after_info_src, announcements[1:])), ON_LAN)
+    await until(lambda: relay.from_lan + relay.dropped == FORGED, "the relay has read all")
+    assert relay.from_lan < SHARED
+
+
+def after_info_src(message: bytes) -> bytes:
+    """The submessages of a message, after an INFO_SRC with its GUID prefix."""
+    return struct.pack("<BBH4x", SubmessageId.INFO_SRC, 1, 20) + message[4:]
 
 
 def announce(address: str, prefix: bytes) -> None:

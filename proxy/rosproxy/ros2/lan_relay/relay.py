@@ -16,6 +16,7 @@ import errno
 import logging
 import socket
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -30,7 +31,7 @@ from rosproxy.ros2.domain_settings import (
 from rosproxy.ros2.lan_relay.sources import SOURCE_BURST_UNITS, SOURCE_UNITS_PER_SECOND, LanSources
 from rosproxy.ros2.protocol.relay_envelope import listed_addresses, wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
-from rosproxy.ros2.protocol.rtps import RtpsError, by_source
+from rosproxy.ros2.protocol.rtps import RtpsError, by_source, by_source_if_sound
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
@@ -61,7 +62,8 @@ class LanRelaySettings:
 class LanRelay:
     """Passes announcements on, from `start` to `close`. Needs a running event loop.
 
-    ``from_lan`` and ``to_lan`` count announcements, and ``dropped`` counts datagrams.
+    ``from_lan`` and ``to_lan`` count announcements, and ``dropped`` counts datagrams. If a datagram
+    has messages of several participants, each message counts as a datagram.
     """
 
     def __init__(self, settings: LanRelaySettings) -> None:
@@ -113,12 +115,26 @@ class LanRelay:
             for _ in range(DATAGRAMS_PER_TURN):
                 datagram, sender = sock.recvfrom(LARGEST_DATAGRAM)
                 source = plain_address(sender[0])
-                size = len(datagram)
-                tell = partial(self._tell_proxy, datagram, source)
-                is_queued = self._sources.take(source, size, now) and self._scheduler.put(
-                    source, self._sources.standing(source, now), size, tell
-                )
-                self.dropped += not is_queued
+                standing = self._sources.standing(source, now)
+                for message in self._taken(datagram, source, now):
+                    tell = partial(self._tell_proxy, message, source)
+                    is_queued = self._scheduler.put(source, standing, len(message), tell)
+                    self.dropped += not is_queued
+
+    def _taken(self, datagram: bytes, source: str, now: float) -> Iterator[bytes]:
+        """Yield the message of each participant in a datagram, within the source's allowance.
+
+        The relay splits a datagram only after a charge: in a flood, most datagrams end before that.
+        The charge includes the first message.
+        """
+        if not self._sources.take(source, len(datagram), now):
+            self.dropped += 1
+            return
+        for index, message in enumerate(by_source_if_sound(datagram)):
+            if index == 0 or self._sources.take(source, len(message), now):
+                yield message
+            else:
+                self.dropped += 1
 
     def _tell_proxy(self, datagram: bytes, source: str) -> list[Outgoing]:
         """Send the announcements of a source on the LAN to the proxy. Return the sent datagrams."""

@@ -248,6 +248,14 @@ def by_source(datagram: bytes) -> list[bytes]:
     return [*messages, header + datagram[start:]] if start < len(datagram) else messages
 
 
+def by_source_if_sound(datagram: bytes) -> list[bytes]:
+    """Split a message as `by_source`; a malformed message stays whole, for its reader to refuse."""
+    try:
+        return by_source(datagram)
+    except RtpsError:
+        return [datagram]
+
+
 def info_dst(prefix: bytes) -> bytes:
     """The submessage that names the destination of the next submessages."""
     return struct.pack("<BBH", INFO_DST, _LITTLE, PREFIX_BYTES) + prefix

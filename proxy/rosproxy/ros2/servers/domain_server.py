@@ -47,7 +47,7 @@ from rosproxy.ros2.domain_settings import (
 from rosproxy.ros2.protocol.addressing import heartbeat_stream
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.relay_envelope import address_lists
-from rosproxy.ros2.protocol.rtps import PREFIX_BYTES, RtpsError, by_source
+from rosproxy.ros2.protocol.rtps import PREFIX_BYTES, RtpsError, by_source_if_sound
 from rosproxy.ros2.rewriting.discovery import read_messages
 from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
@@ -488,7 +488,7 @@ class DomainServer:
         heard_at = self.domain.source_of(datagram, source)
         standing = self.domain.standing(heard_at)
         left = len(datagram)
-        for message in _messages(datagram):
+        for message in by_source_if_sound(datagram):
             received = min(len(message), left)  # together, the messages may be longer
             left -= received
             read = partial(self._carry_out, take, message, source, received)
@@ -568,14 +568,6 @@ class DomainServer:
             must_queue = partial(self.domain.must_queue_at_stand_in, port)
             self._loop.add_reader(sock, self._take_in, sock, take, must_queue)
         return closed
-
-
-def _messages(datagram: bytes) -> list[bytes]:
-    """The message of each participant in a datagram. `Domain` refuses a malformed datagram."""
-    try:
-        return by_source(datagram)
-    except RtpsError:
-        return [datagram]
 
 
 def _families(bind: str) -> list[socket.AddressFamily]:
