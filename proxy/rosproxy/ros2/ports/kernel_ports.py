@@ -5,7 +5,8 @@ ignores discovery there: a port for user data of Fast DDS (`Participant.reads_di
 datagrams at such a port go to one locator.
 
 A port that the kernel forwarded before the start stays in the list until the proxy maps the port,
-or until no participant is left that could claim it. Meanwhile the kernel goes on forwarding.
+until a participant reads discovery at the locator, or until no participant is left that could claim
+the port. Meanwhile the kernel goes on forwarding.
 """
 
 from collections.abc import Iterator, Mapping
@@ -74,9 +75,8 @@ class KernelPorts:
         if changes != self._cached_changes:
             self._cached_changes = changes
             self._cached = {forwarded.port: forwarded for forwarded in self._mapped()}
-            mapped_ports = {port for mappings in self.domains for port in mappings.by_port}
-            for port in mapped_ports & self._former.keys():
-                del self._former[port]
+            if self._former:
+                self._end_former()
             self._cached |= self._former
         return self._cached
 
@@ -91,6 +91,16 @@ class KernelPorts:
             for port, target in forwards.items()
         }
         self._cached_changes = -1  # so that `by_port` is computed again
+
+    def _end_former(self) -> None:
+        """End former forwards of mapped ports, and to locators where discovery is read now."""
+        mapped = {p: m for mappings in self.domains for p, (_, m) in mappings.by_port.items()}
+        read_at = {mapping.target for mapping in mapped.values() if mapping.is_read}
+        self._former = {
+            port: former
+            for port, former in self._former.items()
+            if port not in mapped and former.target not in read_at
+        }
 
     def _mapped(self) -> Iterator[ForwardedPort]:
         """Yield the mapped ports. A port with the same locator stays the same object."""

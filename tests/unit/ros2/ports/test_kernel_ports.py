@@ -117,3 +117,18 @@ def test_what_an_older_process_forwarded_to_such_a_port_ends_with_the_participan
     settle(domain, SETTLING_PERIOD_S + ANSWER_TIMEOUT_S)
     assert domain.mappings.by_port[port][1].target == LOCATOR
     assert led(kernel_ports) == {}
+
+
+def test_what_an_older_process_forwarded_to_discovery_ends() -> None:
+    """The kernel led a former port for user data to the new participant's port for discovery."""
+    domain = make_domain()
+    kernel_ports = kernel_ports_of(domain)
+    port = 45007
+    discovery = HostPort(INSIDE, 7410)
+    kernel_ports.note_former({port: discovery})
+    domain.ports.note_forwarded({port: discovery})
+    assert led(kernel_ports) == {port: discovery}
+    domain.heard_inside(of_vendor(spdp(A, INSIDE)), INSIDE, 0.0)
+    settle(domain, SETTLING_PERIOD_S + ANSWER_TIMEOUT_S)
+    assert port not in domain.mappings.by_port
+    assert led(kernel_ports) == {}
