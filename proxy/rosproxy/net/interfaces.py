@@ -26,6 +26,8 @@ def route_towards(address: str) -> Route:
     is_ipv6 = ":" in address
     with socket.socket(socket.AF_INET6 if is_ipv6 else socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
+            if is_ipv6 and _is_own_anycast(address):
+                return Route(plain_address(address), _LOOPBACK_MTU)
             probe.connect((address, 9))
             if is_ipv6:
                 mtu = probe.getsockopt(socket.IPPROTO_IPV6, _IPV6_MTU)
@@ -58,6 +60,16 @@ def is_own(address: str) -> bool:
     The source address of a route to an own address is the same address.
     """
     return is_loopback(address) or address_towards(address) == address
+
+
+def _is_own_anycast(address: str) -> bool:
+    """Whether an IPv6 address is an anycast address of this machine.
+
+    A machine that forwards IPv6 receives what is sent to the first address of each of its networks
+    (RFC 4291, 2.6.1). But Linux gives a route to this address another source.
+    """
+    packed = socket.inet_pton(socket.AF_INET6, address.partition("%")[0]).hex()
+    return any(packed == line.split()[2] for line in _lines("/proc/net/anycast6"))
 
 
 def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:

@@ -9,6 +9,7 @@ from rosproxy.net.interfaces import (
     address_into,
     default_gateways,
     interface_networks,
+    is_own,
     route_towards,
 )
 
@@ -36,6 +37,16 @@ def test_the_route_to_an_own_address_begins_there_and_takes_packets_of_loopback(
 
 def test_there_is_no_route_to_what_is_no_address() -> None:
     assert route_towards("?").source == "127.0.0.1"
+
+
+def test_an_anycast_address_of_this_machine_is_an_own_address(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A port of the proxy that led there led to the proxy: one datagram circulated without end."""
+    line = "3 eth0 20010db8000000010000000000000000 1"
+    monkeypatch.setattr(interfaces, "_lines", lambda path: [line] if "anycast6" in path else [])
+    assert is_own("2001:db8:0:1::")
+    assert not is_own("2001:db8:0:2::")
 
 
 def test_the_gateway_of_the_default_route(monkeypatch: pytest.MonkeyPatch) -> None:
