@@ -27,7 +27,7 @@ from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import SubmessageId, source_prefix
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
-from rosproxy.ros2.sources.rates import Standing
+from rosproxy.ros2.sources.rates import Standing, cost
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import A, B, spdp
@@ -213,6 +213,19 @@ async def test_refused_datagrams_cost_the_proxy_none_of_its_allowance(boundary: 
         process.sendto(good.sealed(Direction.TO_LAN, spdp(A, PROXY)), target)
         await until(lambda: relay.to_lan == 1, "the proxy is announced")
     assert PROXY in relay._proxy_rates._by_source
+
+
+async def test_repeated_lists_of_proven_addresses_have_a_bound(boundary: Boundary) -> None:
+    """Each list of 256 addresses takes milliseconds, and the relay read any number of lists."""
+    relay = boundary.start_relay()
+    (listed,) = address_lists([f"192.0.2.{number}" for number in range(256)])
+    sealed = RelayProof(SECRET, time.time).sealed(Direction.TO_LAN, listed)
+    most = sources.SOURCE_BURST_UNITS // cost(len(listed))
+    with closing(bind(PROXY, 0)) as process:
+        for _ in range(int(2 * most)):
+            process.sendto(sealed, (boundary.bind.host, boundary.bind.port))
+            await asyncio.sleep(0)
+        await until(lambda: relay.dropped > 0, "the relay leaves repeated lists unread")
 
 
 async def test_different_secrets_are_reported(

@@ -159,14 +159,14 @@ class LanRelay:
                     continue
                 source = plain_address(sender[0])
                 content = self._proven(datagram, source)
-                if content is None:
+                now = self._loop.time()
+                # A list is charged, too: an attacker that reads a list can repeat it.
+                if content is None or not self._proxy_rates.take(source, len(content), now):
                     self.dropped += 1
                 elif (addresses := listed_addresses(content)) is not None:
-                    self._sources.note_proven(addresses, self._loop.time())
-                elif self._proxy_rates.take(source, len(content), self._loop.time()):
-                    self._tell_lan(content)
+                    self._sources.note_proven(addresses, now)
                 else:
-                    self.dropped += 1
+                    self._tell_lan(content)
 
     def _tell_lan(self, content: bytes) -> None:
         """Send announcements of the proxy to the groups on the LAN."""
