@@ -4,7 +4,7 @@ from typing import Any
 from xmlrpc.client import dumps
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
@@ -197,7 +197,11 @@ def test_spaces_cost_no_more_than_their_number() -> None:
     assert fast.call(body.replace(b"</param>", b"</parm>")) is None
 
 
-NAMES = st.recursive(TEXT | st.integers(-(2**31), 2**31 - 1), st.lists)
+LETTERS = st.characters(exclude_categories=["Cs", "Cc"], exclude_characters="\ufffe\uffff")
+NAMES = st.recursive(
+    st.text(LETTERS | st.sampled_from("&<>\"'\t\n\x7f")) | st.integers(-(2**31), 2**31 - 1),
+    st.lists,
+)
 
 
 @given(st.lists(NAMES))
@@ -208,6 +212,11 @@ def test_lists_of_names_and_numbers_are_read_as_they_are(value: list[Any]) -> No
 
 
 @given(SOUP)
+@example("<value><string>\r&lt;\r\né&amp;lt;&quot;&apos;</string></value>")
+@example("<value><string>&#65;</string></value>")
+@example("<value><string>&nosuch;</string></value>")
+@example("<value><string>\ufffe</string></value>")
+@example("<value><string>]]></string></value>")
 def test_what_is_taken_for_lists_is_what_expat_reads(soup: str) -> None:
     for inner in (soup, f"<value><array><data>{soup}</data></array></value>"):
         body = f"<methodResponse><params><param>{inner}</param></params></methodResponse>".encode()
@@ -215,6 +224,18 @@ def test_what_is_taken_for_lists_is_what_expat_reads(soup: str) -> None:
         if read_lists is not None:
             _, (value, _) = by_expat(body)
             assert xmlrpc.python_value(value) == read_lists
+
+
+def test_a_text_that_is_not_utf8_is_left_to_expat() -> None:
+    body = py_reply(["x"]).replace(b"x</", b"\xff</")
+    assert fast.lists(body) is None
+    assert by_expat(body) == ("refused", xmlrpc.PARSE_ERROR)
+
+
+@pytest.mark.parametrize("name", ["/a&b", "/a<b", "/é", "/a\x7f"])
+def test_a_name_of_any_letters_makes_the_reading_of_all_others_no_slower(name: str) -> None:
+    state = [[[topic, ["/n"]] for topic in ("/t", name)], [], []]
+    assert fast.lists(py_reply([1, "", state])) == [1, "", state]
 
 
 @given(VALUES, st.integers(0, 40))

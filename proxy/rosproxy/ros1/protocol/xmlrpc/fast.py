@@ -3,17 +3,23 @@
 A plain document has only printable ASCII and tags without attributes, but no entities, comments,
 CDATA or self-closing tags. So a tag ends at the next ``>``, a text at the next ``<``, and all
 readers find the same content. expat reads all other documents, four times as slowly, and decides
-what is an error.
+what is an error. In the replies that `lists` reads, texts may also have entities and any letters.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
+from xml.sax.saxutils import unescape
 
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.values import KINDS, Value, text_of
 
 _PLAIN = bytes({*b"\t\n\r", *range(0x20, 0x7F)} - {*b"&"})
+_IN_LISTS = bytes({*b"\t\n\r", *range(0x20, 0x100)})
+_OTHER_ENTITY = re.compile(rb"&(?!(?:amp|lt|gt|quot|apos);)")
+_FORBIDDEN = b"]]>", b"\xef\xbf\xbe", b"\xef\xbf\xbf"
+"""What may be in no text (XML 1.0, 2.2 and 2.4)."""
+_QUOTES = {"&quot;": '"', "&apos;": "'"}
 _PROLOG = rb"(?:<\?xml version=(?:'1\.0'|\"1\.0\")\?>)?\s*"
 _CALL = re.compile(_PROLOG + rb"<methodCall>\s*<methodName>\s*([^<\s]+)\s*</methodName>\s*<params>")
 _CALL_END = re.compile(rb"\s*</params>\s*</methodCall>\s*\Z")
@@ -140,23 +146,31 @@ def lists(body: bytes, limits: Limits = OWN_REPLY) -> list[Any] | None:
     """The value of a ``methodResponse`` that is a list of strings, numbers and lists; else None.
 
     The master sends such replies, and replies with all topics are long. The function takes a fifth
-    of the time of `response`, which also finds the position of each value.
+    of the time of `response`, which also finds the position of each value. Texts may have any
+    characters: a single name would make the reading of all others several times as slow.
     """
     head = _RESPONSE.match(body)
     param = _FIRST_PARAM.match(body, head.end()) if head else None
-    # A parser has to turn "\r" into "\n" (XML 1.0, 2.11). This function copies texts unchanged.
-    if param is None or b"\r" in body or not _is_plain(body, limits):
+    if param is None or not _fits_lists(body, limits):
         return None
+    text_of_token = _text if body.translate(None, _PLAIN) or b"\r" in body else bytes.decode
+    depth = (limits.depth - len(_OUTER_ELEMENTS)) // 3
     top = list[Any]()
-    end = _read_lists(body, param.end(), top, (limits.depth - len(_OUTER_ELEMENTS)) // 3)
+    try:
+        end = _read_lists(body, param.end(), top, depth, text_of_token)
+    except UnicodeDecodeError:
+        return None
     value = top[0] if end is not None and _LAST_PARAM.match(body, end) else None
     return value if isinstance(value, list) else None
 
 
-def _read_lists(body: bytes, start: int, top: list[Any], depth: int) -> int | None:
+def _read_lists(
+    body: bytes, start: int, top: list[Any], depth: int, text_of_token: Callable[[bytes], str]
+) -> int | None:
     """Read a value into ``top``; return the position after the value.
 
-    None if the value has another form, or more than ``depth`` nested lists.
+    None if the value has another form, or more than ``depth`` nested lists. Raises
+    UnicodeDecodeError.
     """
     # `scanner` is not documented. Each match has to begin where the last match has ended.
     stack = [top]
@@ -164,7 +178,7 @@ def _read_lists(body: bytes, start: int, top: list[Any], depth: int) -> int | No
     while (token := match()) and len(stack) <= depth:
         group = token.lastindex
         if group == _STRING:
-            stack[-1].append(token[_STRING].decode())
+            stack[-1].append(text_of_token(token[_STRING]))
         elif group == _INTEGER:
             stack[-1].append(int(token[_INTEGER]))
         elif group == _LIST:
@@ -175,6 +189,24 @@ def _read_lists(body: bytes, start: int, top: list[Any], depth: int) -> int | No
         if len(stack) < 2:
             return int(token.end())
     return None
+
+
+def _text(raw: bytes) -> str:
+    """The text of a string, with entities and line ends resolved (XML 1.0, 2.11)."""
+    text = raw.decode()
+    if b"\r" in raw:
+        text = text.replace("\r\n", "\n").replace("\r", "\n")
+    return unescape(text, _QUOTES) if b"&" in raw else text
+
+
+def _fits_lists(body: bytes, limits: Limits) -> bool:
+    return (
+        len(body) <= limits.size
+        and not body.translate(None, _IN_LISTS)
+        and not any(part in body for part in _FORBIDDEN)
+        and not _OTHER_ENTITY.search(body)
+        and body.count(b"</") <= limits.elements
+    )
 
 
 def _is_plain(body: bytes, limits: Limits) -> bool:
