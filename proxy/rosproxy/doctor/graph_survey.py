@@ -35,6 +35,7 @@ from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.clients.master_client import CALLER_ID, MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
+from rosproxy.ros1.protocol.xmlrpc.limits import ALL_LEASES, FLAG, Limits
 from rosproxy.ros1.registry.remembered_leases import NAMESPACE, LeasesAtMaster
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.text import brief
@@ -150,7 +151,7 @@ class _Collector:
         graph = system_state(await self._master.call_master("getSystemState"))
         names = sorted(graph.names())
         uris = await self._master.look_up("lookupNode", names)
-        _, leases = await _attempt(self._master.call_master("getParam", NAMESPACE))
+        leases = await self._parameter(NAMESPACE, ALL_LEASES)
         # In a thread: a long parameter would hold up the proxy, which asks for the live page.
         nodes = await asyncio.to_thread(_all_node_facts, names, uris, leases)
         facts = replace(
@@ -190,9 +191,13 @@ class _Collector:
         )
 
     async def _simulated_time(self) -> bool:
-        _, answer = await _attempt(self._master.call_master("getParam", "/use_sim_time"))
         # A boolean arrives as text. The parameter may also be a text or a number.
-        return answer in ("1", "true", 1)
+        return await self._parameter("/use_sim_time", FLAG) in ("1", "true", 1)
+
+    async def _parameter(self, name: str, limits: Limits) -> Any:
+        """The value of a parameter; None if not set, or if longer than ``limits``."""
+        _, value = await _attempt(self._master.call_master("getParam", name, limits=limits))
+        return value
 
     async def _try_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
         """Try a node at its address; the proxy itself knows whether a node behind it answers.

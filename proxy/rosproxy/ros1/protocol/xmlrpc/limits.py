@@ -40,6 +40,10 @@ PID_REPLY = Limits(4 * 1024 * 1024, 100)
 LEASES = Limits(4 * 1024 * 1024, 100)
 """The value of the parameter with the leases: a text with 40 bytes for each node, or whatever
 another program has written to the parameter."""
+ALL_LEASES = Limits(4 * 1024 * 1024, 10_000)
+"""The values of these parameters of all proxies, with four elements for each proxy."""
+FLAG = Limits(16 * 1024, 100)
+"""A parameter that is true or false, or whatever a program has written to the parameter."""
 OWN_REPLY = Limits(32 * 1024 * 1024, 500_000)
 """The master's reply to a call of the proxy itself: the graph of all nodes, with ten elements for
 each topic and for each service."""
