@@ -24,11 +24,14 @@ from rosproxy.ros1.registry.endpoint import (
 MOST_ADMISSIONS = 16
 """Remembered pairs of host:port and source for an endpoint. A node gives one host, from a single
 address, or from a few on a machine with several networks."""
-MOST_REGISTRATIONS_OF_SOURCE = 50_000
-"""The highest number of registrations of all endpoints of a source. A thousand nodes of a machine
-have twenty registrations each. Each takes 600 bytes and the names."""
-MOST_CHARACTERS_OF_SOURCE = 10_000_000
-"""The highest number of characters of all names and types that a source has registered."""
+MOST_REGISTRATIONS_IN_ALL = 45_000
+"""The highest number of registrations of all endpoints; a source gets no more than it leaves to
+others. With these, the state of the master fits into `OWN_REPLY`: a registration takes up to ten
+elements and 170 bytes. A thousand nodes of a machine have twenty registrations each. In the
+registry, each takes 600 bytes and the names."""
+MOST_CHARACTERS_IN_ALL = 5_000_000
+"""The highest number of characters of all names and types that are registered; a source gets no
+more than it leaves to others. A character takes up to five bytes in the state of the master."""
 UNPROVEN_DIVISOR = 4
 """Nodes of one source that have never answered may hold the range divided by this number. A healthy
 node answers within milliseconds after its first registration."""
@@ -58,6 +61,8 @@ class Registry:
         """The endpoints of all registrations, by kind and name, then by caller."""
         self._hidden: dict[tuple[Kind, str], dict[str, Endpoint]] = {}
         """The endpoints of hidden registrations, by kind and name, then by caller."""
+        self._registrations = self._characters = 0
+        """The number of registrations and of characters, also of promised registrations."""
         self._registrations_of = Counter[str]()
         """The number of registrations, by source of the endpoint."""
         self._characters_of = Counter[str]()
@@ -219,14 +224,17 @@ class Registry:
         source = endpoint.source
         registrations = self._registrations_of[source] + self._promised_of[source]
         characters = self._characters_of[source] + self._promised_characters_of[source]
-        rows = [(characters, MOST_CHARACTERS_OF_SOURCE, "characters of names")]
+        left = MOST_CHARACTERS_IN_ALL - self._characters
+        rows = [(characters, left, "characters of names")]
         if former is None:
-            rows.append((registrations, MOST_REGISTRATIONS_OF_SOURCE, "registrations"))
-        for count, most, label in rows:
-            if count >= most:
+            left = MOST_REGISTRATIONS_IN_ALL - self._registrations
+            rows.append((registrations, left, "registrations"))
+        for count, left, label in rows:
+            if count >= left:
                 return (
-                    f"the nodes of {source} have {count} {label}, at most {most} are accepted. Run "
-                    "some of these nodes at another address, such as in another container"
+                    f"the nodes of {source} have {count} {label}, and leave {max(left, 0)} to "
+                    "others. More are not accepted. Run some of these nodes at another address, "
+                    "such as in another container"
                 )
         return endpoint.reason_full(registration.caller_id, former is None)
 
@@ -416,17 +424,23 @@ class Registry:
     def _count(self, endpoint: Endpoint, registration: Registration, step: int) -> None:
         """Count a registration that begins (``step`` 1) or ends (-1)."""
         source = endpoint.source
-        endpoint.characters += step * registration.characters
-        self._characters_of[source] += step * registration.characters
+        characters = step * registration.characters
+        self._registrations += step
+        self._characters += characters
         self._registrations_of[source] += step
+        self._characters_of[source] += characters
+        endpoint.characters += characters
         if not self._registrations_of[source]:
             del self._registrations_of[source], self._characters_of[source]
 
     def _count_promised(self, endpoint: Endpoint, registration: Registration, step: int) -> None:
         source = endpoint.source
         caller_id = registration.caller_id
-        endpoint.promised_characters += step * registration.characters
-        self._promised_characters_of[source] += step * registration.characters
+        characters = step * registration.characters
+        self._registrations += step
+        self._characters += characters
+        self._promised_characters_of[source] += characters
+        endpoint.promised_characters += characters
         for counter, key in ((self._promised_of, source), (endpoint.promised, caller_id)):
             counter[key] += step
             if not counter[key]:

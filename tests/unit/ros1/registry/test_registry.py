@@ -7,8 +7,10 @@ import pytest
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.clients.master_client import read_value
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY
 from rosproxy.ros1.registry.endpoint import (
     LONGEST_REGISTRATION,
     MOST_CALLERS,
@@ -20,7 +22,7 @@ from rosproxy.ros1.registry.endpoint import (
 )
 from rosproxy.ros1.registry.node_health import Health
 from rosproxy.ros1.registry.registry import MOST_ADMISSIONS, RangeExhausted, Registry
-from tests.unit.builders import own_uri
+from tests.unit.builders import own_uri, py_reply
 
 PUB = Kind.PUBLISHER
 SUB = Kind.SUBSCRIBER
@@ -464,26 +466,26 @@ def test_an_endpoint_has_so_many_characters_of_names_at_most() -> None:
 @pytest.mark.parametrize(
     ("bound", "most", "label"),
     [
-        ("MOST_REGISTRATIONS_OF_SOURCE", 4, "4 registrations"),
-        ("MOST_CHARACTERS_OF_SOURCE", 43, "56 characters of names"),
+        ("MOST_REGISTRATIONS_IN_ALL", 11, "4 registrations, and leave 4 to others"),
+        ("MOST_CHARACTERS_IN_ALL", 150, "56 characters of names, and leave 52 to others"),
     ],
 )
-def test_a_source_has_so_many_registrations_at_most(
+def test_a_source_gets_no_more_registrations_than_it_leaves_to_others(
     monkeypatch: pytest.MonkeyPatch, bound: str, most: int, label: str
 ) -> None:
     """A container with a node at each of 100 ports filled the memory of its proxy."""
     monkeypatch.setattr(f"rosproxy.ros1.registry.registry.{bound}", most)
     registry = make_registry()
-    first, second = (node(registry, 5, port) for port in (40001, 40002))
     other = node(registry, 6)
+    first, second = (node(registry, 5, port) for port in (40001, 40002))
     for number in range(3):
-        for endpoint in (first, second, other):
+        for endpoint in (other, first, second):
             register(registry, endpoint, PUB, f"/t{number}", f"/node{endpoint.port}")
     assert (len(first.registrations), len(second.registrations)) == (2, 2)
     assert len(other.registrations) == 3
     reason = registry.reason_full(second, Registration(PUB, "/new", "/n")) or ""
     assert label in reason
-    assert "are accepted. Run some of these nodes at another address" in reason
+    assert "not accepted. Run some of these nodes at another address" in reason
     assert registry.reason_full(other, Registration(PUB, "/new", "/n")) is None
     register(registry, first, PUB, "/t0", f"/node{first.port}")
     registry.remove(second)
@@ -491,6 +493,26 @@ def test_a_source_has_so_many_registrations_at_most(
     registry.remove(first)
     registry.remove(other)
     assert not registry._registrations_of + registry._characters_of
+    assert (registry._registrations, registry._characters) == (0, 0)
+
+
+@pytest.mark.parametrize("padding", [0, 140])
+def test_the_proxy_can_read_the_state_of_the_master_with_all_registrations(padding: int) -> None:
+    """The nodes of an address registered so much that the proxy treated the master as down.
+
+    A proxy that started then let no other node register.
+    """
+    registry = make_registry(32)
+    for number in range(32):
+        endpoint = node(registry, 5 + number // 8, 40001 + number)
+        for count in range(MOST_REGISTRATIONS):
+            name = f"/{number}/{count}".ljust(padding, "&")
+            if not registry.reason_full(endpoint, Registration(PUB, name, f"/n{number}")):
+                register(registry, endpoint, PUB, name, f"/n{number}")
+    names = [r.name for e in registry for r in e.registrations.values()]
+    assert len(names) > 20_000
+    state = [[[name, ["/n00"]] for name in names], [], []]
+    assert read_value("getSystemState", py_reply([1, "", state]), OWN_REPLY) == state
 
 
 def test_an_endpoint_has_so_many_node_names_at_most() -> None:
