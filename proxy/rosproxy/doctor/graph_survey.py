@@ -35,7 +35,7 @@ from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.clients.master_client import CALLER_ID, MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
-from rosproxy.ros1.protocol.xmlrpc.limits import ALL_LEASES, FLAG, Limits
+from rosproxy.ros1.protocol.xmlrpc.limits import ALL_LEASES, FLAG, SHORT_REPLY, Limits
 from rosproxy.ros1.registry.remembered_leases import NAMESPACE, LeasesAtMaster
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.text import brief
@@ -222,7 +222,8 @@ class _Collector:
         return replace(node, addresses=addresses, attempt=attempt)
 
     async def _ask_pid(self, target: HostPort) -> Attempt:
-        attempt, pid = await _attempt(self._nodes.call_node(target, ANSWER_TIMEOUT_S, "getPid"))
+        question = self._nodes.call_node(target, ANSWER_TIMEOUT_S, "getPid", limits=SHORT_REPLY)
+        attempt, pid = await _attempt(question)
         if attempt.failed or isinstance(pid, int):
             return attempt
         return Attempt(ReachOutcome.STRANGER, "the answer is not that of a node")
@@ -263,7 +264,14 @@ class _Collector:
         if slave is None or node.report is None:
             return "", Attempt()
         attempt, answer = await _attempt(
-            self._nodes.call_node(slave, ANSWER_TIMEOUT_S, "requestTopic", topic, [["TCPROS"]])
+            self._nodes.call_node(
+                slave,
+                ANSWER_TIMEOUT_S,
+                "requestTopic",
+                topic,
+                [["TCPROS"]],
+                limits=SHORT_REPLY,
+            )
         )
         target = data_port(answer)
         if attempt.failed:

@@ -14,6 +14,7 @@ import pytest
 
 from examples.demo.fake_http import Answer, host_and_port, value
 from examples.demo.fake_node import FakeNode
+from rosproxy.ros1.protocol.xmlrpc.limits import SHORT_REPLY
 from tests.clock import pass_time
 from tests.integration.net import (
     OTHER_NODE,
@@ -93,6 +94,15 @@ async def test_a_pid_is_taken_whatever_the_status(proxy, node):
     node.answers["getPid"] = value([0, "", 4242])
     await node.publish(proxy.master)
     await until(lambda: proxy.endpoint(node).health.pid == 4242, "the pid is known")
+
+
+async def test_a_long_answer_to_getpid_is_not_read(proxy, node):
+    """With answers of 4 MB with entities, 24 nodes held up the proxy for 7 s at each probe."""
+    node.answers["getPid"] = value([1, "x" * SHORT_REPLY.size, 4242])
+    await node.publish(proxy.master)
+    await until(lambda: proxy.endpoint(node).health.state == "ok", "the node has answered")
+    await pass_time(2)
+    assert (proxy.endpoint(node).health.state, proxy.endpoint(node).health.pid) == ("ok", None)
 
 
 async def test_a_node_that_cannot_be_confirmed_stays_registered(proxy, master, node):

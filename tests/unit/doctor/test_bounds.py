@@ -57,7 +57,7 @@ class MadeUpMaster:
     async def look_up(self, _: str, names: Any) -> dict[str, str]:
         return {name: self._uris[name] for name in names if name in self._uris}
 
-    async def call_node(self, slave: HostPort, _: float, method: str, *__: Any) -> Any:
+    async def call_node(self, slave: HostPort, _: float, method: str, *__: Any, **___: Any) -> Any:
         self.asked.append((slave.host, method))
         self.under_way += 1
         self.most_under_way = max(self.most_under_way, self.under_way)

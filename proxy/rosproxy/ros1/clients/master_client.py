@@ -232,8 +232,9 @@ class MasterClient:
         within: float = NODE_TIMEOUT_S,
         path: str = "/",
         name: str = "",
+        limits: Limits = REPLY,
     ) -> bytes:
-        """A node's reply to a call. Raises Unreachable.
+        """A node's reply to a call, within ``limits``. Raises Unreachable.
 
         ``within`` is in seconds. ``name`` is the host and port for the HTTP header and for errors,
         if they differ from the address.
@@ -241,7 +242,7 @@ class MasterClient:
         called = name or str(slave)
         with _FailuresOf(f"node at {called}"):
             target = self.reach(slave)
-            return await self._nodes.post(target, path, called, body, within, REPLY.size)
+            return await self._nodes.post(target, path, called, body, within, limits.size)
 
     async def pass_to_node(self, slave: HostPort, body: bytes | LongBody) -> bytes | LongReply:
         """A node's reply to a call; the proxy reads neither the call nor the reply.
@@ -258,7 +259,8 @@ class MasterClient:
     ) -> Any:
         """Call a node in ``within`` seconds; return the value. Raises Unreachable, MasterError."""
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
-        return read_value(method, await self.post_to_node(slave, body, within), limits)
+        reply = await self.post_to_node(slave, body, within, limits=limits)
+        return read_value(method, reply, limits)
 
     def close_after_answer(self, sock: socket.socket, received: bytes) -> None:
         """Close a connection to a node once the answer that is due has arrived.

@@ -30,7 +30,7 @@ from rosproxy.ros1.clients.master_client import (
 )
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc.limits import PID_REPLY
+from rosproxy.ros1.protocol.xmlrpc.limits import SHORT_REPLY
 from rosproxy.ros1.registry.graph import ROSOUT, NodeInfo, read_types
 from rosproxy.ros1.registry.node_health import ProbeResult
 
@@ -66,7 +66,9 @@ class NodeClient:
         Any HTTP answer shows that the node lives, even an error because the method is unknown.
         """
         try:
-            body = await self._upstream.post_to_node(slave, _PID_CALL, within or self._within)
+            body = await self._upstream.post_to_node(
+                slave, _PID_CALL, within or self._within, limits=SHORT_REPLY
+            )
             return ProbeAnswer(ProbeResult.ANSWERED, self.read_pid(body))
         except Unreachable as error:
             return ProbeAnswer(error.probe, reason=str(error))
@@ -91,7 +93,7 @@ class NodeClient:
 
         Raises Unreachable if the body is not XML-RPC.
         """
-        match parse_value(body, PID_REPLY):
+        match parse_value(body, SHORT_REPLY):
             case [_, _, int(pid)]:
                 return pid
         return None
@@ -123,7 +125,9 @@ class NodeClient:
         registration (topic_manager.cpp, subscribe).
         """
         try:
-            name = await self._upstream.call_node(slave, self._within, "getName")
+            name = await self._upstream.call_node(
+                slave, self._within, "getName", limits=SHORT_REPLY
+            )
             if isinstance(name, str):
                 return name
         except Unreachable as error:
@@ -192,7 +196,7 @@ class NodeClient:
         Raises Unreachable, MasterError.
         """
         answer = await self._upstream.call_node(
-            slave, self._within, "requestTopic", topic, [["TCPROS"]]
+            slave, self._within, "requestTopic", topic, [["TCPROS"]], limits=SHORT_REPLY
         )
         match answer:
             case [_, _, int(port)] if 0 < port < 65536:

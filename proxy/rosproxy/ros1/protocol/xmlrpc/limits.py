@@ -35,8 +35,9 @@ REPLY = Limits(4 * 1024 * 1024, 20_000)
 """A reply with addresses to replace: the publishers of a topic, the connections of a node."""
 BUS_STATS = Limits(4 * 1024 * 1024, 10_000)
 """The counts of a node: twelve elements for each topic with two connections."""
-PID_REPLY = Limits(4 * 1024 * 1024, 100)
-"""The pid of a node, for which the proxy asks again and again, or a refusal: five elements."""
+SHORT_REPLY = Limits(64 * 1024, 100)
+"""The pid of a node, for which the proxy asks again and again, or a name, a port, or a refusal: up
+to ten elements."""
 LEASES = Limits(4 * 1024 * 1024, 100)
 """The value of the parameter with the leases: a text with 40 bytes for each node, or whatever
 another program has written to the parameter."""
