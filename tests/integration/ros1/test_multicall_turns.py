@@ -7,7 +7,11 @@ from typing import Any
 import pytest
 
 from rosproxy.access.access_policy import AccessPolicy
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.http_client import LONG_BODY_BYTES
 from rosproxy.ros1.api.slave import SlaveApi
+from rosproxy.ros1.clients import master_client
+from rosproxy.ros1.protocol.xmlrpc.document import dump_reply
 from rosproxy.ros1.protocol.xmlrpc.passing import PIECE_BYTES, MulticallWatch
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.stand_ins.stand_in_ports import URIS_PER_TURN
@@ -103,6 +107,22 @@ async def test_the_uris_of_a_topic_with_thousands_of_publishers(make_proxy, roun
     uris = [f"http://elsewhere.{NODE}/{number}" for number in range(3000)]
     await proxy.ros1.stand_ins.listen_for(uris, Caller(NODE, PROXY))
     assert len(rounds.noted) >= len(uris) // URIS_PER_TURN
+
+
+async def test_long_replies_of_several_nodes(make_proxy, rounds, monkeypatch):
+    """Lists of 4 MB with entities, of 24 nodes that changed their pids, took 10 s at once."""
+    proxy = await make_proxy()
+    nodes = proxy.ros1.context.upstream
+
+    async def post_to_node(*_: Any, **__: Any) -> bytes:
+        return dump_reply([1, "", [["/t", "x" * LONG_BODY_BYTES]]])
+
+    monkeypatch.setattr(nodes, "post_to_node", post_to_node)
+    monkeypatch.setattr(master_client, "read_value", rounds.noting(master_client.read_value))
+    slave = HostPort(NODE, 40000)
+    calls = [nodes.call_node(slave, 1.0, "getPublications") for _ in range(3)]
+    assert len(await asyncio.gather(*calls)) == 3
+    assert len(rounds.noted) >= 3
 
 
 async def test_what_the_master_may_have_lost(make_proxy, master, make_node, rounds, monkeypatch):

@@ -23,6 +23,7 @@ import msgspec
 
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy.net.http_client import (
+    LONG_BODY_BYTES,
     MOST_BODY_BYTES,
     BadResponse,
     CallFailed,
@@ -101,6 +102,7 @@ class MasterClient:
         self.master_uri = master_uri
         self.master_address = master_address
         self._metrics = metrics
+        self._reading = asyncio.Lock()
         uri = urlsplit(master_uri)
         self._master_path = uri.path or "/"
         self._netloc = uri.netloc
@@ -257,10 +259,21 @@ class MasterClient:
     async def call_node(
         self, slave: HostPort, within: float, method: str, *params: Any, limits: Limits = REPLY
     ) -> Any:
-        """Call a node in ``within`` seconds; return the value. Raises Unreachable, MasterError."""
+        """Call a node in ``within`` seconds; return the value. Raises Unreachable, MasterError.
+
+        Long replies of nodes, which may come at once, are read one after the other. Between these,
+        the proxy serves others for as long as it has read.
+        """
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
         reply = await self.post_to_node(slave, body, within, limits=limits)
-        return read_value(method, reply, limits)
+        if len(reply) <= LONG_BODY_BYTES:
+            return read_value(method, reply, limits)
+        async with self._reading:
+            began = time.monotonic()
+            try:
+                return read_value(method, reply, limits)
+            finally:
+                await asyncio.sleep(time.monotonic() - began)
 
     def close_after_answer(self, sock: socket.socket, received: bytes) -> None:
         """Close a connection to a node once the answer that is due has arrived.
