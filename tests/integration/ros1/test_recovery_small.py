@@ -147,6 +147,18 @@ async def test_a_new_node_gets_no_port_that_belongs_to_another(proxy, master, no
     assert len(ports) == 4
 
 
+async def test_more_types_of_former_topics_than_the_proxy_can_read(proxy, master, nodes):
+    """rosmaster keeps them, so a node could keep all others from a proxy that started."""
+    await populate(proxy, *nodes)
+    uris = {node.name: uri_of(master, node.name) for node in nodes}
+    master.types |= {f"/former{number}": "std_msgs/String" for number in range(80_000)}
+    await proxy.restart()
+    for uri in uris.values():
+        await until(partial(answers, uri), "the node is served")
+    assert master.nodes == uris
+    assert proxy.app.status()["master"]["up"]
+
+
 async def test_a_hanging_node_does_not_hold_up_recovery_and_is_served_later(
     make_proxy, master, nodes
 ):

@@ -207,10 +207,21 @@ class MasterClient:
 
     async def read_registrations(self) -> dict[str, list[Registration]]:
         """The registrations of each node. Raises Unreachable, MasterError."""
-        state, types = await asyncio.gather(
-            self.call_master("getSystemState"), self.call_master("getTopicTypes")
-        )
+        state, types = await asyncio.gather(self.call_master("getSystemState"), self._read_types())
         return _read_state(state, types)
+
+    async def _read_types(self) -> Any:
+        """The types of all topics; none if there are too many to read.
+
+        rosmaster keeps the types of topics that no node has any more (master_api.py, topics_types).
+        So a node that registers ever new topics makes the reply longer and longer.
+        """
+        try:
+            return await self.call_master("getTopicTypes")
+        except Unreachable as error:
+            if error.probe is not ProbeResult.ANSWERED:
+                raise
+            return []
 
     async def read_graph(self) -> Graph:
         """The registrations and URI of each node. Raises Unreachable, MasterError."""
