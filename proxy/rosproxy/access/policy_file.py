@@ -94,5 +94,5 @@ class PolicyFile:
 
 
 def file_signature(stat: os.stat_result) -> tuple[int, ...]:
-    """A value that differs if the file has changed, or if another file has replaced it."""
-    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns
+    """A value that differs after a change of the file or its permissions, or a replacement."""
+    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns

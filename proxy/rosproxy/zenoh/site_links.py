@@ -79,14 +79,16 @@ class SiteLinks:
         return self._plan.config(self.files.credentials if self.files else None, hub_socket)
 
     def look(self) -> bool:
-        """Read the files again after a change or a fault. Return whether the contents differ.
+        """Read the files again after a change. Return whether the contents differ.
 
         A fault counts if the next look finds the fault, too: another program may be about to write
-        the files, one after the other.
+        the files, one after the other. Later looks wait for a change, because OpenSSL may need a
+        second for a file with thousands of certificates.
         """
         before = self.files
+        is_settled = self._fault is None or self._is_fault_old
         try:
-            if self._fault is None and signatures(paths_of(self._settings)) == self._signatures:
+            if is_settled and signatures(paths_of(self._settings)) == self._signatures:
                 return False
         except OSError:
             pass  # the read below has the same error, with the name of the file
