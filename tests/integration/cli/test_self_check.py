@@ -19,9 +19,12 @@ from tests.integration.commands import run
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.doctor.test_doctor import examine
 from tests.integration.net import MASTER, rpc, until
+from tests.integration.own_domain import own_domain
 from tests.integration.process import Process, command_line
 from tests.integration.proxy import Proxy, options_for
 
+DOMAIN = own_domain()
+OTHER_DOMAIN = own_domain()
 NOT_FOUND = b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"
 
 
@@ -66,7 +69,7 @@ async def test_a_second_proxy_on_the_range_of_the_first_ends_and_names_it(start_
     assert (await status(first))["ports"]["blocked"] == 0
 
 
-@pytest.mark.parametrize("ros", [{}, {"ros": "2", "ros2_domain": 203, "ros2_peer": "127.0.0.1"}])
+@pytest.mark.parametrize("ros", [{}, {"ros": "2", "ros2_domain": DOMAIN, "ros2_peer": "127.0.0.1"}])
 async def test_a_proxy_that_is_started_twice_names_itself(start_process, ros):
     """Even with the same admin endpoint."""
     first: Process = start_process(**ros)
@@ -92,10 +95,10 @@ async def test_a_second_proxy_on_a_part_of_the_range_names_the_first(start_proce
     assert (await status(first))["ports"]["blocked"] == 0, "the same ports again"
 
 
-@pytest.mark.parametrize("domain", [201, 202])
+@pytest.mark.parametrize("domain", [DOMAIN, OTHER_DOMAIN], ids=["same", "other"])
 async def test_a_second_proxy_of_ros2_on_the_range_names_the_first(start_process, domain):
     """A machine can have only one proxy for a domain anyway."""
-    first: Process = start_process(ros="2", ros2_domain=201, ros2_peer="127.0.0.1")
+    first: Process = start_process(ros="2", ros2_domain=DOMAIN, ros2_peer="127.0.0.1")
     options = options_for(ros="2", ros2_domain=domain, ros2_peer="127.0.0.1")
     options["port_range"] = first.options["port_range"]
     ended = await asyncio.to_thread(started, options)
@@ -163,7 +166,7 @@ RELAY = {"ros2_lan_relay": "127.0.0.1:7500", "ros2_lan_relay_secret": "012345678
     ],
 )
 async def test_all_checks_agree_whether_outside_is_on_this_machine(start_process, given, is_fault):
-    options = options_for(ros="2", ros2_domain=204, advertise_host="127.0.0.1", **given)
+    options = options_for(ros="2", ros2_domain=DOMAIN, advertise_host="127.0.0.1", **given)
     deep = await asyncio.to_thread(started, {**options, "check": True, "deep": True})
     process: Process = start_process(**options)
     doctor = await run("doctor", "--admin", admin_of(process))
@@ -326,7 +329,7 @@ async def test_the_deep_check_names_another_proxy(start_process):
 
 @pytest.mark.parametrize(("port", "code"), [(0, 0), (1, 1)])
 async def test_the_deep_check_for_ros2(port, code):
-    options = options_for(ros="2", ros2_domain=203, ros2_peer="127.0.0.1")
+    options = options_for(ros="2", ros2_domain=DOMAIN, ros2_peer="127.0.0.1")
     if port:
         options["advertise_host"] = "nowhere.invalid"
     ended, told = await deep(options)
