@@ -168,6 +168,12 @@ FIXES = {
         "use a network plug-in that keeps the source of datagrams to hostPorts (CNI: the plug-in "
         "portmap)",
     ),
+    "kernel plane": Fix(
+        "set --data-plane kernel, and give the proxy the capability NET_ADMIN",
+        "start the operator with --allow-data-plane kernel, and add the label "
+        "rosproxy.data-plane=kernel to a container of this proxy",
+        "set spec.dataPlane: Kernel. The chart's allow.dataPlanes must list Kernel",
+    ),
     "direction both": Fix(
         "set --direction both",
         "add the label rosproxy.direction=both to the containers of this proxy",

@@ -346,8 +346,10 @@ class DomainStatus(msgspec.Struct, frozen=True):
 
     ``discovery``: the address at which the proxy receives discovery from outside. ``direction``:
     the setting of the proxy. ``dropped``: refused datagrams. ``lost``: datagrams that the kernel
-    did not accept. ``data_plane`` is for user data. ``not_compared``: pairs of a reader and a
-    writer that the proxy has not compared.
+    did not accept. ``overflowed``: datagrams that the kernel dropped because a receive buffer of
+    the proxy was full; ``overflowed_recently`` counts the last minute. ``receive_buffer``: the size
+    of these buffers in bytes. ``data_plane`` is for user data. ``not_compared``: pairs of a reader
+    and a writer that the proxy has not compared.
     """
 
     domain: Count = 0
@@ -359,6 +361,9 @@ class DomainStatus(msgspec.Struct, frozen=True):
     ports_free: Count = 0
     dropped: Count = 0
     lost: Count = 0
+    overflowed: Count = 0
+    overflowed_recently: Count = 0
+    receive_buffer: Count = 0
     data_plane: DataPlaneStatus | None = None
     inside: tuple[ParticipantStatus, ...] = ()
     outside: tuple[ParticipantStatus, ...] = ()

@@ -42,8 +42,8 @@ def _summary(domain: document.DomainStatus) -> str:
         or "no peer and no LAN relay is set, so inside is announced to no host outside"
     )
     ports = f"{domain.ports_used} ports used, {domain.ports_free} free"
-    lost = f"; {domain.dropped} datagrams refused, {domain.lost} lost"
-    trouble = lost if domain.dropped or domain.lost else ""
+    lost = domain.lost + domain.overflowed
+    trouble = f"; {domain.dropped} datagrams refused, {lost} lost" if domain.dropped or lost else ""
     plane = f"; user data {_plane(domain.data_plane)}" if domain.data_plane else ""
     discovery = clean(domain.discovery)
     return (

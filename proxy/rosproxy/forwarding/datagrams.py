@@ -11,6 +11,7 @@ import logging
 import socket
 from collections.abc import Callable, Collection
 
+from rosproxy.forwarding.buffer_sizes import UDP_RECEIVE_BUFFER_BYTES
 from rosproxy.net.addresses import HostPort, plain_address
 
 log = logging.getLogger(__name__)
@@ -19,15 +20,15 @@ DATAGRAMS_PER_TURN = 64
 """Datagrams that a relay reads at most in a round of the event loop."""
 LARGEST_DATAGRAM = 65_536
 """Bytes of a datagram that are read at most."""
-RECEIVE_BUFFER_BYTES = 1024 * 1024
-"""Bytes that wait while the event loop is busy; Linux grants rmem_max at most."""
+_SO_RCVBUFFORCE = 33
+"""An option of asm-generic/socket.h, which Python's socket lacks."""
 
 
 def bind(address: str, port: int) -> socket.socket:
     """A bound, non-blocking UDP socket; port 0 stands for any free port. Raises OSError."""
     sock = _socket(address)
     try:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        enlarge_receive_buffer(sock)
         if sock.family == socket.AF_INET6:
             # `::` accepts IPv4, too, with any value of net.ipv6.bindv6only (ipv6(7)).
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
@@ -36,6 +37,14 @@ def bind(address: str, port: int) -> socket.socket:
         sock.close()
         raise
     return sock
+
+
+def enlarge_receive_buffer(sock: socket.socket) -> None:
+    """Set the receive buffer to `UDP_RECEIVE_BUFFER_BYTES`, or to as much as the kernel grants."""
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, UDP_RECEIVE_BUFFER_BYTES)
+    except PermissionError:  # without NET_ADMIN (socket(7))
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_RECEIVE_BUFFER_BYTES)
 
 
 class DatagramRelay:

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
 from rosproxy.fixes import how_to
+from rosproxy.forwarding.buffer_sizes import UDP_RECEIVE_BUFFER_BYTES
 from rosproxy.ros2.protocol.rtps import CYCLONE_DDS, FAST_DDS
 from rosproxy.ros2.registry.participants import VENDORS, DdsSecurity, LocatorFault, ShortageKind
 from rosproxy.telemetry.text import plural
@@ -32,6 +33,9 @@ class DomainProblem(msgspec.Struct, frozen=True):
     owner: str = ""
 
 
+LEAST_OVERFLOWED = 60
+"""Datagrams that the kernel drops in a minute, from which on they are a problem. DDS sends single
+lost datagrams again."""
 _FAST_DDS_NAME = VENDORS[FAST_DDS]
 _CYCLONE_DDS_NAME = VENDORS[CYCLONE_DDS]
 _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
@@ -80,6 +84,7 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
     """Yield the problems of a domain, in the order in which to fix them."""
     yield from (problem for _, problem in _participant_problems(domain))
     yield from (problem for _, problem in mismatch_problems(domain))
+    yield from _overflow(domain)
     if domain.mismatches_left_out:
         text = f"{plural(domain.mismatches_left_out, 'more pair')} of endpoints don't match"
         yield DomainProblem(
@@ -97,6 +102,27 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
             "that have thousands. A domain of hundreds of nodes may have so many without a fault"
         )
         yield DomainProblem("qos", f"domain {domain.domain}", text, fix, grave=False)
+
+
+def _overflow(domain: DomainStatus) -> Iterator[DomainProblem]:
+    """Yield the problem that the kernel drops datagrams, unless these are a few.
+
+    The text has no count, because `DomainWatch` would report each change.
+    """
+    if domain.overflowed_recently < LEAST_OVERFLOWED:
+        return
+    text = (
+        "datagrams arrive faster than the proxy reads them, and the kernel drops some, because a "
+        f"receive buffer has {domain.receive_buffer // 1024} KiB. Large messages are late or lost"
+    )
+    fixes = []
+    if domain.receive_buffer < UDP_RECEIVE_BUFFER_BYTES:
+        sysctl = f"sysctl -w net.core.rmem_max={UDP_RECEIVE_BUFFER_BYTES}"
+        fixes.append(f"run {sysctl} on the host of the proxy, and restart the proxy")
+    if domain.data_plane is not None and domain.data_plane.plane != "kernel":
+        fixes.append(how_to("kernel plane"))
+    fix = "; or ".join(fixes) or "send smaller or fewer messages, or give the host more processors"
+    yield DomainProblem("buffer", f"domain {domain.domain}", text, fix, grave=False)
 
 
 def mismatch_problems(domain: DomainStatus) -> Iterator[tuple[MismatchStatus, DomainProblem]]:

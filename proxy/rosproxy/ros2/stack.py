@@ -125,6 +125,8 @@ class Ros2:
         tasks.repeat(self._sample_rates, RATE_INTERVAL_S, "sampling rates")
 
     async def _look_at_domains(self) -> None:
+        for server in self.servers:
+            server.buffers.sample(self._runtime.now())
         await self.state.comparisons.renew([server.domain for server in self.servers])
         await self._watch.look()
 

@@ -140,6 +140,11 @@ class Ros2State(Collector):
         dropped = CounterMetricFamily(
             "rosproxy_ros2_dropped_datagrams", "Datagrams that were refused.", labels=["domain"]
         )
+        overflowed = CounterMetricFamily(
+            "rosproxy_ros2_overflowed_datagrams",
+            "Datagrams that the kernel dropped because a receive buffer of the proxy was full.",
+            labels=["domain"],
+        )
         passed = CounterMetricFamily(
             "rosproxy_ros2_relayed_bytes",
             "Bytes of datagrams passed on.",
@@ -152,9 +157,10 @@ class Ros2State(Collector):
             free.add_metric([number], domain.ports.pool.free)
             lacking.add_metric([number], len(domain.mappings.shortages))
             dropped.add_metric([number], domain.refused.count)
+            overflowed.add_metric([number], server.buffers.overflowed)
             for (kind, inwards), size in domain.passed.items():
                 passed.add_metric([number, kind.value, "inward" if inwards else "outward"], size)
-        yield from (used, free, lacking, dropped, passed)
+        yield from (used, free, lacking, dropped, overflowed, passed)
 
     def _participants(self) -> Iterator[Metric]:
         gauge = GaugeMetricFamily(
@@ -198,6 +204,9 @@ class Ros2State(Collector):
             ports_free=domain.ports.pool.free,
             dropped=domain.refused.count,
             lost=server.lost,
+            overflowed=server.buffers.overflowed,
+            overflowed_recently=server.buffers.overflowed_recently,
+            receive_buffer=server.buffers.size_bytes,
             data_plane=self._plane.status(),
             mismatches=tuple(map(_mismatch, shown_pairs)),
             mismatches_left_out=len(pairs) - len(shown_pairs),

@@ -1,10 +1,17 @@
 """Problems in the status of a domain: reasons why participants do not discover each other."""
 
+import re
+
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
-from rosproxy.ros2.domain_problems import DomainProblem, domain_problems
+from rosproxy.admin.status_document import (
+    DataPlaneStatus,
+    DomainStatus,
+    MismatchStatus,
+    ParticipantStatus,
+)
+from rosproxy.ros2.domain_problems import LEAST_OVERFLOWED, DomainProblem, domain_problems
 
 INSIDE = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
 OUTSIDE = ParticipantStatus("01.10.bb", "10.0.0.9", "Cyclone DDS")
@@ -52,6 +59,29 @@ def test_each_cause_has_its_fix(
     assert (problem.check, problem.subject, problem.grave) == (check, "01.0f.aa", grave)
     assert said in problem.text + problem.fix
     assert problem.text.startswith("participant at 172.30.0.5 (")
+
+
+@pytest.mark.parametrize(
+    ("buffer", "plane", "fix"),
+    [
+        (212_992, "copy", "net.core.rmem_max=1048576 .*, and restart the proxy; or .* kernel"),
+        (212_992, "kernel", "net.core.rmem_max=1048576 .*, and restart the proxy$"),
+        (1_048_576, "copy", "^set --data-plane kernel"),
+        (1_048_576, "kernel", "^send smaller or fewer messages"),
+    ],
+)
+def test_full_receive_buffers_have_a_fix_that_is_left(buffer: int, plane: str, fix: str) -> None:
+    few = replace(
+        DOMAIN,
+        overflowed_recently=LEAST_OVERFLOWED - 1,
+        receive_buffer=buffer,
+        data_plane=DataPlaneStatus(plane=plane),
+    )
+    assert list(domain_problems(few)) == []
+    (problem,) = domain_problems(replace(few, overflowed_recently=LEAST_OVERFLOWED))
+    assert (problem.subject, problem.grave) == ("domain 3", False)
+    assert f"{buffer // 1024} KiB" in problem.text
+    assert re.search(fix, problem.fix), problem.fix
 
 
 def test_of_a_participant_the_first_cause_alone_is_told() -> None:

@@ -2,7 +2,7 @@
 
 import asyncio
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import cast
 
 import pytest
@@ -25,6 +25,7 @@ from rosproxy.ros2.registry.participants import (
     PortMapping,
 )
 from rosproxy.ros2.servers.domain_server import DomainServer
+from rosproxy.ros2.servers.receive_buffers import ReceiveBuffers
 from rosproxy.ros2.status import MOST_STEPS_AT_ONCE, Ros2State, _first_endpoints
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
@@ -50,6 +51,7 @@ class Served:
 
     domain: Domain
     lost: int = 0
+    buffers: ReceiveBuffers = field(default_factory=ReceiveBuffers)
 
 
 class Copied:

@@ -33,6 +33,7 @@ from collections.abc import (
 from functools import partial
 
 from rosproxy.forwarding import datagrams
+from rosproxy.forwarding.buffer_sizes import UDP_RECEIVE_BUFFER_BYTES
 from rosproxy.forwarding.datagrams import LARGEST_DATAGRAM
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort, plain_address
@@ -51,6 +52,7 @@ from rosproxy.ros2.protocol.rtps import PREFIX_BYTES, RtpsError, by_source_if_so
 from rosproxy.ros2.rewriting.discovery import read_messages
 from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
+from rosproxy.ros2.servers.receive_buffers import ReceiveBuffers
 from rosproxy.ros2.sources.selected import SelectedAddresses
 
 log = logging.getLogger(__name__)
@@ -107,6 +109,7 @@ class DomainServer:
         )
         self._selected = SelectedAddresses(now() + selection_timeout)
         self._loop = asyncio.get_running_loop()
+        self.buffers = ReceiveBuffers()
         self._sockets: list[socket.socket] = []
         self._stand_ins: dict[int, socket.socket] = {}
         self._synced_changes = 0
@@ -358,16 +361,20 @@ class DomainServer:
         self._send(Outgoing(HostPort(group, port), datagram) for group in groups_of(near))
 
     def _read_group(self, sock: socket.socket) -> None:
-        must_queue = self._must_queue_inside
-        self._loop.add_reader(sock, self._take_in, sock, self._heard_in_group, must_queue)
+        self._begin_reading(sock, self._heard_in_group, self._must_queue_inside)
+
+    def _begin_reading(self, sock: socket.socket, take: Take, must_queue: MustQueue) -> None:
+        self.buffers.sockets.add(sock)
+        self._loop.add_reader(sock, self._take_in, sock, take, must_queue)
 
     def _stop_reading(self, sock: socket.socket) -> None:
         self._loop.remove_reader(sock)
+        self.buffers.remove(sock)
         sock.close()
 
     def _read(self, sock: socket.socket, take: Take, must_queue: MustQueue) -> None:
         self._sockets.append(sock)
-        self._loop.add_reader(sock, self._take_in, sock, take, must_queue)
+        self._begin_reading(sock, take, must_queue)
 
     def _must_queue_inside(self, datagram: bytes, source: str) -> bool:
         if self._is_at_relay(source):
@@ -566,7 +573,7 @@ class DomainServer:
             self._stand_ins[port] = sock
             take = partial(self._at_stand_in, port)
             must_queue = partial(self.domain.must_queue_at_stand_in, port)
-            self._loop.add_reader(sock, self._take_in, sock, take, must_queue)
+            self._begin_reading(sock, take, must_queue)
         return closed
 
 
@@ -579,5 +586,5 @@ def _sending_socket(family: socket.AddressFamily) -> socket.socket:
     sock = socket.socket(family, socket.SOCK_DGRAM)
     sock.setblocking(False)
     with contextlib.suppress(OSError):
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, datagrams.RECEIVE_BUFFER_BYTES)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, UDP_RECEIVE_BUFFER_BYTES)
     return sock

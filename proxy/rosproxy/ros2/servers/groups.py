@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from rosproxy.forwarding.datagrams import RECEIVE_BUFFER_BYTES
+from rosproxy.forwarding.datagrams import enlarge_receive_buffer
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.interfaces import interface_index
 
@@ -181,7 +181,7 @@ def group_socket(group: HostPort, link_of: str = "") -> socket.socket:
     try:
         sock.setblocking(False)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        enlarge_receive_buffer(sock)
         if sock.family == socket.AF_INET:
             with contextlib.suppress(OSError):  # without this option the socket receives too much
                 sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
