@@ -340,9 +340,15 @@ async def test_a_lost_fast_port_is_cut_once(bench: Bench) -> None:
     bench.plane.syncer.note_change(endpoint)
     await bench.plane.syncer.wait_until_unforwarded(45002)
     assert endpoint in bench.plane.owners
+    bench.tools.flows = bench.flow(45002)
+    await bench.plane.look()
+    assert endpoint.fast_peers == {"198.51.100.2": 1}
     bench.plane.cut(endpoint)
     assert endpoint not in bench.plane.owners
     await until(lambda: bool(bench.tools.forgotten))
+    # Otherwise the proxy takes the subscribers for connected, and tells them no publisher.
+    assert endpoint.fast_peers == {}
+    assert bench.plane.status_of(endpoint)["sent"]
 
 
 async def test_forwards_that_nobody_claims_are_removed(bench: Bench) -> None:

@@ -102,12 +102,15 @@ class KernelAccounts:
         for former in set(before.values()) - holders:
             # A reading of the connections may have ended after the former owner gave its port back.
             former.fast_peers = {}
-        self._accounts = {e: account for e, account in self._accounts.items() if e in holders}
+        by_port = endpoints.by_port
+        self._accounts = {e: a for e, a in self._accounts.items() if by_port.get(e.port) is e}
 
     def forget_lost_ports(self, endpoint: LeaseHolder) -> None:
         """Forget the ports of an endpoint, except its fast port: their connections have ended."""
         lost = set(self.ports_of(endpoint)) - {endpoint.fast_port}
         self.owners = {port: owner for port, owner in self.owners.items() if port not in lost}
+        if not self.owns(endpoint):
+            endpoint.fast_peers = {}  # no later reading of the connections is about this endpoint
 
     def owns(self, endpoint: LeaseHolder) -> bool:
         """Whether an endpoint had a fast port at the last call of `note_owners`."""
