@@ -216,7 +216,9 @@ class Registry:
         """Why an endpoint does not accept a registration; None if there is room.
 
         A registration that the endpoint has already is accepted, unless its names get longer: a
-        node repeats all its registrations at a master that has restarted.
+        node repeats all its registrations at a master that has restarted. Until a recovered
+        endpoint is ``trusted``, only the total counts: the master lists nodes in any order, so the
+        first source would get less than before.
         """
         former = endpoint.registrations.get(registration.key)
         if former is not None and registration.characters <= former.characters:
@@ -230,7 +232,7 @@ class Registry:
             left = MOST_REGISTRATIONS_IN_ALL - self._registrations
             rows.append((registrations, left, "registrations"))
         for count, left, label in rows:
-            if count >= left:
+            if left <= (count if endpoint.trusted else 0):
                 return (
                     f"the nodes of {source} have {count} {label}, and leave {max(left, 0)} to "
                     "others. More are not accepted. Run some of these nodes at another address, "

@@ -515,6 +515,32 @@ def test_the_proxy_can_read_the_state_of_the_master_with_all_registrations(paddi
     assert read_value("getSystemState", py_reply([1, "", state]), OWN_REPLY) == state
 
 
+@pytest.mark.parametrize("bound", ["MOST_REGISTRATIONS_IN_ALL", "MOST_CHARACTERS_IN_ALL"])
+def test_all_accepted_registrations_return_after_a_restart(
+    monkeypatch: pytest.MonkeyPatch, bound: str
+) -> None:
+    """The master lists nodes in another order than they registered in.
+
+    Of two containers, the first could have 20,000 registrations and the second 12,500. Read in the
+    other order, the first lost 3,750 of these.
+    """
+    monkeypatch.setattr(f"rosproxy.ros1.registry.registry.{bound}", 700)
+    before = make_registry()
+    for number, count in ((5, 300), (6, 300)):
+        endpoint = node(before, number)
+        for topic in range(count):
+            registration = Registration(PUB, f"/{number}/{topic}", f"/n{number}")
+            if not before.reason_full(endpoint, registration):
+                before.register(endpoint, registration)
+    after = make_registry()
+    for endpoint in reversed(list(before)):
+        restored = after.restore(endpoint.uri, endpoint.node, endpoint.location, endpoint.port)
+        assert restored is not None
+        for registration in endpoint.registrations.values():
+            after.register(restored, registration)
+        assert len(restored.registrations) == len(endpoint.registrations)
+
+
 def test_an_endpoint_has_so_many_node_names_at_most() -> None:
     """The policy judges a topic for each name: 2 s for 10,000 names and 100 rules."""
     registry = make_registry()
