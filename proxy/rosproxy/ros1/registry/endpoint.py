@@ -77,9 +77,14 @@ class Registration:
 
     @property
     def characters(self) -> int:
-        """The number of characters of all texts of the registration."""
-        texts = self.name, self.caller_id, self.type, self.service_api or ""
-        return sum(map(len, texts))
+        """The number of characters of all texts of the registration.
+
+        Each character counts as its bytes in XML, six at most. ROS allows only characters that have
+        one byte there, but rosmaster accepts all characters.
+        """
+        texts = (self.name + self.caller_id + self.type + (self.service_api or "")).encode()
+        escaped = len(texts) - len(texts.translate(None, b"&<>\"'"))
+        return len(texts) + 5 * escaped
 
 
 @dataclass(slots=True, eq=False)

@@ -29,9 +29,10 @@ MOST_REGISTRATIONS_IN_ALL = 45_000
 others. With these, the state of the master fits into `OWN_REPLY`: a registration takes up to ten
 elements and 170 bytes. A thousand nodes of a machine have twenty registrations each. In the
 registry, each takes 600 bytes and the names."""
-MOST_CHARACTERS_IN_ALL = 5_000_000
+MOST_CHARACTERS_IN_ALL = 20_000_000
 """The highest number of characters of all names and types that are registered; a source gets no
-more than it leaves to others. A character takes up to five bytes in the state of the master."""
+more than it leaves to others. Of the 32 MiB of the master's state, 6 MB are left to nodes outside.
+A thousand nodes with long namespaces have 3,000,000."""
 UNPROVEN_DIVISOR = 4
 """Nodes of one source that have never answered may hold the range divided by this number. A healthy
 node answers within milliseconds after its first registration."""

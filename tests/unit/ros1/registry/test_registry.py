@@ -541,6 +541,19 @@ def test_all_accepted_registrations_return_after_a_restart(
         assert len(restored.registrations) == len(endpoint.registrations)
 
 
+def test_a_thousand_nodes_of_an_address_may_have_long_names() -> None:
+    """These nodes got no more than 16,500 registrations of 150 characters."""
+    registry = make_registry(1000)
+    for number in range(1000):
+        caller_id = f"/warehouse_a/robot_{number:03}/move_base_flex"
+        endpoint = node(registry, 5, 40001 + number)
+        for count in range(20):
+            name = f"{caller_id}/global_costmap/obstacle_layer_{count:02}/parameter_updates"
+            registration = Registration(PUB, name, caller_id, "dynamic_reconfigure/Config")
+            assert registry.reason_full(endpoint, registration) is None
+            registry.register(endpoint, registration)
+
+
 def test_an_endpoint_has_so_many_node_names_at_most() -> None:
     """The policy judges a topic for each name: 2 s for 10,000 names and 100 rules."""
     registry = make_registry()
