@@ -19,6 +19,7 @@ from rosproxy.forwarding.datagrams import bind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
+from rosproxy.ros2.lan_relay import relay as lan_relay
 from rosproxy.ros2.lan_relay import sources
 from rosproxy.ros2.lan_relay.relay import LanRelay, LanRelaySettings
 from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S
@@ -226,6 +227,28 @@ async def test_repeated_lists_of_proven_addresses_have_a_bound(boundary: Boundar
             process.sendto(sealed, (boundary.bind.host, boundary.bind.port))
             await asyncio.sleep(0)
         await until(lambda: relay.dropped > 0, "the relay leaves repeated lists unread")
+
+
+async def test_announcements_cost_the_lists_of_proven_addresses_nothing(
+    boundary: Boundary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A proxy with 500 participants uses up its allowance, and the relay read no lists."""
+    monkeypatch.setattr(lan_relay, "SOURCE_UNITS_PER_SECOND", 0.0)
+    relay = boundary.start_relay()
+    proof = RelayProof(SECRET, time.time)
+    target = boundary.bind.host, boundary.bind.port
+    (listed,) = address_lists([LAPTOP])
+    with closing(bind(PROXY, 0)) as process:
+        while not relay.dropped:
+            process.sendto(proof.sealed(Direction.TO_LAN, spdp(A, PROXY)), target)
+            await asyncio.sleep(0)
+        process.sendto(proof.sealed(Direction.TO_LAN, listed), target)
+
+    def is_proven() -> bool:
+        now = asyncio.get_running_loop().time()
+        return relay._sources.standing(LAPTOP, now) is Standing.PROVEN
+
+    await until(is_proven, "the relay reads the list")
 
 
 async def test_different_secrets_are_reported(

@@ -29,7 +29,7 @@ from rosproxy.ros2.domain_settings import (
     Outgoing,
 )
 from rosproxy.ros2.lan_relay.sources import SOURCE_BURST_UNITS, SOURCE_UNITS_PER_SECOND, LanSources
-from rosproxy.ros2.protocol.relay_envelope import listed_addresses, wrapped
+from rosproxy.ros2.protocol.relay_envelope import LIST_MAGIC, listed_addresses, wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source, by_source_if_sound
 from rosproxy.ros2.rewriting.discovery import read_discovery
@@ -76,6 +76,9 @@ class LanRelay:
         self._sources = LanSources()
         # A machine on the LAN may forge the proxy's address, but not its proof.
         self._proxy_rates = DiscoveryRates(SOURCE_UNITS_PER_SECOND, SOURCE_BURST_UNITS)
+        # An attacker that reads a list can repeat it. The lists have an allowance of their own,
+        # because the announcements of hundreds of participants use up the other.
+        self._list_rates = DiscoveryRates(SOURCE_UNITS_PER_SECOND, SOURCE_BURST_UNITS)
         self._scheduler = DiscoveryScheduler()
         self._warned_at = -PROOF_WARNING_INTERVAL_S
         self.from_lan = self.to_lan = self.dropped = 0
@@ -159,14 +162,19 @@ class LanRelay:
                     continue
                 source = plain_address(sender[0])
                 content = self._proven(datagram, source)
-                now = self._loop.time()
-                # A list is charged, too: an attacker that reads a list can repeat it.
-                if content is None or not self._proxy_rates.take(source, len(content), now):
-                    self.dropped += 1
-                elif (addresses := listed_addresses(content)) is not None:
-                    self._sources.note_proven(addresses, now)
-                else:
-                    self._tell_lan(content)
+                self.dropped += content is None or not self._take(content, source)
+
+    def _take(self, content: bytes, source: str) -> bool:
+        """Carry out a datagram of the proxy. False if its allowance is used up."""
+        now = self._loop.time()
+        rates = self._list_rates if content.startswith(LIST_MAGIC) else self._proxy_rates
+        if not rates.take(source, len(content), now):
+            return False
+        if (addresses := listed_addresses(content)) is not None:
+            self._sources.note_proven(addresses, now)
+        else:
+            self._tell_lan(content)
+        return True
 
     def _tell_lan(self, content: bytes) -> None:
         """Send announcements of the proxy to the groups on the LAN."""
