@@ -28,7 +28,7 @@ from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import SubmessageId, source_prefix
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
-from rosproxy.ros2.sources.rates import Standing, cost
+from rosproxy.ros2.sources.rates import Standing
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import A, B, spdp
@@ -216,39 +216,52 @@ async def test_refused_datagrams_cost_the_proxy_none_of_its_allowance(boundary: 
     assert PROXY in relay._proxy_rates._by_source
 
 
-async def test_repeated_lists_of_proven_addresses_have_a_bound(boundary: Boundary) -> None:
+async def test_repeated_lists_of_proven_addresses_have_a_bound(
+    boundary: Boundary, small_allowance: None
+) -> None:
     """Each list of 256 addresses takes milliseconds, and the relay read any number of lists."""
     relay = boundary.start_relay()
     (listed,) = address_lists([f"192.0.2.{number}" for number in range(256)])
-    sealed = RelayProof(SECRET, time.time).sealed(Direction.TO_LAN, listed)
-    most = sources.SOURCE_BURST_UNITS // cost(len(listed))
-    with closing(bind(PROXY, 0)) as process:
-        for _ in range(int(2 * most)):
-            process.sendto(sealed, (boundary.bind.host, boundary.bind.port))
-            await asyncio.sleep(0)
-        await until(lambda: relay.dropped > 0, "the relay leaves repeated lists unread")
+    await use_up(boundary, listed, relay)
 
 
 async def test_announcements_cost_the_lists_of_proven_addresses_nothing(
-    boundary: Boundary, monkeypatch: pytest.MonkeyPatch
+    boundary: Boundary, small_allowance: None
 ) -> None:
-    """A proxy with 500 participants uses up its allowance, and the relay read no lists."""
-    monkeypatch.setattr(lan_relay, "SOURCE_UNITS_PER_SECOND", 0.0)
+    """A proxy with 600 participants uses up its allowance, and the relay read no lists."""
     relay = boundary.start_relay()
-    proof = RelayProof(SECRET, time.time)
-    target = boundary.bind.host, boundary.bind.port
+    await use_up(boundary, spdp(A, PROXY), relay)
     (listed,) = address_lists([LAPTOP])
     with closing(bind(PROXY, 0)) as process:
-        while not relay.dropped:
-            process.sendto(proof.sealed(Direction.TO_LAN, spdp(A, PROXY)), target)
-            await asyncio.sleep(0)
-        process.sendto(proof.sealed(Direction.TO_LAN, listed), target)
+        sealed = RelayProof(SECRET, time.time).sealed(Direction.TO_LAN, listed)
+        process.sendto(sealed, (boundary.bind.host, boundary.bind.port))
 
     def is_proven() -> bool:
         now = asyncio.get_running_loop().time()
         return relay._sources.standing(LAPTOP, now) is Standing.PROVEN
 
     await until(is_proven, "the relay reads the list")
+
+
+@pytest.fixture
+def small_allowance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An allowance of the proxy at the relay that does not refill."""
+    monkeypatch.setattr(lan_relay, "SOURCE_UNITS_PER_SECOND", 0.0)
+    monkeypatch.setattr(lan_relay, "SOURCE_BURST_UNITS", 20.0)
+
+
+async def use_up(boundary: Boundary, content: bytes, relay: LanRelay) -> None:
+    """Repeat a datagram of the proxy until the relay drops it."""
+    proof = RelayProof(SECRET, time.time)
+    with closing(bind(PROXY, 0)) as process:
+
+        def is_dropped() -> bool:
+            # A proof that has expired would be dropped, too.
+            sealed = proof.sealed(Direction.TO_LAN, content)
+            process.sendto(sealed, (boundary.bind.host, boundary.bind.port))
+            return relay.dropped > 0
+
+        await until(is_dropped, "the relay leaves repeated datagrams unread")
 
 
 async def test_different_secrets_are_reported(
