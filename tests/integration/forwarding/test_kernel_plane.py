@@ -334,6 +334,18 @@ async def test_what_a_killed_process_left_ends_where_a_topic_may_be_denied(bench
     await later.context.tasks.cancel()
 
 
+async def test_what_a_killed_process_left_of_a_known_node_goes_on(bench: Bench) -> None:
+    """The policy has judged the node by its name, and denies it nothing."""
+    await bench.forwarded()
+    later = Bench(tools=bench.tools)
+    await later.plane.start()
+    later.plane.recovered([later.node()])
+    await later.plane.syncer.cut_former(lambda port, host: True)
+    assert later.tools.forgotten == []
+    assert later.tools.forwards == {45002: (NODE, 50000)}
+    await later.context.tasks.cancel()
+
+
 async def test_a_lost_fast_port_is_cut_once(bench: Bench) -> None:
     endpoint = await bench.forwarded()
     fast_ports.give_back(bench.context.registry.pool, endpoint)
