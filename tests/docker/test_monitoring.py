@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.certificates import Authority
 from tests.chart.monitoring import expressions, of_kubernetes
 from tests.docker.controller import Controller, Proxy, proxies
 from tests.docker.engine import docker, wait_until
@@ -14,11 +15,14 @@ from tests.docker.prometheus import Prometheus, guides_configuration, running_pr
 from tests.docker.robot import Robot, named_robot
 from tests.docker.ros2 import HERE, Inside2, Outside, ros2_proxies
 from tests.docker.traffic import traffic
+from tests.docker.zenoh import NODE
 
 PATROL = 86
 OPERATOR = "127.0.0.1:21313"
 NODES = 5
 """Three nodes for traffic, a node with a hidden topic, and a node that is killed."""
+LINK = "tls/192.0.2.1:7447"
+"""A link to another site, which has no router."""
 LABELS = (ENABLE, "rosproxy.data-plane=kernel", f"rosproxy.ports={2 * NODES}")
 """The kernel's share of the range is there for each node."""
 
@@ -45,9 +49,20 @@ def prometheus(tmp_path: Path) -> Iterator[Prometheus]:
 
 
 @pytest.fixture
-def operator(start_controller: Callable[..., Controller], patrol: Robot) -> Controller:
+def operator(
+    start_controller: Callable[..., Controller], patrol: Robot, tmp_path: Path
+) -> Controller:
     names = {patrol.name: patrol.address}
-    return start_controller("--allow-data-plane", "kernel", names=names)
+    certificates = Authority().write(tmp_path / "link")
+    links = ("--allow-link", "tls/192.0.2.1", "--zenoh-link-certificates", str(certificates))
+    return start_controller("--allow-data-plane", "kernel", *links, names=names)
+
+
+@pytest.fixture
+def cell_of_zenoh(zenoh_image: str) -> Iterator[Inside]:
+    """Networks and containers for nodes of rmw_zenoh."""
+    with inside(zenoh_image, "") as made:
+        yield made
 
 
 def ros1_proxy() -> Proxy:
@@ -57,7 +72,7 @@ def ros1_proxy() -> Proxy:
 
 def test_dashboard_and_alerts(
     operator: Controller, prometheus: Prometheus, cell: Inside, patrol: Robot,
-    lan: Outside, inside2: Inside2,
+    lan: Outside, inside2: Inside2, cell_of_zenoh: Inside,
 ) -> None:  # fmt: skip
     """First all is well, then parts break in turn. At the end each panel has had data."""
     network = cell.network()
@@ -80,6 +95,10 @@ def test_dashboard_and_alerts(
         )  # fmt: skip
         wait_until(lambda: patrol.knows_proxied("victim"), 30, operator.logs)
         wait_until(lambda: prometheus.firing() == [], 30, lambda: str(prometheus.firing()))
+
+        # Only now, because the link to the other site is down.
+        linked = (ENABLE, f"rosproxy.zenoh-link={LINK}")
+        cell_of_zenoh.run(cell_of_zenoh.network(), *NODE, "pub", "talker", "chatter", labels=linked)
 
         box.run("sh", "-c", "kill -KILL $(cat /tmp/victim.pid)")
         alert = prometheus.wait_for_alert("RosproxyNodeDown", instance=proxy.name, node="/victim")
