@@ -89,3 +89,14 @@ async def test_forged_sources_at_a_data_port(abused, good, robot):  # noqa: F811
         "all are counted",
     )
     assert data_lease(abused)["datagrams"] == passed_on
+
+
+async def test_the_kernel_tracks_connections_as_before(abused, forwarding):
+    """The table for datagrams ended the tracking of TCP, so topics of ROS 1 were not forwarded."""
+    abused.status()  # by a connection from another machine
+    host, port = abused.admin
+    words = ("conntrack", "-L", "-p", "tcp", "--orig-port-dst", str(port))
+    listed = subprocess.run(
+        [*forwarding.prefix, *words], capture_output=True, text=True, check=True
+    )
+    assert f"dst={host}" in listed.stdout

@@ -35,11 +35,12 @@ def rules(chain: str) -> list[str]:
     return [line.strip() for line in lines]
 
 
-def test_no_connection_is_tracked() -> None:
+def test_no_datagram_of_the_range_is_tracked() -> None:
     document = TABLE.made(FORWARDS, AROUND)
     assert not re.search("dnat|masquerade|snat|type nat|ct mark", document)
-    assert rules("prerouting")[:4] == [
+    assert rules("prerouting")[:5] == [
         'iif "lo" return',
+        "meta l4proto != udp return",
         "udp dport != 45000-45999 return",
         "fib daddr type != local return",
         "notrack",
@@ -47,7 +48,7 @@ def test_no_connection_is_tracked() -> None:
 
 
 def test_the_port_is_rewritten_after_all_that_is_looked_up_by_it() -> None:
-    for rule in rules("prerouting")[4:]:
+    for rule in rules("prerouting")[5:]:
         looked_up, rewritten = rule.split("udp dport set udp dport map @ports")
         assert "daddr set udp dport map @hosts" in looked_up
         assert "udp dport @received" in looked_up

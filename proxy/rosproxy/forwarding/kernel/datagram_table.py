@@ -35,6 +35,7 @@ table inet $name {
   chain prerouting {
     type filter hook prerouting priority -300; policy accept;
     iif "lo" return
+    meta l4proto != udp return
     udp dport != $range return
     fib daddr type != local return
     notrack
