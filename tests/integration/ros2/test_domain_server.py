@@ -288,6 +288,27 @@ async def test_the_participants_in_a_datagram_are_read_in_turn(server: DomainSer
     assert received == len(datagram)  # although the messages repeat the destination
 
 
+async def test_acknowledgements_of_several_participants_wait_as_a_whole(
+    server: DomainServer,
+) -> None:
+    """Fifty participants of Cyclone DDS in a process send fifty in a datagram: apart, they filled
+    the queue of discovery, and a hundred participants were discovered in 3 s instead of 1.5 s.
+    """
+    server._scheduler.put("another source", Standing.PROVEN, 0, list)
+    read = list[bytes]()
+
+    def take(part: bytes, _source: str, _now: float, _: int) -> list[Outgoing]:
+        read.append(part)
+        return []
+
+    acknowledgement = submessage(0x06, 0, bytes(24))
+    sources = [submessage(0x0C, 0, bytes(4) + VERSION + FAST_DDS + bytes(12))] * 50
+    whole = message(*(source + acknowledgement for source in sources), prefix=A)
+    server._read_in_turn(take, whole, INSIDE, None)
+    await until(lambda: not server._scheduler.is_behind, "all is read")
+    assert read == [whole]
+
+
 async def test_announcements_that_were_held_are_read_in_turn(server: DomainServer) -> None:
     """At the first selection there may be 2,048 of these: 0.4 s in one step."""
     server._scheduler = DiscoveryScheduler(count().__next__)

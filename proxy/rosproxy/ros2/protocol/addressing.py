@@ -201,6 +201,18 @@ def carries_samples(datagram: bytes) -> bool:
     return offset > size
 
 
+def only_acknowledges(datagram: bytes) -> bool:
+    """Whether a message of any length, of one or several participants, is without samples.
+
+    False for a malformed message.
+    """
+    kinds = _WITHOUT_SAMPLES | {SubmessageId.INFO_SRC}
+    try:
+        return all(kind in kinds for kind, _, _ in walk_submessages(datagram))
+    except RtpsError:
+        return False
+
+
 def may_be_discovery(datagram: bytes) -> bool:
     """Whether the proxy has to read a message: a builtin reader or writer may be named there.
 

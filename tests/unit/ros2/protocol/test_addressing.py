@@ -8,6 +8,7 @@ from rosproxy.ros2.protocol.addressing import (
     LONGEST_WITHOUT_SAMPLES_BYTES,
     carries_samples,
     may_be_discovery,
+    only_acknowledges,
 )
 from rosproxy.ros2.protocol.rtps import SubmessageId
 from tests.unit.ros2.protocol.messages import data, fragment, message, submessage
@@ -17,6 +18,7 @@ ACKNACK = submessage(SubmessageId.ACKNACK, 0, bytes(24))
 HEARTBEAT = submessage(SubmessageId.HEARTBEAT, 0, bytes(28))
 INVALIDATED_TIME = submessage(SubmessageId.INFO_TS, 0x02, b"")
 EMPTY_PAD = submessage(SubmessageId.PAD, 0, b"")
+SOURCE = submessage(SubmessageId.INFO_SRC, 0, bytes(20))
 ENCRYPTED = submessage(0x33, 0, bytes(24))
 SAMPLE = data(b"12345678", writer=0x00001203)
 
@@ -53,6 +55,15 @@ def test_any_message_has_samples_or_not(rest: bytes) -> None:
 @given(st.lists(st.sampled_from([ACKNACK, HEARTBEAT, ENCRYPTED, SAMPLE]), min_size=1, max_size=5))
 def test_a_message_without_samples_has_no_submessage_with_one(parts: list[bytes]) -> None:
     assert carries_samples(message(*parts)) is bool({ENCRYPTED, SAMPLE} & {*parts})
+
+
+@given(st.lists(st.sampled_from([ACKNACK, HEARTBEAT, SOURCE, ENCRYPTED, SAMPLE]), max_size=50))
+def test_a_message_of_several_participants_may_be_without_samples(parts: list[bytes]) -> None:
+    assert only_acknowledges(message(*parts)) is not bool({ENCRYPTED, SAMPLE} & {*parts})
+
+
+def test_a_malformed_message_does_not_count_as_one_without_samples() -> None:
+    assert not only_acknowledges(message(ACKNACK)[:-1])
 
 
 @pytest.mark.parametrize("vendor", VENDORS)
