@@ -2,7 +2,7 @@
 
 etcd and API server are real. Nodes, kubelets and proxies are fake (`crowded_cluster`), so the costs
 are only those of the operator and the API server. For each size, ``python -m tests.bench.cluster
-NODES SECONDS`` measures in a separate network namespace.
+NODES SECONDS IDLE`` measures in a separate network namespace.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ PODS_A_NODE = 30
 SECONDS = 60.0
 QUICK_SECONDS = 10.0
 """Seconds of measuring without events, and while other pods come and go."""
+IDLE_SECONDS = 600.0
+"""Seconds without events at the largest size. The operator asks all proxies anew in this time."""
 CHURN = 20.0
 """Other pods that come and go in a second."""
 TRIES = 5
@@ -81,13 +83,14 @@ def run(book: Book, rounds: int, quick: bool) -> None:
         raise RuntimeError("etcd and kube-apiserver are missing: scripts/install-kubernetes.sh")
     for _ in range(rounds):
         for size in QUICK_SIZES if quick else SIZES:
-            _apart(book, size, QUICK_SECONDS if quick else SECONDS)
+            seconds = QUICK_SECONDS if quick else SECONDS
+            _apart(book, size, seconds, IDLE_SECONDS if size == SIZES[-1] else seconds)
     book.note(f"{PODS_A_NODE} pods a node, one of them labelled; nodes and proxies are simulated")
 
 
-def _apart(book: Book, size: int, seconds: float) -> None:
+def _apart(book: Book, size: int, seconds: float, idle: float) -> None:
     """Measure in a network namespace where no other program has the proxies' port."""
-    words = [sys.executable, "-m", "tests.bench.cluster", str(size), str(seconds)]
+    words = [sys.executable, "-m", "tests.bench.cluster", str(size), str(seconds), str(idle)]
     inside = f"ip link set lo up && exec {shlex.join(words)}"
     done = subprocess.run(
         ["unshare", "--net", "sh", "-c", inside], stdout=subprocess.PIPE, text=True, check=True
@@ -99,7 +102,7 @@ def _apart(book: Book, size: int, seconds: float) -> None:
         book.note(note)
 
 
-async def _measure_size(book: Book, size: int, seconds: float) -> None:
+async def _measure_size(book: Book, size: int, seconds: float, idle: float) -> None:
     folder = Path(tempfile.mkdtemp(prefix="rosproxy-bench-cluster-"))
     try:
         async with ControlPlane(folder) as plane, CrowdedCluster(plane) as cluster:
@@ -107,7 +110,7 @@ async def _measure_size(book: Book, size: int, seconds: float) -> None:
             started = time.monotonic()
             operator = Operator(plane)
             try:
-                await _measure(book, size, seconds, Bench(plane, cluster, operator, started))
+                await _measure(book, size, seconds, idle, Bench(plane, cluster, operator, started))
             finally:
                 operator.stop()
     finally:
@@ -160,7 +163,9 @@ class Bench:
         return await self.cluster.made_on(node, 120.0) - bound
 
 
-async def _measure(book: Book, size: int, seconds: float, bench: Bench) -> None:
+async def _measure(book: Book, size: int, seconds: float, idle: float, bench: Bench) -> None:
+    """Measure for ``seconds`` while pods come and go, and for ``idle`` seconds without events."""
+
     def add(row: str, value: float) -> None:
         book.add(row, PATH, value, size)
 
@@ -170,11 +175,11 @@ async def _measure(book: Book, size: int, seconds: float, bench: Bench) -> None:
     await bench.rest()
     took, count = await bench.operator.looks()
     add("one look, s", took / count)
-    own, api, asked = await bench.over(seconds)
+    own, api, asked = await bench.over(idle)
     add("nothing happens: operator, % of a core", own * 100)
     add("nothing happens: API server, % of a core", api * 100)
     add("nothing happens: operator, MiB", resident(bench.operator.pid) / 1024)
-    add("nothing happens: requests a minute", sum(asked.values()) * 60 / seconds)
+    add("nothing happens: requests a minute", sum(asked.values()) * 60 / idle)
     book.note(f"{size} nodes, requests when nothing happens: {asked}")
     tries = [await bench.reaction(f"new{number}") for number in range(TRIES)]
     add("labelled pod bound, proxy's pod made: median, s", median(tries))
@@ -193,7 +198,7 @@ async def _measure(book: Book, size: int, seconds: float, bench: Bench) -> None:
 def main() -> None:
     """Measure a size, and print the results as JSON."""
     book = Book()
-    asyncio.run(_measure_size(book, int(sys.argv[1]), float(sys.argv[2])))
+    asyncio.run(_measure_size(book, int(sys.argv[1]), *map(float, sys.argv[2:])))
     rows = [(line.row, line.middle) for line in book.lines()]
     notes = [note.partition(": ")[2] for note in book.notes]
     print(json.dumps({"rows": rows, "notes": notes}))
