@@ -58,7 +58,7 @@ test-all: $(VENV)/.dev ## every test of every layer that this machine can run; b
 	@$(BIN)/python -m scripts.test_layers $(LAYERS)
 
 .PHONY: bench
-bench: $(VENV)/.bench ## speed and memory next to a direct connection, socat, HAProxy and nginx, in half an hour (BENCH="--quick"); as root on Debian or Ubuntu, installs those and ROS
+bench: $(VENV)/.bench ## speed and memory next to a direct connection, socat, HAProxy and nginx, in an hour (BENCH="--quick"); as root on Debian or Ubuntu, installs those and ROS
 	@scripts/install-bench.sh
 	@$(BIN)/python -m tests.bench $(BENCH)
 
