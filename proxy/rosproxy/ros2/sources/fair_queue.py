@@ -20,7 +20,7 @@ MOST_BYTES_PER_SOURCE = 512 * 1024
 
 Participants repeat discovery that is late, so a much longer queue makes an overload worse. With
 256 KiB and a hundred participants of Cyclone DDS at two addresses, discovery was lost that came
-again only after 1.5 s. With 0.3 of a processor, the proxy took 10 to 12 s then, instead of 7 to 8 s.
+again only after 1.5 s. With 0.3 of a processor, the proxy then took 10 to 12 s instead of 7 to 8.
 """
 MOST_BYTES_PER_STANDING = 3 * 1024 * 1024
 """Bytes of all sources with the same standing that may wait."""
