@@ -99,7 +99,7 @@ async def announcement(sock: socket.socket, prefix: bytes) -> bytes:
 
 @contextmanager
 def outsider_without_a_port(server: DomainServer) -> Iterator[tuple[socket.socket, int]]:
-    """A participant outside, and the port of its stand-in, which another program holds."""
+    """A participant outside. Another program holds the port of the participant's stand-in."""
     domain = server.domain
     with ExitStack() as stack:
         while True:
@@ -135,7 +135,7 @@ async def test_no_stand_in_is_announced_that_can_not_be_opened(
 
 
 async def test_a_participant_on_the_lan_relays_machine_is_not_inside() -> None:
-    """Such a participant announces itself on the inside network, often before it does on the LAN.
+    """Such a participant often announces itself on the inside network first, and then on the LAN.
 
     The proxy then took the participant for one of inside, and refused the LAN relay's announcement.
     """
@@ -204,12 +204,12 @@ async def test_participants_that_have_waited_are_admitted_in_turn() -> None:
     assert max(after - before for before, after in pairwise([0, *counts])) == 1
     await server.expire()
     await asyncio.sleep(0)
-    assert prefixes[-1] not in table  # ended before its turn
+    assert prefixes[-1] not in table  # the participant ended before the turn
     server.close()
 
 
 async def test_a_participant_whose_turn_is_lost_gets_another_one() -> None:
-    """In a flood the longest queue loses its last items."""
+    """In a flood the longest queue loses the last items."""
     now = 0.0
     server = DomainServer(
         settings_of(), PROXY, lambda: now, lambda address: address == INSIDE, lambda: None
@@ -265,7 +265,7 @@ def of_many(prefixes: Sequence[bytes]) -> bytes:
 
 
 async def test_the_participants_in_a_datagram_are_read_in_turn(server: DomainServer) -> None:
-    """The proxy announced 48 of these to all of the other side in one step of 0.25 s."""
+    """The proxy announced 48 participants to the whole other side in a single step of 0.25 s."""
     server._scheduler = DiscoveryScheduler(count().__next__)
     prefixes = [bytes([1, 15, number]) + bytes(9) for number in range(60)]
     datagram = of_many(prefixes)
@@ -310,7 +310,7 @@ async def test_acknowledgements_of_several_participants_wait_as_a_whole(
 
 
 async def test_announcements_that_were_held_are_read_in_turn(server: DomainServer) -> None:
-    """At the first selection there may be 2,048 of these: 0.4 s in one step."""
+    """The first selection may have 2,048 participants: 0.4 s in a single step."""
     server._scheduler = DiscoveryScheduler(count().__next__)
     prefixes = [bytes([1, 15, number]) + bytes(9) for number in range(8)]
     for number, prefix in enumerate(prefixes):
@@ -318,7 +318,7 @@ async def test_announcements_that_were_held_are_read_in_turn(server: DomainServe
     server.select([INSIDE])
     table = server.domain.inside.by_prefix
     assert len(table) <= 1
-    await until(lambda: len(table) > 1, "the others are read")
+    await until(lambda: len(table) > 1, "the other participants are read")
 
 
 async def test_announcements_of_the_proxy_are_sent_in_turns(
@@ -339,13 +339,13 @@ async def test_announcements_of_the_proxy_are_sent_in_turns(
         await asyncio.sleep(0)
         sent.append(0)
     assert sum(sent) > 100
-    assert max(sent) <= 4 + 2 * 3  # beside those of a turn, some by multicast
+    assert max(sent) <= 4 + 2 * 3  # and further datagrams of a turn, some by multicast
 
 
 async def test_the_lan_relay_is_told_of_proven_addresses_in_turns(
     server: DomainServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """4,096 addresses took 0.1 s in one step, every three seconds."""
+    """4,096 addresses took 0.1 s in a single step, every three seconds."""
     lists = [0]
 
     def send(outgoing: Iterable[Outgoing]) -> None:
