@@ -278,7 +278,7 @@ class DockerController:
 
     def _silent(self, planned: DockerPlan) -> list[str]:
         """Return the names of the wanted proxies that do not answer."""
-        names = (proxy_name(desired.key) for desired in planned.desired if desired.live)
+        names = (proxy_name(desired.place) for desired in planned.desired if desired.live)
         return [name for name in names if not self._proxy_sync.answers(name)]
 
     def _unsolved_problems(self) -> list[Problem]:

@@ -41,7 +41,6 @@ from rosproxy_operator.docker.planner.actions import (
     Unpause,
 )
 from rosproxy_operator.docker.planner.flush import flush_config
-from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.own_containers import forgery_reason
 from rosproxy_operator.docker.planner.plan import Group
 from rosproxy_operator.docker.planner.redirect import redirect_config
@@ -51,13 +50,13 @@ from rosproxy_operator.docker.planner.specs import (
     Creation,
     container_config,
     lan_relay_config,
-    master,
     proxy_name,
     read_own,
     sandbox_config,
 )
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
+from rosproxy_operator.proxy_spec.place import Master, Place
 
 log = logging.getLogger(__name__)
 
@@ -102,10 +101,10 @@ END_POLL_INTERVAL_S = 0.03
 """Seconds between two checks whether a helper container has ended."""
 
 CarryOut = Callable[[Action], Awaitable[None]]
-Job = tuple[Key | None, str]
-"""Identifies a job: the key and the subject of its groups. Different jobs run at the same time."""
+Job = tuple[Place | None, str]
+"""A job: the place and the subject of the groups. Different jobs run at the same time."""
 UPLINK: Job = (None, "")
-"""The job of the uplink network, which has neither key nor subject."""
+"""The job of the uplink network, which has neither place nor subject."""
 
 
 @dataclass(slots=True)
@@ -175,7 +174,7 @@ class Executor:
         self._logged_failures = {a: f for a, f in self._logged_failures.items() if f[1] > oldest}
         by_job: dict[Job, list[Group]] = {}
         for group in groups:
-            job = group.key, group.subject
+            job = group.place, group.subject
             if self._ended_at.get(job, 0.0) < looked_at:
                 by_job.setdefault(job, []).append(group)
         self._ended_at = {job: at for job, at in self._ended_at.items() if at >= looked_at}
@@ -232,7 +231,7 @@ class Executor:
                 break
             except EngineError as error:
                 fix = f". {group.fix}" if group.fix else ""
-                subject = _problem_subject((group.key, group.subject))
+                subject = _problem_subject((group.place, group.subject))
                 text = f"{action}: {error}{fix}"
                 # A later failure may be a consequence of the first. The log has both.
                 problem = problem or Problem(subject, text, group.fatal)
@@ -270,8 +269,8 @@ class Executor:
 
 def _problem_subject(job: Job) -> str:
     """The subject of the problems of a job."""
-    key, subject = job
-    return subject or (f"proxy {proxy_name(key)}" if key else "uplink")
+    place, subject = job
+    return subject or (f"proxy {proxy_name(place)}" if place else "uplink")
 
 
 class DockerActions:
@@ -374,8 +373,8 @@ class DockerActions:
             return flush_config(action, self._settings)
         secret = snapshot.state.secret
         masters = snapshot.state.masters
-        key = action.key
-        address = masters.get(master(key).host.lower(), "") if key.ros == "1" else ""
+        graph = action.place.graph
+        address = masters.get(graph.host.lower(), "") if isinstance(graph, Master) else ""
         return container_config(action, self._settings, secret, address)
 
     def _remove(self, action: Remove, snapshot: DockerSnapshot) -> None:

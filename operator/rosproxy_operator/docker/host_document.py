@@ -18,19 +18,13 @@ from rosproxy_operator.common.proxy_client import Json
 from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
 from rosproxy_operator.common.ros2_variables import MOST_VALUE_CHARACTERS, discovery_obstacle
 from rosproxy_operator.common.zenoh import SESSION_FILE
-from rosproxy_operator.docker.planner.model import (
-    ZENOH,
-    Container,
-    HostState,
-    Key,
-    Member,
-    OwnContainer,
-)
+from rosproxy_operator.docker.planner.model import Container, HostState, Member, OwnContainer
 from rosproxy_operator.docker.planner.network_owner import by_reference, network_owner
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.redirect import redirect_record_name
 from rosproxy_operator.docker.planner.specs import lan_relay_name, proxy_name, sandbox_name
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Master, Place
 
 ProxyStatuses = Mapping[str, ProxyStatus]
 """The status of each proxy that answers, by container name."""
@@ -66,19 +60,21 @@ def host_document(
     problems += _unconnected(planned.members, observed, statuses, now)
     subjects = {problem.subject for problem in problems}
     redirects = _redirects(planned.members, observed)
-    keys: dict[str, list[Key | None]] = {}
+    places: dict[str, list[Place | None]] = {}
     for member in planned.members:
-        key = member.key if member.key in observed.keys else None
-        keys.setdefault(member.container.id, []).append(key)
+        place = member.place if member.place in observed.places else None
+        places.setdefault(member.container.id, []).append(place)
     return {
         "version": __version__,
         "uplink": settings.uplink,
-        "proxies": [_proxy(key, observed, statuses, settings) for key in sorted(observed.keys)],
+        "proxies": [
+            _proxy(place, observed, statuses, settings) for place in sorted(observed.places)
+        ],
         "containers": [
-            _container(container, key, observed, statuses, redirects.get((container.id, key)))
+            _container(container, place, observed, statuses, redirects.get((container.id, place)))
             for container in observed.containers
-            if container.id in keys or f"container {container.name}" in subjects
-            for key in keys.get(container.id, [None])
+            if container.id in places or f"container {container.name}" in subjects
+            for place in places.get(container.id, [None])
         ],
         "problems": [asdict(problem) for problem in problems],
         "actions": [
@@ -89,43 +85,46 @@ def host_document(
     }
 
 
-def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: PlanSettings) -> Json:
+def _proxy(
+    place: Place, observed: HostState, statuses: ProxyStatuses, settings: PlanSettings
+) -> Json:
     """Return the row of a proxy. Faults of the sandbox and the LAN relay are in ``problems``."""
-    proxy = _best(observed.proxies_of(key), proxy_name(key))
-    sandbox = _best(observed.sandboxes_of(key), sandbox_name(key))
+    proxy = _best(observed.proxies_of(place), proxy_name(place))
+    sandbox = _best(observed.sandboxes_of(place), sandbox_name(place))
     own = sandbox or proxy
+    graph = place.graph
     sandbox_state = sandbox.container.state if sandbox else "absent"
     status = statuses.get(proxy.container.name) if proxy else None
     problems = [f"{p.subject}: {p.text}" for p in (status.problems if status else ())]
     if sandbox_state != "running":
-        subject = f"the container {sandbox_name(key)}, which holds the proxy's ports and networks"
+        subject = f"the container {sandbox_name(place)}, which holds the proxy's ports and networks"
         problems.insert(0, f"{subject}, is {sandbox_state}")
-    lan_relay = _best(observed.lan_relays_of(key), lan_relay_name(key))
+    lan_relay = _best(observed.lan_relays_of(place), lan_relay_name(place))
     if lan_relay and lan_relay.container.state != "running":
         problems.append(
-            f"the container {lan_relay_name(key)}, the proxy's LAN relay, is "
+            f"the container {lan_relay_name(place)}, the proxy's LAN relay, is "
             f"{lan_relay.container.state}"
         )
     domain = status.domains[0] if status and status.domains else None
     zenoh = status.zenoh if status else None
     return {
-        "name": proxy_name(key),
-        "ros": key.ros,
-        "domain": key.domain,
+        "name": proxy_name(place),
+        "ros": graph.ros,
+        "domain": graph.number if isinstance(graph, Domain) else None,
         "peers": list(domain.peers) if domain else [],
         "links": {link.title: link.up for link in zenoh.links} if zenoh else {},
         "lan_relay": lan_relay.container.state if lan_relay else None,
-        "master_uri": key.master_uri,
+        "master_uri": graph.uri if isinstance(graph, Master) else "",
         "master_address": (status.master.address if status else None) or "",
-        "master_up": status.master.up if status and key.ros == "1" else None,
-        "advertise_host": key.advertise_host,
+        "master_up": status.master.up if status and isinstance(graph, Master) else None,
+        "advertise_host": place.advertise_host,
         "range": str(own.range) if own else "",
         "state": proxy.container.state if proxy else "absent",
         "reachable": status is not None,
         "networks": sorted(sandbox.container.networks - {settings.uplink}) if sandbox else [],
         "data_plane": status.data_plane.plane if status and status.data_plane else None,
-        "used": status.ports.used if status and key != ZENOH else None,
-        "free": status.ports.free if status and key != ZENOH else None,
+        "used": status.ports.used if status and place != ZENOH else None,
+        "free": status.ports.free if status and place != ZENOH else None,
         "reached": status.range_probe.reached if status and status.range_probe else None,
         "problems": problems,
     }
@@ -166,15 +165,15 @@ def _zenoh_node(node: ZenohNodeStatus) -> Json:
 
 def _redirects(
     members: Iterable[Member], observed: HostState
-) -> dict[tuple[str, Key | None], Json]:
-    """Return the planned redirects of living containers, by container id and key of the proxy."""
+) -> dict[tuple[str, Place | None], Json]:
+    """Return the planned redirects of living containers, by container id and place of the proxy."""
     containers = by_reference(observed.containers)
     return {
-        (member.container.id, member.key): {
+        (member.container.id, member.place): {
             "master": listed(map(str, member.redirected)),
             "in_place": bool(
                 redirect_record_name(
-                    observed, member.key, network_owner(member.container, containers)
+                    observed, member.place, network_owner(member.container, containers)
                 )
             ),
         }
@@ -223,8 +222,12 @@ def _undiscovered(
     """
     for member in members:
         container = member.container
-        status = statuses.get(proxy_name(member.key))
-        if not member.key.is_ros2 or status is None or container.state != "running":
+        status = statuses.get(proxy_name(member.place))
+        if (
+            not isinstance(member.place.graph, Domain)
+            or status is None
+            or container.state != "running"
+        ):
             continue
         settled = _is_settled(container, status, now)
         addresses = _addresses(container, observed).values()
@@ -240,7 +243,7 @@ def _unconnected(
     """Yield a problem for each container that has a session file for zenoh, but no session."""
     for member in members:
         container = member.container
-        status = statuses.get(proxy_name(member.key))
+        status = statuses.get(proxy_name(member.place))
         file = container.variables.get(SESSION_FILE, "")
         if not file or not member.redirected or not status or not status.zenoh:
             continue
@@ -279,12 +282,12 @@ def _addresses(container: Container, observed: HostState) -> dict[str, str]:
 
 def _container(
     container: Container,
-    key: Key | None,
+    place: Place | None,
     observed: HostState,
     statuses: ProxyStatuses,
     redirect: Json | None = None,
 ) -> Json:
-    proxy = proxy_name(key) if key else None
+    proxy = proxy_name(place) if place else None
     addresses = _addresses(container, observed)
     status = statuses.get(proxy or "")
     nodes = nodes_by_address(status) if status else {}
@@ -293,7 +296,7 @@ def _container(
         "name": container.name,
         "state": container.state,
         "proxy": proxy,
-        "ros": key.ros if key else None,
+        "ros": place.graph.ros if place else None,
         "participants": [
             _participant(p)
             for address in dict.fromkeys(addresses.values())

@@ -28,10 +28,11 @@ from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, Pr
 from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 from rosproxy_operator.common.proxy_status import Leases, inside_addresses, leases
 from rosproxy_operator.docker.host_document import PROXY_STARTING_S
-from rosproxy_operator.docker.planner.model import ZENOH, Member
+from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.planner.proxy_update import NetworkFacts, ProxyUpdate, network_facts
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
+from rosproxy_operator.proxy_spec.place import ZENOH
 
 log = logging.getLogger(__name__)
 
@@ -223,7 +224,7 @@ class DockerProxySync:
                     self._proxies,
                     self._answered,
                     self._former_leases(name, proxy.range),
-                    has_callers=proxy.key != ZENOH,  # routers of zenoh have no list of callers
+                    has_callers=proxy.place != ZENOH,  # routers of zenoh have no list of callers
                 )
                 self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
             facts = network_facts(snapshot.state, proxy, members, self._settings.policy)

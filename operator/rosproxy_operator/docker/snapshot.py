@@ -357,7 +357,7 @@ class DockerObserver:
                 containers.append(replace(container, forged=forged))
                 own = None
             else:
-                own_container = _KINDS[own.role](own.key, container, own.range, own.fingerprint)
+                own_container = _KINDS[own.role](own.place, container, own.range, own.fingerprint)
                 own_by_role[own.role].append(own_container)
             if own and not self._inspector.is_current(row):
                 busy.add(container.name)
@@ -394,9 +394,9 @@ class DockerObserver:
             (a.address for a in sandbox.container.attachments if a.network == uplink), ""
         )
         run = f"{proxy.container.id} {proxy.container.started_at}"
-        admin = HostPort(address, admin_port(proxy.key))
+        admin = HostPort(address, admin_port(proxy.place))
         variables = engine_json.environment(self._inspector.get(proxy.container.id))
-        token = variables.get(FORMER_TOKEN) or proxy_token(proxy.key, state.secret)
+        token = variables.get(FORMER_TOKEN) or proxy_token(proxy.place, state.secret)
         return ProxyAccess(admin, token, run) if address else None
 
 

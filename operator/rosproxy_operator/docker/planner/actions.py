@@ -12,7 +12,7 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.telemetry.text import clean, listed
-from rosproxy_operator.docker.planner.model import Key
+from rosproxy_operator.proxy_spec.place import Place
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec
 
 
@@ -51,14 +51,14 @@ class RemoveNetwork(Action, frozen=True):
 
 
 class _CreateContainer(Action, frozen=True):
-    """Create a container for the proxy of ``key``, and do not start the container.
+    """Create a container for the proxy of ``place``, and do not start the container.
 
     ``range`` are the ports of the proxy. In subclasses, ``fingerprint`` is a hash of the creation
     request.
     """
 
     does = "create container"
-    key: Key
+    place: Place
     range: PortRange
 
 
@@ -69,7 +69,7 @@ class CreateSandbox(_CreateContainer, frozen=True):
     fingerprint: str = ""
 
     def _details(self) -> str:
-        return f": sandbox with ports {self.range} for the proxy of the {self.key.graph}"
+        return f": sandbox with ports {self.range} for the proxy of the {self.place.graph}"
 
 
 class Create(_CreateContainer, frozen=True):
@@ -93,9 +93,9 @@ class Create(_CreateContainer, frozen=True):
     def _details(self) -> str:
         instead = f", instead of {self.replaces}" if self.replaces else ""
         rights = ", with NET_ADMIN" if self.spec.data_plane == "kernel" else ""
-        host = f" at {self.key.advertise_host}" if self.key.advertise_host else ""
+        host = f" at {self.place.advertise_host}" if self.place.advertise_host else ""
         return (
-            f": proxy of the {self.key.graph}{host}, "
+            f": proxy of the {self.place.graph}{host}, "
             f"ports {self.range} of {self.sandbox}{rights}{instead}"
         )
 
@@ -114,7 +114,7 @@ class CreateLanRelay(_CreateContainer, frozen=True):
 
     def _details(self) -> str:
         return (
-            f": LAN relay of the {self.key.graph} between the LAN at {self.lan} and the proxy at "
+            f": LAN relay of the {self.place.graph} between the LAN at {self.lan} and the proxy at "
             f"{self.proxy}"
         )
 
@@ -136,7 +136,7 @@ class CreateRedirect(_CreateContainer, frozen=True):
     def _details(self) -> str:
         location = f"in the network namespace of container {self.target[:12]}"
         if self.proxy is None:
-            return f": removes the redirect of the {self.key.graph} {location}"
+            return f": removes the redirect of the {self.place.graph} {location}"
         addresses = listed(map(str, self.addresses))
         return f": redirects {addresses} to the proxy at {self.proxy} {location}"
 
@@ -149,7 +149,7 @@ class CreateFlush(_CreateContainer, frozen=True):
     def _details(self) -> str:
         return (
             f": deletes the host's conntrack entries for UDP ports {self.range} of the "
-            f"{self.key.graph}"
+            f"{self.place.graph}"
         )
 
 

@@ -16,18 +16,19 @@ from rosproxy_operator.docker.planner.labels.alias_bounds import (
     is_allowed_by_administrator,
 )
 from rosproxy_operator.docker.planner.labels.readers import ALIAS, MASTER_URI
-from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key, Member
-from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
+from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Member
+from rosproxy_operator.docker.planner.specs import is_proxy_name, proxy_name
 from rosproxy_operator.docker.planner.taken_names import (
     FormerNames,
     NamesByNetwork,
-    places_of,
+    lookups_of,
     present_names,
 )
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Master, Place
 
-Aliases = Mapping[Key, Mapping[str, tuple[str, ...]]]
-"""The names of a proxy on a network, by key and network."""
+Aliases = Mapping[Place, Mapping[str, tuple[str, ...]]]
+"""The names of a proxy on a network, by place and network."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ class _Claim:
     alias: str
     claimants: tuple[Desired, ...]
     containers: tuple[str, ...]
-    holders: tuple[Key, ...]
+    holders: tuple[Place, ...]
     refusal: str = ""
 
     @property
@@ -74,7 +75,7 @@ class _Claim:
         return bool(self.containers or self.refusal)
 
     @property
-    def owner(self) -> Key | None:
+    def owner(self) -> Place | None:
         """The proxy that gets the name; None if no proxy may have or wants the name.
 
         A proxy that has the name keeps the name, so that no connection is cut. Otherwise the name
@@ -84,8 +85,10 @@ class _Claim:
             return None
         if self.holders:
             return self.holders[0]
-        needed = [d.key for d in self.claimants if containers_seeking(d, self.network, self.alias)]
-        return (needed or [d.key for d in self.claimants])[0]
+        needed = [
+            d.place for d in self.claimants if containers_seeking(d, self.network, self.alias)
+        ]
+        return (needed or [d.place for d in self.claimants])[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,9 +106,9 @@ def assign_aliases(
 ) -> Naming:
     """Return the names of the proxies, and the problems of containers that won't find their proxy.
 
-    ``desired`` is sorted by key. ``former`` has the names that containers have or had.
+    ``desired`` is sorted by place. ``former`` has the names that containers have or had.
     """
-    aliases: dict[Key, dict[str, tuple[str, ...]]] = {}
+    aliases: dict[Place, dict[str, tuple[str, ...]]] = {}
     withdrawn: dict[str, frozenset[str]] = {}
     problems: list[Problem] = []
     facts = _NameFacts(observed, settings, present_names(observed), former)
@@ -113,7 +116,7 @@ def assign_aliases(
         proxies = [d for d in desired if network in d.networks]
         claims = [
             _claim(network, alias, proxies, facts)
-            for alias in sorted({name for d in proxies for name in _names(d.key)})
+            for alias in sorted({name for d in proxies for name in _names(d.place)})
         ]
         for claim in claims:
             if claim.owner is not None:
@@ -143,48 +146,49 @@ def answers_to(container: Container, network: str, alias: str) -> bool:
     )
 
 
-def _names(key: Key) -> tuple[str, ...]:
+def _names(place: Place) -> tuple[str, ...]:
     """Return the names that a proxy wants.
 
     The name of the proxy's container has to be an alias of the sandbox: only the sandbox is on
     networks.
     """
-    if key.ros != "1":  # nodes find the proxy by multicast, as a peer, or by a redirect
-        return (proxy_name(key),)
-    host = master(key).host
-    return (ALIAS, proxy_name(key), *(() if is_address(host) else (host,)))
+    if not isinstance(place.graph, Master):
+        # Nodes find the proxy by multicast, as a peer, or by a redirect.
+        return (proxy_name(place),)
+    host = place.master.host
+    return (ALIAS, proxy_name(place), *(() if is_address(host) else (host,)))
 
 
 def _claim(network: str, alias: str, proxies: Collection[Desired], facts: _NameFacts) -> _Claim:
     observed = facts.observed
-    places = [*places_of(alias, network, (n.name for n in observed.networks))]
+    lookups = [*lookups_of(alias, network, (n.name for n in observed.networks))]
     containers = {
         holder
-        for where, name in places
+        for where, name in lookups
         for holder in facts.present.get(where, {}).get(name, frozenset())
     }
     holding = [s for s in observed.sandboxes if answers_to(s.container, network, alias)]
-    staying = [d.key for d in proxies if d.key in {s.key for s in holding}]
+    staying = [d.place for d in proxies if d.place in {s.place for s in holding}]
     # A sandbox that restarts can't leave the network, and has the name again in a moment.
-    stuck = sorted(s.key for s in holding if s.container.state == "restarting")
+    stuck = sorted(s.place for s in holding if s.container.state == "restarting")
     return _Claim(
         network,
         alias,
-        claimants=tuple(d for d in proxies if d.live and alias in _names(d.key)),
+        claimants=tuple(d for d in proxies if d.live and alias in _names(d.place)),
         containers=tuple(sorted(containers)),
         holders=tuple(dict.fromkeys([*staying, *stuck])),
-        refusal="" if alias == ALIAS or is_proxy_name(alias) else _refusal(alias, places, facts),
+        refusal="" if alias == ALIAS or is_proxy_name(alias) else _refusal(alias, lookups, facts),
     )
 
 
-def _refusal(alias: str, places: Iterable[tuple[str, str]], facts: _NameFacts) -> str:
+def _refusal(alias: str, lookups: Iterable[tuple[str, str]], facts: _NameFacts) -> str:
     """Return why no proxy may have a name; empty if a proxy may.
 
     Names that containers have now are not checked here (`_Claim.containers`).
     """
     if refusal := alias_refusal(alias, facts.settings):
         return refusal
-    former = next((facts.former[place] for place in places if place in facts.former), "")
+    former = next((facts.former[lookup] for lookup in lookups if lookup in facts.former), "")
     if not former or is_allowed_by_administrator(alias, facts.settings):
         return ""
     return f"container {former} had the name, and may return"
@@ -196,23 +200,23 @@ def _problems(claim: _Claim, common: _Claim | None) -> Iterator[Problem]:
     ``common`` is the claim to ALIAS, the name that all proxies want.
     """
     for claimant in claim.claimants:
-        key = claimant.key
-        if _has_name(claim, key):
+        place = claimant.place
+        if _has_name(claim, place):
             continue
-        host = ALIAS if common and _has_name(common, key) else proxy_name(key)
+        host = ALIAS if common and _has_name(common, place) else proxy_name(place)
         for member in _seekers(claimant, claim.network, claim.alias):
-            fix = f"ROS_MASTER_URI=http://{host}:{master(key).port}"
+            fix = f"ROS_MASTER_URI=http://{host}:{place.master.port}"
             if MASTER_URI not in member.container.labels:
                 # A variable that names a proxy does not say which master the container means.
-                fix += f" and the label {MASTER_URI}={key.master_uri}"
+                fix += f" and the label {MASTER_URI}={place.master.uri}"
             text = (
                 f"the nodes look for the proxy by the name {claim.alias}, but "
-                f"{_obstacle(claim, key, fix)}"
+                f"{_obstacle(claim, place, fix)}"
             )
             yield Problem(f"container {member.container.name}", text, fatal=False)
 
 
-def _obstacle(claim: _Claim, key: Key, fix: str) -> str:
+def _obstacle(claim: _Claim, place: Place, fix: str) -> str:
     """Return what keeps a proxy from having a name, and the fix.
 
     ``fix`` has the variable to set, and a label if the container lacks the label.
@@ -224,7 +228,7 @@ def _obstacle(claim: _Claim, key: Key, fix: str) -> str:
             f"{claim.alias}, or set {fix}"
         )
     holders = [f"container {name}" for name in claim.containers]
-    rivals = {*claim.holders, claim.owner or key} - {key}
+    rivals = {*claim.holders, claim.owner or place} - {place}
     holders += [_holder(claim, rival) for rival in sorted(rivals)]
     return (
         f"on network {claim.network} that name belongs to {listed(holders)}. So the nodes bypass "
@@ -232,18 +236,18 @@ def _obstacle(claim: _Claim, key: Key, fix: str) -> str:
     )
 
 
-def _has_name(claim: _Claim, key: Key) -> bool:
+def _has_name(claim: _Claim, place: Place) -> bool:
     """Return whether the proxy has or gets the name, and no other proxy has the name."""
-    return key == claim.owner and len(claim.holders) <= 1
+    return place == claim.owner and len(claim.holders) <= 1
 
 
-def _holder(claim: _Claim, key: Key) -> str:
+def _holder(claim: _Claim, place: Place) -> str:
     """Return the text for a proxy that has the name, with its containers: a label may be wrong."""
     containers = [
         member.container.name
         for claimant in claim.claimants
-        if claimant.key == key
+        if claimant.place == place
         for member in claimant.members
     ]
-    served = f" (for the master {key.master_uri} of {listed(containers)})" if containers else ""
-    return f"proxy {proxy_name(key)}{served}"
+    served = f" (for the {place.graph} of {listed(containers)})" if containers else ""
+    return f"proxy {proxy_name(place)}{served}"

@@ -17,38 +17,31 @@ from rosproxy_operator.common.port_ranges import (
     overlap,
 )
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.model import (
-    SERVING,
-    STARTED,
-    ZENOH,
-    Container,
-    Desired,
-    HostState,
-    Key,
-)
+from rosproxy_operator.docker.planner.model import SERVING, STARTED, Container, Desired, HostState
 from rosproxy_operator.docker.planner.specs import proxy_name, reserved_ports
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.planner.zenoh_redirect import FIRST_PORT
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Place
 
 
 def after_refusals(
-    observed: HostState, live: Collection[Key], memory: DockerMemory, now: float
+    observed: HostState, live: Collection[Place], memory: DockerMemory, now: float
 ) -> DockerMemory:
     """Return the memory after the engine's refusals to start sandboxes.
 
     A range that has never served is given up at once: the refused ports become ``taken``. A range
     that has served is given up after `REFUSED_RANGE_KEPT_S` seconds, since the engine may be slow
-    to free the ports. ``live`` are the keys of wanted proxies, ``now`` is in monotonic seconds.
+    to free the ports. ``live`` are the places of wanted proxies, ``now`` is in monotonic seconds.
     """
     refusals = dict(memory.refusals)
     taken = dict(memory.taken)
     moved = dict(memory.moved)
     for sandbox in observed.sandboxes:
         refusal = refusals.get(sandbox.container.name)
-        if refusal is None or sandbox.key not in live:
+        if refusal is None or sandbox.place not in live:
             continue
-        served = memory.served.get(sandbox.key)
+        served = memory.served.get(sandbox.place)
         port = refusal.port
         suspects = {port} if port and port in sandbox.range else {*sandbox.range.ports()}
         # In a range that was made longer, only the added ports count as taken. The proxy has
@@ -57,7 +50,7 @@ def after_refusals(
         if served is not None and not unserved:
             if now - refusal.since < REFUSED_RANGE_KEPT_S:
                 continue
-            moved[sandbox.key] = Move(served, now)
+            moved[sandbox.place] = Move(served, now)
         del refusals[sandbox.container.name]
         taken |= dict.fromkeys(unserved or suspects, now)
     return replace(memory, refusals=refusals, taken=taken, moved=moved)
@@ -69,51 +62,51 @@ class _Host:
 
     observed: HostState
     memory: DockerMemory
-    live: Mapping[Key, Desired]
-    serving: frozenset[Key]
+    live: Mapping[Place, Desired]
+    serving: frozenset[Place]
 
-    def published(self, containers: Collection[Container], key: Key) -> frozenset[int]:
+    def published(self, containers: Collection[Container], place: Place) -> frozenset[int]:
         """Return refused ports, and ports that containers publish by the protocols of a proxy."""
         tcp = frozenset(port for c in containers for port in c.host_ports)
         udp = frozenset(port for c in containers for port in c.udp_ports)
-        return self._matching(key, tcp, udp) | self.memory.taken.keys()
+        return self._matching(place, tcp, udp) | self.memory.taken.keys()
 
-    def request(self, key: Key, settings: PlanSettings) -> RangeRequest:
+    def request(self, place: Place, settings: PlanSettings) -> RangeRequest:
         """Return the ports that a proxy wants, and the ports that the proxy can't have."""
         observed = self.observed
-        claimed = self.published(observed.containers, key) | reserved_ports(key)
-        blocked = claimed | self._matching(key, observed.listening, observed.listening_udp)
+        claimed = self.published(observed.containers, place) | reserved_ports(place)
+        blocked = claimed | self._matching(place, observed.listening, observed.listening_udp)
         # The host does not publish the ports of the proxy for rmw_zenoh.
-        others = [s for s in observed.sandboxes if s.key not in (key, ZENOH)]
+        others = [s for s in observed.sandboxes if s.place not in (place, ZENOH)]
         ranges = [s.range for s in others]
         former: list[FormerRange] = []
-        if served := self.memory.served.get(key):
+        if served := self.memory.served.get(place):
             # Listening programs do not count: the engine may still hold ports for this proxy.
             started = [c for c in observed.containers if c.state in STARTED]
-            held = (s for s in others if s.key not in self.live or s.key in self.serving)
-            taken = self.published(started, key)
+            held = (s for s in others if s.place not in self.live or s.place in self.serving)
+            taken = self.published(started, place)
             former.append(FormerRange(served, taken, [s.range for s in held]))
-        created = [s.range for s in observed.sandboxes_of(key)]
-        if planned := self.memory.planned.get(key) or next(iter(created), None):
+        created = [s.range for s in observed.sandboxes_of(place)]
+        if planned := self.memory.planned.get(place) or next(iter(created), None):
             # On the ports of a created sandbox, the engine itself may listen to start the sandbox.
             taken = claimed if planned in created else blocked
             former.append(FormerRange(planned, taken, [observed.ephemeral, *ranges]))
         return RangeRequest(
-            self.live[key].ports,
+            self.live[place].ports,
             settings.port_window,
             blocked,
             [observed.ephemeral],
-            held=served if key in self.serving else None,
+            held=served if place in self.serving else None,
             former=tuple(former),
             growing=ranges,
             room=2,
         )
 
-    def _matching(self, key: Key, tcp: frozenset[int], udp: frozenset[int]) -> frozenset[int]:
+    def _matching(self, place: Place, tcp: frozenset[int], udp: frozenset[int]) -> frozenset[int]:
         """Return the ports of the protocols that a proxy publishes."""
-        if key.is_ros2:
+        if isinstance(place.graph, Domain):
             return udp
-        return tcp | udp if self.live[key].spec.udp else tcp
+        return tcp | udp if self.live[place].spec.udp else tcp
 
 
 def allocate(
@@ -131,55 +124,56 @@ def allocate(
     range, or if other containers or proxies hold such ports. With ``frozen`` no range gets longer,
     since no container can be created.
     """
-    live = {d.key: d for d in desired if d.live}
+    live = {d.place: d for d in desired if d.live}
     routers = live.pop(ZENOH, None)
-    serving = frozenset(s.key for s in observed.sandboxes if s.container.state in SERVING)
+    serving = frozenset(s.place for s in observed.sandboxes if s.container.state in SERVING)
     host = _Host(observed, memory, live, serving)
     # Proxies that serve come first, then proxies that have served, then planned, then new proxies.
     groups = (serving, memory.served, memory.planned, live)
-    order = sorted(live, key=lambda key: ([key in group for group in groups].index(True), key))
-    requests = {key: host.request(key, settings) for key in order}
+    order = sorted(live, key=lambda p: ([p in group for group in groups].index(True), p))
+    requests = {place: host.request(place, settings) for place in order}
     kept = kept_ranges(requests)
     if frozen:
-        requests |= {key: replace(requests[key], count=len(ports)) for key, ports in kept.items()}
+        requests |= {p: replace(requests[p], count=len(ports)) for p, ports in kept.items()}
     ranges, exhausted = assign_ranges(requests, kept)
     problems = [
         _problem(
-            key,
+            place,
             f"{error}. Lower --ports or the label rosproxy.ports ({error.count}), widen "
             f"--port-window ({error.window}), or stop programs that hold ports there",
             fatal=True,
         )
-        for key, error in exhausted.items()
+        for place, error in exhausted.items()
     ]
     problems += _too_short(requests, ranges, observed.ephemeral)
     if routers:
         ranges[ZENOH] = _router_ports(routers.ports, memory)
     left = new_moves(memory.served, ranges, now)
-    served = {key: ports for key, ports in memory.served.items() if key not in left}
+    served = {place: ports for place, ports in memory.served.items() if place not in left}
     moved = left | dict(memory.moved)
-    for key, ports in sorted(ranges.items()):
-        if key in moved and is_moved(moved[key].ports, ports):
-            advice = advice_after_move(key.ros == "1", key.is_ros2)
+    for place, ports in sorted(ranges.items()):
+        if place in moved and is_moved(moved[place].ports, ports):
+            ros = place.graph.ros
+            advice = advice_after_move(ros == "1", ros == "2")
             text = (
-                f"has left ports {moved[key].ports} for {ports}, since another program or "
+                f"has left ports {moved[place].ports} for {ports}, since another program or "
                 f"container has taken the old ports. {advice}"
             )
-            problems.append(_problem(key, text))
+            problems.append(_problem(place, text))
     return replace(memory, served=served, planned=ranges, moved=moved), problems
 
 
 def _too_short(
-    requests: Mapping[Key, RangeRequest], ranges: Mapping[Key, PortRange], ephemeral: PortRange
+    requests: Mapping[Place, RangeRequest], ranges: Mapping[Place, PortRange], ephemeral: PortRange
 ) -> Iterator[Problem]:
     """Yield a problem for each range with fewer ports than the proxy wants, with the fix."""
-    for key, ports in ranges.items():
-        count = requests[key].count
+    for place, ports in ranges.items():
+        count = requests[place].count
         if len(ports) >= count:
             continue
         missing = PortRange(ports.last + 1, ports.first + count - 1)
-        window = requests[key].window
-        others = (other for other in sorted(ranges) if other != key)
+        window = requests[place].window
+        others = (other for other in sorted(ranges) if other != place)
         neighbour = next((other for other in others if overlap(ranges[other], missing)), None)
         if missing.last > window.last:
             why = f"ports {missing} are beyond --port-window ({window}). Widen --port-window"
@@ -202,7 +196,7 @@ def _too_short(
             f"has only the {len(ports)} ports {ports}, although --ports or the label "
             f"rosproxy.ports asks for {count}: {why}"
         )
-        yield _problem(key, text)
+        yield _problem(place, text)
 
 
 def _router_ports(count: int, memory: DockerMemory) -> PortRange:
@@ -214,5 +208,5 @@ def _router_ports(count: int, memory: DockerMemory) -> PortRange:
     return PortRange(FIRST_PORT, FIRST_PORT + max(count, len(former) if former else 0) - 1)
 
 
-def _problem(key: Key, text: str, fatal: bool = False) -> Problem:
-    return Problem(f"proxy {proxy_name(key)}", text, fatal)
+def _problem(place: Place, text: str, fatal: bool = False) -> Problem:
+    return Problem(f"proxy {proxy_name(place)}", text, fatal)

@@ -38,12 +38,10 @@ from rosproxy_operator.docker.planner.label_policy import label_layers
 from rosproxy_operator.docker.planner.model import (
     SERVING,
     STARTED,
-    ZENOH,
     Attachment,
     Container,
     Desired,
     HostState,
-    Key,
     OwnContainer,
     Proxy,
     Sandbox,
@@ -55,6 +53,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_name,
 )
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Place
 
 REPLACED = "replaced by another container"
 """The reason in `Remove` for a container that has a successor."""
@@ -78,7 +77,7 @@ class PlanContext:
 
     def aliases(self, network: str) -> tuple[str, ...]:
         """Return the names of the proxy on a network."""
-        return self.naming.aliases.get(self.desired.key, {}).get(network, ())
+        return self.naming.aliases.get(self.desired.place, {}).get(network, ())
 
     def taken(self, own: Iterable[OwnContainer]) -> frozenset[str]:
         """Return the names of all containers except ``own``."""
@@ -88,13 +87,13 @@ class PlanContext:
     @property
     def label_policy(self) -> tuple[PolicyLayer, ...]:
         """The layers from the labels of the proxy's containers."""
-        routers = self.ports if self.desired.key == ZENOH else None
+        routers = self.ports if self.desired.place == ZENOH else None
         return label_layers(self.desired.members, self.observed, self.desired.networks, routers)
 
     @property
     def lan_relay(self) -> HostPort | None:
         """The endpoint of the LAN relay; None if the proxy gets no LAN relay."""
-        if not self.desired.key.is_ros2 or self.settings.ros2_lan == NOWHERE:
+        if not isinstance(self.desired.place.graph, Domain) or self.settings.ros2_lan == NOWHERE:
             return None
         gateway = self.observed.gateway(self.settings.uplink)
         return HostPort(gateway, self.ports.last) if gateway else None
@@ -145,21 +144,25 @@ def wanted_steps(context: PlanContext) -> list[Action] | None:
 
 
 def removal_steps(
-    observed: HostState, key: Key, reason: str, again: bool = False
+    observed: HostState, place: Place, reason: str, again: bool = False
 ) -> Iterator[Action]:
     """Yield the actions that remove all containers of a proxy.
 
     With ``again``, the actions include containers that the engine is removing already.
     """
     # A proxy that retires needs the LAN relay to reach the LAN, and the sandbox to reach outside.
-    ordered = (*observed.proxies_of(key), *observed.lan_relays_of(key), *observed.sandboxes_of(key))
+    ordered = (
+        *observed.proxies_of(place),
+        *observed.lan_relays_of(place),
+        *observed.sandboxes_of(place),
+    )
     for own in ordered:
         if own.container.state == "paused" and not isinstance(own, Sandbox):
             yield Unpause(own.container.name)
     for own in ordered:
         state = own.container.state
         if again or state != "removing":
-            retire = isinstance(own, Proxy) and state in STARTED and key != ZENOH
+            retire = isinstance(own, Proxy) and state in STARTED and place != ZENOH
             yield Remove(own.container.name, reason, retire=retire)
 
 
@@ -179,7 +182,7 @@ def disconnect_steps(
     is_idle = not desired.live or planned is None
     planned = planned or ()
     gone = _removed(planned)
-    for sandbox in observed.sandboxes_of(desired.key):
+    for sandbox in observed.sandboxes_of(desired.place):
         container = sandbox.container
         if container.state in _CONNECTABLE_STATES and container.name not in gone:
             for network in _existing_networks(observed, container):
@@ -200,13 +203,13 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _SandboxC
     The sandbox is None if no sandbox is going to run. The actions are None if the sandbox is
     missing and can't be created.
     """
-    key = context.desired.key
-    sandboxes = context.observed.sandboxes_of(key)
+    place = context.desired.place
+    sandboxes = context.observed.sandboxes_of(place)
     taken = context.taken(sandboxes)
     # The fingerprint depends on the data plane, so a proxy that loses the kernel plane gets another
     # sandbox. In the former sandbox, a killed proxy may have left rules. A proxy without NET_ADMIN
     # can't remove these rules.
-    action = CreateSandbox(sandbox_name(key), key, context.ports, context.desired.spec)
+    action = CreateSandbox(sandbox_name(place), place, context.ports, context.desired.spec)
     expected = sandbox_fingerprint(action, context.settings)
     selection = context.select(
         sandboxes, action.name, expected, lambda c: _usable(c, context.observed)
@@ -301,7 +304,7 @@ def _connect(context: PlanContext, name: str) -> Iterator[Action]:
 
 def _emptying_steps(context: PlanContext, old: Container) -> Iterator[Action]:
     """Yield the actions that stop and remove the proxies in a sandbox, before the sandbox goes."""
-    for proxy in context.observed.proxies_of(context.desired.key):
+    for proxy in context.observed.proxies_of(context.desired.place):
         if proxy.container.network_container == old.id and proxy.container.state != "removing":
             yield Remove(proxy.container.name, "the sandbox is replaced", stop=True)
 
@@ -313,14 +316,14 @@ def _proxy_steps(
 
     ``gone`` has the names of the containers that earlier actions remove.
     """
-    key = context.desired.key
-    wanted_name = proxy_name(context.desired.key)
-    proxies = context.observed.proxies_of(key)
+    place = context.desired.place
+    wanted_name = proxy_name(context.desired.place)
+    proxies = context.observed.proxies_of(place)
     taken = context.taken(proxies)
     name = free_name(wanted_name, taken)
     action = Create(
         name,
-        key,
+        place,
         context.ports,
         sandbox.name,
         context.desired.spec,

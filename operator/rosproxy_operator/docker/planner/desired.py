@@ -6,9 +6,10 @@ from rosproxy.settings import MOST_ZENOH_PORTS
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.ros2 import LEAST_PORTS
 from rosproxy_operator.docker.planner.labels.readers import BUILT_IN_NETWORKS
-from rosproxy_operator.docker.planner.model import THIS_HOST, ZENOH, Desired, HostState, Key, Member
+from rosproxy_operator.docker.planner.model import THIS_HOST, Desired, HostState, Member
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Place
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, merged
 
 ROUTERS_STEP = 32
@@ -22,7 +23,7 @@ def desire(
     memory: DockerMemory,
     now: float,
 ) -> tuple[tuple[Desired, ...], tuple[Problem, ...]]:
-    """Return a Desired for each key that a container asks for or that has a proxy, sorted by key.
+    """Return a Desired for each place that has a proxy or that a container asks for, by place.
 
     Return problems, too. A living member without a usable network is ignored. The labels of an
     exited container count for ``grace`` seconds: the proxy keeps options and peers, and stays on
@@ -39,22 +40,24 @@ def desire(
         and now - memory.exited.get(member.container.id, now) < settings.grace
     ]
     desired: list[Desired] = []
-    for key in sorted({member.key for member in members} | observed.keys):
-        own = tuple(member for member in alive if member.key == key and member.networks & usable)
-        exited = [member for member in recent if member.key == key]
-        joined = {name for s in observed.sandboxes_of(key) for name in s.container.networks}
+    for place in sorted({member.place for member in members} | observed.places):
+        own = tuple(
+            member for member in alive if member.place == place and member.networks & usable
+        )
+        exited = [member for member in recent if member.place == place]
+        joined = {name for s in observed.sandboxes_of(place) for name in s.container.networks}
         networks = _networks(own) | (_networks(exited) & joined)
         considered = [*own, *exited]
         desired.append(
             Desired(
-                key,
+                place,
                 bool(own),
-                _ports(key, own, settings),
+                _ports(place, own, settings),
                 networks & usable,
                 own,
-                proxy_spec(key, considered, settings),
-                _peers(key, considered, observed, settings),
-                _links(key, considered, settings),
+                proxy_spec(place, considered, settings),
+                _peers(place, considered, observed, settings),
+                _links(place, considered, settings),
             )
         )
     problems = [
@@ -64,40 +67,40 @@ def desire(
     return tuple(desired), (*problems, *_option_warnings(desired))
 
 
-def proxy_spec(key: Key, members: Iterable[Member], settings: PlanSettings) -> ProxySpec:
+def proxy_spec(place: Place, members: Iterable[Member], settings: PlanSettings) -> ProxySpec:
     """Return the options of a proxy with these containers."""
-    if key == ZENOH:  # no option is for routers of rmw_zenoh
+    if place == ZENOH:  # no option is for routers of rmw_zenoh
         return OWN_SPEC
-    names = (name for name, wish in WISHES.items() if wish.ros in ("", key.ros))
+    names = (name for name, wish in WISHES.items() if wish.ros in ("", place.graph.ros))
     defaults = ProxySpec(**{name: getattr(settings, name) for name in names})
     return merged([member.wishes for member in members], defaults)
 
 
-def _ports(key: Key, members: Collection[Member], settings: PlanSettings) -> int:
+def _ports(place: Place, members: Collection[Member], settings: PlanSettings) -> int:
     """Return the least number of ports of a proxy with these containers."""
     # A change of the number recreates the proxy, and all nodes connect again: so in steps.
-    if key == ZENOH:
+    if place == ZENOH:
         steps = max(-(-len(members) // ROUTERS_STEP), 1)
         return min(steps * ROUTERS_STEP, MOST_ZENOH_PORTS)
     ports = max([settings.ports, *(member.ports for member in members)])
-    return max(ports, LEAST_PORTS) if key.is_ros2 else ports
+    return max(ports, LEAST_PORTS) if isinstance(place.graph, Domain) else ports
 
 
 def _peers(
-    key: Key, members: Iterable[Member], observed: HostState, settings: PlanSettings
+    place: Place, members: Iterable[Member], observed: HostState, settings: PlanSettings
 ) -> tuple[str, ...]:
     """Return the peers from the labels, and for DDS the peers of the operator; empty for ROS 1."""
     peers = {peer for member in members for peer in member.peers}
-    if key == ZENOH:
+    if place == ZENOH:
         gateway = observed.gateway(settings.uplink) or THIS_HOST
         return tuple(sorted(peer.replace(THIS_HOST, gateway) for peer in peers))
-    return tuple(sorted({*settings.ros2_peer, *peers})) if key.is_ros2 else ()
+    return tuple(sorted({*settings.ros2_peer, *peers})) if isinstance(place.graph, Domain) else ()
 
 
-def _links(key: Key, members: Iterable[Member], settings: PlanSettings) -> tuple[str, ...]:
+def _links(place: Place, members: Iterable[Member], settings: PlanSettings) -> tuple[str, ...]:
     """Return the links to other sites from the labels and of the operator."""
     links = {link for member in members for link in member.links}
-    return tuple(sorted({*settings.zenoh_link, *links})) if key == ZENOH else ()
+    return tuple(sorted({*settings.zenoh_link, *links})) if place == ZENOH else ()
 
 
 def _networks(members: Iterable[Member]) -> frozenset[str]:

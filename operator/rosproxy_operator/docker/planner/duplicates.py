@@ -1,6 +1,6 @@
 """Decide which of several containers in the same role stays, and which goes.
 
-A role is the sandbox, the proxy or the LAN relay of a key. Several containers have the same role
+A role is the sandbox, the proxy or the LAN relay of a place. Several containers have the same role
 while a new container takes over. The reason may also be an operator that was killed, or a change by
 a user.
 """

@@ -24,7 +24,7 @@ from msgspec.structs import replace
 
 from rosproxy_operator.docker.planner.actions import Action, CreateFlush, Remove, Run
 from rosproxy_operator.docker.planner.instants import instant
-from rosproxy_operator.docker.planner.model import Desired, FlushContainer, HostState, Key, Sandbox
+from rosproxy_operator.docker.planner.model import Desired, FlushContainer, HostState, Sandbox
 from rosproxy_operator.docker.planner.specs import (
     flush_command,
     flush_name,
@@ -34,20 +34,21 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.fingerprint import digest
+from rosproxy_operator.proxy_spec.place import Place
 
 
 @dataclass(frozen=True, slots=True)
 class FlushSteps:
-    """The actions for the flush of a key. ``fix`` says what users can do if an action fails."""
+    """The actions for the flush of a place. ``fix`` says what users can do if an action fails."""
 
-    key: Key
+    place: Place
     actions: tuple[Action, ...]
     fix: str = ""
 
 
 def flush_config(action: CreateFlush, settings: PlanSettings) -> dict[str, Any]:
     """Return the body of the engine's ``POST /containers/create`` for a flush container."""
-    command = flush_command(action.key, action.range)
+    command = flush_command(action.place, action.range)
     return {
         **helper_config(settings, "host"),
         "Entrypoint": [command[0]],
@@ -66,32 +67,32 @@ def flush_steps(
 
     ``outdated`` has the records whose last run does not count, by id, with the time of that run.
     """
-    live = {wanted.key for wanted in desired if wanted.live}
-    records: dict[Key, list[FlushContainer]] = {}
+    live = {wanted.place for wanted in desired if wanted.live}
+    records: dict[Place, list[FlushContainer]] = {}
     for record in observed.flushes:
-        records.setdefault(record.key, []).append(record)
-    for key in sorted(live | records.keys()):
-        existing = records.get(key, [])
-        if any(r.container.state == "removing" for r in existing) or _is_busy(key, observed):
+        records.setdefault(record.place, []).append(record)
+    for place in sorted(live | records.keys()):
+        existing = records.get(place, [])
+        if any(r.container.state == "removing" for r in existing) or _is_busy(place, observed):
             continue
-        is_published = bool(observed.sandboxes_of(key)) or key in live
+        is_published = bool(observed.sandboxes_of(place)) or place in live
         if observed.deletes_udp_entries or not is_published:
             gone = (Remove(r.container.name, "no longer needed") for r in existing)
-            yield FlushSteps(key, tuple(gone))
-        elif key in live and (sandbox := _publishing_sandbox(key, observed)):
+            yield FlushSteps(place, tuple(gone))
+        elif place in live and (sandbox := _publishing_sandbox(place, observed)):
             steps = _steps(sandbox, existing, outdated, observed, settings)
-            yield FlushSteps(key, tuple(steps), _fix(sandbox))
+            yield FlushSteps(place, tuple(steps), _fix(sandbox))
 
 
-def _is_busy(key: Key, observed: HostState) -> bool:
-    """Return whether a record or sandbox of a key has no current inspection yet (`HostState`)."""
+def _is_busy(place: Place, observed: HostState) -> bool:
+    """Return whether a record or sandbox of a place has no current inspection yet (`HostState`)."""
     containers = [*observed.flushes, *observed.sandboxes]
-    return any(o.key == key and o.container.name in observed.busy for o in containers)
+    return any(o.place == place and o.container.name in observed.busy for o in containers)
 
 
-def _publishing_sandbox(key: Key, observed: HostState) -> Sandbox | None:
-    """Return the running sandbox of a key that publishes UDP ports; None without such a sandbox."""
-    running = (s for s in observed.sandboxes_of(key) if s.container.state == "running")
+def _publishing_sandbox(place: Place, observed: HostState) -> Sandbox | None:
+    """Return the running sandbox of a place that publishes UDP ports; None if there is none."""
+    running = (s for s in observed.sandboxes_of(place) if s.container.state == "running")
     return next((s for s in running if s.container.udp_ports), None)
 
 
@@ -102,7 +103,7 @@ def _steps(
     observed: HostState,
     settings: PlanSettings,
 ) -> Iterator[Action]:
-    action = CreateFlush(flush_name(sandbox.key), sandbox.key, sandbox.range)
+    action = CreateFlush(flush_name(sandbox.place), sandbox.place, sandbox.range)
     body = {**flush_config(action, settings), "Image": observed.image_id}
     action = replace(action, fingerprint=digest(body))
     usable = None
@@ -131,7 +132,7 @@ def _is_current(record: FlushContainer, sandbox: Sandbox, outdated: Mapping[str,
 
 def _fix(sandbox: Sandbox) -> str:
     """Return the command with which users delete the entries themselves."""
-    ports = own_range(sandbox.key, sandbox.range)
+    ports = own_range(sandbox.place, sandbox.range)
     return (
         "Datagrams of nodes that went on sending while the ports were not published may bypass the "
         f"ports. Run as root: for port in $(seq {ports.first} {ports.last}); do conntrack -D -p "

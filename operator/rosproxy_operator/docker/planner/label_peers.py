@@ -13,8 +13,9 @@ from dataclasses import replace
 from rosproxy.settings import MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels.readers import LINK, PEERS
-from rosproxy_operator.docker.planner.model import ZENOH, Key, Member
+from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Place
 
 MOST_PEERS_OF_PROXY = 256
 """Most peers of a DDS proxy from labels, in 66 KiB: a host has 253 characters at most."""
@@ -29,7 +30,8 @@ def with_bounded_peers(
     """
 
     def peers(member: Member) -> frozenset[str]:
-        return member.peers - frozenset(settings.ros2_peer if member.key.is_ros2 else ())
+        common = settings.ros2_peer if isinstance(member.place.graph, Domain) else ()
+        return member.peers - frozenset(common)
 
     ignored = _ignored(members, peers, _most)
     return (
@@ -59,44 +61,44 @@ def with_bounded_links(
 def _ignored(
     members: Collection[Member],
     names: Callable[[Member], frozenset[str]],
-    most: Callable[[Key], int],
+    most: Callable[[Place], int],
 ) -> list[Member]:
     """Return the members with too many names for their proxy."""
-    named: dict[Key, frozenset[str]] = defaultdict(frozenset)
+    named: dict[Place, frozenset[str]] = defaultdict(frozenset)
     ignored: list[Member] = []
     # Living containers first: the names of an exited container count for the grace only (`desire`).
     order = sorted(members, key=lambda m: (not m.container.alive, len(names(m)), m.container.name))
     for member in order:
-        together = named[member.key] | names(member)
-        if len(together) > most(member.key):
+        together = named[member.place] | names(member)
+        if len(together) > most(member.place):
             ignored.append(member)
         else:
-            named[member.key] = together
+            named[member.place] = together
     return ignored
 
 
-def _problems(ignored: Collection[Member], text: Callable[[Key], str]) -> tuple[Problem, ...]:
+def _problems(ignored: Collection[Member], text: Callable[[Place], str]) -> tuple[Problem, ...]:
     return tuple(
-        Problem(f"container {member.container.name}", text(member.key), fatal=False)
+        Problem(f"container {member.container.name}", text(member.place), fatal=False)
         for member in ignored
         if member.container.alive
     )
 
 
-def _most(key: Key) -> int:
-    return MOST_ZENOH_PEERS if key == ZENOH else MOST_PEERS_OF_PROXY
+def _most(place: Place) -> int:
+    return MOST_ZENOH_PEERS if place == ZENOH else MOST_PEERS_OF_PROXY
 
 
-def _ignored_peers(key: Key) -> str:
+def _ignored_peers(place: Place) -> str:
     """Return why the peers of a container are ignored, and the fix."""
-    common = "" if key == ZENOH else ", or start the operator with --ros2-peer for common peers"
+    common = "" if place == ZENOH else ", or start the operator with --ros2-peer for common peers"
     return (
-        f"label {PEERS} is ignored: a proxy takes at most {_most(key)} peers from all labels of "
+        f"label {PEERS} is ignored: a proxy takes at most {_most(place)} peers from all labels of "
         f"its containers, and ignores the labels with the most peers. Name fewer peers{common}"
     )
 
 
-def _ignored_links(_: Key) -> str:
+def _ignored_links(_: Place) -> str:
     """Return why the links of a container are ignored, and the fix."""
     return (
         f"label {LINK} is ignored: a proxy has at most {MOST_ZENOH_LINKS} links, and ignores the "

@@ -15,9 +15,10 @@ from rosproxy.access.rules import MOST_RULES, format_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.docker.planner.labels.readers import POLICY
-from rosproxy_operator.docker.planner.model import ZENOH, Container, HostState, Key, Member
+from rosproxy_operator.docker.planner.model import Container, HostState, Member
 from rosproxy_operator.docker.planner.network_owner import by_reference, network_owner
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import ZENOH, Place
 
 LAYERS_KEPT_S = 10.0
 """Seconds for which an address keeps the layers of a container that has gone.
@@ -32,18 +33,18 @@ def with_bounded_rules(
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
     """Return the members whose rules the proxies can hold, and a problem for each other member."""
     common = sum(len(layer.rules) for layer in settings.policy)
-    rules: Counter[Key] = Counter()
-    layers: Counter[Key] = Counter()
+    rules: Counter[Place] = Counter()
+    layers: Counter[Place] = Counter()
     refused: list[Member] = []
     asking = [member for member in members if member.policy and member.container.alive]
     for member in sorted(asking, key=lambda m: (len(m.policy), m.container.name)):
-        key = member.key
-        is_full = common + rules[key] + len(member.policy) > MOST_RULES
-        if is_full or layers[key] + len(settings.policy) >= MOST_LAYERS:
+        place = member.place
+        is_full = common + rules[place] + len(member.policy) > MOST_RULES
+        if is_full or layers[place] + len(settings.policy) >= MOST_LAYERS:
             refused.append(member)
             continue
-        rules[key] += len(member.policy)
-        layers[key] += 1
+        rules[place] += len(member.policy)
+        layers[place] += 1
     text = (
         f"label {POLICY}: the container gets no proxy, since the containers of one proxy have too "
         f"many rules together (at most {MOST_RULES} rules in {MOST_LAYERS} policies). Join rules "
@@ -89,7 +90,7 @@ def _ports_at(owner: Container, routers: PortRange, observed: HostState) -> froz
     owner_by_port: dict[int, set[str]] = {}
     for record in observed.redirects:
         target = record.container.network_container
-        if record.key == ZENOH and target in alive:
+        if record.place == ZENOH and target in alive:
             owner_by_port.setdefault(record.range.first, set()).add(target)
     return frozenset(p for p in routers.ports() if owner.id in owner_by_port.get(p, {owner.id}))
 

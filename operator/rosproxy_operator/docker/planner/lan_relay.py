@@ -29,9 +29,10 @@ from rosproxy_operator.docker.planner.container_steps import (
     keep_running_steps,
 )
 from rosproxy_operator.docker.planner.duplicates import free_name
-from rosproxy_operator.docker.planner.model import HostState, Key
+from rosproxy_operator.docker.planner.model import HostState
 from rosproxy_operator.docker.planner.specs import lan_relay_fingerprint, lan_relay_name, proxy_name
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Domain, Place
 
 
 def with_lan_relay(context: PlanContext, steps: list[Action]) -> list[Action]:
@@ -40,28 +41,28 @@ def with_lan_relay(context: PlanContext, steps: list[Action]) -> list[Action]:
     If the steps start, create or remove a sandbox, the operator removes the LAN relay first: the
     new sandbox may publish the LAN relay's port. Later looks create the LAN relay again.
     """
-    key = context.desired.key
-    if not key.is_ros2:
+    place = context.desired.place
+    if not isinstance(place.graph, Domain):
         return steps
-    sandboxes = {s.container.name for s in context.observed.sandboxes_of(key)}
+    sandboxes = {s.container.name for s in context.observed.sandboxes_of(place)}
     if any(_starts(step, sandboxes) for step in steps):
         return [*_removal_steps(context, "the proxy gets another address"), *steps]
     return [*steps, *_lan_relay_steps(context)]
 
 
-def missing_lan_relay(key: Key, observed: HostState, settings: PlanSettings) -> Problem | None:
+def missing_lan_relay(place: Place, observed: HostState, settings: PlanSettings) -> Problem | None:
     """Return a warning if a proxy for ROS 2 lacks the LAN relay; None if nothing is missing."""
     if (
         settings.ros2_lan == NOWHERE
-        or _lan_address(key, observed, settings)
-        or observed.lan_relays_of(key)
+        or _lan_address(place, observed, settings)
+        or observed.lan_relays_of(place)
     ):
         return None
     text = (
         "has no LAN relay, since the operator does not know this host's address on the LAN. Start "
         f"the operator with --ros2-lan ADDRESS, or with --ros2-lan {NOWHERE} if peers are enough"
     )
-    return Problem(f"proxy {proxy_name(key)}", text, fatal=False)
+    return Problem(f"proxy {proxy_name(place)}", text, fatal=False)
 
 
 def _starts(step: Action, sandboxes: Collection[str]) -> bool:
@@ -70,11 +71,13 @@ def _starts(step: Action, sandboxes: Collection[str]) -> bool:
     return begins or isinstance(step, CreateSandbox)
 
 
-def _lan_address(key: Key, observed: HostState, settings: PlanSettings) -> str:
+def _lan_address(place: Place, observed: HostState, settings: PlanSettings) -> str:
     """Return this host's address on the LAN; empty if unknown, or if ``--ros2-lan`` is ``none``."""
     if settings.ros2_lan:
         return "" if settings.ros2_lan == NOWHERE else settings.ros2_lan
-    return key.advertise_host if is_address(key.advertise_host) else observed.default_route_address
+    return (
+        place.advertise_host if is_address(place.advertise_host) else observed.default_route_address
+    )
 
 
 def _creation(context: PlanContext) -> CreateLanRelay | None:
@@ -83,15 +86,15 @@ def _creation(context: PlanContext) -> CreateLanRelay | None:
     None if the proxy gets no LAN relay, or while an address is unknown: this host's on the LAN, the
     proxy's on the uplink, or the gateway's of the uplink.
     """
-    key = context.desired.key
+    place = context.desired.place
     observed = context.observed
     settings = context.settings
-    lan = _lan_address(key, observed, settings)
+    lan = _lan_address(place, observed, settings)
     bind = context.lan_relay
     address = next(
         (
             attachment.address
-            for sandbox in observed.sandboxes_of(key)
+            for sandbox in observed.sandboxes_of(place)
             for attachment in sandbox.container.attachments
             if attachment.network == settings.uplink and attachment.address
         ),
@@ -100,7 +103,7 @@ def _creation(context: PlanContext) -> CreateLanRelay | None:
     if not lan or not address or bind is None:
         return None
     proxy = HostPort(address, context.ports.first)
-    return CreateLanRelay(lan_relay_name(key), key, context.ports, lan, bind, proxy)
+    return CreateLanRelay(lan_relay_name(place), place, context.ports, lan, bind, proxy)
 
 
 def _lan_relay_steps(context: PlanContext) -> Iterator[Action]:
@@ -114,7 +117,7 @@ def _lan_relay_steps(context: PlanContext) -> Iterator[Action]:
 
 def _ensure_lan_relay(context: PlanContext, lan_relay: CreateLanRelay) -> Iterator[Action]:
     """Yield the steps after which the proxy has this LAN relay and no other."""
-    lan_relays = context.observed.lan_relays_of(lan_relay.key)
+    lan_relays = context.observed.lan_relays_of(lan_relay.place)
     observed = context.observed
     expected = lan_relay_fingerprint(
         lan_relay, context.settings, observed.image_id, observed.secret
@@ -136,6 +139,6 @@ def _ensure_lan_relay(context: PlanContext, lan_relay: CreateLanRelay) -> Iterat
 
 
 def _removal_steps(context: PlanContext, reason: str) -> Iterator[Action]:
-    for lan_relay in context.observed.lan_relays_of(context.desired.key):
+    for lan_relay in context.observed.lan_relays_of(context.desired.place):
         if lan_relay.container.state != "removing":
             yield Remove(lan_relay.container.name, reason)

@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network
-from typing import Literal
 
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy_operator.proxy_spec.place import Place
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec, Wishes
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
@@ -114,45 +114,6 @@ class Network:
     dual_stack: bool = False
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Key:
-    """The identity of a proxy on a host: the master's URI or the domain, and the advertised host.
-
-    A key of ROS 1 has a master. A key of ROS 2 has a domain, and an empty ``master_uri``. A
-    container with both versions has two proxies, since the containers of a master and of a domain
-    may differ. All containers with rmw_zenoh share a single proxy (`ZENOH`), since zenoh itself
-    keeps domains apart. This proxy publishes no port.
-    """
-
-    # The order of keys never compares a domain with None: only a key of ROS 1 has a master_uri, and
-    # of all other keys only ZENOH has no advertised host.
-    master_uri: str
-    advertise_host: str
-    domain: int | None = None
-
-    @property
-    def ros(self) -> Literal["1", "2", "zenoh"]:
-        """The ROS version that the proxy serves, as a value of the proxy's option ``--ros``."""
-        if self.is_ros2:
-            return "2"
-        return "1" if self.master_uri else "zenoh"
-
-    @property
-    def is_ros2(self) -> bool:
-        """Whether the proxy is for ROS 2 by DDS, and publishes UDP ports instead of TCP ports."""
-        return self.domain is not None
-
-    @property
-    def graph(self) -> str:
-        """The master, domain or zenoh network of the nodes, in the words of messages."""
-        graphs = {"1": f"master {self.master_uri}", "2": f"ROS 2 domain {self.domain}"}
-        return graphs.get(self.ros, "zenoh network")
-
-
-ZENOH = Key("", "")
-"""The key of the proxy for rmw_zenoh."""
-
-
 @dataclass(frozen=True, slots=True)
 class OwnContainer:
     """A container of this operator on the host, and the content of its labels.
@@ -160,7 +121,7 @@ class OwnContainer:
     ``range`` are the proxy's ports. ``fingerprint`` is a hash of the creation request.
     """
 
-    key: Key
+    place: Place
     container: Container
     range: PortRange
     fingerprint: str
@@ -265,25 +226,25 @@ class HostState:
         return (*self.sandboxes, *self.proxies, *self.lan_relays)
 
     @property
-    def keys(self) -> frozenset[Key]:
-        """The keys that have a sandbox, a proxy or a LAN relay."""
-        return frozenset(own.key for own in self.own)
+    def places(self) -> frozenset[Place]:
+        """The places that have a sandbox, a proxy or a LAN relay."""
+        return frozenset(own.place for own in self.own)
 
-    def sandboxes_of(self, key: Key) -> tuple[Sandbox, ...]:
-        """The sandboxes of a key."""
-        return tuple(s for s in self.sandboxes if s.key == key)
+    def sandboxes_of(self, place: Place) -> tuple[Sandbox, ...]:
+        """The sandboxes of a place."""
+        return tuple(s for s in self.sandboxes if s.place == place)
 
-    def proxies_of(self, key: Key) -> tuple[Proxy, ...]:
-        """The proxies of a key."""
-        return tuple(p for p in self.proxies if p.key == key)
+    def proxies_of(self, place: Place) -> tuple[Proxy, ...]:
+        """The proxies of a place."""
+        return tuple(p for p in self.proxies if p.place == place)
 
     def gateway(self, name: str) -> str:
         """The gateway of a network; empty without a gateway, or without the network."""
         return next((n.gateway for n in self.networks if n.name == name), "")
 
-    def lan_relays_of(self, key: Key) -> tuple[LanRelayContainer, ...]:
-        """The LAN relays of a key."""
-        return tuple(e for e in self.lan_relays if e.key == key)
+    def lan_relays_of(self, place: Place) -> tuple[LanRelayContainer, ...]:
+        """The LAN relays of a place."""
+        return tuple(e for e in self.lan_relays if e.place == place)
 
     def sandbox_of(self, proxy: Proxy) -> Sandbox | None:
         """The sandbox in whose network namespace a proxy runs; None if the sandbox is gone."""
@@ -316,7 +277,7 @@ class Member:
     """
 
     container: Container
-    key: Key
+    place: Place
     ports: int = 0
     networks: frozenset[str] = frozenset()
     wanted_alias: str = ""
@@ -330,7 +291,7 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class Desired:
-    """The proxy that the operator wants for a key.
+    """The proxy that the operator wants for a place.
 
     If ``live`` is false, no live container needs the proxy. Until the grace ends, the operator then
     only disconnects the sandbox from networks. ``ports`` is the least number of ports. ``members``
@@ -339,7 +300,7 @@ class Desired:
     option.
     """
 
-    key: Key
+    place: Place
     live: bool
     ports: int
     networks: frozenset[str] = frozenset()

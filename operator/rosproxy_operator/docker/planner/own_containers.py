@@ -4,7 +4,7 @@ The operator has no disk, and recognises its containers by their labels. But an 
 labels too, and variables, a command and a user. An image can't choose the name and the HostConfig
 of a container; the client that creates the container chooses both. So a container counts as own
 only if the operator would choose this name and HostConfig. Of all other containers, the operator
-ignores the labels for range and key.
+ignores the labels for range and place.
 
 The labels have no signature, such as an HMAC. A client that chooses name and HostConfig has access
 to the engine, and is root on the host. Such a client can read every secret of the operator, and
@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rosproxy_operator.common.ros2 import LAN_RELAY_COMMAND
-from rosproxy_operator.docker.planner.model import ZENOH
 from rosproxy_operator.docker.planner.specs import (
     FORMER_LAN_RELAY,
     HELPER_USER,
@@ -48,6 +47,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_name,
 )
 from rosproxy_operator.docker.planner.zenoh_redirect import zenoh_sysctls
+from rosproxy_operator.proxy_spec.place import ZENOH
 
 _NAME_ENDINGS = r"(-\d+)?(-old(-\d+)?)?"
 """Pattern of the endings of a container's name: a number if the name is taken
@@ -89,7 +89,7 @@ def has_own_name(own: OwnLabels, name: str) -> bool:
     """Whether the operator gives this name to a container with these labels."""
     names = [_expected_name(own)]
     if own.role == ROLE_LAN_RELAY:
-        names.append(f"{proxy_name(own.key)}-{FORMER_LAN_RELAY}")
+        names.append(f"{proxy_name(own.place)}-{FORMER_LAN_RELAY}")
     return any(re.fullmatch(re.escape(each) + _NAME_ENDINGS, name) for each in names)
 
 
@@ -105,7 +105,7 @@ def forgery_reason(own: OwnLabels, name: str, creation: CreationFacts, image_id:
     user = HELPER_USER if own.role in _HELPERS else USER
     if creation.user != user:
         return f"the user is not {user}"
-    if own.role == ROLE_FLUSH and creation.command != flush_command(own.key, own.range):
+    if own.role == ROLE_FLUSH and creation.command != flush_command(own.place, own.range):
         return "the command is not the operator's"
     command = _COMMANDS.get(own.role, creation.command)
     of_image = own.role == ROLE_PROXY and creation.image == image_id
@@ -127,9 +127,9 @@ def forgery_reason(own: OwnLabels, name: str, creation: CreationFacts, image_id:
 
 def _expected_name(own: OwnLabels) -> str:
     if own.role == ROLE_REDIRECT:
-        return redirect_name(own.key, own.fingerprint)
+        return redirect_name(own.place, own.fingerprint)
     names = {ROLE_SANDBOX: sandbox_name, ROLE_LAN_RELAY: lan_relay_name, ROLE_FLUSH: flush_name}
-    return names.get(own.role, proxy_name)(own.key)
+    return names.get(own.role, proxy_name)(own.place)
 
 
 def _wrong_fields(host: Mapping[str, Any]) -> Iterator[str]:
@@ -157,7 +157,7 @@ def _wrong_sandbox_fields(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[s
     bindings = host.get("PortBindings") or {}
     # No label says whether the ports are published for UDP as well, so both are valid.
     expected = [
-        {name: {str(port)} for name, port in published_ports(own.key, own.range, udp)}
+        {name: {str(port)} for name, port in published_ports(own.place, own.range, udp)}
         for udp in (False, True)
     ]
     actual = {
@@ -188,7 +188,7 @@ def _wrong_redirect_fields(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[
 
     A redirect has NET_ADMIN in another container's network; for rmw_zenoh also a sysctl.
     """
-    sysctls = frozenset(zenoh_sysctls(True)) if own.key == ZENOH else frozenset()
+    sysctls = frozenset(zenoh_sysctls(True)) if own.place == ZENOH else frozenset()
     yield from _wrong_helper_fields(host, sysctls)
     if not str(host.get("NetworkMode")).startswith("container:"):
         yield "NetworkMode"
@@ -218,7 +218,7 @@ def _wrong_helper_fields(
 def _wrong_proxy_fields(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
     # No label says whether the proxy has links, and the option may name another directory by now.
     mounts = [{key: mount.get(key) for key in LINK_MOUNT} for mount in host.get("Mounts") or ()]
-    has_links = own.key == ZENOH and mounts == [LINK_MOUNT]
+    has_links = own.place == ZENOH and mounts == [LINK_MOUNT]
     yield from _wrong_fields({**host, "Mounts": None} if has_links else host)
     if not has_kernel_privileges(host):
         if host.get("CapAdd"):

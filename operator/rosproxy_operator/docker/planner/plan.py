@@ -26,11 +26,12 @@ from rosproxy_operator.docker.planner.label_policy import with_bounded_rules
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
 from rosproxy_operator.docker.planner.labels.zenoh import with_bounded_containers
 from rosproxy_operator.docker.planner.lan_relay import missing_lan_relay, with_lan_relay
-from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member, Proxy
+from rosproxy_operator.docker.planner.model import Desired, HostState, Member, Proxy
 from rosproxy_operator.docker.planner.redirect import redirect_steps
-from rosproxy_operator.docker.planner.specs import master, proxy_name, unresolved_master
+from rosproxy_operator.docker.planner.specs import proxy_name, unresolved_master
 from rosproxy_operator.docker.planner.state import DockerMemory, after_look, with_exited
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Domain, Master, Place
 
 UNWANTED_REASON = "no running container needs the proxy"
 ENGINE_BUSY_RECHECK_S = 1.0
@@ -39,10 +40,11 @@ ENGINE_BUSY_RECHECK_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Actions for a proxy, in order. If ``key`` is None, the actions are for networks (uplink).
+    """Actions for a proxy, in order. If ``place`` is None, the actions are for networks (uplink).
 
-    Every group waits for the uplink's group. Groups with the same key and ``subject`` run in order.
-    Redirects and flushes have a ``subject``, so other work for the proxy does not wait for these.
+    Every group waits for the uplink's group. Groups with the same place and ``subject`` run in
+    order. Redirects and flushes have a ``subject``, so other work for the proxy does not wait for
+    these.
 
     If an action fails, the executor skips the rest of the group. Create comes before Remove in a
     group, so the operator removes a proxy only after the operator has created the successor. A
@@ -51,7 +53,7 @@ class Group:
     fatal `Problem`.
     """
 
-    key: Key | None
+    place: Place | None
     actions: tuple[Action, ...]
     subject: str = ""
     fix: str = ""
@@ -105,26 +107,27 @@ def plan(
     desired, network_problems = desire(observed, settings, members, memory, now)
     memory = after_look(memory, observed, desired, settings.grace, now)
     naming = assign_aliases(desired, observed, settings, memory.names)
-    live = {d.key for d in desired if d.live}
+    live = {d.place for d in desired if d.live}
     memory = after_refusals(observed, live, memory, now)
     obstacle = _obstacle(observed, settings) if live else None
     creatable = obstacle is None
     memory, port_problems = allocate(observed, settings, desired, memory, now, frozen=not creatable)
-    expired = {key for key, since in memory.absent.items() if now - since >= settings.grace}
-    actions_by_key: dict[Key, list[Action] | None] = {
-        key: [*removal_steps(observed, key, UNWANTED_REASON)] for key in expired
+    expired = {place for place, since in memory.absent.items() if now - since >= settings.grace}
+    actions_by_place: dict[Place, list[Action] | None] = {
+        place: [*removal_steps(observed, place, UNWANTED_REASON)] for place in expired
     }
     for wanted in desired:
-        if ports := memory.planned.get(wanted.key):  # else the reason is in port_problems
+        if ports := memory.planned.get(wanted.place):  # else the reason is in port_problems
             context = PlanContext(observed, settings, wanted, ports, naming, creatable)
             steps = wanted_steps(context)
-            actions_by_key[wanted.key] = steps if steps is None else with_lan_relay(context, steps)
+            with_relay = steps if steps is None else with_lan_relay(context, steps)
+            actions_by_place[wanted.place] = with_relay
     problems = [*labels.problems, *member_problems, *bound_problems, *network_problems]
     problems += [*naming.problems, *port_problems, *_container_problems(observed, live)]
     problems += _missing_lan_relays(observed, settings, live)
     if obstacle:  # fatal only if a proxy lacks a container, and the operator can't create it
-        problems.append(replace(obstacle, fatal=None in actions_by_key.values()))
-    groups = [*_possible_groups(observed, settings, desired, actions_by_key, naming, memory)]
+        problems.append(replace(obstacle, fatal=None in actions_by_place.values()))
+    groups = [*_possible_groups(observed, settings, desired, actions_by_place, naming, memory)]
     deferred = tuple(group for group in groups if _is_deferred(group, observed, settings.uplink))
     docker_plan = DockerPlan(
         groups=tuple(group for group in groups if group not in deferred),
@@ -176,16 +179,16 @@ def _possible_groups(
     observed: HostState,
     settings: PlanSettings,
     desired: Collection[Desired],
-    actions_by_key: Mapping[Key, list[Action] | None],
+    actions_by_place: Mapping[Place, list[Action] | None],
     naming: Naming,
     memory: DockerMemory,
 ) -> Iterator[Group]:
-    """The groups of keys without busy containers, and all groups of redirects and flushes."""
-    busy = {own.key for own in observed.own if own.container.name in observed.busy}
-    groups = _groups(observed, settings.uplink, desired, actions_by_key, naming)
-    yield from (group for group in groups if group.key not in busy)
+    """The groups of places without busy containers, and all groups of redirects and flushes."""
+    busy = {own.place for own in observed.own if own.container.name in observed.busy}
+    groups = _groups(observed, settings.uplink, desired, actions_by_place, naming)
+    yield from (group for group in groups if group.place not in busy)
     for steps in redirect_steps(observed, settings, desired):
-        yield Group(steps.key, steps.actions, f"container {steps.container}", steps.fix)
+        yield Group(steps.place, steps.actions, f"container {steps.container}", steps.fix)
     yield from flush_groups(observed, settings, desired, memory.outdated_flushes)
 
 
@@ -198,15 +201,15 @@ def flush_groups(
     """The groups that delete conntrack entries. No other group waits for these groups."""
     for flush in flush_steps(observed, settings, desired, outdated):
         if flush.actions:
-            subject = f"conntrack entries for {proxy_name(flush.key)}"
-            yield Group(flush.key, flush.actions, subject, flush.fix, fatal=False)
+            subject = f"conntrack entries for {proxy_name(flush.place)}"
+            yield Group(flush.place, flush.actions, subject, flush.fix, fatal=False)
 
 
 def _groups(
     observed: HostState,
     uplink: str,
     desired: Collection[Desired],
-    actions_by_key: Mapping[Key, list[Action] | None],
+    actions_by_place: Mapping[Place, list[Action] | None],
     naming: Naming,
 ) -> Iterator[Group]:
     """The groups of proxies and the uplink.
@@ -215,46 +218,48 @@ def _groups(
     groups that leave networks, then all other actions. Proxies do not wait for each other.
     """
     for wanted in desired:
-        others = actions_by_key.get(wanted.key)
+        others = actions_by_place.get(wanted.place)
         for action in disconnect_steps(observed, wanted, others, uplink, naming):
-            yield Group(wanted.key, (action,))
-    all_actions = [action for actions in actions_by_key.values() for action in actions or ()]
+            yield Group(wanted.place, (action,))
+    all_actions = [action for actions in actions_by_place.values() for action in actions or ()]
     joins = (isinstance(a, Connect) and a.network == uplink for a in all_actions)
     is_needed = any(joins) or any(isinstance(action, CreateSandbox) for action in all_actions)
     if is_needed and uplink not in {network.name for network in observed.networks}:
         yield Group(None, (CreateNetwork(uplink),))
     for wanted in desired:
-        if actions := actions_by_key.get(wanted.key):
-            yield Group(wanted.key, tuple(actions))
+        if actions := actions_by_place.get(wanted.place):
+            yield Group(wanted.place, tuple(actions))
 
 
 def _is_deferred(group: Group, observed: HostState, uplink: str) -> bool:
     """Whether a group creates a proxy without a known address of the master, or of the uplink."""
     return any(
-        isinstance(action, Create) and _lacks_address(action.key, observed, uplink)
+        isinstance(action, Create) and _lacks_address(action.place, observed, uplink)
         for action in group.actions
     )
 
 
-def _lacks_address(key: Key, observed: HostState, uplink: str) -> bool:
-    if key.ros != "1":  # LAN relays, and zenoh routers of this host, are at the uplink's gateway
+def _lacks_address(place: Place, observed: HostState, uplink: str) -> bool:
+    if not isinstance(place.graph, Master):
+        # LAN relays, and zenoh routers of this host, are at the uplink's gateway.
         return uplink not in {network.name for network in observed.networks}
-    return observed.masters.get(master(key).host) == ""
+    return observed.masters.get(place.master.host) == ""
 
 
 def _missing_lan_relays(
-    observed: HostState, settings: PlanSettings, live: Collection[Key]
+    observed: HostState, settings: PlanSettings, live: Collection[Place]
 ) -> Iterator[Problem]:
     """Warnings for proxies for ROS 2 without a LAN relay."""
-    problems = (missing_lan_relay(key, observed, settings) for key in sorted(live) if key.is_ros2)
+    places = (place for place in sorted(live) if isinstance(place.graph, Domain))
+    problems = (missing_lan_relay(place, observed, settings) for place in places)
     yield from filter(None, problems)
 
 
-def _container_problems(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
+def _container_problems(observed: HostState, live: Collection[Place]) -> Iterator[Problem]:
     """Problems of own containers that the engine restarts, and of masters without an address."""
     for own in observed.own:
         name = own.container.name
-        if own.key in live and own.container.state == "restarting":
+        if own.place in live and own.container.state == "restarting":
             kind = "proxy" if isinstance(own, Proxy) else "container"  # a sandbox, or a LAN relay
             text = f"the container has ended and restarts. Read docker logs {name}"
             yield Problem(f"{kind} {name}", text)
@@ -272,16 +277,16 @@ def _seconds_to_changes(
     """
     memory = docker_plan.memory
     for wanted in docker_plan.desired:
-        present = [own.container for own in observed.own if own.key == wanted.key]
+        present = [own.container for own in observed.own if own.place == wanted.place]
         if not wanted.live and any(c.state != "removing" for c in present):
-            yield settings.grace - (now - memory.absent[wanted.key])
+            yield settings.grace - (now - memory.absent[wanted.place])
         if wanted.live and any(c.state == "removing" or c.name in memory.refusals for c in present):
             yield ENGINE_BUSY_RECHECK_S
     helpers = (*observed.redirects, *observed.flushes)
     if any(helper.container.state == "removing" for helper in helpers):
         yield ENGINE_BUSY_RECHECK_S
     for member in docker_plan.members:
-        sandboxes = [s.container for s in observed.sandboxes_of(member.key)]
+        sandboxes = [s.container for s in observed.sandboxes_of(member.place)]
         joined = any(c.networks & member.networks for c in sandboxes if c.state != "removing")
         if not member.container.alive and (joined or member.wishes or member.peers or member.links):
             yield settings.grace - (now - memory.exited[member.container.id])

@@ -17,7 +17,6 @@ from rosproxy.net.addresses import is_address, is_inside, is_loopback
 from rosproxy_operator.docker.planner.label_policy import RecentLayers, label_layers
 from rosproxy_operator.docker.planner.model import (
     STARTED,
-    ZENOH,
     Attachment,
     Container,
     HostState,
@@ -26,7 +25,7 @@ from rosproxy_operator.docker.planner.model import (
 )
 from rosproxy_operator.docker.planner.network_owner import ByReference, by_reference, network_owner
 from rosproxy_operator.docker.planner.redirect import redirect_record_name
-from rosproxy_operator.docker.planner.specs import master
+from rosproxy_operator.proxy_spec.place import ZENOH, Master
 
 ARRIVAL_MESSAGE_TIMES_S = (0.0, 1.0, 3.0, 10.0)
 """Seconds after a container's arrival at which the operator tells the proxy of the arrival.
@@ -105,13 +104,13 @@ class AddressHistory:
 
     def record(self, latest: NetworkFacts, now: float) -> None:
         """Record the latest facts. Compare them with the facts of the last call, and note moves."""
-        missing = [place for place in self._at if place not in latest.addresses]
-        self._absent = {place: self._absent.get(place, now) for place in missing}
-        for place, since in list(self._absent.items()):
-            if place[0] not in latest.running or now >= since + ADDRESS_GONE_AFTER_S:
-                del self._at[place], self._absent[place]
-        for place, address in latest.addresses.items():
-            previous = self._at.get(place, address)
+        missing = [pair for pair in self._at if pair not in latest.addresses]
+        self._absent = {pair: self._absent.get(pair, now) for pair in missing}
+        for pair, since in list(self._absent.items()):
+            if pair[0] not in latest.running or now >= since + ADDRESS_GONE_AFTER_S:
+                del self._at[pair], self._absent[pair]
+        for pair, address in latest.addresses.items():
+            previous = self._at.get(pair, address)
             if previous != address:
                 self._moves[previous] = address, now
         self._follow(latest, now)
@@ -140,7 +139,7 @@ class AddressHistory:
     @property
     def reserved_addresses(self) -> frozenset[str]:
         """The former addresses of containers that may come back, or that have moved."""
-        return frozenset(self._at[place] for place in self._absent) | self._moves.keys()
+        return frozenset(self._at[pair] for pair in self._absent) | self._moves.keys()
 
     @property
     def next_expiry(self) -> float | None:
@@ -239,13 +238,13 @@ def network_facts(
     ``members`` are the members of all proxies, ``policy`` are the administrator's layers. Only a
     proxy for ROS 1 has a master, and gets arrivals: other proxies discover new nodes themselves.
     """
-    host = master(proxy.key).host.lower() if proxy.key.ros == "1" else ""
+    host = proxy.place.master.host.lower() if isinstance(proxy.place.graph, Master) else ""
     sandbox = observed.sandbox_of(proxy)
     joined = {a.network for a in sandbox.container.attachments if a.address} if sandbox else set()
     containers = by_reference(observed.containers)
     running = [container for container in observed.containers if container.state in STARTED]
-    router_ports = proxy.range if proxy.key == ZENOH else None
-    own_members = [member for member in members if member.key == proxy.key]
+    router_ports = proxy.range if proxy.place == ZENOH else None
+    own_members = [member for member in members if member.place == proxy.place]
     return NetworkFacts(
         master_address="" if not host or is_address(host) else observed.masters.get(host, ""),
         addresses={
@@ -263,7 +262,7 @@ def network_facts(
         arrivals=frozenset(
             arrival
             for member in own_members
-            if proxy.key.ros == "1"
+            if isinstance(proxy.place.graph, Master)
             for arrival in _arrivals(member, observed, containers, joined)
         ),
         running=frozenset(container.id for container in running),
@@ -302,7 +301,7 @@ def _arrivals(
             attachment.address,
             attachment.endpoint,
             frozenset(name for name in attachment.names | own if _HOST_NAME.fullmatch(name)),
-            redirect_record_name(observed, member.key, owner),
+            redirect_record_name(observed, member.place, owner),
         )
         for attachment in _attachments(owner, joined)
     ]

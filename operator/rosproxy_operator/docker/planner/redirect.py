@@ -32,11 +32,9 @@ from rosproxy_operator.docker.planner.actions import Action, CreateRedirect, Rem
 from rosproxy_operator.docker.planner.labels.readers import MASTER_URI
 from rosproxy_operator.docker.planner.model import (
     STARTED,
-    ZENOH,
     Container,
     Desired,
     HostState,
-    Key,
     Member,
     RedirectContainer,
 )
@@ -44,7 +42,6 @@ from rosproxy_operator.docker.planner.network_owner import by_reference, network
 from rosproxy_operator.docker.planner.specs import (
     NFT,
     helper_config,
-    master,
     own_labels,
     proxy_name,
     redirect_name,
@@ -58,6 +55,7 @@ from rosproxy_operator.docker.planner.zenoh_redirect import (
 )
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.fingerprint import digest
+from rosproxy_operator.proxy_spec.place import ZENOH, Place
 
 # The priorities are the kernel's for destination and source NAT (nf_ip_hook_priorities). In the
 # hook output, nat chains see only connections that this network namespace itself opens. No other
@@ -76,8 +74,8 @@ table ip $table {
 """)
 """The rules for a master. The masquerade is needed, because the kernel chooses the source address
 before dnat, and dnat may lead to another network."""
-RedirectSite = tuple[Key, str]
-"""The key of a proxy, and the id of the container that owns the network of a redirect."""
+RedirectSite = tuple[Place, str]
+"""The place of a proxy, and the id of the container that owns the network of a redirect."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +85,7 @@ class RedirectSteps:
     ``fix`` says what users can do if a step fails; empty for the removal of a redirect.
     """
 
-    key: Key
+    place: Place
     container: str
     actions: tuple[Action, ...]
     fix: str = ""
@@ -96,7 +94,7 @@ class RedirectSteps:
 def redirect_config(action: CreateRedirect, settings: PlanSettings) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for a redirect's container."""
     helper = helper_config(settings, f"container:{action.target}")
-    if action.key == ZENOH:
+    if action.place == ZENOH:
         helper["HostConfig"]["Sysctls"] = zenoh_sysctls(bool(action.addresses))
     return {
         **helper,
@@ -111,12 +109,12 @@ def _rules(action: CreateRedirect) -> str:
 
     Without ``proxy``, the transaction only deletes the table.
     """
-    table = f"rosproxy-redirect-{proxy_name(action.key).rpartition('-')[2]}"
+    table = f"rosproxy-redirect-{proxy_name(action.place).rpartition('-')[2]}"
     # Add the table first: to delete a missing table is an error, and undoes the whole transaction.
     text = f"add table ip {table}\ndelete table ip {table}\n"
     if action.proxy is None:
         return text
-    if action.key == ZENOH:
+    if action.place == ZENOH:
         return text + zenoh_rules(table, action.addresses, action.proxy)
     (master,) = action.addresses
     return text + _MASTER_RULES.substitute(
@@ -134,7 +132,7 @@ def redirect_steps(
     wanted = _wanted(observed, settings, desired)
     records: dict[RedirectSite, list[RedirectContainer]] = {}
     for record in observed.redirects:
-        records.setdefault((record.key, record.container.network_container or ""), []).append(
+        records.setdefault((record.place, record.container.network_container or ""), []).append(
             record
         )
     names = {container.id: container.name for container in observed.containers}
@@ -151,21 +149,21 @@ def redirect_steps(
             yield RedirectSteps(site[0], name, tuple(steps), fix if site in wanted else "")
 
 
-def _redirect_fix(key: Key) -> str:
+def _redirect_fix(place: Place) -> str:
     """What users can do if the operator can't set a redirect."""
-    if key == ZENOH:
+    if place == ZENOH:
         return (
             "Until the redirect is in place, the nodes do not find the proxy. The operator tries "
-            f"again; or set {as_client(proxy_name(key))}"
+            f"again; or set {as_client(proxy_name(place))}"
         )
     return (
         "Until the redirect is in place, the nodes bypass the proxy. The operator tries again; or "
-        f"set ROS_MASTER_URI=http://{proxy_name(key)}:{master(key).port} and the label "
-        f"{MASTER_URI}={key.master_uri}"
+        f"set ROS_MASTER_URI=http://{proxy_name(place)}:{place.master.port} and the label "
+        f"{MASTER_URI}={place.master.uri}"
     )
 
 
-def redirect_record_name(observed: HostState, key: Key, owner: Container) -> str:
+def redirect_record_name(observed: HostState, place: Place, owner: Container) -> str:
     """The name of the record of a container's redirect to a proxy; empty without a redirect.
 
     The redirect may still lead to a former address of the proxy.
@@ -174,7 +172,7 @@ def redirect_record_name(observed: HostState, key: Key, owner: Container) -> str
         (
             record.container.name
             for record in observed.redirects
-            if record.key == key and record.done and _is_of(record, owner)
+            if record.place == place and record.done and _is_of(record, owner)
         ),
         "",
     )
@@ -188,18 +186,18 @@ def _wanted(
     If several proxies claim an address in a network, the first proxy gets the address.
     """
     wanted: dict[RedirectSite, CreateRedirect | None] = {}
-    owners: dict[tuple[str, HostPort], Key] = {}
+    owners: dict[tuple[str, HostPort], Place] = {}
     ports: Mapping[str, int] = {}
     for proxy in desired:
         redirected = [*_redirected_members(proxy, observed)]
-        if proxy.key == ZENOH:
+        if proxy.place == ZENOH:
             targets = frozenset(owner.id for _, owner in redirected)
             ports = router_ports(observed.redirects, targets)
             redirected = [*with_all_routers(redirected)]
         for member, owner in redirected:
-            if owners.setdefault((owner.id, member.redirected[0]), proxy.key) == proxy.key:
-                site = proxy.key, owner.id
-                port = ports[owner.id] if proxy.key == ZENOH else master(proxy.key).port
+            if owners.setdefault((owner.id, member.redirected[0]), proxy.place) == proxy.place:
+                site = proxy.place, owner.id
+                port = ports[owner.id] if proxy.place == ZENOH else proxy.place.master.port
                 # Containers that share a network share the redirect.
                 wanted[site] = wanted.get(site) or _redirect_to(
                     member, owner, port, observed, settings
@@ -224,13 +222,13 @@ def _redirect_to(
     if reachable is None:
         return None
     proxy, ports = reachable
-    if member.key == ZENOH:
+    if member.place == ZENOH:
         if port not in ports:  # the sandbox is about to get more ports
             return None
         ports = PortRange(port, port)
     action = CreateRedirect(
         "",
-        member.key,
+        member.place,
         ports,
         owner.id,
         owner.started_at,
@@ -248,15 +246,17 @@ def _reachable_proxy(
     None if the proxy or the sandbox does not run, or without a common network.
     """
     shared = {a.network for a in owner.attachments if a.address} & member.networks
-    running = [p for p in observed.proxies_of(member.key) if p.container.state == "running"]
+    running = [p for p in observed.proxies_of(member.place) if p.container.state == "running"]
     for proxy in running:
         sandbox = observed.sandbox_of(proxy)
-        places = (
+        attachments = (
             sandbox.container.attachments
             if sandbox and sandbox.container.state == "running"
             else ()
         )
-        pairs = sorted((p.network, p.address) for p in places if p.network in shared and p.address)
+        pairs = sorted(
+            (a.network, a.address) for a in attachments if a.network in shared and a.address
+        )
         if sandbox and pairs:
             return pairs[0][1], sandbox.range
     return None
@@ -270,7 +270,7 @@ def _with_fingerprint(
     # rule.
     body = redirect_config(replace(action, range=PortRange(1, 1)), settings)
     fingerprint = digest({**body, "Image": observed.image_id})
-    return replace(action, fingerprint=fingerprint, name=redirect_name(action.key, fingerprint))
+    return replace(action, fingerprint=fingerprint, name=redirect_name(action.place, fingerprint))
 
 
 def _set_steps(
@@ -313,7 +313,7 @@ def _removal_steps(
     # Delete rules even if all records are of a former start: a user may have started a record by
     # hand since, and so set the rules again.
     record = next(iter(records))
-    action = CreateRedirect("", record.key, record.range, target, owner.started_at)
+    action = CreateRedirect("", record.place, record.range, target, owner.started_at)
     action = _with_fingerprint(action, observed, settings)
     steps = _set_steps(action, records, observed)
     if not steps and not any(r.fingerprint == action.fingerprint for r in records):

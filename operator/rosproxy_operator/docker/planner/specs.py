@@ -31,11 +31,12 @@ from rosproxy_operator.docker.planner.actions import (
     CreateRedirect,
     CreateSandbox,
 )
-from rosproxy_operator.docker.planner.model import STARTED_LABEL, ZENOH, Key
+from rosproxy_operator.docker.planner.model import STARTED_LABEL
 from rosproxy_operator.docker.planner.zenoh_redirect import FIRST_PORT
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.environment import environment
 from rosproxy_operator.proxy_spec.fingerprint import LIVE_VARIABLES, digest
+from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Graph, Master, Place, ZenohNetwork
 
 MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"
@@ -127,38 +128,43 @@ class OwnLabels:
     """The content of the labels of an own container. ``role`` is one of ``ROLE_…``."""
 
     role: str
-    key: Key
+    place: Place
     range: PortRange
     fingerprint: str
 
 
-def proxy_name(key: Key) -> str:
+def proxy_name(place: Place) -> str:
     """The name of a proxy's container: master's host, domain or ``zenoh``, and six hex digits."""
-    digest = hashlib.sha256(_identity(key).encode()).hexdigest()
-    labels = {"2": f"domain-{key.domain}", "zenoh": "zenoh"}
-    label = labels.get(key.ros) or master(key).host.lower()
+    digest = hashlib.sha256(_identity(place).encode()).hexdigest()
+    match place.graph:
+        case Master() as master:
+            label = master.host.lower()
+        case Domain(number):
+            label = f"domain-{number}"
+        case ZenohNetwork():
+            label = "zenoh"
     slug = re.sub(r"[^a-z0-9]+", "-", label)[:30].strip("-")
     return f"rosproxy-{slug or 'master'}-{digest[:6]}"
 
 
-def sandbox_name(key: Key) -> str:
-    """The name of the container that holds the ports of a key's proxy."""
-    return f"{proxy_name(key)}-ports"
+def sandbox_name(place: Place) -> str:
+    """The name of the container that holds the ports of a place's proxy."""
+    return f"{proxy_name(place)}-ports"
 
 
-def lan_relay_name(key: Key) -> str:
-    """The name of the container in which a key's LAN relay runs."""
-    return f"{proxy_name(key)}-lan-relay"
+def lan_relay_name(place: Place) -> str:
+    """The name of the container in which a place's LAN relay runs."""
+    return f"{proxy_name(place)}-lan-relay"
 
 
-def redirect_name(key: Key, fingerprint: str) -> str:
-    """The name of a container that sets a redirect to a key's proxy, with the fingerprint."""
-    return f"{proxy_name(key)}-redirect-{fingerprint[:12]}"
+def redirect_name(place: Place, fingerprint: str) -> str:
+    """The name of a container that sets a redirect to a place's proxy, with the fingerprint."""
+    return f"{proxy_name(place)}-redirect-{fingerprint[:12]}"
 
 
-def flush_name(key: Key) -> str:
-    """The name of the container that deletes conntrack entries for a key's UDP ports."""
-    return f"{proxy_name(key)}-flush"
+def flush_name(place: Place) -> str:
+    """The name of the container that deletes conntrack entries for a place's UDP ports."""
+    return f"{proxy_name(place)}-flush"
 
 
 def is_proxy_name(name: str) -> bool:
@@ -166,9 +172,10 @@ def is_proxy_name(name: str) -> bool:
     return re.fullmatch(r"rosproxy-[a-z0-9-]+-[0-9a-f]{6}(-ports|-lan-relay)?", name) is not None
 
 
-def _identity(key: Key) -> str:
-    """The text that identifies a key, for hashes and secrets."""
-    return f"{key.master_uri or key.graph} {key.advertise_host}"
+def _identity(place: Place) -> str:
+    """The text that identifies a place, for hashes and secrets."""
+    name = place.graph.uri if isinstance(place.graph, Master) else str(place.graph)
+    return f"{name} {place.advertise_host}"
 
 
 def unresolved_master(host: str) -> str:
@@ -185,54 +192,56 @@ def unresolved_master(host: str) -> str:
     )
 
 
-def master(key: Key) -> HostPort:
-    """The host and port of a key's master. Raises ValueError for a key without a master."""
-    host_port = parse_slave_uri(key.master_uri)
-    if host_port is None:
-        raise ValueError(f"{key.master_uri!r} is no master's URI")
-    return host_port
-
-
-def admin_port(key: Key) -> int:
+def admin_port(place: Place) -> int:
     """The port of a proxy's admin endpoint: 11312, or 11313 if 11312 is the master port."""
-    taken = key.ros == "1" and master(key).port == ADMIN_PORT
+    taken = isinstance(place.graph, Master) and place.master.port == ADMIN_PORT
     return ADMIN_PORT + 1 if taken else ADMIN_PORT
 
 
-def proxy_token(key: Key, secret: str) -> str:
-    """The token of a key's proxy, 64 hex digits: HMAC-SHA256 (RFC 2104) of the key.
+def proxy_token(place: Place, secret: str) -> str:
+    """The token of a place's proxy, 64 hex digits: HMAC-SHA256 (RFC 2104) of the place.
 
     The operator has no disk, and computes the token for each use. The proxy has only the hash of
     the token.
     """
-    return hmac.new(secret.encode(), _identity(key).encode(), hashlib.sha256).hexdigest()
+    return hmac.new(secret.encode(), _identity(place).encode(), hashlib.sha256).hexdigest()
 
 
-def reserved_ports(key: Key) -> frozenset[int]:
-    """The ports that can't be in the range of a key's proxy.
+def reserved_ports(place: Place) -> frozenset[int]:
+    """The ports that can't be in the range of a place's proxy.
 
     These are the further ports on which the proxy listens. For ROS 2, the default master port is
     reserved as well: each proxy refuses a range that contains the port of ``--master-port``.
     """
-    if key.domain is not None:
-        return frozenset({DEFAULT_MASTER_PORT, ADMIN_PORT, *well_known_ports(key.domain)})
-    return frozenset({admin_port(key), *((master(key).port,) if key.ros == "1" else ())})
+    match place.graph:
+        case Master() as master:
+            return frozenset({admin_port(place), master.port})
+        case Domain(number):
+            return frozenset({DEFAULT_MASTER_PORT, ADMIN_PORT, *well_known_ports(number)})
+        case ZenohNetwork():
+            return frozenset({ADMIN_PORT})
 
 
-def own_range(key: Key, ports: PortRange) -> PortRange:
+def own_range(place: Place, ports: PortRange) -> PortRange:
     """The ports that the proxy itself may use. For ROS 2, the LAN relay has the last port."""
-    return PortRange(ports.first, ports.last - 1) if key.is_ros2 else ports
+    return PortRange(ports.first, ports.last - 1) if isinstance(place.graph, Domain) else ports
 
 
-def published_ports(key: Key, ports: PortRange, udp: bool) -> list[tuple[str, int]]:
-    """The ports that a key's sandbox publishes, as the engine writes ports, with the host's port.
+def published_ports(place: Place, ports: PortRange, udp: bool) -> list[tuple[str, int]]:
+    """The ports that a place's sandbox publishes, as the engine writes ports, with the host's port.
 
     If ``udp`` is true, the sandbox of a proxy for ROS 1 publishes the ports for UDP as well, for
     UDPROS. The sandbox for rmw_zenoh publishes no port, since that proxy opens all connections to
     outside.
     """
-    protocols = {"1": ["tcp", *(["udp"] if udp else [])], "2": ["udp"], "zenoh": []}[key.ros]
-    own = own_range(key, ports).ports()
+    match place.graph:
+        case Master():
+            protocols = ["tcp", "udp"] if udp else ["tcp"]
+        case Domain():
+            protocols = ["udp"]
+        case ZenohNetwork():
+            protocols = []
+    own = own_range(place, ports).ports()
     return [(f"{port}/{protocol}", port) for protocol in protocols for port in own]
 
 
@@ -247,17 +256,17 @@ def read_own(labels: Mapping[str, str]) -> OwnLabels | None:
         role = ROLE_LAN_RELAY
     if labels.get(MANAGED) != "true" or role not in _ROLES.values():
         return None
-    key = _read_key(labels)
+    place = _read_place(labels)
     try:
         ports = parse_range(RANGE, labels.get(RANGE, ""))
     except SettingError:
         return None
-    if key is None or (role == ROLE_LAN_RELAY and not key.is_ros2):
+    if place is None or (role == ROLE_LAN_RELAY and not isinstance(place.graph, Domain)):
         return None
-    return OwnLabels(role, key, ports, labels.get(FINGERPRINT, ""))
+    return OwnLabels(role, place, ports, labels.get(FINGERPRINT, ""))
 
 
-def _read_key(labels: Mapping[str, str]) -> Key | None:
+def _read_place(labels: Mapping[str, str]) -> Place | None:
     uri = labels.get(MASTER_URI, "")
     host = labels.get(ADVERTISE_HOST, "")
     domain = labels.get(DOMAIN, "")
@@ -266,30 +275,40 @@ def _read_key(labels: Mapping[str, str]) -> Key | None:
     if not host or bool(uri) == bool(domain):
         return None
     if uri:
-        return Key(uri, host) if parse_slave_uri(uri) else None
+        return Place(Master(uri), host) if parse_slave_uri(uri) else None
     is_domain = re.fullmatch(r"[0-9]{1,3}", domain, re.ASCII) and int(domain) <= LAST_DOMAIN
-    return Key("", host, int(domain)) if is_domain else None
+    return Place(Domain(int(domain)), host) if is_domain else None
 
 
 Creation = CreateSandbox | Create | CreateLanRelay | CreateRedirect | CreateFlush
 """An action that creates a container."""
 
 
-def flush_command(key: Key, ports: PortRange) -> tuple[str, ...]:
-    """The command that deletes the conntrack entries for the UDP ports of a key's sandbox."""
-    published = own_range(key, ports)
+def flush_command(place: Place, ports: PortRange) -> tuple[str, ...]:
+    """The command that deletes the conntrack entries for the UDP ports of a place's sandbox."""
+    published = own_range(place, ports)
     return ("/bin/sh", "-ec", FLUSH_SCRIPT, "flush", str(published.first), str(published.last))
+
+
+def _graph_labels(graph: Graph) -> dict[str, str]:
+    """The labels that name the graph. `_read_place` reads these labels."""
+    match graph:
+        case Master(uri):
+            return {MASTER_URI: uri}
+        case Domain(number):
+            return {DOMAIN: str(number)}
+        case ZenohNetwork():
+            return {ROUTERS: "true"}
 
 
 def own_labels(action: Creation) -> dict[str, str]:
     """The labels of a container that the action creates. `read_own` reads these labels."""
-    key = action.key
-    graph = {"1": {MASTER_URI: key.master_uri}, "2": {DOMAIN: str(key.domain)}}
+    place = action.place
     return {
         MANAGED: "true",
         ROLE: _ROLES[type(action)],
-        **graph.get(key.ros, {ROUTERS: "true"}),
-        **({ADVERTISE_HOST: key.advertise_host} if key != ZENOH else {}),
+        **_graph_labels(place.graph),
+        **({ADVERTISE_HOST: place.advertise_host} if place != ZENOH else {}),
         RANGE: str(action.range),
         FINGERPRINT: action.fingerprint,
         **({STARTED_LABEL: action.started} if isinstance(action, CreateRedirect) else {}),
@@ -322,14 +341,14 @@ def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, A
     outside the range. For rmw_zenoh, these ports begin after the ports of the routers.
     """
     local = local_ports([action.range])
-    if action.key == ZENOH:
+    if action.place == ZENOH:
         local = PortRange(FIRST_PORT + MOST_ZENOH_PORTS, 11000)
     sysctls = {"net.ipv4.ip_local_port_range": f"{local.first} {local.last}"}
     if action.spec.data_plane == "kernel":
         sysctls["net.ipv4.ip_forward"] = "1"
     bindings = {
         name: [{"HostIp": ip, "HostPort": str(port)} for ip in settings.publish_address]
-        for name, port in published_ports(action.key, action.range, action.spec.udp)
+        for name, port in published_ports(action.place, action.range, action.spec.udp)
     }
     return {
         "Image": settings.proxy_image,
@@ -408,12 +427,13 @@ def _settings_fields(
 
     Keep the order: another order of variables changes the fingerprint, and recreates all proxies.
     """
-    key = action.key
-    if key == ZENOH:
+    place = action.place
+    graph = place.graph
+    if place == ZENOH:
         return {
-            "admin": HostPort("0.0.0.0", admin_port(key)),
-            "admin_token_hash": hash_token(proxy_token(key, secret)),
-            "ros": (key.ros,),
+            "admin": HostPort("0.0.0.0", admin_port(place)),
+            "admin_token_hash": hash_token(proxy_token(place, secret)),
+            "ros": (graph.ros,),
             "zenoh_ports": action.range,
             "zenoh_peer": action.peers,
             "await_policy": POLICY_WAIT_S,
@@ -421,22 +441,22 @@ def _settings_fields(
             **_link_fields(action, settings),
         }
     return {
-        "master_uri": key.master_uri,
-        "advertise_host": key.advertise_host,
-        "port_range": own_range(key, action.range),
-        "master_port": None if key.is_ros2 else master(key).port,
-        "admin": HostPort("0.0.0.0", admin_port(key)),
+        "master_uri": graph.uri if isinstance(graph, Master) else "",
+        "advertise_host": place.advertise_host,
+        "port_range": own_range(place, action.range),
+        "master_port": graph.port if isinstance(graph, Master) else None,
+        "admin": HostPort("0.0.0.0", admin_port(place)),
         **asdict(action.spec),
-        "admin_token_hash": hash_token(proxy_token(key, secret)),
+        "admin_token_hash": hash_token(proxy_token(place, secret)),
         "master_address": master_address,
-        **({} if key.is_ros2 else asdict(settings.proxy_bounds)),
+        **(asdict(settings.proxy_bounds) if isinstance(graph, Master) else {}),
         "await_policy": POLICY_WAIT_S,
         "policy_layers": as_variable((*settings.policy, *action.policy)),
-        "ros": (key.ros,),
-        "ros2_domain": key.domain,
+        "ros": (graph.ros,),
+        "ros2_domain": graph.number if isinstance(graph, Domain) else None,
         "ros2_peer": action.peers,
         "ros2_lan_relay": action.lan_relay,
-        "ros2_lan_relay_secret": _relay_secret(key, secret) if action.lan_relay else None,
+        "ros2_lan_relay_secret": _relay_secret(place, secret) if action.lan_relay else None,
     }
 
 
@@ -456,9 +476,9 @@ def _link_mount(settings: PlanSettings) -> dict[str, Any]:
     return {**LINK_MOUNT, "Source": settings.zenoh_link_certificates}
 
 
-def _relay_secret(key: Key, secret: str) -> str:
+def _relay_secret(place: Place, secret: str) -> str:
     """The secret with which a proxy and the LAN relay prove their datagrams to each other."""
-    return relay_secret(secret.encode(), _identity(key))
+    return relay_secret(secret.encode(), _identity(place))
 
 
 def lan_relay_config(action: CreateLanRelay, settings: PlanSettings, secret: str) -> dict[str, Any]:
@@ -467,10 +487,10 @@ def lan_relay_config(action: CreateLanRelay, settings: PlanSettings, secret: str
     The LAN relay shares only the network with the host. The operator makes the LAN relay's own
     secret from ``secret``.
     """
-    own = _relay_secret(action.key, secret)
-    variables = lan_relay_variables(
-        action.key.domain or 0, action.lan, action.bind, action.proxy, own
-    )
+    graph = action.place.graph
+    domain = graph.number if isinstance(graph, Domain) else 0
+    own = _relay_secret(action.place, secret)
+    variables = lan_relay_variables(domain, action.lan, action.bind, action.proxy, own)
     return {
         "Image": settings.proxy_image,
         "User": USER,

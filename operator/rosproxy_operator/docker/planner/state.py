@@ -10,12 +10,13 @@ from rosproxy_operator.common.port_ranges import (
     Move,
     within,
 )
-from rosproxy_operator.docker.planner.model import SERVING, Desired, HostState, Key, Member
+from rosproxy_operator.docker.planner.model import SERVING, Desired, HostState, Member
 from rosproxy_operator.docker.planner.taken_names import (
     FormerNames,
     present_names,
     remember_names,
 )
+from rosproxy_operator.proxy_spec.place import Place
 
 # A container in the state created has published no port yet: the range may still be taken.
 _SERVED_STATES = SERVING | {"exited", "dead", "removing"}
@@ -53,12 +54,12 @@ class DockerMemory:
     """
 
     exited: Mapping[str, float] = field(default_factory=dict)
-    absent: Mapping[Key, float] = field(default_factory=dict)
-    served: Mapping[Key, PortRange] = field(default_factory=dict)
-    planned: Mapping[Key, PortRange] = field(default_factory=dict)
+    absent: Mapping[Place, float] = field(default_factory=dict)
+    served: Mapping[Place, PortRange] = field(default_factory=dict)
+    planned: Mapping[Place, PortRange] = field(default_factory=dict)
     refusals: Mapping[str, PortRefusal] = field(default_factory=dict)
     taken: Mapping[int, float] = field(default_factory=dict)
-    moved: Mapping[Key, Move] = field(default_factory=dict)
+    moved: Mapping[Place, Move] = field(default_factory=dict)
     names: FormerNames = field(default_factory=dict)
     engine_returned: bool = False
     outdated_flushes: Mapping[str, str] = field(default_factory=dict)
@@ -86,26 +87,30 @@ def after_look(
 
     ``grace`` is in seconds.
     """
-    live = {d.key for d in desired if d.live}
+    live = {d.place for d in desired if d.live}
     idle = {s.container.name for s in observed.sandboxes if s.container.state not in SERVING}
-    keys = (observed.keys | set(memory.served)) - live
-    absent = {key: memory.absent.get(key, now) for key in sorted(keys)}
+    places = (observed.places | set(memory.served)) - live
+    absent = {place: memory.absent.get(place, now) for place in sorted(places)}
     flushes = {r.container.id: r.container.started_at for r in observed.flushes}
-    wanted = live | {key for key, since in absent.items() if now - since < grace}
+    wanted = live | {place for place, since in absent.items() if now - since < grace}
     return DockerMemory(
         exited=memory.exited,
-        absent={k: since for k, since in absent.items() if k in wanted | observed.keys},
-        served={key: ports for key, ports in _served(memory, observed).items() if key in wanted},
-        planned={key: ports for key, ports in memory.planned.items() if key in live},
+        absent={p: since for p, since in absent.items() if p in wanted | observed.places},
+        served={
+            place: ports for place, ports in _served(memory, observed).items() if place in wanted
+        },
+        planned={place: ports for place, ports in memory.planned.items() if place in live},
         refusals={name: refusal for name, refusal in memory.refusals.items() if name in idle},
         taken={port: at for port, at in memory.taken.items() if now - at < REFUSED_PORT_AVOIDED_S},
-        moved={key: move for key, move in memory.moved.items() if now - move.at < MOVE_REPORTED_S},
+        moved={
+            place: move for place, move in memory.moved.items() if now - move.at < MOVE_REPORTED_S
+        },
         names=remember_names(memory.names, present_names(observed), observed.containers),
         outdated_flushes=flushes if memory.engine_returned else memory.outdated_flushes,
     )
 
 
-def _served(memory: DockerMemory, observed: HostState) -> dict[Key, PortRange]:
+def _served(memory: DockerMemory, observed: HostState) -> dict[Place, PortRange]:
     """Return the range on which each proxy has served.
 
     The range of a running sandbox counts first, then the remembered range. A stopped container may
@@ -114,10 +119,10 @@ def _served(memory: DockerMemory, observed: HostState) -> dict[Key, PortRange]:
     """
     served = dict(memory.served)
     for own in (*observed.sandboxes, *observed.proxies):
-        previous = served.get(own.key)
+        previous = served.get(own.place)
         if own.container.state in _SERVED_STATES and (not previous or within(previous, own.range)):
-            served[own.key] = own.range
+            served[own.place] = own.range
     for sandbox in reversed(observed.sandboxes):
         if sandbox.container.state in SERVING:
-            served[sandbox.key] = sandbox.range
+            served[sandbox.place] = sandbox.range
     return served

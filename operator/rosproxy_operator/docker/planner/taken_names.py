@@ -45,13 +45,13 @@ def present_names(observed: HostState) -> NamesByNetwork:
         merged: dict[str, set[str]] = defaultdict(set)
         for other in others | {network}:
             for name, containers in own[other].items():
-                place = "" if other == network else f" (network {other})"
-                merged[name] |= {f"{container}{place}" for container in containers}
+                suffix = "" if other == network else f" (network {other})"
+                merged[name] |= {f"{container}{suffix}" for container in containers}
         taken[network] = {name: frozenset(containers) for name, containers in merged.items()}
     return taken
 
 
-def places_of(name: str, network: str, networks: Iterable[str]) -> Iterator[tuple[str, str]]:
+def lookups_of(name: str, network: str, networks: Iterable[str]) -> Iterator[tuple[str, str]]:
     """The pairs of network and name where the engine looks up a name for a container of a network.
 
     The engine resolves ``NAME.NETWORK`` as well (moby: libnetwork/sandbox.go, ResolveName), but
@@ -77,5 +77,5 @@ def remember_names(
         for name, holders in names.items()
         if name not in short_ids
     }
-    known = {place: holder for place, holder in former.items() if place not in current} | current
+    known = {pair: holder for pair, holder in former.items() if pair not in current} | current
     return dict(list(known.items())[-MOST_REMEMBERED_NAMES:])

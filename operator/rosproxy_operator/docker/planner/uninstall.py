@@ -4,8 +4,8 @@ The executor removes the following at the same time (`Group`):
 
 - Each redirect in the network of a user's container, and then the records of this redirect.
 - Each flush whose sandbox is gone.
-- The proxy of each key, then the LAN relay and the sandbox. The proxy first tells outside that the
-  nodes have ended.
+- The proxy of each place, then the LAN relay and the sandbox. The proxy first tells outside that
+  the nodes have ended.
 
 After all proxies, LAN relays and sandboxes are gone, the operator removes the networks that it has
 made.
@@ -69,15 +69,15 @@ def _other_operator(observed: HostState, first: frozenset[str]) -> Problem | Non
 
 def _groups(observed: HostState, settings: PlanSettings) -> Iterator[Group]:
     """The groups of everything that the operator can remove now."""
-    busy = {own.key for own in observed.own if own.container.name in observed.busy}
+    busy = {own.place for own in observed.own if own.container.name in observed.busy}
     for steps in redirect_steps(observed, settings, ()):
-        yield Group(steps.key, steps.actions, f"container {steps.container}")
+        yield Group(steps.place, steps.actions, f"container {steps.container}")
     yield from flush_groups(observed, settings, (), {})
-    for key in sorted(observed.keys - busy):
+    for place in sorted(observed.places - busy):
         # With ``again``, the plan has also the containers that the engine removes already. So the
         # command does not end before these containers are gone and the networks can go.
-        if actions := tuple(removal_steps(observed, key, UNINSTALL_REASON, again=True)):
-            yield Group(key, actions)
+        if actions := tuple(removal_steps(observed, place, UNINSTALL_REASON, again=True)):
+            yield Group(place, actions)
     if not observed.own:
         for network in observed.networks:
             if network.made_by_operator and not _guests(observed, network.name):

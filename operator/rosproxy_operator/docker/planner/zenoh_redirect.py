@@ -21,7 +21,8 @@ from string import Template
 from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import ZENOH_PORT
 from rosproxy_operator.common.zenoh import OVERRIDE, client_override
-from rosproxy_operator.docker.planner.model import ZENOH, Container, Member, RedirectContainer
+from rosproxy_operator.docker.planner.model import Container, Member, RedirectContainer
+from rosproxy_operator.proxy_spec.place import ZENOH
 
 LOCAL_ROUTER = HostPort("127.0.0.1", ZENOH_PORT)
 """The address at which nodes of rmw_zenoh look for a router by default."""
@@ -103,7 +104,7 @@ def with_all_routers(
     ``placed`` pairs each member with the container that owns the network namespace.
     """
     for member, owner in placed:
-        near = (other.redirected for other, place in placed if place.id == owner.id)
+        near = (other.redirected for other, other_owner in placed if other_owner.id == owner.id)
         routers = dict.fromkeys(sorted((router for routers in near for router in routers), key=str))
         yield replace(member, redirected=tuple(routers)), owner
 
@@ -119,7 +120,7 @@ def router_ports(
     for record in records:
         target = record.container.network_container or ""
         port = record.range.first
-        if record.key == ZENOH and target in targets and port not in ports.values():
+        if record.place == ZENOH and target in targets and port not in ports.values():
             ports.setdefault(target, port)
     free = (port for port in count(FIRST_PORT) if port not in {*ports.values()})
     for target in sorted(targets - ports.keys()):

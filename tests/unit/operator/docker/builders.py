@@ -14,7 +14,6 @@ from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
     HostState,
-    Key,
     Member,
     Network,
     Proxy,
@@ -22,7 +21,6 @@ from rosproxy_operator.docker.planner.model import (
 )
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.specs import (
-    master,
     own_labels,
     proxy_fingerprint,
     proxy_name,
@@ -31,10 +29,11 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Master, Place
 
 ROBOT = "http://robot:11311"
 HERE = "192.0.2.10"
-KEY = Key(ROBOT, HERE)
+PLACE = Place(Master(ROBOT), HERE)
 RANGE = PortRange(11400, 11431)
 SETTINGS = PlanSettings(advertise_host=HERE, port_window=PortRange(11400, 65535))
 IMAGE = "sha256:1"
@@ -45,7 +44,7 @@ APP = Network("n1", "app", gateway="172.18.0.1")
 ENABLED = {"rosproxy.enable": "true", "rosproxy.master-uri": ROBOT}
 
 
-def place(network: str = "app", *names: str, network_id: str = "") -> Attachment:
+def attachment(network: str = "app", *names: str, network_id: str = "") -> Attachment:
     return Attachment(network, "", frozenset(names), network_id)
 
 
@@ -59,21 +58,21 @@ def container(
     ports: Iterable[int] = (),
 ) -> Container:
     """A container, by default running, labelled and on the network ``app``."""
-    places = tuple(place(n, name) if isinstance(n, str) else n for n in networks)
+    attachments = tuple(attachment(n, name) if isinstance(n, str) else n for n in networks)
     return Container(
         id=f"id-{name}",
         name=name,
         state=state,
         labels=ENABLED if labels is None else labels,
-        network_mode=mode or (places[0].network if places else ""),
-        attachments=places,
+        network_mode=mode or (attachments[0].network if attachments else ""),
+        attachments=attachments,
         master_uri=env,
         host_ports=frozenset(ports),
     )
 
 
 def sandbox(
-    key: Key = KEY,
+    place: Place = PLACE,
     ports: PortRange = RANGE,
     networks: Iterable[str | Attachment] = ("app",),
     state: str = "running",
@@ -83,23 +82,23 @@ def sandbox(
     started_at: str = "2026-01-01T10:00:00.5Z",
 ) -> Sandbox:
     """A sandbox of the operator, by default running on the uplink and on ``app``."""
-    name = name or sandbox_name(key)
-    create = CreateSandbox(name, key, ports)
+    name = name or sandbox_name(place)
+    create = CreateSandbox(name, place, ports)
     made = made or sandbox_fingerprint(create, settings)
-    aliases = ("rosproxy", master(key).host, proxy_name(key), name)
-    places = [place(n, *aliases) if isinstance(n, str) else n for n in networks]
+    aliases = ("rosproxy", place.master.host, proxy_name(place), name)
+    attachments = [attachment(n, *aliases) if isinstance(n, str) else n for n in networks]
     own = container(
         name,
         own_labels(structs.replace(create, fingerprint=made)),
-        [place(settings.uplink, name), *places],
+        [attachment(settings.uplink, name), *attachments],
         state,
         ports=ports.ports(),
     )
-    return Sandbox(key, replace(own, started_at=started_at), ports, made)
+    return Sandbox(place, replace(own, started_at=started_at), ports, made)
 
 
 def proxy(
-    key: Key = KEY,
+    place: Place = PLACE,
     ports: PortRange = RANGE,
     state: str = "running",
     name: str = "",
@@ -109,18 +108,18 @@ def proxy(
     sandbox_id: str = "",
     started_at: str = "2026-01-01T10:00:00.75Z",
 ) -> Proxy:
-    """A proxy of the operator, by default running in the `sandbox` of the same key."""
-    name = name or proxy_name(key)
-    create = Create(name, key, ports, sandbox_name(key))
+    """A proxy of the operator, by default running in the `sandbox` of the same place."""
+    name = name or proxy_name(place)
+    create = Create(name, place, ports, sandbox_name(place))
     made = made or proxy_fingerprint(create, settings, image, SECRET)
-    mode = f"container:{sandbox_id or f'id-{sandbox_name(key)}'}"
+    mode = f"container:{sandbox_id or f'id-{sandbox_name(place)}'}"
     labels = own_labels(structs.replace(create, fingerprint=made))
     own = container(name, labels, [], state, mode=mode)
-    return Proxy(key, replace(own, started_at=started_at), ports, made)
+    return Proxy(place, replace(own, started_at=started_at), ports, made)
 
 
 def both(**more: Any) -> dict[str, Any]:
-    """A sandbox with a proxy, for `observed`. Words: key, ports, settings."""
+    """A sandbox with a proxy, for `observed`. Words: place, ports, settings."""
     return {"sandboxes": [sandbox(**more)], "proxies": [proxy(**more)]}
 
 

@@ -228,8 +228,8 @@ class Hosts(Invariants):
         if boxes := self.boxes("exited", "restarting"):
             box = pick(boxes, n)
             serving = self.own(*SERVING, role=box.role)
-            if box.own and box.own.key not in {
-                own.key for other, own in serving if other is not box
+            if box.own and box.own.place not in {
+                own.place for other, own in serving if other is not box
             }:
                 self.start(box)
 
@@ -255,7 +255,7 @@ class Hosts(Invariants):
     def forget(self, box: Box) -> Box:
         """Without its record, the operator does not know of a rule that is no longer wanted."""
         if box.redirect is not None:
-            self.forgotten.add((box.namespace, box.redirect.key))
+            self.forgotten.add((box.namespace, box.redirect.place))
         return box
 
     def rename_own(self, n: int, m: int) -> None:
@@ -268,7 +268,7 @@ class Hosts(Invariants):
                 ROLE_FLUSH: flush_name,
             }
             own = names.get(box.role, proxy_name)
-            name = own(box.own.key) + pick(("-old", "-2", "-old-2"), m) if box.own else ""
+            name = own(box.own.place) + pick(("-old", "-2", "-old-2"), m) if box.own else ""
             if name and not self.engine.named(name):
                 box.name = name
 
@@ -319,16 +319,16 @@ class Hosts(Invariants):
         before = self.engine.observe()
         remembered = self.controller.memory.served
         self.may_move |= {
-            key
-            for key, ports in self.served.items()
-            if self.published(ports) or key not in remembered
+            place
+            for place, ports in self.served.items()
+            if self.published(ports) or place not in remembered
         }
         failed = self.controller.carry_out(plan, most)
         refused = {action.name for action, _ in failed if isinstance(action, Start)}
-        self.may_move |= {own.key for box, own in self.own() if box.name in refused}
-        wanted = {proxy.key for proxy in plan.desired if proxy.live}
-        for key in before.keys - {own.key for _, own in self.own()} - wanted:
-            self.served.pop(key, None)
+        self.may_move |= {own.place for box, own in self.own() if box.name in refused}
+        wanted = {proxy.place for proxy in plan.desired if proxy.live}
+        for place in before.places - {own.place for _, own in self.own()} - wanted:
+            self.served.pop(place, None)
         return failed
 
     def published(self, ports: PortRange) -> bool:
@@ -339,5 +339,5 @@ class Hosts(Invariants):
     def lose_memory(self) -> None:
         """From now on the operator knows ports only from existing containers."""
         self.controller.memory = DockerMemory()
-        started = {own.key for box, own in self.own(role=ROLE_SANDBOX) if box.state != "created"}
-        self.served = {key: ports for key, ports in self.served.items() if key in started}
+        started = {own.place for box, own in self.own(role=ROLE_SANDBOX) if box.state != "created"}
+        self.served = {place: ports for place, ports in self.served.items() if place in started}

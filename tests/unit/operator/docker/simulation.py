@@ -30,7 +30,6 @@ from rosproxy_operator.docker.planner.model import (
     Container,
     FlushContainer,
     HostState,
-    Key,
     LanRelayContainer,
     Network,
     Proxy,
@@ -53,6 +52,7 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Place
 from tests.unit.operator.docker.builders import planned
 
 SERVING = {"running", "paused", "restarting"}
@@ -138,7 +138,7 @@ class Engine:
         self.image = "image-1"
         self.names_ports = True
         self.redirects_fail = False
-        self.rules: dict[tuple[int, Key], tuple[tuple[HostPort, ...], HostPort | None]] = {}
+        self.rules: dict[tuple[int, Place], tuple[tuple[HostPort, ...], HostPort | None]] = {}
         self.uninstalls = False
         self.ids = itertools.count()
 
@@ -182,7 +182,7 @@ class Engine:
             containers=tuple(self._container(box) for box, role in own if role is None),
             networks=tuple(self.networks.values()),
             proxies=tuple(
-                Proxy(is_.key, self._container(box), is_.range, is_.fingerprint)
+                Proxy(is_.place, self._container(box), is_.range, is_.fingerprint)
                 for box, is_ in own
                 if is_ and is_.role == ROLE_PROXY
             ),
@@ -190,23 +190,23 @@ class Engine:
             listening=frozenset(self.open | tcp_ports),
             listening_udp=frozenset(self.open | udp_ports),
             lan_relays=tuple(
-                LanRelayContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
+                LanRelayContainer(is_.place, self._container(box), is_.range, is_.fingerprint)
                 for box, is_ in own
                 if is_ and is_.role == ROLE_LAN_RELAY
             ),
             flushes=tuple(
-                FlushContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
+                FlushContainer(is_.place, self._container(box), is_.range, is_.fingerprint)
                 for box, is_ in own
                 if is_ and is_.role == ROLE_FLUSH
             ),
             redirects=tuple(
-                RedirectContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
+                RedirectContainer(is_.place, self._container(box), is_.range, is_.fingerprint)
                 for box, is_ in own
                 if is_ and is_.role == ROLE_REDIRECT
             ),
             image_id=self.image,
             sandboxes=tuple(
-                Sandbox(is_.key, self._container(box), is_.range, is_.fingerprint)
+                Sandbox(is_.place, self._container(box), is_.range, is_.fingerprint)
                 for box, is_ in own
                 if is_ and is_.role == ROLE_SANDBOX
             ),
@@ -214,7 +214,7 @@ class Engine:
 
     def _container(self, box: Box) -> Container:
         running = box.state in STARTED
-        places = tuple(
+        attachments = tuple(
             Attachment(name, box.address if running else "", names | {box.name}, network_id)
             for name, (network_id, names) in box.networks.items()
         )
@@ -224,7 +224,7 @@ class Engine:
             state=box.state,
             labels=dict(box.labels),
             network_mode=box.mode,
-            attachments=places,
+            attachments=attachments,
             master_uri=box.env,
             host_ports=box.ports,
             udp_ports=box.udp,
@@ -311,7 +311,7 @@ class Engine:
         if isinstance(action, CreateSandbox):
             if uplink not in self.networks:
                 raise Failed("no uplink")
-            published = published_ports(action.key, action.range, action.spec.udp)
+            published = published_ports(action.place, action.range, action.spec.udp)
             tcp = frozenset(port for exposed, port in published if exposed.endswith("/tcp"))
             udp = frozenset(port for exposed, port in published if exposed.endswith("/udp"))
             self.join(self.add(name, labels=labels, ports=tcp, udp=udp), uplink)
@@ -365,10 +365,10 @@ class Engine:
         box.namespace = home.namespace
         if self.redirects_fail:
             raise Failed("ended with 1")
-        place = home.namespace, box.redirect.key
-        self.rules[place] = box.redirect.addresses, box.redirect.proxy
+        site = home.namespace, box.redirect.place
+        self.rules[site] = box.redirect.addresses, box.redirect.proxy
         if not box.redirect.addresses:
-            del self.rules[place]
+            del self.rules[site]
 
     def begin(self, box: Box, state: str) -> None:
         """Give a user's container a state. Each start makes a new namespace."""

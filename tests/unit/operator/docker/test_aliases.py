@@ -8,26 +8,27 @@ import pytest
 from rosproxy_operator.docker.option_values import read_name_pattern
 from rosproxy_operator.docker.planner.actions import Connect, Disconnect
 from rosproxy_operator.docker.planner.labels.alias_bounds import alias_refusal
-from rosproxy_operator.docker.planner.model import Container, Key, Network
+from rosproxy_operator.docker.planner.model import Container, Network
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.planner.taken_names import MOST_REMEMBERED_NAMES, remember_names
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Master, Place
 from tests.unit.operator.docker.builders import (
     APP,
     HERE,
     SETTINGS,
     UPLINK,
+    attachment,
     both,
     container,
     observed,
-    place,
     planned,
     sandbox,
 )
 
-DB = Key("http://db:5432", HERE)
+DB = Place(Master("http://db:5432"), HERE)
 BACK = Network("n3", "back")
 LAN = Network("n4", "lan")
 NETWORKS = (UPLINK, APP, BACK, LAN)
@@ -37,7 +38,7 @@ def allowing(*patterns: str, **more: Any) -> PlanSettings:
     return replace(SETTINGS, allow_alias=tuple(map(read_name_pattern, patterns)), **more)
 
 
-def hostile(uri: str = DB.master_uri, env: str = "http://rosproxy:5432", **more: Any) -> Container:
+def hostile(uri: str = DB.master.uri, env: str = "http://rosproxy:5432", **more: Any) -> Container:
     """A container whose image has a label with the name of a service."""
     labels = {"rosproxy.enable": "true", "rosproxy.master-uri": uri}
     return container("hostile", labels, env=env, **more)
@@ -132,9 +133,9 @@ def test_what_is_no_pattern_of_a_name(text: str) -> None:
 
 def test_a_refused_name_costs_that_name_alone() -> None:
     uri = "http://robot.example.com:11311"
-    key = Key(uri, HERE)
+    place = Place(Master(uri), HERE)
     plan = look(container("talker", {"rosproxy.enable": "true"}, env=uri))
-    assert aliases(plan) == {"rosproxy", proxy_name(key)}
+    assert aliases(plan) == {"rosproxy", proxy_name(place)}
     (text,) = told(plan)
     assert text == (
         "the nodes look for the proxy by the name robot.example.com, but labels may not give a "
@@ -148,7 +149,7 @@ def test_a_refused_name_costs_that_name_alone() -> None:
         container("talker", {"rosproxy.enable": "true"}, env=uri),
         settings=allowing("robot.example.com"),
     )
-    assert aliases(allowed) == {"rosproxy", "robot.example.com", proxy_name(key)}
+    assert aliases(allowed) == {"rosproxy", "robot.example.com", proxy_name(place)}
     assert told(allowed) == []
 
 
@@ -160,13 +161,13 @@ def test_a_refused_name_that_no_node_uses_is_no_problem() -> None:
 
 def test_a_name_that_is_refused_now_is_taken_back() -> None:
     """An operator with other options, or of a newer version, finds the proxy with the name."""
-    key = Key("http://pypi.org:11311", HERE)
-    plan = look(hostile(key.master_uri, "http://rosproxy:11311"), **both(key=key))
-    assert aliases(plan) == {"rosproxy", proxy_name(key)}
-    after = sandbox(key, networks=[place("app", "rosproxy", proxy_name(key))])
+    place = Place(Master("http://pypi.org:11311"), HERE)
+    plan = look(hostile(place.master.uri, "http://rosproxy:11311"), **both(place=place))
+    assert aliases(plan) == {"rosproxy", proxy_name(place)}
+    after = sandbox(place, networks=[attachment("app", "rosproxy", proxy_name(place))])
     again = look(
-        hostile(key.master_uri, "http://rosproxy:11311"),
-        **{**both(key=key), "sandboxes": [after]},
+        hostile(place.master.uri, "http://rosproxy:11311"),
+        **{**both(place=place), "sandboxes": [after]},
     )
     assert again.actions == ()
 
@@ -177,13 +178,13 @@ def test_a_name_that_is_refused_now_is_taken_back() -> None:
 @pytest.mark.parametrize("state", ["created", "running", "exited"])
 def test_a_container_that_comes_later_gets_its_name_from_the_proxy(state: str) -> None:
     """Neighbours must never reach the proxy under that name."""
-    steady = look(hostile(), **both(key=DB))
+    steady = look(hostile(), **both(place=DB))
     assert steady.actions == ()
     for newcomer in (
         container("db", {}, state=state),
-        container("x-db-1", {}, [place("app", "x-db-1", "DB")], state=state),
+        container("x-db-1", {}, [attachment("app", "x-db-1", "DB")], state=state),
     ):
-        plan = look(hostile(), newcomer, **both(key=DB), memory=steady.memory)
+        plan = look(hostile(), newcomer, **both(place=DB), memory=steady.memory)
         box = sandbox(DB).container.name
         names = ("rosproxy", proxy_name(DB))
         assert plan.actions == (Disconnect(box, "app"), Connect(box, "app", names))
@@ -191,13 +192,13 @@ def test_a_container_that_comes_later_gets_its_name_from_the_proxy(state: str) -
 
 def test_the_name_of_a_container_that_is_gone_stays_its_own() -> None:
     """``docker compose up`` recreates containers in turn."""
-    before = look(container("x-db-1", {}, [place("app", "x-db-1", "db")]))
-    plan = look(hostile(env=DB.master_uri), memory=before.memory)
+    before = look(container("x-db-1", {}, [attachment("app", "x-db-1", "db")]))
+    plan = look(hostile(env=DB.master.uri), memory=before.memory)
     assert "db" not in aliases(plan)
     (text,) = told(plan)
     assert "container x-db-1 had the name, and may return. So the nodes" in text
     assert "--allow-alias db," in text
-    allowed = look(hostile(env=DB.master_uri), memory=before.memory, settings=allowing("db"))
+    allowed = look(hostile(env=DB.master.uri), memory=before.memory, settings=allowing("db"))
     assert "db" in aliases(allowed)
     elsewhere = look(hostile(networks=("back",)), memory=before.memory)
     assert "db" in aliases(elsewhere, "back")
@@ -212,7 +213,7 @@ def test_a_name_on_another_network_of_a_neighbour_is_taken() -> None:
     """The engine searches a neighbour's networks for a name in any order."""
     web = container("web", {}, ("app", "back"))
     db = container("db", {}, ("back",))
-    plan = look(hostile(env=DB.master_uri), web, db)
+    plan = look(hostile(env=DB.master.uri), web, db)
     assert "db" not in aliases(plan)
     assert "that name belongs to container db (network back)." in told(plan)[0]
     assert "db" in aliases(look(hostile(), db))
@@ -240,8 +241,8 @@ def test_no_label_of_an_image_takes_a_name_from_a_proxy() -> None:
 
 def test_a_proxy_that_only_lingers_leaves_a_container_its_name() -> None:
     gone = hostile(state="exited")
-    assert look(gone, **both(key=DB)).actions == ()
-    plan = look(gone, container("db", {}), **both(key=DB))
+    assert look(gone, **both(place=DB)).actions == ()
+    plan = look(gone, container("db", {}), **both(place=DB))
     assert plan.actions == (Disconnect(sandbox(DB).container.name, "app"),)
 
 
@@ -267,5 +268,7 @@ def test_names_are_forgotten_when_there_are_too_many() -> None:
 
 
 def test_short_ids_are_not_remembered() -> None:
-    db = replace(container("db", {}, [place("app", "db", "0123456789ab")]), id="0123456789abcdef")
+    db = replace(
+        container("db", {}, [attachment("app", "db", "0123456789ab")]), id="0123456789abcdef"
+    )
     assert look(db).memory.names == {("app", "db"): "db"}

@@ -16,9 +16,9 @@ from tests.unit.operator.docker.builders import (
     ENABLED,
     HERE,
     SETTINGS,
+    attachment,
     container,
     observed,
-    place,
     planned,
     read_members,
 )
@@ -130,7 +130,10 @@ def test_nothing_is_made_and_no_name_taken_for_a_master_that_is_not_allowed() ->
 def test_a_label_takes_no_name_that_a_neighbour_answers_to() -> None:
     """Neither its name nor an alias, such as the name of a Compose service."""
     labels = {**ENABLED, "rosproxy.master-uri": "http://db:5432"}
-    for neighbour in (container("db", {}), container("x-db-1", {}, [place("app", "x-db-1", "DB")])):
+    for neighbour in (
+        container("db", {}),
+        container("x-db-1", {}, [attachment("app", "x-db-1", "DB")]),
+    ):
         seen = observed(container(labels=labels), neighbour)
         plan = planned(seen, SETTINGS, DockerMemory(), 0.0)
         (joined,) = [action for action in plan.actions if isinstance(action, Connect)]
@@ -231,4 +234,4 @@ def test_an_exited_container_keeps_slave_control_narrow_for_the_grace() -> None:
     assert first.again_in is not None
     later = planned(seen, SETTINGS, first.memory, 60.0)
     assert later.desired[0].spec.slave_control == "any"
-    assert later.desired[0].key.advertise_host == HERE
+    assert later.desired[0].place.advertise_host == HERE

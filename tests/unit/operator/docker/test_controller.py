@@ -29,13 +29,13 @@ from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerObserver
 from tests.unit.operator.docker import captured
-from tests.unit.operator.docker.builders import IMAGE, KEY, RANGE, inspection
+from tests.unit.operator.docker.builders import IMAGE, PLACE, RANGE, inspection
 from tests.unit.operator.docker.conftest import FakeEngine
 
-SETTINGS = PlanSettings(advertise_host=KEY.advertise_host, secret="secret")
-BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE, fingerprint="f")
-PROCESS = Create(proxy_name(KEY), KEY, RANGE, sandbox_name(KEY), fingerprint="f")
-TOKEN = proxy_token(KEY, "secret")
+SETTINGS = PlanSettings(advertise_host=PLACE.advertise_host, secret="secret")
+BOX = CreateSandbox(sandbox_name(PLACE), PLACE, RANGE, fingerprint="f")
+PROCESS = Create(proxy_name(PLACE), PLACE, RANGE, sandbox_name(PLACE), fingerprint="f")
+TOKEN = proxy_token(PLACE, "secret")
 
 
 def own(
@@ -72,11 +72,11 @@ def observer() -> DockerObserver:
 async def test_a_look_finds_containers_labels_masters_and_proxies() -> None:
     look = await observer().look(5.0)
     state = look.state
-    name = proxy_name(KEY)
+    name = proxy_name(PLACE)
     assert [container.name for container in state.containers] == ["talker"]
-    assert [box.container.name for box in state.sandboxes] == [sandbox_name(KEY)]
-    assert [(proxy.key, proxy.range) for proxy in state.proxies] == [(KEY, RANGE)]
-    assert [request.key.master_uri for request in look.labels.requests] == [KEY.master_uri]
+    assert [box.container.name for box in state.sandboxes] == [sandbox_name(PLACE)]
+    assert [(proxy.place, proxy.range) for proxy in state.proxies] == [(PLACE, RANGE)]
+    assert [request.place.master.uri for request in look.labels.requests] == [PLACE.master.uri]
     assert state.masters == {"robot": "172.29.0.2"}  # the name of a container, not of a name server
     assert not state.busy
     assert state.addresses >= {"172.29.0.2", "172.30.0.2"}
@@ -136,7 +136,7 @@ async def test_a_forged_container_is_told_and_left_alone(engine: FakeEngine, nam
 
 
 async def test_a_forged_container_does_not_delay_own_containers(engine: FakeEngine) -> None:
-    """The container claims to be a sandbox of the same key, and is not inspected yet."""
+    """The container claims to be a sandbox of the same place, and is not inspected yet."""
     row, _ = forged("e" * 64, "evil")
     engine.rows.append(row)
     look = await observer().look(5.0)
@@ -149,7 +149,7 @@ async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine)
         del engine.knows[f"/containers/{row['Id']}/json"]
     look = await observer().look(5.0)
     assert not look.state.containers
-    assert look.state.busy == {proxy_name(KEY), sandbox_name(KEY)}
+    assert look.state.busy == {proxy_name(PLACE), sandbox_name(PLACE)}
     assert look.state.masters == {"robot": ""}
 
 
@@ -197,7 +197,7 @@ async def test_an_inspection_that_cannot_be_read_harms_no_other_container(
 async def test_a_list_that_is_behind_the_inspection_makes_busy(engine: FakeEngine) -> None:
     engine.knows[f"/containers/{'p' * 64}/json"]["State"] = {"Status": "exited"}
     look = await observer().look(5.0)
-    assert look.state.busy == {proxy_name(KEY)}
+    assert look.state.busy == {proxy_name(PLACE)}
 
 
 async def test_an_inspection_of_before_makes_busy(engine: FakeEngine) -> None:
@@ -206,8 +206,8 @@ async def test_an_inspection_of_before_makes_busy(engine: FakeEngine) -> None:
     del engine.knows[f"/containers/{'p' * 64}/json"]
     looking.note_event("p" * 64)
     look = await looking.look(5.0)
-    assert look.state.busy == {proxy_name(KEY)}
-    assert look.access[proxy_name(KEY)].token == TOKEN
+    assert look.state.busy == {proxy_name(PLACE)}
+    assert look.access[proxy_name(PLACE)].token == TOKEN
 
 
 def inspected_again(engine: FakeEngine) -> set[str]:
@@ -234,12 +234,12 @@ async def test_a_doubt_is_good_for_one_look_however_late(
 ) -> None:
     monkeypatch.setattr(snapshot, "REINSPECTED_FOR_S", 0.0)
     looking = observer()
-    first = (await looking.look(5.0)).access[proxy_name(KEY)].run
+    first = (await looking.look(5.0)).access[proxy_name(PLACE)].run
     engine.knows[f"/containers/{'p' * 64}/json"]["State"]["StartedAt"] = "2"
     for container in ("p" * 64, None):
         looking.note_event(container)
         await asyncio.sleep(0.01)
-        assert (await looking.look(5.0)).access[proxy_name(KEY)].run != first
+        assert (await looking.look(5.0)).access[proxy_name(PLACE)].run != first
         engine.calls.clear()
         await looking.look(5.0)
         assert not inspected_again(engine)
@@ -250,7 +250,7 @@ async def test_a_redirect_that_was_run_again_is_inspected_again(engine: FakeEngi
     looking = observer()
     seen = replace((await looking.look(5.0)).state, image_id=IMAGE)
     master = HostPort("192.0.2.7", 11311)
-    made = CreateRedirect("", KEY, RANGE, "c" * 64, "1", (master,), HostPort("172.18.0.9", 11311))
+    made = CreateRedirect("", PLACE, RANGE, "c" * 64, "1", (master,), HostPort("172.18.0.9", 11311))
     made = _with_fingerprint(made, seen, SETTINGS)
     row = own(made, "r" * 64, f"container:{'c' * 64}", "") | {"State": "exited"}
     state = {"Status": "exited", "StartedAt": "1", "ExitCode": 1}
@@ -284,7 +284,7 @@ async def test_a_start_that_no_event_told_is_found(
     async def look() -> str:
         host_snapshot = await looking.look(5.0)
         assert not looking.waiting
-        return host_snapshot.access[proxy_name(KEY)].run
+        return host_snapshot.access[proxy_name(PLACE)].run
 
     first = await look()
     assert inspected_again(engine) >= {"p"}
@@ -309,7 +309,7 @@ async def test_the_page_tells_of_a_proxy_that_has_ended(
     controller = DockerController(SETTINGS, 30.0, DockerMetrics())
     assert await controller.documents() == {}
     await controller.look()
-    wanted = {proxy_name(KEY): "the proxy's container is exited"} if is_told else {}
+    wanted = {proxy_name(PLACE): "the proxy's container is exited"} if is_told else {}
     assert await controller.documents() == wanted
 
 
@@ -320,7 +320,7 @@ async def test_once_tells_what_is_not_as_wanted(engine: FakeEngine) -> None:
     problems = await controller.run_once(0.5)
     assert [problem.subject for problem in problems] == [
         f"proxy image {SETTINGS.proxy_image}",
-        f"proxy {proxy_name(KEY)}",
+        f"proxy {proxy_name(PLACE)}",
     ]
     assert controller.unready() is None
     assert metrics.registry.get_sample_value("rosproxy_operator_engine_up") == 1.0

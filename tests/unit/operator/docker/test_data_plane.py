@@ -23,7 +23,7 @@ from tests.unit.operator.docker import builders
 from tests.unit.operator.docker.builders import (
     ENABLED,
     IMAGE,
-    KEY,
+    PLACE,
     RANGE,
     SECRET,
     container,
@@ -35,9 +35,9 @@ from tests.unit.operator.docker.builders import (
 
 SETTINGS = replace(builders.SETTINGS, allow_data_plane=("auto", "kernel", "splice", "copy"))
 LABEL = "rosproxy.data-plane"
-NAME = proxy_name(KEY)
-SANDBOX = CreateSandbox("s", KEY, RANGE, fingerprint="f1")
-PROXY = Create("p", KEY, RANGE, "s")
+NAME = proxy_name(PLACE)
+SANDBOX = CreateSandbox("s", PLACE, RANGE, fingerprint="f1")
+PROXY = Create("p", PLACE, RANGE, "s")
 
 
 def asking(name: str, plane: str, state: str = "running") -> Container:

@@ -15,7 +15,7 @@ from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,
     IMAGE,
-    KEY,
+    PLACE,
     RANGE,
     SECRET,
     SETTINGS,
@@ -28,7 +28,7 @@ from tests.unit.operator.docker.builders import (
 
 LABEL = "rosproxy.direction"
 CELL = Network("n2", "cell", internal=True)
-PROXY = Create("p", KEY, RANGE, "s")
+PROXY = Create("p", PLACE, RANGE, "s")
 
 
 def labelled(name: str, direction: str, network: str = "app", state: str = "running") -> Container:

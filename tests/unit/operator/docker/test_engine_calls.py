@@ -32,7 +32,6 @@ from rosproxy_operator.docker.planner.actions import (
     Unpause,
 )
 from rosproxy_operator.docker.planner.labels.members import LabelReading
-from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.specs import (
     lan_relay_config,
     own_labels,
@@ -41,8 +40,9 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_name,
 )
 from rosproxy_operator.docker.snapshot import DockerSnapshot
+from rosproxy_operator.proxy_spec.place import Domain, Place
 from tests.unit.operator.docker.builders import (
-    KEY,
+    PLACE,
     RANGE,
     SECRET,
     SETTINGS,
@@ -52,13 +52,13 @@ from tests.unit.operator.docker.builders import (
 from tests.unit.operator.docker.conftest import FakeEngine
 
 PERMISSIONS = Path(__file__).parents[4] / "docs/reference/permissions.md"
-BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE)
+BOX = CreateSandbox(sandbox_name(PLACE), PLACE, RANGE)
 SEEN = observed(masters={"robot": "192.0.2.7"})
 LOOK = DockerSnapshot(SEEN, LabelReading(), {}, at_host=True, new_secret="fresh secret")
 ACTIONS: list[Action] = [
     CreateNetwork("0-rosproxy"),
     BOX,
-    Create("p", KEY, RANGE, "box"),
+    Create("p", PLACE, RANGE, "box"),
     Start("p"),
     Restart("p"),
     Unpause("p"),
@@ -66,9 +66,9 @@ ACTIONS: list[Action] = [
     Connect("box", "app", ("robot",)),
     Disconnect("box", "app"),
     Remove("box", "", stop=True),
-    CreateRedirect("r", KEY, RANGE, "talker", "2026-01-01T10:00:00Z"),
+    CreateRedirect("r", PLACE, RANGE, "talker", "2026-01-01T10:00:00Z"),
     Run("box"),
-    CreateFlush("f", KEY, RANGE),
+    CreateFlush("f", PLACE, RANGE),
 ]
 
 
@@ -148,15 +148,17 @@ async def test_what_does_not_end_is_removed(
 async def test_a_proxy_gets_its_tokens_hash_and_its_masters_address(engine: FakeEngine) -> None:
     await carry_out(ACTIONS[2])
     variables = engine.calls["POST /containers/create"]["Env"]
-    expected = hash_token(proxy_token(KEY, SECRET))
+    expected = hash_token(proxy_token(PLACE, SECRET))
     assert f"ROSPROXY_ADMIN_TOKEN_HASH={expected}" in variables
     assert "ROSPROXY_MASTER_ADDRESS=192.0.2.7" in variables
 
 
 async def test_a_lan_relay_gets_what_it_shares_with_its_proxy(engine: FakeEngine) -> None:
-    key = Key("", "192.0.2.1", 0)
+    place = Place(Domain(0), "192.0.2.1")
     near = HostPort("172.30.0.1", RANGE.last)
-    relay = CreateLanRelay("e", key, RANGE, "192.0.2.1", near, HostPort("172.30.0.2", RANGE.first))
+    relay = CreateLanRelay(
+        "e", place, RANGE, "192.0.2.1", near, HostPort("172.30.0.2", RANGE.first)
+    )
     await carry_out(relay)
     variables = engine.calls["POST /containers/create"]["Env"]
     assert variables == lan_relay_config(relay, SETTINGS, SECRET)["Env"]

@@ -1,4 +1,4 @@
-"""Work under way: key by key, with patience for what fails."""
+"""The executor runs jobs of different places at the same time, and retries failed jobs."""
 
 import asyncio
 import logging
@@ -10,11 +10,11 @@ from rosproxy.net.tasks import Tasks
 from rosproxy_operator.docker.errors import EngineError, PortTaken
 from rosproxy_operator.docker.executor import Executor
 from rosproxy_operator.docker.planner.actions import Action, Connect, CreateNetwork, Remove, Start
-from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.plan import Group
+from rosproxy_operator.proxy_spec.place import Master, Place
 
-ONE = Key("http://one:11311", "192.0.2.1")
-OTHER = Key("http://other:11311", "192.0.2.1")
+ONE = Place(Master("http://one:11311"), "192.0.2.1")
+OTHER = Place(Master("http://other:11311"), "192.0.2.1")
 UPLINK = Group(None, (CreateNetwork("0-rosproxy"),))
 
 
@@ -88,7 +88,7 @@ async def test_the_uplink_comes_first(host: Host) -> None:
     assert host.done == [UPLINK.actions[0], Start("a")]
 
 
-async def test_a_key_that_takes_long_holds_up_no_other(host: Host) -> None:
+async def test_a_slow_job_holds_up_no_job_of_another_place(host: Host) -> None:
     host.does[Start("slow")] = asyncio.Event()
     slow = Group(ONE, (Start("slow"),))
     host.begin(slow)

@@ -13,7 +13,7 @@ from rosproxy_operator.docker.engine_json import check_inspection, read_making
 from rosproxy_operator.docker.planner.actions import Action, CreateFlush, Remove, Run
 from rosproxy_operator.docker.planner.flush import flush_config
 from rosproxy_operator.docker.planner.labels.members import LabelReading
-from rosproxy_operator.docker.planner.model import FlushContainer, HostState, Key, Sandbox
+from rosproxy_operator.docker.planner.model import FlushContainer, HostState, Sandbox
 from rosproxy_operator.docker.planner.own_containers import forgery_reason
 from rosproxy_operator.docker.planner.plan import DockerPlan, Group
 from rosproxy_operator.docker.planner.specs import (
@@ -26,6 +26,7 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.planner.uninstall import Uninstall
+from rosproxy_operator.proxy_spec.place import Domain, Place
 from tests.unit.operator.docker.builders import (
     HERE,
     IMAGE,
@@ -37,9 +38,9 @@ from tests.unit.operator.docker.builders import (
     observed,
     planned,
 )
-from tests.unit.operator.docker.test_lan_relay import KEY, TALKER, running_proxy
+from tests.unit.operator.docker.test_lan_relay import PLACE, TALKER, running_proxy
 
-NAME = flush_name(KEY)
+NAME = flush_name(PLACE)
 SANDBOX_STARTED = "2026-01-01T10:00:00Z"
 LATER = "2026-01-01T10:00:00.25Z"
 EARLIER = "2026-01-01T09:59:59.75Z"
@@ -51,8 +52,8 @@ def published(ports: PortRange = RANGE, state: str = "running", busy: bool = Fal
     (box,) = parts["sandboxes"]
     udp = frozenset(ports.ports())
     made = replace(box.container, state=state, udp_ports=udp, started_at=SANDBOX_STARTED)
-    parts["sandboxes"] = [Sandbox(KEY, made, ports, box.fingerprint)]
-    names = frozenset({sandbox_name(KEY)}) if busy else frozenset[str]()
+    parts["sandboxes"] = [Sandbox(PLACE, made, ports, box.fingerprint)]
+    names = frozenset({sandbox_name(PLACE)}) if busy else frozenset[str]()
     return observed(TALKER, busy=names, **parts)
 
 
@@ -70,7 +71,7 @@ def record(
 ) -> FlushContainer:
     own = container(made.name, own_labels(made), [], state, mode="host")
     own = replace(own, started_at=started_at, exit_code=code)
-    return FlushContainer(made.key, own, made.range, made.fingerprint)
+    return FlushContainer(made.place, own, made.range, made.fingerprint)
 
 
 def wanted(state: HostState) -> CreateFlush:
@@ -84,7 +85,7 @@ MADE = wanted(published())
 
 
 def test_it_runs_once_after_the_start_of_a_sandbox() -> None:
-    assert (MADE.name, MADE.key, MADE.range) == (NAME, KEY, RANGE)
+    assert (MADE.name, MADE.place, MADE.range) == (NAME, PLACE, RANGE)
     done = replace(published(), flushes=(record(MADE),))
     assert steps(done) == []
 
@@ -158,7 +159,7 @@ def test_udp_ports_of_ros_1_are_flushed_whole() -> None:
     parts = both()
     (box,) = parts["sandboxes"]
     made = replace(box.container, udp_ports=frozenset(RANGE.ports()))
-    parts["sandboxes"] = [Sandbox(box.key, made, box.range, box.fingerprint)]
+    parts["sandboxes"] = [Sandbox(box.place, made, box.range, box.fingerprint)]
     create = wanted(observed(container(), **parts))
     assert flush_config(create, SETTINGS)["Cmd"][-2:] == [str(RANGE.first), str(RANGE.last)]
 
@@ -191,7 +192,7 @@ def test_uninstalling_removes_the_record() -> None:
 
 def test_where_it_fails_users_are_told_the_command_and_nothing_else_waits() -> None:
     (group,) = groups(published())
-    assert group.subject == f"conntrack entries for {proxy_name(KEY)}"
+    assert group.subject == f"conntrack entries for {proxy_name(PLACE)}"
     assert not group.fatal
     assert group.fix.endswith(
         f"for port in $(seq {RANGE.first} {RANGE.last - 1}); "
@@ -269,8 +270,9 @@ def test_it_runs_the_operators_command_for_its_own_ports_alone(change: dict[str,
     assert forgery(inspection(body), "talker") == f"the name is not {NAME}"
 
 
-def test_another_key_has_one_of_its_own() -> None:
-    assert flush_name(Key("", HERE, 1)) != NAME
-    other = structs.replace(MADE, key=Key("", HERE, 1), name=flush_name(Key("", HERE, 1)))
+def test_another_place_has_a_flush_of_its_own() -> None:
+    place = Place(Domain(1), HERE)
+    assert flush_name(place) != NAME
+    other = structs.replace(MADE, place=place, name=flush_name(place))
     state = replace(published(), flushes=(record(MADE), record(other)))
     assert steps(state) == [Remove(other.name, "no longer needed")]

@@ -22,14 +22,15 @@ from rosproxy_operator.docker.host_document import (
     container_names,
     host_document,
 )
-from rosproxy_operator.docker.planner.model import ZENOH, Attachment, Key
+from rosproxy_operator.docker.planner.model import Attachment
 from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Place
 from tests.unit.operator.docker.builders import (
     HERE,
-    KEY,
+    PLACE,
     SETTINGS,
     container,
     observed,
@@ -61,19 +62,19 @@ def test_a_container_whose_master_is_refused_is_listed() -> None:
     assert (row["name"], row["proxy"]) == ("talker", None)
 
 
-@pytest.mark.parametrize(("key", "up"), [(KEY, False), (Key("", HERE, 0), None)])
-def test_only_a_proxy_for_ros_1_has_a_master(key: Key, up: bool | None) -> None:
+@pytest.mark.parametrize(("place", "up"), [(PLACE, False), (Place(Domain(0), HERE), None)])
+def test_only_a_proxy_for_ros_1_has_a_master(place: Place, up: bool | None) -> None:
     """A proxy for ROS 2 has no master, which is not a fault."""
-    running = proxy(KEY)
-    own = replace(running.container, name=proxy_name(key))
-    state = observed(proxies=[replace(running, key=key, container=own)])
+    running = proxy(PLACE)
+    own = replace(running.container, name=proxy_name(place))
+    state = observed(proxies=[replace(running, place=place, container=own)])
     made = planned(state, SETTINGS, DockerMemory(), 0.0)
-    answers = {proxy_name(key): ProxyStatus()}
+    answers = {proxy_name(place): ProxyStatus()}
     (row,) = host_document(state, made, (), answers, SETTINGS, 0.0)["proxies"]
     assert (row["reachable"], row["master_up"]) == (True, up)
 
 
-DOMAIN = Key("", HERE, 0)
+DOMAIN = Place(Domain(0), HERE)
 STARTED = 1_700_000_000.0
 STARTED_AT = "2023-11-14T22:13:20.123456789Z"
 TALKER = Attachment("app", "172.30.0.5")
@@ -92,9 +93,9 @@ def told_of_talker(
     labels = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
     talker = container(labels=labels, networks=[TALKER], env="")
     talker = replace(talker, variables=variables, started_at=STARTED_AT)
-    running = proxy(KEY)
+    running = proxy(PLACE)
     own = replace(running.container, name=proxy_name(DOMAIN))
-    state = observed(talker, proxies=[replace(running, key=DOMAIN, container=own)])
+    state = observed(talker, proxies=[replace(running, place=DOMAIN, container=own)])
     made = planned(state, SETTINGS, DockerMemory(), 0.0)
     participants = tuple(ParticipantStatus("01.0f.aa", address) for address in inside)
     status = ProxyStatus(uptime=uptime, domains=(DomainStatus(inside=participants),))
@@ -110,7 +111,7 @@ def told_of_talker(
 )
 def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) -> None:
     """Even if the engine's clock is ahead, later silence is a problem."""
-    running = proxy(KEY)
+    running = proxy(PLACE)
     own = replace(running.container, name="p", started_at=STARTED_AT)
     state = observed(proxies=[replace(running, container=own)])
     made = planned(state, SETTINGS, DockerMemory(), 0.0)
@@ -162,9 +163,9 @@ def test_a_container_in_the_network_of_another_has_its_participants() -> None:
     pause = container("pause", labels={}, networks=[TALKER])
     labels = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
     talker = container(labels=labels, networks=(), env="", mode=f"container:{pause.id}")
-    running = proxy(KEY)
+    running = proxy(PLACE)
     own = replace(running.container, name=proxy_name(DOMAIN))
-    state = observed(pause, talker, proxies=[replace(running, key=DOMAIN, container=own)])
+    state = observed(pause, talker, proxies=[replace(running, place=DOMAIN, container=own)])
     made = planned(state, SETTINGS, DockerMemory(), 0.0)
     domain = DomainStatus(inside=(ParticipantStatus("01.0f.aa", TALKER.address),))
     answers = {proxy_name(DOMAIN): ProxyStatus(domains=(domain,))}
@@ -208,10 +209,10 @@ def test_a_file_of_sessions_is_named_where_no_node_has_connected(
 def test_a_container_of_rmw_zenoh_has_its_nodes_and_its_proxy_the_links() -> None:
     zenoh = {"ROS_DISTRO": "kilted", "RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
     talker = container(labels={"rosproxy.enable": "true"}, networks=[TALKER], env="")
-    running = proxy(KEY)
+    running = proxy(PLACE)
     own = replace(running.container, name=proxy_name(ZENOH))
     state = observed(
-        replace(talker, variables=zenoh), proxies=[replace(running, key=ZENOH, container=own)]
+        replace(talker, variables=zenoh), proxies=[replace(running, place=ZENOH, container=own)]
     )
     made = planned(state, SETTINGS, DockerMemory(), 0.0)
     nodes = (ZenohNodeStatus("/talker", 0, TALKER.address), ZenohNodeStatus("/robot", 0, ""))

@@ -15,14 +15,15 @@ from rosproxy_operator.docker.planner.label_policy import (
     with_bounded_rules,
 )
 from rosproxy_operator.docker.planner.labels.readers import MOST_LABEL_RULES
-from rosproxy_operator.docker.planner.model import Attachment, Key, Member
+from rosproxy_operator.docker.planner.model import Attachment, Member
 from rosproxy_operator.docker.planner.proxy_update import ProxyUpdate, network_facts
 from rosproxy_operator.docker.planner.specs import container_config, proxy_fingerprint
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.proxy_spec.place import Master, Place
 from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import (
     ENABLED,
-    KEY,
+    PLACE,
     SETTINGS,
     both,
     container,
@@ -101,9 +102,9 @@ def test_a_layer_is_for_the_addresses_of_its_container() -> None:
     seen = observed(
         talker, guest, friend, soon, ended, **{**own, "sandboxes": [replace(box, container=home)]}
     )
-    members = [Member(c, KEY, policy=RULES) for c in (talker, guest, friend, soon, ended)]
-    plain = Member(container("plain", networks=[Attachment("app", B)]), KEY)
-    other = Member(talker, Key("http://other:11311", "192.0.2.10"), policy=RULES)
+    members = [Member(c, PLACE, policy=RULES) for c in (talker, guest, friend, soon, ended)]
+    plain = Member(container("plain", networks=[Attachment("app", B)]), PLACE)
+    other = Member(talker, Place(Master("http://other:11311"), "192.0.2.10"), policy=RULES)
     facts = network_facts(seen, seen.proxies[0], [*members, plain, other], COMMON)
     shared = (layer("talker", A), layer("guest", A), layer("friend", A))
     assert facts.policy == (*COMMON, *shared)
@@ -163,7 +164,7 @@ def test_the_same_look_is_the_same_policy() -> None:
 
 
 def crowd(**rules: int) -> list[Member]:
-    return [Member(container(name), KEY, policy=RULES * count) for name, count in rules.items()]
+    return [Member(container(name), PLACE, policy=RULES * count) for name, count in rules.items()]
 
 
 def test_who_has_many_rules_takes_no_room_from_who_has_few() -> None:
@@ -177,8 +178,8 @@ def test_who_has_many_rules_takes_no_room_from_who_has_few() -> None:
 
 
 def test_proxies_are_bounded_each_for_itself() -> None:
-    other = Key("http://other:11311", "192.0.2.10")
-    more = [replace(member, key=other) for member in crowd(x=100)]
+    other = Place(Master("http://other:11311"), "192.0.2.10")
+    more = [replace(member, place=other) for member in crowd(x=100)]
     members = [*crowd(**{f"c{number}": 100 for number in range(10)}), *more]
     assert with_bounded_rules(members, SETTINGS)[1] == ()
 

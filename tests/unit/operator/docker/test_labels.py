@@ -8,19 +8,20 @@ from hypothesis import strategies as st
 
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels.members import master_hosts, read_labels
-from rosproxy_operator.docker.planner.model import Container, Key, Member
+from rosproxy_operator.docker.planner.model import Container, Member
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Master, Place
 from tests.unit.operator.docker.builders import (
     ENABLED,
     HERE,
-    KEY,
+    PLACE,
     ROBOT,
     SETTINGS,
+    attachment,
     both,
     container,
     observed,
-    place,
     proxy,
     read_members,
     sandbox,
@@ -69,14 +70,14 @@ def test_a_labelled_container_wishes_for_a_proxy() -> None:
     labels = {**ENABLED, "rosproxy.ports": "40", "rosproxy.advertise-host": "Host.lab"}
     talker = container(labels=labels, networks=("app", "lab"))
     assert good(talker) == Member(
-        talker, Key(ROBOT, "host.lab"), 40, frozenset({"app", "lab"}), "rosproxy"
+        talker, Place(Master(ROBOT), "host.lab"), 40, frozenset({"app", "lab"}), "rosproxy"
     )
 
 
 @pytest.mark.parametrize("value", ["true", "True", " TRUE "])
 def test_the_label_alone_is_enough(value: str) -> None:
     member = good(container(labels={"rosproxy.enable": value}, env=ROBOT))
-    assert (member.key, member.ports, member.wanted_alias) == (KEY, 0, "robot")
+    assert (member.place, member.ports, member.wanted_alias) == (PLACE, 0, "robot")
 
 
 URI = "is not of the form http://HOST:11311"
@@ -189,7 +190,7 @@ def test_a_master_has_one_uri(uri: str, same: str) -> None:
     talker = container(labels={**ON, "rosproxy.master-uri": uri}, env=uri)
     member, _ = read(talker)
     assert member is not None
-    assert member.key.master_uri == same
+    assert member.place.master.uri == same
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "[::1]", "0.0.0.0", "a.localhost"])
@@ -213,16 +214,16 @@ def test_a_proxy_is_no_master(host: str) -> None:
 
 def test_the_operators_master_is_for_those_who_name_the_proxy_or_nobody() -> None:
     settings = replace(SETTINGS, master_uri="http://arm:11311")
-    arm = Key("http://arm:11311", HERE)
+    arm = Place(Master("http://arm:11311"), HERE)
     for env in ("http://rosproxy:11311", f"http://{proxy_name(arm)}:11311"):
-        assert good(container(labels=ON, env=env), settings).key == arm
+        assert good(container(labels=ON, env=env), settings).place == arm
     member, told = read(container(labels=ON, env=""), settings)
     assert member is not None
-    assert member.key == arm
+    assert member.place == arm
     assert "so the operator assumes ROS 1" in told[0].text
     member, _ = read(container(labels=ON, env="http://rosproxy-zoo-0a1b2c:11311"), settings)
     assert member is not None
-    assert good(container(labels=ON, env=ROBOT), settings).key == KEY
+    assert good(container(labels=ON, env=ROBOT), settings).place == PLACE
 
 
 def test_no_master() -> None:
@@ -268,7 +269,7 @@ def test_an_address_is_told_the_variable_and_the_label_at_once() -> None:
     advice = f"Set ROS_MASTER_URI=http://rosproxy:11311 and the label rosproxy.master-uri={uri}, or"
     assert advice in problem.text
     cured = container(labels={**ON, "rosproxy.master-uri": uri}, env="http://rosproxy:11311")
-    assert good(cured, settings).key.master_uri == uri
+    assert good(cured, settings).place.master.uri == uri
 
 
 def test_no_variable_leads_to_localhost() -> None:
@@ -293,7 +294,7 @@ def test_who_says_what_this_host_is_called() -> None:
         (container(), SETTINGS, HERE),
         (container(), PlanSettings(), "192.0.2.99"),
     ):
-        assert good(talker, settings, advertise=addresses).key.advertise_host == host
+        assert good(talker, settings, advertise=addresses).place.advertise_host == host
 
 
 def test_loopback_is_no_address_for_others() -> None:
@@ -339,9 +340,9 @@ def test_labels_of_others_are_left_alone(label: str) -> None:
 
 def test_an_address_that_is_not_known_for_a_moment() -> None:
     """An existing proxy stays, if possible the proxy on the container's network."""
-    other = Key(ROBOT, "192.0.2.1")
-    seen = [sandbox(other, networks=()), sandbox(KEY)]
-    assert good(container(), PlanSettings(), sandboxes=seen).key == KEY
+    other = Place(Master(ROBOT), "192.0.2.1")
+    seen = [sandbox(other, networks=()), sandbox(PLACE)]
+    assert good(container(), PlanSettings(), sandboxes=seen).place == PLACE
 
 
 # networks
@@ -441,8 +442,8 @@ def test_who_is_dead_wants_nothing(state: str) -> None:
 
 
 def test_everybody_with_a_master_is_exposed() -> None:
-    assert good(container(labels={}, env=ROBOT), EXPOSING).key == KEY
-    assert good(container(labels={"rosproxy.master-uri": ROBOT}), EXPOSING).key == KEY
+    assert good(container(labels={}, env=ROBOT), EXPOSING).place == PLACE
+    assert good(container(labels={"rosproxy.master-uri": ROBOT}), EXPOSING).place == PLACE
     assert read(container(labels={}, env=""), EXPOSING) == (None, [])
 
 
@@ -478,14 +479,14 @@ def test_a_container_with_the_operators_own_label() -> None:
 
 
 def test_whose_address_is_needed() -> None:
-    proxy_key = Key("http://left:11311", HERE)
+    proxy_place = Place(Master("http://left:11311"), HERE)
     seen = observed(
         container("a"),
         container("b", ON, env="http://arm:11311"),
         container("c", ON, env="http://gone:11311", state="exited"),
         container("d", ON),
         container("e", {**ON, "rosproxy.enable": "maybe"}, env="http://no:11311"),
-        **both(key=proxy_key),
+        **both(place=proxy_place),
     )
     assert master_hosts(read_labels(seen, SETTINGS), seen) == ("arm", "left", "robot")
 
@@ -496,7 +497,7 @@ def test_a_proxy_of_whatever_name_is_no_master() -> None:
         talker = container(labels=ON, env=f"http://{host}:11311")
         member, _ = read(talker, replace(SETTINGS, master_uri=ROBOT), **odd)
         assert member is not None
-        assert member.key == KEY
+        assert member.place == PLACE
 
 
 TEXT = st.text(max_size=30) | st.sampled_from(["true", ROBOT, "app", "8", HERE])
@@ -513,13 +514,13 @@ LABELS = st.dictionaries(
 def test_labels_of_whatever_kind_are_read_or_told(
     labels: dict[str, str], env: str, mode: str, expose: bool
 ) -> None:
-    odd = container("odd", labels, [place("app")], env=env, mode=mode)
+    odd = container("odd", labels, [attachment("app")], env=env, mode=mode)
     settings = replace(SETTINGS, expose_by_default=expose)
     member, problems = read(odd, settings)
     asked = labels.get("rosproxy.enable", "").strip().lower()
     if asked == "true":
         assert member or any(problem.fatal for problem in problems)
     if member:
-        assert member.key.master_uri.startswith("http://")
-        assert member.key.advertise_host
+        assert member.place.master.uri.startswith("http://")
+        assert member.place.advertise_host
         assert 0 <= member.ports <= 1000

@@ -24,7 +24,6 @@ from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
     HostState,
-    Key,
     LanRelayContainer,
     Proxy,
     Sandbox,
@@ -50,6 +49,7 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Domain, Place
 from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import (
     APP,
@@ -66,17 +66,19 @@ from tests.unit.operator.docker.builders import (
 )
 
 TWO = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
-KEY = Key("", HERE, 0)
+PLACE = Place(Domain(0), HERE)
 NEAR = "172.30.0.2"
 LAN_RELAY = HostPort(UPLINK.gateway, RANGE.last)
-MADE = CreateLanRelay(lan_relay_name(KEY), KEY, RANGE, HERE, LAN_RELAY, HostPort(NEAR, RANGE.first))
-BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE)
-PROXY = Create(proxy_name(KEY), KEY, RANGE, BOX.name, lan_relay=LAN_RELAY)
+MADE = CreateLanRelay(
+    lan_relay_name(PLACE), PLACE, RANGE, HERE, LAN_RELAY, HostPort(NEAR, RANGE.first)
+)
+BOX = CreateSandbox(sandbox_name(PLACE), PLACE, RANGE)
+PROXY = Create(proxy_name(PLACE), PLACE, RANGE, BOX.name, lan_relay=LAN_RELAY)
 
 
-def own(made: Any, places: tuple[Attachment, ...] = (), mode: str = "host") -> Container:
+def own(made: Any, attachments: tuple[Attachment, ...] = (), mode: str = "host") -> Container:
     return Container(
-        f"id-{made.name}", made.name, "running", own_labels(made), mode, places,
+        f"id-{made.name}", made.name, "running", own_labels(made), mode, attachments,
         started_at="2026-01-01T10:00:00Z",
     )  # fmt: skip
 
@@ -85,16 +87,16 @@ def running_proxy(near: str = NEAR, lan_relay: CreateLanRelay | None = MADE) -> 
     """A running proxy for ROS 2, with a LAN relay."""
     box = structs.replace(BOX, fingerprint=sandbox_fingerprint(BOX, SETTINGS))
     made = proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET)
-    places = (Attachment(SETTINGS.uplink, near), Attachment("app", "172.18.0.9"))
+    attachments = (Attachment(SETTINGS.uplink, near), Attachment("app", "172.18.0.9"))
     lan_relays = []
     if lan_relay is not None:
         lan_relay = structs.replace(
             lan_relay, fingerprint=lan_relay_fingerprint(lan_relay, SETTINGS, IMAGE, SECRET)
         )
-        lan_relays = [LanRelayContainer(KEY, own(lan_relay), RANGE, lan_relay.fingerprint)]
+        lan_relays = [LanRelayContainer(PLACE, own(lan_relay), RANGE, lan_relay.fingerprint)]
     return {
-        "sandboxes": [Sandbox(KEY, own(box, places, "app"), RANGE, box.fingerprint)],
-        "proxies": [Proxy(KEY, own(PROXY, mode=f"container:id-{BOX.name}"), RANGE, made)],
+        "sandboxes": [Sandbox(PLACE, own(box, attachments, "app"), RANGE, box.fingerprint)],
+        "proxies": [Proxy(PLACE, own(PROXY, mode=f"container:id-{BOX.name}"), RANGE, made)],
         "lan_relays": tuple(lan_relays),
     }
 
@@ -132,7 +134,7 @@ def test_the_lan_relay_is_made_once_its_proxy_has_an_address() -> None:
 
 def test_a_proxy_retires_before_its_relay_and_its_sandbox_go() -> None:
     """The relay carries the dispose messages of a proxy that retires."""
-    assert list(removal_steps(observed(**running_proxy()), KEY, "gone")) == [
+    assert list(removal_steps(observed(**running_proxy()), PLACE, "gone")) == [
         Remove(PROXY.name, "gone", retire=True),
         Remove(MADE.name, "gone"),
         Remove(BOX.name, "gone"),
@@ -143,9 +145,9 @@ def test_a_paused_relay_is_resumed_before_its_proxy_retires() -> None:
     parts = running_proxy()
     (lan_relay,) = parts["lan_relays"]
     paused = replace(lan_relay.container, state="paused")
-    parts["lan_relays"] = (LanRelayContainer(KEY, paused, RANGE, lan_relay.fingerprint),)
+    parts["lan_relays"] = (LanRelayContainer(PLACE, paused, RANGE, lan_relay.fingerprint),)
 
-    first, second, *_ = removal_steps(observed(**parts), KEY, "gone")
+    first, second, *_ = removal_steps(observed(**parts), PLACE, "gone")
 
     assert (first, second) == (Unpause(MADE.name), Remove(PROXY.name, "gone", retire=True))
 
@@ -185,13 +187,13 @@ def test_no_lan_no_lan_relay() -> None:
 def test_the_lan_is_where_the_option_says_or_the_advertised_host_or_far_hosts_are() -> None:
     def lan(host: str, option: str, far: str = "") -> list[str]:
         settings = replace(SETTINGS, advertise_host=host, ros2_lan=option)
-        key = Key("", host, 0)
-        box = CreateSandbox(sandbox_name(key), key, RANGE)
+        place = Place(Domain(0), host)
+        box = CreateSandbox(sandbox_name(place), place, RANGE)
         box = structs.replace(box, fingerprint=sandbox_fingerprint(box, settings))
-        place = (Attachment(settings.uplink, NEAR), Attachment("app", "172.18.0.9"))
+        attachments = (Attachment(settings.uplink, NEAR), Attachment("app", "172.18.0.9"))
         state = observed(
             TALKER, default_route_address=far,
-            sandboxes=[Sandbox(key, own(box, place, "app"), RANGE, box.fingerprint)],
+            sandboxes=[Sandbox(place, own(box, attachments, "app"), RANGE, box.fingerprint)],
         )  # fmt: skip
         plan = look(state, settings)
         told = [p.text for p in plan.problems if "has no LAN relay" in p.text]
@@ -225,8 +227,8 @@ def test_both_versions_have_ports_of_their_own() -> None:
     labels = {**TWO, "rosproxy.ros": "1,2", "rosproxy.master-uri": "http://192.0.2.7:11311"}
     boxes = [action for action in actions(observed(container(labels=labels)))
              if isinstance(action, CreateSandbox)]  # fmt: skip
-    assert {(box.key.domain, str(box.range)) for box in boxes} == {
-        (0, "11400-11431"), (None, "11464-11495"),
+    assert {(str(box.place.graph), str(box.range)) for box in boxes} == {
+        ("ROS 2 domain 0", "11400-11431"), ("master http://192.0.2.7:11311", "11464-11495"),
     }  # fmt: skip
 
 
@@ -258,8 +260,8 @@ def test_what_a_proxy_for_ros_2_is_made_of() -> None:
     }
     ports = sandbox_config(BOX, SETTINGS)["HostConfig"]["PortBindings"]
     assert [*ports] == [f"{port}/udp" for port in range(11400, 11431)]
-    assert (proxy_name(KEY), read_own(own_labels(BOX))) == (
-        "rosproxy-domain-0-7ec54e", OwnLabels("ports", KEY, RANGE, ""),
+    assert (proxy_name(PLACE), read_own(own_labels(BOX))) == (
+        "rosproxy-domain-0-7ec54e", OwnLabels("ports", PLACE, RANGE, ""),
     )  # fmt: skip
 
 
@@ -267,10 +269,10 @@ def environment(config: dict[str, Any]) -> dict[str, str]:
     return dict(text.split("=", 1) for text in config["Env"])
 
 
-def secrets_of(secret: str, key: Key = KEY) -> tuple[str, str]:
-    """The secret of a key's proxy, and the secret of the LAN relay."""
-    proxy = container_config(structs.replace(PROXY, key=key), SETTINGS, secret, "")
-    relay = lan_relay_config(structs.replace(MADE, key=key), SETTINGS, secret)
+def secrets_of(secret: str, place: Place = PLACE) -> tuple[str, str]:
+    """The secret of a place's proxy, and the secret of the LAN relay."""
+    proxy = container_config(structs.replace(PROXY, place=place), SETTINGS, secret, "")
+    relay = lan_relay_config(structs.replace(MADE, place=place), SETTINGS, secret)
     proxy_env = environment(proxy)
     relay_env = environment(relay)
     return proxy_env["ROSPROXY_ROS2_LAN_RELAY_SECRET"], relay_env["ROSPROXY_LAN_RELAY_SECRET"]
@@ -282,10 +284,10 @@ def test_a_proxy_and_its_lan_relay_share_a_secret() -> None:
     """
     of_proxy, of_relay = secrets_of(SECRET)
     assert of_proxy == of_relay == secrets_of(SECRET)[0]
-    others = [secrets_of("another"), secrets_of(SECRET, Key("", HERE, 1))]
+    others = [secrets_of("another"), secrets_of(SECRET, Place(Domain(1), HERE))]
     assert len({of_proxy, *(secret for pair in others for secret in pair)}) == 3
     # The secret, visible by inspection of the LAN relay, is no token for the admin endpoint.
-    assert proxy_token(KEY, SECRET) != of_proxy
+    assert proxy_token(PLACE, SECRET) != of_proxy
     without = container_config(structs.replace(PROXY, lan_relay=None), SETTINGS, SECRET, "")
     assert "ROSPROXY_ROS2_LAN_RELAY_SECRET" not in environment(without)
 
@@ -311,23 +313,23 @@ def test_an_lan_relay_has_the_hosts_network_and_no_other_right() -> None:
         "NetworkMode": "host",
     }
     own = read_own(config["Labels"])
-    assert own == OwnLabels("lan-relay", KEY, RANGE, "")
+    assert own == OwnLabels("lan-relay", PLACE, RANGE, "")
     assert not forgery_reason(own, MADE.name, read_making(inspection(config)), IMAGE)
 
 
 def test_one_that_an_operator_before_0_1_0_made_is_known_and_made_anew() -> None:
-    former = f"{proxy_name(KEY)}-ear"
+    former = f"{proxy_name(PLACE)}-ear"
     config = lan_relay_config(MADE, SETTINGS, SECRET)
     labels = {**config["Labels"], ROLE: "ear", FINGERPRINT: "of then"}
     making = inspection({**config, "Cmd": ["ear"]})
     own = read_own(labels)
-    assert own == OwnLabels("lan-relay", KEY, RANGE, "of then")
+    assert own == OwnLabels("lan-relay", PLACE, RANGE, "of then")
     assert not forgery_reason(own, former, read_making(making), IMAGE)
 
     parts = running_proxy()
     (lan_relay,) = parts["lan_relays"]
     there = replace(lan_relay.container, name=former)
-    parts["lan_relays"] = (LanRelayContainer(KEY, there, RANGE, "of then"),)
+    parts["lan_relays"] = (LanRelayContainer(PLACE, there, RANGE, "of then"),)
     steps = actions(observed(TALKER, **parts))
     assert any(isinstance(step, Remove) and step.name.startswith(former) for step in steps)
     assert any(isinstance(step, CreateLanRelay) and step.name == MADE.name for step in steps)
@@ -346,7 +348,7 @@ def test_one_that_an_operator_before_0_1_0_made_is_known_and_made_anew() -> None
 def test_what_gives_a_forged_lan_relay_away(field: str, value: object) -> None:
     making = inspection(lan_relay_config(MADE, SETTINGS, SECRET))
     making["HostConfig"][field] = value
-    own = OwnLabels("lan-relay", KEY, RANGE, "")
+    own = OwnLabels("lan-relay", PLACE, RANGE, "")
     reason = forgery_reason(own, MADE.name, read_making(making), IMAGE)
     assert reason == f"HostConfig.{field} is not the operator's"
 

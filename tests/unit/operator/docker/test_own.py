@@ -19,11 +19,11 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_name,
 )
 from rosproxy_operator.proxy_spec.spec import ProxySpec
-from tests.unit.operator.docker.builders import IMAGE, KEY, SECRET, SETTINGS, inspection
+from tests.unit.operator.docker.builders import IMAGE, PLACE, SECRET, SETTINGS, inspection
 
 PORTS = PortRange(11400, 11401)
-BOX = CreateSandbox(sandbox_name(KEY), KEY, PORTS)
-PROCESS = Create(proxy_name(KEY), KEY, PORTS, "id-of-the-sandbox")
+BOX = CreateSandbox(sandbox_name(PLACE), PLACE, PORTS)
+PROCESS = Create(proxy_name(PLACE), PLACE, PORTS, "id-of-the-sandbox")
 MADE = {
     "sandbox": inspection(sandbox_config(BOX, SETTINGS)),
     "proxy": inspection(container_config(PROCESS, SETTINGS, SECRET, "")),

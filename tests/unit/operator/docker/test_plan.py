@@ -21,7 +21,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.model import HostState, Key, Network, Proxy
+from rosproxy_operator.docker.planner.model import HostState, Network, Proxy
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     proxy_fingerprint,
@@ -31,30 +31,31 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Master, Place
 from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,
     HERE,
     IMAGE,
-    KEY,
+    PLACE,
     RANGE,
     SECRET,
     SETTINGS,
     UPLINK,
+    attachment,
     both,
     container,
     observed,
-    place,
     planned,
     proxy,
     sandbox,
 )
 
-NAME = proxy_name(KEY)
-PORTS = sandbox_name(KEY)
+NAME = proxy_name(PLACE)
+PORTS = sandbox_name(PLACE)
 ALIASES = ("robot", "rosproxy", NAME)
-ARM = Key("http://arm:11311", HERE)
-ON_ARM = {**ENABLED, "rosproxy.master-uri": ARM.master_uri}
+ARM = Place(Master("http://arm:11311"), HERE)
+ON_ARM = {**ENABLED, "rosproxy.master-uri": ARM.master.uri}
 LAB = Network("n2", "lab")
 NEXT = PortRange(11432, 11463)
 WITH_ROOM = PortRange(11464, 11495)
@@ -65,14 +66,14 @@ ASKS_FOR_40 = {**ENABLED, "rosproxy.ports": "40"}
 
 
 def new_sandbox(ports: PortRange = RANGE, name: str = PORTS) -> CreateSandbox:
-    made = CreateSandbox(name, KEY, ports)
+    made = CreateSandbox(name, PLACE, ports)
     return structs.replace(made, fingerprint=sandbox_fingerprint(made, SETTINGS))
 
 
 def new_proxy(
     ports: PortRange = RANGE, replaces: str = "", image: str = IMAGE, home: str = PORTS
 ) -> Create:
-    made = Create(NAME, KEY, ports, home, replaces=replaces)
+    made = Create(NAME, PLACE, ports, home, replaces=replaces)
     return structs.replace(made, fingerprint=proxy_fingerprint(made, SETTINGS, image, SECRET))
 
 
@@ -110,7 +111,7 @@ ANEW = [
 def test_the_first_container_on_a_host() -> None:
     plan = look(observed(container(), networks=[APP]))
     assert list(plan.actions) == [CreateNetwork("0-rosproxy"), *FIRST]
-    assert [group.key for group in plan.groups] == [None, KEY]
+    assert [group.place for group in plan.groups] == [None, PLACE]
     assert (plan.problems, plan.again_in) == ((), None)
 
 
@@ -170,16 +171,21 @@ def test_the_last_one_leaves() -> None:
 
 def test_the_uplink_is_joined_again() -> None:
     bare = sandbox()
-    bare = replace(bare, container=replace(bare.container, attachments=(place("app", *ALIASES),)))
+    bare = replace(
+        bare, container=replace(bare.container, attachments=(attachment("app", *ALIASES),))
+    )
     seen = observed(container(), networks=[APP], sandboxes=[bare], proxies=[proxy()])
     assert actions(seen) == [CreateNetwork("0-rosproxy"), Connect(PORTS, "0-rosproxy", ())]
 
 
 def test_a_missing_name_that_somebody_looks_for() -> None:
-    existing: Any = {"sandboxes": [sandbox(networks=[place("app", "robot")])], "proxies": [proxy()]}
+    existing: Any = {
+        "sandboxes": [sandbox(networks=[attachment("app", "robot")])],
+        "proxies": [proxy()],
+    }
     again = [Disconnect(PORTS, "app"), Connect(PORTS, "app", ALIASES)]
     assert actions(observed(container(), **existing)) == again
-    assert actions(observed(container(env=KEY.master_uri), **existing)) == []
+    assert actions(observed(container(env=PLACE.master.uri), **existing)) == []
 
 
 def test_a_name_that_another_one_has_now_is_not_taken_again() -> None:
@@ -205,7 +211,7 @@ def test_a_sandbox_that_has_stopped_is_started_without_networks() -> None:
 
 @pytest.mark.parametrize("network_id", ["other", "n1"])
 def test_a_sandbox_on_a_network_that_was_made_anew_is_made_anew(network_id: str) -> None:
-    stopped = sandbox(networks=[place("app", network_id=network_id)], state="exited")
+    stopped = sandbox(networks=[attachment("app", network_id=network_id)], state="exited")
     seen = observed(container(), sandboxes=[stopped])
     anew = [
         Rename(PORTS, f"{PORTS}-old"),
@@ -443,8 +449,8 @@ def created(plan: DockerPlan) -> PortRange:
     return next(iter(ranges(plan).values()))
 
 
-def ranges(plan: DockerPlan) -> dict[Key, PortRange]:
-    return {a.key: a.range for a in plan.actions if isinstance(a, CreateSandbox)}
+def ranges(plan: DockerPlan) -> dict[Place, PortRange]:
+    return {a.place: a.range for a in plan.actions if isinstance(a, CreateSandbox)}
 
 
 @pytest.mark.parametrize(
@@ -456,7 +462,7 @@ def ranges(plan: DockerPlan) -> dict[Key, PortRange]:
         (observed(container(), container("web", {}, state="exited", ports=[11431])), 11432),
         (observed(container(), listening=[11400, 11410]), 11411),
         (observed(container(), ephemeral=PortRange(10000, 20000)), 20001),
-        (observed(container(), **both(key=ARM)), WITH_ROOM.first),
+        (observed(container(), **both(place=ARM)), WITH_ROOM.first),
         (observed(container(), sandboxes=[sandbox(ARM, state="created")]), WITH_ROOM.first),
     ],
 )
@@ -472,10 +478,10 @@ def test_ports_on_which_the_proxy_itself_listens_are_not_in_its_range() -> None:
 def test_two_new_proxies_do_not_get_the_same_ports() -> None:
     """A proxy keeps its promised ports while its container is being created."""
     plan = look(observed(container(), container("b", ON_ARM)))
-    assert ranges(plan) == {ARM: RANGE, KEY: WITH_ROOM}
+    assert ranges(plan) == {ARM: RANGE, PLACE: WITH_ROOM}
     memory = look(observed(container())).memory
     plan = look(observed(container(), container("a", ON_ARM)), memory=memory)
-    assert ranges(plan) == {ARM: WITH_ROOM, KEY: RANGE}
+    assert ranges(plan) == {ARM: WITH_ROOM, PLACE: RANGE}
 
 
 def test_a_sandbox_that_the_engine_is_just_starting_keeps_its_ports() -> None:
@@ -509,8 +515,8 @@ def test_a_stopped_sandbox_tells_more_than_memory_only_if_it_has_more_ports() ->
         (PortRange(11500, 11531), RANGE),
     ):
         seen = observed(container(), sandboxes=[sandbox(ports=ports, state="exited")])
-        plan = look(seen, memory=DockerMemory(served={KEY: RANGE}))
-        assert plan.memory.planned == {KEY: expected}
+        plan = look(seen, memory=DockerMemory(served={PLACE: RANGE}))
+        assert plan.memory.planned == {PLACE: expected}
 
 
 def test_never_fewer_ports() -> None:
@@ -536,7 +542,7 @@ def test_more_ports_that_lie_in_the_kernels_range() -> None:
 
 
 def test_more_ports_where_the_next_proxy_begins() -> None:
-    neighbour: Any = both(key=ARM, ports=NEXT)
+    neighbour: Any = both(place=ARM, ports=NEXT)
     own: Any = both()
     seen = observed(
         container(labels=ASKS_FOR_40),
@@ -611,7 +617,7 @@ def test_ports_that_have_served_are_tried_for_a_while(port: int | None) -> None:
     last = refused(seen, port, then.memory, 120.0)
     assert created(last) == (PortRange(11411, 11442) if port else NEXT)
     assert f"has left ports 11400-11431 for {created(last)}" in port_problem(last)
-    assert last.memory.moved == {KEY: Move(RANGE, 120.0)}
+    assert last.memory.moved == {PLACE: Move(RANGE, 120.0)}
     assert last.memory.served == {}
 
 
@@ -636,15 +642,15 @@ def test_a_start_that_went_well_is_the_end_of_it() -> None:
     memory = DockerMemory().with_refusal(PORTS, None, 0.0)
     plan = look(observed(container(), **both()), memory=memory, now=30.0)
     assert (plan.actions, plan.again_in) == ((), None)
-    expected = DockerMemory(served={KEY: RANGE}, planned={KEY: RANGE}, names=plan.memory.names)
+    expected = DockerMemory(served={PLACE: RANGE}, planned={PLACE: RANGE}, names=plan.memory.names)
     assert plan.memory == expected
 
 
 # all together
 
 
-def test_problems_of_one_key_do_not_touch_another() -> None:
-    arm: Any = both(key=ARM, ports=NEXT)
+def test_problems_of_one_place_do_not_touch_another() -> None:
+    arm: Any = both(place=ARM, ports=NEXT)
     alone = look(observed(container("b", ON_ARM), **arm), settings=SETTINGS)
     for bad in (
         container("a", networks=("bridge",)),
@@ -654,23 +660,23 @@ def test_problems_of_one_key_do_not_touch_another() -> None:
     ):
         settings = replace(SETTINGS, port_window=PortRange(11400, 11463))
         plan = look(observed(bad, container("b", ON_ARM), **arm), settings=settings)
-        assert [group for group in plan.groups if group.key == ARM] == list(alone.groups)
+        assert [group for group in plan.groups if group.place == ARM] == list(alone.groups)
 
 
 def test_what_lets_names_go_comes_first() -> None:
-    """Another key may need the name next."""
+    """Another proxy may need the name next."""
     seen = observed(
         container(),
         networks=[UPLINK, APP],
-        sandboxes=[sandbox(Key("http://zoo:11311", HERE), ports=NEXT)],
+        sandboxes=[sandbox(Place(Master("http://zoo:11311"), HERE), ports=NEXT)],
     )
     plan = look(seen)
     assert isinstance(plan.actions[0], Disconnect)
     assert Connect(PORTS, "app", ALIASES) in plan.actions
 
 
-def test_nothing_is_done_for_a_key_while_one_of_its_containers_is_busy() -> None:
-    name = sandbox_name(KEY)
+def test_nothing_is_done_for_a_place_while_one_of_its_containers_is_busy() -> None:
+    name = sandbox_name(PLACE)
     idle = look(observed(container(), sandboxes=[sandbox(state="exited")]))
     assert idle.actions
     busy = look(observed(container(), sandboxes=[sandbox(state="exited")], busy={name}))

@@ -22,10 +22,11 @@ from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.docker import proxy_sync
 from rosproxy_operator.docker.planner.labels.members import LabelReading
-from rosproxy_operator.docker.planner.model import ZENOH, Attachment, Member
+from rosproxy_operator.docker.planner.model import Attachment, Member
 from rosproxy_operator.docker.proxy_sync import DockerProxySync, silent_proxy_problem
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
-from tests.unit.operator.docker.builders import KEY, RANGE, SETTINGS, both, container, observed
+from rosproxy_operator.proxy_spec.place import ZENOH
+from tests.unit.operator.docker.builders import PLACE, RANGE, SETTINGS, both, container, observed
 
 WHERE = HostPort("172.30.0.2", 11312)
 PREFIX = "01.0f.45.d1.3c.00.a7.12.00.00.00.00"
@@ -115,7 +116,7 @@ def look(
     state = observed(*nodes, **own)
     name = state.proxies[0].container.name
     seen = DockerSnapshot(state, LabelReading(), {name: access}, at_host=True)
-    return seen, [Member(node, KEY, policy=parse_rules(policy)) for node in nodes]
+    return seen, [Member(node, PLACE, policy=parse_rules(policy)) for node in nodes]
 
 
 async def test_who_may_use_it_is_told_though_the_proxy_is_busy_with_all_else(tasks: Tasks) -> None:
@@ -144,8 +145,8 @@ async def test_a_proxy_for_rmw_zenoh_is_not_told_who_may_use_it(tasks: Tasks) ->
     sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
     seen, members = look("172.18.0.5")
     (proxy,) = seen.state.proxies
-    seen = replace(seen, state=replace(seen.state, proxies=(replace(proxy, key=ZENOH),)))
-    sync.update(seen, [replace(member, key=ZENOH) for member in members])
+    seen = replace(seen, state=replace(seen.state, proxies=(replace(proxy, place=ZENOH),)))
+    sync.update(seen, [replace(member, place=ZENOH) for member in members])
     while not sync.answers(proxy.container.name):
         await asyncio.sleep(0)
     assert (proxies.calls, proxies.told, proxies.bodies) == ([[]], [], [])

@@ -8,7 +8,6 @@ from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
     HostState,
-    Key,
     Member,
     Network,
     Proxy,
@@ -20,8 +19,9 @@ from rosproxy_operator.docker.planner.proxy_update import (
     ProxyUpdate,
     network_facts,
 )
+from rosproxy_operator.proxy_spec.place import Master, Place
 
-KEY = Key("http://robot:11311", "192.0.2.10")
+PLACE = Place(Master("http://robot:11311"), "192.0.2.10")
 PORTS = PortRange(11400, 11431)
 SUBNET = IPv4Network("172.18.0.0/16")
 
@@ -47,9 +47,9 @@ def look(*containers: Container) -> HostState:
     return HostState(
         containers,
         networks,
-        (Proxy(KEY, process, PORTS, ""),),
+        (Proxy(PLACE, process, PORTS, ""),),
         PORTS,
-        sandboxes=(Sandbox(KEY, home, PORTS, ""),),
+        sandboxes=(Sandbox(PLACE, home, PORTS, ""),),
         addresses=frozenset({"172.18.0.5", "172.18.0.2", "172.30.0.2"}),
     )
 
@@ -59,7 +59,7 @@ def told(seen: HostState, *members: Member) -> NetworkFacts:
 
 
 def member(container: Container) -> Member:
-    return Member(container, KEY)
+    return Member(container, PLACE)
 
 
 def test_a_running_container_has_arrived_under_all_its_names() -> None:
@@ -70,7 +70,7 @@ def test_a_running_container_has_arrived_under_all_its_names() -> None:
 
 
 def test_only_those_that_run_and_want_this_proxy_arrive() -> None:
-    other = Member(talker(), Key("http://other:11311", "192.0.2.10"))
+    other = Member(talker(), Place(Master("http://other:11311"), "192.0.2.10"))
     exited = talker(state="exited")
     assert not told(look(talker()), other).arrivals
     assert not told(look(exited), member(exited)).arrivals
@@ -95,8 +95,8 @@ def test_a_container_in_anothers_network_arrives_at_its_address() -> None:
 def test_the_masters_address_is_only_told_for_a_name() -> None:
     assert told(look()).master_address == "198.51.100.7"
     seen = replace(look(), masters={"198.51.100.8": "198.51.100.8"})
-    key = Key("http://198.51.100.8:11311", "192.0.2.10")
-    process = replace(seen.proxies[0], key=key)
+    place = Place(Master("http://198.51.100.8:11311"), "192.0.2.10")
+    process = replace(seen.proxies[0], place=place)
     assert network_facts(seen, process, ()).master_address == ""
 
 
@@ -111,7 +111,7 @@ def test_selected_are_all_that_may_use_it_on_its_networks() -> None:
     others = Container("o" * 20, "others", "running", attachments=(at("172.18.0.11"),))
     seen = look(talker(), starting, ended, pod, guest, away, plain, others)
     members = [member(container) for container in (talker(), starting, ended, guest, away)]
-    facts = told(seen, *members, Member(others, Key("http://other:11311", "192.0.2.10")))
+    facts = told(seen, *members, Member(others, Place(Master("http://other:11311"), "192.0.2.10")))
     assert facts.selected == {"172.18.0.5", "172.18.0.7", "172.18.0.9"}
 
 
@@ -139,7 +139,7 @@ HERE, AWAY, THERE, NOBODY = (
 )
 
 
-def places(*looks: tuple[float, NetworkFacts]) -> AddressHistory:
+def history_of(*looks: tuple[float, NetworkFacts]) -> AddressHistory:
     history = AddressHistory()
     for when, facts in looks:
         history.record(facts, when)
@@ -147,7 +147,7 @@ def places(*looks: tuple[float, NetworkFacts]) -> AddressHistory:
 
 
 def test_a_container_with_another_address_has_moved_until_its_proxy_knows() -> None:
-    history = places((0.0, HERE), (1.0, THERE))
+    history = history_of((0.0, HERE), (1.0, THERE))
     assert history.moved({OLD}) == {OLD: NEW}
     assert history.moved({NEW}) == {}
     assert history.reserved_addresses == {OLD}
@@ -155,14 +155,14 @@ def test_a_container_with_another_address_has_moved_until_its_proxy_knows() -> N
 
 
 def test_a_move_is_given_up_in_the_end() -> None:
-    history = places((0.0, HERE), (1.0, THERE), (6.0, THERE))
+    history = history_of((0.0, HERE), (1.0, THERE), (6.0, THERE))
     assert not history.moved({OLD})
     assert not history.reserved_addresses
     assert history.next_expiry is None
 
 
 def test_a_container_off_the_network_for_a_moment_may_come_back_elsewhere() -> None:
-    history = places((0.0, HERE), (1.0, AWAY))
+    history = history_of((0.0, HERE), (1.0, AWAY))
     assert not history.moved({OLD})
     assert history.reserved_addresses == {OLD}
     assert history.next_expiry == 3.0
@@ -171,18 +171,18 @@ def test_a_container_off_the_network_for_a_moment_may_come_back_elsewhere() -> N
 
 
 def test_a_container_that_stays_away_is_gone() -> None:
-    assert places((0.0, HERE), (1.0, AWAY), (3.0, AWAY)).reserved_addresses == frozenset()
+    assert history_of((0.0, HERE), (1.0, AWAY), (3.0, AWAY)).reserved_addresses == frozenset()
 
 
 def test_a_container_that_does_not_run_is_gone_at_once() -> None:
-    history = places((0.0, HERE), (1.0, NOBODY))
+    history = history_of((0.0, HERE), (1.0, NOBODY))
     assert not history.reserved_addresses
     assert history.next_expiry is None
 
 
 def test_an_address_that_another_container_has_now_is_not_told_as_moved() -> None:
     other = Container("o", "other", "running", attachments=(at(OLD),))
-    history = places((0.0, HERE), (1.0, told(look(talker(NEW), other))))
+    history = history_of((0.0, HERE), (1.0, told(look(talker(NEW), other))))
     assert history.moved({OLD}) == {}
 
 
@@ -191,7 +191,7 @@ def test_container_that_changes_networks_takes_its_nodes_along() -> None:
     between = NetworkFacts(running=frozenset("t"))
     after = NetworkFacts(addresses={("t", "other"): "172.19.0.9"}, running=frozenset("t"))
 
-    history = places((0.0, before), (0.1, between), (1.0, after))
+    history = history_of((0.0, before), (0.1, between), (1.0, after))
 
     assert history.moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
     assert history.reserved_addresses == {"172.18.0.5"}
@@ -205,7 +205,9 @@ def test_container_that_leaves_one_of_two_networks_is_found_on_the_other() -> No
     both = NetworkFacts(addresses={app: "172.18.0.5", other: "172.19.0.9"}, running=frozenset("t"))
     after = replace(both, addresses={other: "172.19.0.9"})
 
-    assert places((0.0, both), (0.1, after)).moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
+    assert history_of((0.0, both), (0.1, after)).moved({"172.18.0.5"}) == {
+        "172.18.0.5": "172.19.0.9"
+    }
 
 
 def test_an_arrival_is_told_again_until_its_nodes_had_time_to_register() -> None:

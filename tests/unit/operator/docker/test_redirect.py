@@ -14,7 +14,6 @@ from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
     HostState,
-    Key,
     Proxy,
     RedirectContainer,
     Sandbox,
@@ -26,6 +25,7 @@ from rosproxy_operator.docker.planner.redirect import redirect_config
 from rosproxy_operator.docker.planner.specs import own_labels, proxy_name, read_own
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Master, Place
 from tests.unit.operator.docker.builders import (
     APP,
     HERE,
@@ -45,7 +45,7 @@ from tests.unit.operator.docker.invariants import SETTINGS as FEW
 
 ADDRESS = "192.0.2.7"
 MASTER = f"http://{ADDRESS}:11311"
-KEY = Key(MASTER, HERE)
+PLACE = Place(Master(MASTER), HERE)
 LABELS = {"rosproxy.enable": "true"}
 NEAR = "172.18.0.9"
 OFF = replace(SETTINGS, redirect=False)
@@ -54,20 +54,21 @@ OFF = replace(SETTINGS, redirect=False)
 def node(name: str = "talker", env: str = MASTER, mode: str = "", **labels: str) -> Container:
     more = {f"rosproxy.{label.replace('_', '-')}": text for label, text in labels.items()}
     made = container(name, {**LABELS, **more}, env=env, mode=mode, networks=() if mode else ["app"])
-    places = (Attachment("app", "172.18.0.3", frozenset({name})),)
-    return replace(made, attachments=() if mode else places, started_at="2026-01-01T09:00:00Z")
+    attachments = (Attachment("app", "172.18.0.3", frozenset({name})),)
+    return replace(made, attachments=() if mode else attachments, started_at="2026-01-01T09:00:00Z")
 
 
-def nodes_proxy(near: str = NEAR, proxy: str = "running", key: Key = KEY) -> dict[str, Any]:
+def nodes_proxy(near: str = NEAR, proxy: str = "running", place: Place = PLACE) -> dict[str, Any]:
     """The nodes' proxy, with an address on the same network."""
-    pair = both(key=key)
+    pair = both(place=place)
     (box,) = pair["sandboxes"]
     (process,) = pair["proxies"]
-    places = [replace(p, address=near if p.network == "app" else "") for p in
-              box.container.attachments]  # fmt: skip
-    box = Sandbox(key, replace(box.container, attachments=tuple(places)), box.range,
+    attachments = [
+        replace(a, address=near if a.network == "app" else "") for a in box.container.attachments
+    ]
+    box = Sandbox(place, replace(box.container, attachments=tuple(attachments)), box.range,
                   box.fingerprint)  # fmt: skip
-    process = Proxy(key, replace(process.container, state=proxy), process.range,
+    process = Proxy(place, replace(process.container, state=proxy), process.range,
                     process.fingerprint)  # fmt: skip
     return {"sandboxes": [box], "proxies": [process]}
 
@@ -94,7 +95,7 @@ def record(made: CreateRedirect, state: str = "exited", code: int = 0) -> Redire
         f"id-{made.name}", made.name, state, own_labels(made), f"container:{made.target}",
         exit_code=code,
     )  # fmt: skip
-    return RedirectContainer(made.key, own, made.range, made.fingerprint)
+    return RedirectContainer(made.place, own, made.range, made.fingerprint)
 
 
 def test_it_is_set_once_where_the_proxy_is_met() -> None:
@@ -150,7 +151,7 @@ def test_it_is_not_set_without_a_proxy_and_stays_while_that_is_away() -> None:
 def test_where_it_can_not_be_set_a_name_is_the_fix() -> None:
     state = observed(node(), **nodes_proxy())
     (group,) = (g for g in look(state).groups if g.subject == "container talker")
-    assert group.fix.endswith(f"set ROS_MASTER_URI=http://{proxy_name(KEY)}:11311 and the label "
+    assert group.fix.endswith(f"set ROS_MASTER_URI=http://{proxy_name(PLACE)}:11311 and the label "
                                f"rosproxy.master-uri={MASTER}")  # fmt: skip
     made = wanted(state)
     (undo,) = (
@@ -212,9 +213,9 @@ def test_containers_that_share_a_network_have_it_once() -> None:
 @pytest.mark.parametrize("address", [ADDRESS, "192.0.2.8"])
 def test_a_masters_name_may_be_known_by_an_address(address: str) -> None:
     """Also by a former address of the master: the nodes keep the variable."""
-    by_name = Key("http://robot:11311", HERE)
+    by_name = Place(Master("http://robot:11311"), HERE)
     talker = node(master_uri="http://robot:11311")
-    state = observed(talker, **nodes_proxy(key=by_name), masters={"robot": address})
+    state = observed(talker, **nodes_proxy(place=by_name), masters={"robot": address})
     assert [*map(str, wanted(state).addresses)] == [f"{ADDRESS}:11311"]
 
 

@@ -25,7 +25,7 @@ from rosproxy_operator.docker.planner.actions import (
 )
 from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.settings import PlanSettings
-from tests.unit.operator.docker.builders import KEY, RANGE
+from tests.unit.operator.docker.builders import PLACE, RANGE
 
 PROXY: dict[str, Any] = {
     "name": "rosproxy-robot-eefee4",
@@ -82,12 +82,12 @@ STATUS = {
 ACTIONS: list[tuple[Action, str]] = [
     (CreateNetwork("0-rosproxy"), "create network 0-rosproxy, a bridge: the uplink of all proxies"),
     (
-        CreateSandbox("p-ports", KEY, RANGE),
+        CreateSandbox("p-ports", PLACE, RANGE),
         "create container p-ports: sandbox with ports 11400-11431 for the proxy of the master "
         "http://robot:11311",
     ),
     (
-        Create("p", KEY, RANGE, "p-ports", replaces="p-old"),
+        Create("p", PLACE, RANGE, "p-ports", replaces="p-old"),
         "create container p: proxy of the master http://robot:11311 at 192.0.2.10, ports "
         "11400-11431 of p-ports, instead of p-old",
     ),

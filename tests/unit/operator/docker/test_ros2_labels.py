@@ -11,11 +11,12 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.ros2_variables import ROS2_VARIABLES
 from rosproxy_operator.docker.option_values import read_host_pattern
 from rosproxy_operator.docker.planner.labels.members import master_hosts, read_labels
-from rosproxy_operator.docker.planner.model import Container, Key, Member, Network
+from rosproxy_operator.docker.planner.model import Container, Member, Network
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Domain, Place
 from tests.unit.operator.docker.builders import (
     HERE,
-    KEY,
+    PLACE,
     ROBOT,
     SETTINGS,
     UPLINK,
@@ -26,7 +27,7 @@ from tests.unit.operator.docker.builders import (
 
 ON = {"rosproxy.enable": "true"}
 TWO = {**ON, "rosproxy.ros": "2"}
-DOMAIN = Key("", HERE, 0)
+DOMAIN = Place(Domain(0), HERE)
 STATIC_PEERS = "ROS_STATIC_PEERS"
 
 
@@ -46,8 +47,8 @@ def read(
     return list(members), [problem.text for problem in problems]
 
 
-def keys(container: Container, settings: PlanSettings = SETTINGS) -> list[Key]:
-    return [member.key for member in read(container, settings)[0]]
+def places(container: Container, settings: PlanSettings = SETTINGS) -> list[Place]:
+    return [member.place for member in read(container, settings)[0]]
 
 
 def refusal(container: Container, settings: PlanSettings = SETTINGS) -> str:
@@ -73,20 +74,20 @@ def test_its_variables_say_that_it_is_of_ros_2(variables: Mapping[str, str]) -> 
     "variables", [{"ROS_VERSION": "1"}, {"ROS_DISTRO": "noetic"}, {"ROS_DISTRO": "Melodic"}]
 )
 def test_its_variables_say_that_it_is_of_ros_1(variables: Mapping[str, str]) -> None:
-    assert keys(labelled_container({**ON, "rosproxy.master-uri": ROBOT}, variables)) == [KEY]
+    assert places(labelled_container({**ON, "rosproxy.master-uri": ROBOT}, variables)) == [PLACE]
 
 
 def test_the_label_says_it_whatever_the_variables_say() -> None:
-    assert keys(labelled_container({**ON, "rosproxy.ros": "1", "rosproxy.master-uri": ROBOT},
-                                   {"ROS_VERSION": "2"})) == [KEY]  # fmt: skip
-    assert keys(labelled_container(TWO, {"ROS_DISTRO": "noetic"})) == [DOMAIN]
+    labels = {**ON, "rosproxy.ros": "1", "rosproxy.master-uri": ROBOT}
+    assert places(labelled_container(labels, {"ROS_VERSION": "2"})) == [PLACE]
+    assert places(labelled_container(TWO, {"ROS_DISTRO": "noetic"})) == [DOMAIN]
     assert "is none of 1, 2 and 1,2" in refusal(labelled_container({**ON, "rosproxy.ros": "foxy"}))
 
 
 def test_a_container_with_both_versions_gets_both() -> None:
     labels = {**ON, "rosproxy.ros": "1,2", "rosproxy.master-uri": ROBOT, "rosproxy.ports": "40"}
     members, told = read(labelled_container(labels, env=ROBOT))
-    assert [(member.key, member.ports) for member in members] == [(KEY, 40), (DOMAIN, 40)]
+    assert [(member.place, member.ports) for member in members] == [(PLACE, 40), (DOMAIN, 40)]
     assert not told
     state = observed(labelled_container(labels))
     assert master_hosts(read_labels(state, SETTINGS), state) == ("robot",)
@@ -95,7 +96,7 @@ def test_a_container_with_both_versions_gets_both() -> None:
 def test_where_nothing_says_it_ros_1_is_assumed_and_told() -> None:
     settings = replace(SETTINGS, master_uri=ROBOT)
     members, told = read(labelled_container(), settings)
-    assert [member.key for member in members] == [KEY]
+    assert [member.place for member in members] == [PLACE]
     assert told == [
         "no label and no variable states the ROS version, so the operator assumes ROS 1. Add the "
         "label rosproxy.ros=1 or rosproxy.ros=2"
@@ -116,16 +117,16 @@ def test_an_unusable_variable_states_no_version(variables: Mapping[str, str]) ->
     members, told = read(
         labelled_container(variables=variables), replace(SETTINGS, master_uri=ROBOT)
     )
-    assert [member.key for member in members] == [KEY]
+    assert [member.place for member in members] == [PLACE]
     assert ["assumes ROS 1" in text for text in told] == [True]
 
 
 @pytest.mark.parametrize("name", sorted(ROS2_VARIABLES))
 def test_a_variable_of_ros_2_alone_says_it(name: str) -> None:
     variables = {name: "localhost"} if name == STATIC_PEERS else {name: "7"}
-    assert keys(labelled_container(variables=variables))[0].is_ros2
+    assert places(labelled_container(variables=variables))[0].graph.ros == "2"
     assert read(labelled_container(variables=variables))[1] == []
-    assert keys(labelled_container(variables=variables, env=ROBOT)) == [KEY]
+    assert places(labelled_container(variables=variables, env=ROBOT)) == [PLACE]
 
 
 @pytest.mark.parametrize(
@@ -133,7 +134,7 @@ def test_a_variable_of_ros_2_alone_says_it(name: str) -> None:
 )
 def test_a_label_for_ros_2_alone_says_it(labels: Mapping[str, str]) -> None:
     members, told = read(labelled_container({**ON, **labels}))
-    assert [member.key for member in members] == [DOMAIN]
+    assert [member.place for member in members] == [DOMAIN]
     assert not told
 
 
@@ -146,11 +147,11 @@ def test_where_nothing_says_it_and_no_master_is_known_both_ways_are_told() -> No
 
 def test_the_domain_is_that_of_the_label_or_the_variable() -> None:
     variables = {"ROS_DISTRO": "jazzy", "ROS_DOMAIN_ID": "7"}
-    assert keys(labelled_container(ON, variables)) == [Key("", HERE, 7)]
-    assert keys(labelled_container({**ON, "rosproxy.domain": "42"}, variables)) == [
-        Key("", HERE, 42)
+    assert places(labelled_container(ON, variables)) == [Place(Domain(7), HERE)]
+    assert places(labelled_container({**ON, "rosproxy.domain": "42"}, variables)) == [
+        Place(Domain(42), HERE)
     ]
-    assert keys(labelled_container(ON, {"ROS_DISTRO": "jazzy", "ROS_DOMAIN_ID": ""})) == [DOMAIN]
+    assert places(labelled_container(ON, {"ROS_DISTRO": "jazzy", "ROS_DOMAIN_ID": ""})) == [DOMAIN]
     text = refusal(labelled_container({**TWO, "rosproxy.domain": "233"}))
     assert text.startswith("label rosproxy.domain='233' is not a domain from 0 to 232")
     assert "variable ROS_DOMAIN_ID='x'" in refusal(labelled_container(TWO, {"ROS_DOMAIN_ID": "x"}))
@@ -250,14 +251,14 @@ def test_on_an_internal_network_it_reaches_outside_through_the_proxy() -> None:
 def test_it_is_exposed_by_default_as_it_is_by_its_variables() -> None:
     settings = replace(SETTINGS, expose_by_default=True)
     bare = replace(container(labels={}), variables={"ROS_DISTRO": "jazzy"})
-    assert keys(bare, settings) == [DOMAIN]
-    assert keys(bare) == []
+    assert places(bare, settings) == [DOMAIN]
+    assert places(bare) == []
 
 
 def test_the_advertised_host_is_the_address_for_far_hosts() -> None:
     settings = replace(SETTINGS, advertise_host=None)
     members, told = read(labelled_container(TWO), settings, default_route_address=HERE)
-    assert ([member.key for member in members], told) == ([DOMAIN], [])
+    assert ([member.place for member in members], told) == ([DOMAIN], [])
     members, told = read(labelled_container(TWO), settings)
     assert not members
     assert told[0].startswith(

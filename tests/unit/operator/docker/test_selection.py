@@ -5,14 +5,14 @@ from hypothesis import strategies as st
 
 from rosproxy_operator.docker.planner.duplicates import IDLE, free_name, select
 from rosproxy_operator.docker.planner.model import SERVING, Proxy
-from tests.unit.operator.docker.builders import KEY, RANGE, container
+from tests.unit.operator.docker.builders import PLACE, RANGE, container
 
 STATES = ["running", "paused", "restarting", "created", "exited", "dead", "removing"]
 SOME = st.lists(st.tuples(st.sampled_from(STATES), st.booleans()), max_size=4)
 
 
 def own(name: str, state: str = "running") -> Proxy:
-    return Proxy(KEY, container(name, state=state), RANGE, "")
+    return Proxy(PLACE, container(name, state=state), RANGE, "")
 
 
 @given(SOME, st.booleans())

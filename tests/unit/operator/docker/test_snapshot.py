@@ -24,12 +24,12 @@ from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
     HostState,
-    Key,
     LanRelayContainer,
     Network,
     Sandbox,
 )
 from rosproxy_operator.docker.snapshot import DockerObserver, address_in, foreign_ports
+from rosproxy_operator.proxy_spec.place import Domain, Master, Place
 from tests.unit.operator.docker import captured
 from tests.unit.operator.docker.builders import SETTINGS, observed, read_members
 from tests.unit.operator.docker.conftest import FakeEngine
@@ -49,9 +49,13 @@ def test_a_running_container() -> None:
     assert talker.master_uri == "http://robot:11311"
     assert talker.host_ports == {18080, 18000, 18001, 18002}
     assert talker.started_at == "2026-11-21T10:27:24.131326951Z"
-    (place,) = talker.attachments
-    assert (place.network, place.address, place.network_id) == ("app", "172.29.0.2", APP.id)
-    assert place.names == {"talker", "45afed2aea6c", "web", "bhost"}
+    (attachment,) = talker.attachments
+    assert (attachment.network, attachment.address, attachment.network_id) == (
+        "app",
+        "172.29.0.2",
+        APP.id,
+    )
+    assert attachment.names == {"talker", "45afed2aea6c", "web", "bhost"}
 
 
 def test_a_created_container_on_the_default_network() -> None:
@@ -159,25 +163,25 @@ def test_the_signature_changes_with_each_connection() -> None:
 
 
 def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
-    key = Key("http://robot:11311", "192.0.2.10")
+    place = Place(Master("http://robot:11311"), "192.0.2.10")
     ports = PortRange(11400, 11401)
-    box = Sandbox(key, Container("1", "box", "created"), ports, "")
+    box = Sandbox(place, Container("1", "box", "created"), ports, "")
     listening = frozenset({22, 11400, 11401})
     assert foreign_ports([box], [], listening) == {22}
     assert foreign_ports([], [], listening) == listening
 
 
 def test_the_port_of_an_lan_relay_is_no_strangers() -> None:
-    key = Key("", "192.0.2.10", 0)
+    place = Place(Domain(0), "192.0.2.10")
     ports = PortRange(11400, 11431)
-    lan_relay = LanRelayContainer(key, Container("1", "lan-relay", "running"), ports, "")
+    lan_relay = LanRelayContainer(place, Container("1", "lan-relay", "running"), ports, "")
     assert foreign_ports([], [lan_relay], frozenset({11400, 11431})) == {11400}
 
 
 def test_the_engine_knows_names_that_no_name_server_has() -> None:
     uplink = Network("n0", "0-rosproxy", gateway="172.30.0.1")
-    places = (Attachment("app", "172.18.0.5", frozenset({"RosCore"})),)
-    core = Container("1", "core", "running", attachments=places)
+    attachments = (Attachment("app", "172.18.0.5", frozenset({"RosCore"})),)
+    core = Container("1", "core", "running", attachments=attachments)
     state = HostState((core,), (uplink,), (), PortRange(1, 2))
     assert address_in(state, "roscore", "0-rosproxy") == "172.18.0.5"
     assert address_in(state, "host.docker.internal", "0-rosproxy") == "172.30.0.1"

@@ -12,7 +12,6 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.setting_kinds import hash_token
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
-from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.specs import (
     OwnLabels,
     admin_port,
@@ -28,13 +27,14 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_fingerprint,
     sandbox_name,
 )
+from rosproxy_operator.proxy_spec.place import Master, Place
 from rosproxy_operator.proxy_spec.spec import ProxySpec
 from tests.run_options import settings_of
-from tests.unit.operator.docker.builders import HERE, IMAGE, KEY, RANGE, SECRET, SETTINGS
+from tests.unit.operator.docker.builders import HERE, IMAGE, PLACE, RANGE, SECRET, SETTINGS
 
-SANDBOX = CreateSandbox("s", KEY, PortRange(11400, 11401), fingerprint="f1")
-PROXY = Create("p", KEY, PortRange(11400, 11401), "s", fingerprint="f2")
-TOKEN = proxy_token(KEY, SECRET)
+SANDBOX = CreateSandbox("s", PLACE, PortRange(11400, 11401), fingerprint="f1")
+PROXY = Create("p", PLACE, PortRange(11400, 11401), "s", fingerprint="f2")
+TOKEN = proxy_token(PLACE, SECRET)
 HASH = hash_token(TOKEN)
 
 
@@ -114,11 +114,11 @@ def test_an_unknown_address_is_not_given() -> None:
     assert "ROSPROXY_MASTER_ADDRESS" not in names
 
 
-def test_a_token_is_made_of_the_secret_and_the_key_and_is_nowhere() -> None:
+def test_a_token_is_made_of_the_secret_and_the_place_and_is_nowhere() -> None:
     """An inspection of a proxy shows only the hash of the token."""
-    assert proxy_token(KEY, SECRET) == TOKEN
-    assert proxy_token(KEY, "another secret") != TOKEN
-    assert proxy_token(Key(KEY.master_uri, "192.0.2.11"), SECRET) != TOKEN
+    assert proxy_token(PLACE, SECRET) == TOKEN
+    assert proxy_token(PLACE, "another secret") != TOKEN
+    assert proxy_token(replace(PLACE, advertise_host="192.0.2.11"), SECRET) != TOKEN
     body = str(container_config(PROXY, SETTINGS, SECRET, ""))
     assert TOKEN not in body
     assert SECRET not in body
@@ -148,12 +148,14 @@ def test_ports_are_published_on_each_address_asked_for() -> None:
 @pytest.mark.parametrize("port", [11311, 11312, 11500])
 def test_the_proxy_accepts_its_environment(port: int) -> None:
     """A second roscore is often at 11312, where the admin endpoint usually is."""
-    key = Key(f"http://robot:{port}", HERE)
-    body = container_config(structs.replace(PROXY, key=key), SETTINGS, "t0ken-t0ken", "192.0.2.7")
+    place = Place(Master(f"http://robot:{port}"), HERE)
+    body = container_config(
+        structs.replace(PROXY, place=place), SETTINGS, "t0ken-t0ken", "192.0.2.7"
+    )
     settings = settings_of(dict(pair.split("=", 1) for pair in body["Env"]))
-    assert settings.admin.port == admin_port(key)
-    assert settings.token_hash == hash_token(proxy_token(key, "t0ken-t0ken"))
-    assert reserved_ports(key) == {port, settings.admin.port}
+    assert settings.admin.port == admin_port(place)
+    assert settings.token_hash == hash_token(proxy_token(place, "t0ken-t0ken"))
+    assert reserved_ports(place) == {port, settings.admin.port}
 
 
 def test_what_makes_a_sandbox_anew() -> None:
@@ -183,8 +185,10 @@ def test_what_makes_a_proxy_anew() -> None:
     )
     for bound in (replace(SETTINGS, proxy_memory=0), replace(SETTINGS, proxy_pids=300)):
         assert now != proxy_fingerprint(PROXY, bound, IMAGE, SECRET)
-    elsewhere = Key(KEY.master_uri, "192.0.2.11")
-    assert now != proxy_fingerprint(structs.replace(PROXY, key=elsewhere), SETTINGS, IMAGE, SECRET)
+    elsewhere = replace(PLACE, advertise_host="192.0.2.11")
+    assert now != proxy_fingerprint(
+        structs.replace(PROXY, place=elsewhere), SETTINGS, IMAGE, SECRET
+    )
 
 
 def test_fingerprints_stay_as_they_were() -> None:
@@ -195,9 +199,9 @@ def test_fingerprints_stay_as_they_were() -> None:
 
 def test_labels_are_read_back() -> None:
     assert read_own(own_labels(SANDBOX)) == OwnLabels(
-        "ports", KEY, PortRange(11400, 11401), fingerprint="f1"
+        "ports", PLACE, PortRange(11400, 11401), fingerprint="f1"
     )
-    assert read_own(own_labels(PROXY)) == OwnLabels("proxy", KEY, PortRange(11400, 11401), "f2")
+    assert read_own(own_labels(PROXY)) == OwnLabels("proxy", PLACE, PortRange(11400, 11401), "f2")
 
 
 @pytest.mark.parametrize(
@@ -233,10 +237,10 @@ def test_labels_of_whatever_kind_are_read_or_refused(labels: dict[str, str]) -> 
     ],
 )
 def test_names(uri: str, start: str) -> None:
-    name = proxy_name(Key(uri, HERE))
+    name = proxy_name(Place(Master(uri), HERE))
     assert name.startswith(start)
     assert len(name) == len(start) + 6
     assert is_proxy_name(name)
-    assert is_proxy_name(sandbox_name(Key(uri, HERE)))
-    assert name != proxy_name(Key(uri, "192.0.2.11"))
+    assert is_proxy_name(sandbox_name(Place(Master(uri), HERE)))
+    assert name != proxy_name(Place(Master(uri), "192.0.2.11"))
     assert not is_proxy_name(start)

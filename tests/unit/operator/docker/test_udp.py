@@ -19,7 +19,7 @@ from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.proxy_spec.spec import ProxySpec
 from tests.unit.operator.docker.builders import (
     ENABLED,
-    KEY,
+    PLACE,
     RANGE,
     SETTINGS,
     container,
@@ -30,7 +30,7 @@ from tests.unit.operator.docker.builders import (
 
 BOTH = {"rosproxy.direction": "both"}
 ASKED = {"rosproxy.udp": "true"}
-BOX = CreateSandbox("s", KEY, PortRange(11400, 11401))
+BOX = CreateSandbox("s", PLACE, PortRange(11400, 11401))
 
 
 def labelled(name: str, *labels: Mapping[str, str]) -> Container:
@@ -80,7 +80,7 @@ def test_what_is_published_and_told(udp: bool) -> None:
         for port in (11400, 11401)
         for protocol in (["tcp", "udp"] if udp else ["tcp"])
     )
-    create = Create("p", KEY, RANGE, "s", ProxySpec(udp=udp))
+    create = Create("p", PLACE, RANGE, "s", ProxySpec(udp=udp))
     told = container_config(create, SETTINGS, "t", "")["Env"]
     assert ("ROSPROXY_UDP=1" in told) == udp
 
@@ -99,5 +99,5 @@ def test_udp_ports_that_others_have_are_in_the_way_of_those_that_ask(
     plan = planned(seen, SETTINGS, DockerMemory(), 0.0)
     (box,) = [action for action in plan.actions if isinstance(action, CreateSandbox)]
     assert box.range.first == first
-    published = published_ports(KEY, box.range, box.spec.udp)
+    published = published_ports(PLACE, box.range, box.spec.udp)
     assert len(published) == len(box.range) * (1 + box.spec.udp)

@@ -16,7 +16,7 @@ from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.planner.uninstall import Uninstall
 from tests.unit.operator.docker.builders import (
     APP,
-    KEY,
+    PLACE,
     SETTINGS,
     UPLINK,
     both,
@@ -41,7 +41,7 @@ def test_after_whatever_happened_nothing_is_left(containers: int, events: list) 
         host.run(number, number)
     for happen, n, m in events:
         happen(host, n, m)
-        host.check()  # check also notes the ports of each key
+        host.check()  # check also notes the ports of each place
     host.engine.redirects_fail = False
     host.engine.uninstalls = True
     before = [(box.id, box.name, box.state, dict(box.networks)) for box in host.strangers()]
@@ -58,8 +58,8 @@ def test_after_whatever_happened_nothing_is_left(containers: int, events: list) 
         assert not network.made_by_operator or f"network {network.name}" in problems
     # Of a container that has ended the rules have gone with the namespace.
     namespaces = {box.namespace for box in host.strangers() if box.state in STARTED}
-    for place in host.engine.rules:
-        assert not host.engine.image or place in host.forgotten or place[0] not in namespaces
+    for site in host.engine.rules:
+        assert not host.engine.image or site in host.forgotten or site[0] not in namespaces
 
 
 def run(host: Hosts) -> set[str]:
@@ -78,7 +78,7 @@ def run(host: Hosts) -> set[str]:
 def test_containers_go_before_their_network() -> None:
     uninstall = Uninstall()
     first = look(uninstall, observed(container(), networks=(OURS, APP), **both()))
-    assert {action.name for action in first.actions} == {proxy_name(KEY), sandbox_name(KEY)}
+    assert {action.name for action in first.actions} == {proxy_name(PLACE), sandbox_name(PLACE)}
     assert all("rosproxy is uninstalled" in str(action) for action in first.actions)
     second = look(uninstall, observed(container(), networks=(OURS, APP)))
     assert second.actions == (RemoveNetwork(UPLINK.name),)
@@ -109,7 +109,7 @@ def test_where_another_operator_makes_all_anew_it_stops() -> None:
     (problem,) = planned.problems
     assert problem.fatal
     assert "another operator is running" in problem.text
-    assert sandbox_name(KEY) in problem.text
+    assert sandbox_name(PLACE) in problem.text
 
 
 def test_the_label_says_which_networks_are_the_operators() -> None:

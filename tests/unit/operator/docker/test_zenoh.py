@@ -24,7 +24,6 @@ from rosproxy_operator.docker.planner.actions import (
 )
 from rosproxy_operator.docker.planner.labels.readers import RMW
 from rosproxy_operator.docker.planner.model import (
-    ZENOH,
     Attachment,
     Container,
     HostState,
@@ -50,16 +49,17 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import ZENOH
 from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import (
     IMAGE,
     SECRET,
     SETTINGS,
     UPLINK,
+    attachment,
     container,
     inspection,
     observed,
-    place,
     planned,
     read_members,
 )
@@ -83,8 +83,8 @@ def node(
 ) -> Container:
     variables = {**VARIABLES, **({"ZENOH_CONFIG_OVERRIDE": override} if override else {})}
     made = container(name, {**ON, **(labels or {})}, env="", mode=mode)
-    places = () if mode else (Attachment("app", address, frozenset({name})),)
-    return replace(made, attachments=places, variables=variables, is_zenoh_router=router,
+    attachments = () if mode else (Attachment("app", address, frozenset({name})),)
+    return replace(made, attachments=attachments, variables=variables, is_zenoh_router=router,
                    started_at="2026-01-01T09:00:00Z")  # fmt: skip
 
 
@@ -107,7 +107,7 @@ def the_proxy(peers: tuple[str, ...] = (), ports: PortRange = PORTS) -> dict[str
     box_print = sandbox_fingerprint(box, SETTINGS)
     made = Create(proxy_name(ZENOH), ZENOH, ports, box.name, peers=peers)
     made_print = proxy_fingerprint(made, SETTINGS, IMAGE, SECRET)
-    at = [place(SETTINGS.uplink, box.name), Attachment("app", NEAR, frozenset({made.name}))]
+    at = [attachment(SETTINGS.uplink, box.name), Attachment("app", NEAR, frozenset({made.name}))]
     holder = replace(container(box.name, own_labels(box), at, env=""), started_at="2026-01-01T10Z")
     runs = container(made.name, own_labels(made), (), env="", mode=f"container:id-{box.name}")
     runs = replace(runs, started_at="2026-01-01T10:00:01Z")
@@ -132,7 +132,7 @@ def made_for(state: HostState) -> dict[str, CreateRedirect]:
 def record(made: CreateRedirect) -> RedirectContainer:
     own = Container(f"id-{made.name}", made.name, "exited", own_labels(made),
                     f"container:{made.target}")  # fmt: skip
-    return RedirectContainer(made.key, own, made.range, made.fingerprint)
+    return RedirectContainer(made.place, own, made.range, made.fingerprint)
 
 
 # which containers
@@ -152,27 +152,27 @@ def test_a_label_or_a_variable_says_it(
     labels: Mapping[str, str], variables: Mapping[str, str]
 ) -> None:
     (member,), told = read(replace(node(labels=labels), variables=variables))
-    assert (member.key, member.redirected, told) == (ZENOH, (LOCAL,), [])
+    assert (member.place, member.redirected, told) == (ZENOH, (LOCAL,), [])
 
 
 def test_a_container_may_have_ros_1_as_well() -> None:
     both = {"rosproxy.ros": "1,2", "rosproxy.master-uri": "http://robot:11311"}
     members, told = read(replace(node(labels=both), master_uri="http://robot:11311"))
-    assert [member.key.ros for member in members] == ["1", "zenoh"]
+    assert [member.place.graph.ros for member in members] == ["1", "zenoh"]
     assert told == []
 
 
 def test_where_variables_are_enough_rmw_zenoh_is_served() -> None:
     quiet = replace(node(), labels={})
     (member,), _ = read(quiet, settings=replace(SETTINGS, expose_by_default=True))
-    assert member.key == ZENOH
+    assert member.place == ZENOH
 
 
 def test_domains_and_hosts_share_one_proxy() -> None:
     other = replace(node("arm", {"rosproxy.peers": "robot"}), variables={
         **VARIABLES, "ROS_DOMAIN_ID": "5"})  # fmt: skip
     plan = look(observed(node(), other), replace(SETTINGS, advertise_host=None))
-    assert [wanted.key for wanted in plan.desired] == [ZENOH]
+    assert [wanted.place for wanted in plan.desired] == [ZENOH]
     assert plan.problems == ()
 
 
@@ -208,7 +208,7 @@ def test_labels_that_can_not_be_had_are_told(labels: Mapping[str, str], text: st
 def test_the_label_is_ignored_on_a_container_of_ros_1() -> None:
     labels = {RMW: "zenoh", "rosproxy.ros": "1", "rosproxy.master-uri": "http://robot:11311"}
     (member,), told = read(replace(node(labels=labels), master_uri="http://robot:11311"))
-    assert member.key.ros == "1"
+    assert member.place.graph.ros == "1"
     assert told == [
         "label rosproxy.rmw is ignored: the label is for ROS 2, the container is not. Remove the "
         "label, or set rosproxy.ros=2 if the nodes use ROS 2"
@@ -219,7 +219,7 @@ def test_a_container_of_ros_1_and_rmw_zenoh_has_no_domain() -> None:
     labels = {RMW: "zenoh", "rosproxy.ros": "1,2", "rosproxy.domain": "7"}
     ros1 = replace(node(labels=labels), master_uri="http://robot:11311")
     members, told = read(ros1)
-    assert sorted(member.key.ros for member in members) == ["1", "zenoh"]
+    assert sorted(member.place.graph.ros for member in members) == ["1", "zenoh"]
     assert told == [
         "label rosproxy.domain is ignored: the label has no effect on rmw_zenoh. Remove the label"
     ]
@@ -498,7 +498,7 @@ def test_its_containers_are_known_by_their_labels(role: str) -> None:
     labels = own_labels(made)
     own = read_own(labels)
     assert own is not None
-    assert (own.role, own.key, own.range) == (role, ZENOH, made.range)
+    assert (own.role, own.place, own.range) == (role, ZENOH, made.range)
     for forged in ("io.rosproxy.domain", "io.rosproxy.master-uri", "io.rosproxy.advertise-host"):
         assert read_own({**labels, forged: "1"}) is None
 

@@ -10,7 +10,6 @@ from rosproxy.settings import MOST_ZENOH_LINKS
 from rosproxy_operator.cli import main
 from rosproxy_operator.docker.engine_json import read_making
 from rosproxy_operator.docker.planner.actions import Create
-from rosproxy_operator.docker.planner.model import ZENOH
 from rosproxy_operator.docker.planner.own_containers import forgery_reason
 from rosproxy_operator.docker.planner.specs import (
     container_config,
@@ -21,6 +20,7 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings, make_plan_settings
+from rosproxy_operator.proxy_spec.place import ZENOH
 from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import (
     ENABLED,
@@ -171,7 +171,7 @@ def test_a_proxy_without_links_stays_as_before() -> None:
 
 
 def replace_links(action: Create) -> Create:
-    return Create(action.name, action.key, action.range, action.sandbox, links=(CLOUD,))
+    return Create(action.name, action.place, action.range, action.sandbox, links=(CLOUD,))
 
 
 def test_many_labels_leave_the_few_their_links() -> None:

@@ -25,9 +25,10 @@ from rosproxy_operator.docker.planner.labels.readers import (
     UnusableLabel,
 )
 from rosproxy_operator.docker.planner.labels.zenoh import zenoh_member
-from rosproxy_operator.docker.planner.model import ALIVE, ZENOH, Container, HostState, Key, Member
-from rosproxy_operator.docker.planner.specs import MANAGED, master, unresolved_master
+from rosproxy_operator.docker.planner.model import ALIVE, Container, HostState, Member
+from rosproxy_operator.docker.planner.specs import MANAGED, unresolved_master
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Master, Place
 
 _PREFIX = "rosproxy"
 # An exited container may start again: the proxy stays on its networks for the grace (`desire`).
@@ -45,7 +46,7 @@ MOST_NAME_CHARACTERS = 80
 class LabelReading:
     """The requests of all labels, in the order of container names, and the problems of labels.
 
-    The addresses of the masters are unknown here. So a key in ``requests`` has an empty
+    The addresses of the masters are unknown here. So a place in ``requests`` has an empty
     ``advertise_host`` if no label or option sets that host. Aliases and redirects of masters are
     still open.
     """
@@ -80,9 +81,9 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
 
 def master_hosts(reading: LabelReading, observed: HostState) -> tuple[str, ...]:
     """Return the master hosts of all wanted and existing proxies, in lower case, sorted."""
-    wanted = {r.key for r in reading.requests if r.container.alive}
-    keys = (key for key in observed.keys | wanted if key.ros == "1")
-    return tuple(sorted({master(key).host.lower() for key in keys}))
+    wanted = {r.place for r in reading.requests if r.container.alive}
+    places = (place for place in observed.places | wanted if isinstance(place.graph, Master))
+    return tuple(sorted({place.master.host.lower() for place in places}))
 
 
 def find_members(
@@ -97,18 +98,20 @@ def find_members(
     problems: list[Problem] = []
     for request in reading.requests:
         container = request.container
-        if request.key == ZENOH:
+        if request.place == ZENOH:
             members.append(request)
             continue
-        host = request.key.advertise_host or _advertised(request, observed)
-        key = replace(request.key, advertise_host=host)
+        host = request.place.advertise_host or _advertised(request, observed)
+        place = replace(request.place, advertise_host=host)
         if host:
-            member, text = _placed(replace(request, key=key), observed, settings)
-            texts = [text, "" if key.is_ros2 else wrong_own_address(container, key, observed)]
+            member, text = _placed(replace(request, place=place), observed, settings)
+            texts = [text]
+            if isinstance(place.graph, Master):
+                texts.append(wrong_own_address(container, place, observed))
             wrong = [_problem(container, text, False) for text in texts if text]
             members.append(member)
         else:
-            text = _why_no_host(key, observed)
+            text = _why_no_host(place, observed)
             wrong = [_unusable(container, text)]
         problems += wrong if container.alive else []
     return tuple(members), tuple(problems)
@@ -117,16 +120,16 @@ def find_members(
 def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tuple[Member, str]:
     """Return the member with the alias or redirect by which nodes find the proxy, and a warning.
 
-    The key of ``request`` is complete. The warning may be empty.
+    The place of ``request`` is complete. The warning may be empty.
     """
     container = request.container
-    key = request.key
-    if key.is_ros2:
+    place = request.place
+    if not isinstance(place.graph, Master):
         return request, ""
-    needs, text = readers.proxy_alias(container, key)
+    needs, text = readers.proxy_alias(container, place)
     if not container.master_uri and ros_versions.is_guessed(container):
         text = ""  # the container may be of ROS 2, and has a warning about the unknown version
-    by_address = readers.master_by_address(container, key)
+    by_address = readers.master_by_address(container, place)
     if by_address is None:
         return replace(request, wanted_alias=needs), text
     internal = {network.name for network in observed.networks if network.internal}
@@ -152,15 +155,18 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
     return request, text
 
 
-def _why_no_host(key: Key, observed: HostState) -> str:
+def _why_no_host(place: Place, observed: HostState) -> str:
     """Return why the advertised host is unknown, and the fix.
 
     The address of the Docker host depends on the route to the master. So an unknown address of the
     master is the first cause.
     """
-    if not key.is_ros2 and observed.masters.get(master(key).host.lower()) == "":
-        return f"no address of the master: {unresolved_master(master(key).host)}"
-    towards = "" if key.is_ros2 else f" towards the {key.graph}"
+    towards = ""
+    if isinstance(place.graph, Master):
+        host = place.graph.host
+        if observed.masters.get(host.lower()) == "":
+            return f"no address of the master: {unresolved_master(host)}"
+        towards = f" towards the {place.graph}"
     return (
         f"the operator does not know this host's address{towards}. Add the label "
         f"{ADVERTISE_HOST}=ADDRESS, or start the operator with --advertise-host ADDRESS"
@@ -183,7 +189,7 @@ def _requests(
     granted = [bounds.narrowed(r, settings) for r in requests]
     warnings = [*ros_versions.warnings(container, served)]
     for request in requests:
-        if request.key.is_ros2:
+        if isinstance(request.place.graph, Domain):
             warnings += ros_versions.static_peer_warnings(container, request.networks, observed)
     warnings += dict.fromkeys(text for _, texts in granted for text in texts)
     members = [request for request, _ in granted]
@@ -206,21 +212,20 @@ def _request(
     Raises UnusableLabel.
     """
     labels = container.labels
-    is_ros2 = ros == "2"
-    uri = "" if is_ros2 else _master_uri(container, settings, proxies)
+    uri = _master_uri(container, settings, proxies) if ros == "1" else ""
     host = readers.advertise_host(labels, settings)
-    if is_ros2:
+    if ros == "2":
         ros_versions.refuse_ipv6_host(host)
     networks = readers.networks(container, observed, settings.uplink)
     return Member(
         container,
-        Key(uri, host, ros_versions.domain(container) if is_ros2 else None),
+        Place(Master(uri) if ros == "1" else Domain(ros_versions.domain(container)), host),
         ports=readers.ports(labels),
         networks=networks,
         wishes=readers.wishes(labels, ros, networks, observed.networks),
         policy=readers.policy(labels),
-        peers=frozenset(readers.peers(labels, read_peer_name) if is_ros2 else ()),
-        redirect=None if is_ros2 else readers.redirect(labels),
+        peers=frozenset(readers.peers(labels, read_peer_name) if ros == "2" else ()),
+        redirect=readers.redirect(labels) if ros == "1" else None,
     )
 
 
@@ -260,8 +265,8 @@ def _is_exposed(container: Container, settings: PlanSettings) -> bool:
     """
     if not settings.expose_by_default:
         return False
-    is_ros2 = not ros_versions.versions(container) <= {"1"}
-    return bool(_labels_for_operator(container) or container.master_uri or is_ros2)
+    has_ros2 = not ros_versions.versions(container) <= {"1"}
+    return bool(_labels_for_operator(container) or container.master_uri or has_ros2)
 
 
 def _labels_for_operator(container: Container) -> list[str]:
@@ -315,19 +320,15 @@ def _advertised(request: Member, observed: HostState) -> str:
     for a moment: then the proxy stays. Of several proxies, a proxy on a network of the container
     comes first. Return an empty text if there is neither an address nor a proxy.
     """
-    key = request.key
+    place = request.place
     networks = request.container.networks
     towards = (
-        observed.default_route_address
-        if key.is_ros2
-        else observed.advertise.get(master(key).host, "")
+        observed.advertise.get(place.graph.host, "")
+        if isinstance(place.graph, Master)
+        else observed.default_route_address
     )
-    sandboxes = [
-        s
-        for s in observed.sandboxes
-        if (s.key.master_uri, s.key.domain) == (key.master_uri, key.domain)
-    ]
+    sandboxes = [s for s in observed.sandboxes if s.place.graph == place.graph]
     if towards or not sandboxes:
         return towards
-    near = {s.key for s in sandboxes if s.container.networks & networks}
-    return min(near or {s.key for s in sandboxes}).advertise_host
+    near = {s.place for s in sandboxes if s.container.networks & networks}
+    return min(near or {s.place for s in sandboxes}).advertise_host

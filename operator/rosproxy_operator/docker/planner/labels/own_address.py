@@ -10,12 +10,13 @@ the proxy replaces the address. Two values do harm:
 
 from rosproxy.net.addresses import is_loopback
 from rosproxy_operator.common.problem import bounded
-from rosproxy_operator.docker.planner.model import Container, HostState, Key
+from rosproxy_operator.docker.planner.model import Container, HostState
+from rosproxy_operator.proxy_spec.place import Place
 
 _ADDRESS_VARIABLES = ("ROS_IP", "ROS_HOSTNAME")
 
 
-def wrong_own_address(container: Container, key: Key, observed: HostState) -> str:
+def wrong_own_address(container: Container, place: Place, observed: HostState) -> str:
     """Return what is wrong with ROS_IP or ROS_HOSTNAME of a ROS 1 container; empty for no fault."""
     for name in _ADDRESS_VARIABLES:
         value = container.variables.get(name, "").strip().lower()
@@ -25,7 +26,7 @@ def wrong_own_address(container: Container, key: Key, observed: HostState) -> st
                 f"variable {name}={bounded(value, 80)} makes the nodes listen on loopback only, so "
                 f"the proxy can't reach them. {fix}"
             )
-        if value and value in _names_of_this_host(key, observed):
+        if value and value in _names_of_this_host(place, observed):
             return (
                 f"variable {name}={value} is the address of this host, not of the container. So "
                 f"roslaunch ends with 'Unable to contact my own server'. {fix}"
@@ -33,10 +34,10 @@ def wrong_own_address(container: Container, key: Key, observed: HostState) -> st
     return ""
 
 
-def _names_of_this_host(key: Key, observed: HostState) -> frozenset[str]:
+def _names_of_this_host(place: Place, observed: HostState) -> frozenset[str]:
     """Return the known addresses and names of this host, in lower case."""
     gateways = (network.gateway for network in observed.networks)
     towards = observed.advertise.values()
     return frozenset(
-        {key.advertise_host.lower(), observed.default_route_address, *gateways, *towards} - {""}
+        {place.advertise_host.lower(), observed.default_route_address, *gateways, *towards} - {""}
     )

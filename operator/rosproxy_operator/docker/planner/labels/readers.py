@@ -17,10 +17,11 @@ from rosproxy_operator.common.ros2 import MOST_PEERS
 from rosproxy_operator.common.zenoh import read_link_name
 from rosproxy_operator.docker.option_values import MOST_PORTS
 from rosproxy_operator.docker.planner.labels import bounds
-from rosproxy_operator.docker.planner.model import Container, HostState, Key, Network
+from rosproxy_operator.docker.planner.model import Container, HostState, Network
 from rosproxy_operator.docker.planner.network_owner import NoOwner, by_reference, find_network_owner
-from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
+from rosproxy_operator.docker.planner.specs import is_proxy_name, proxy_name
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import Place
 from rosproxy_operator.proxy_spec.spec import WISHES, Wish, words
 
 ENABLE = "rosproxy.enable"
@@ -305,12 +306,12 @@ def master_uri(container: Container, settings: PlanSettings, proxies: Collection
     )
 
 
-def proxy_alias(container: Container, key: Key) -> tuple[str, str]:
+def proxy_alias(container: Container, place: Place) -> tuple[str, str]:
     """Return the name by which a container's nodes look for the proxy, and a warning.
 
     The name is empty if no alias can help. The warning is empty if nothing is wrong.
     """
-    real = master(key)
+    real = place.master
     fix = f"Set ROS_MASTER_URI=http://{ALIAS}:{real.port}"
     if not container.master_uri:
         # Without the variable, ROS's setup script sets ROS_MASTER_URI to localhost
@@ -322,17 +323,17 @@ def proxy_alias(container: Container, key: Key) -> tuple[str, str]:
     if target is None:
         return "", f"{variable} is not of the form http://HOST:11311. {fix}"
     host = target.host.lower()
-    if not is_address(host) and host in (ALIAS, real.host, proxy_name(key)):
+    if not is_address(host) and host in (ALIAS, real.host, proxy_name(place)):
         if target.port == real.port:
             return host, ""
         return host, f"{variable} has the wrong port, the proxy listens on {real.port}. {fix}"
     if MASTER_URI not in container.labels:
         # A variable that names the proxy does not say which master the container means.
-        fix += f" and the label {MASTER_URI}={key.master_uri}"
-    return "", f"{variable} {_wrong_master(host, key, fix)}"
+        fix += f" and the label {MASTER_URI}={place.master.uri}"
+    return "", f"{variable} {_wrong_master(host, place, fix)}"
 
 
-def master_by_address(container: Container, key: Key) -> HostPort | None:
+def master_by_address(container: Container, place: Place) -> HostPort | None:
     """Return the address in a container's ROS_MASTER_URI that a redirect may lead to the proxy.
 
     If a label gives the master by name, any address is accepted: the name may resolve to another
@@ -340,7 +341,7 @@ def master_by_address(container: Container, key: Key) -> HostPort | None:
     loopback and IPv6.
     """
     target = parse_slave_uri(container.master_uri)
-    real = master(key)
+    real = place.master
     if target is None or target.port != real.port or ":" in target.host:
         return None
     if not is_address(target.host) or is_loopback(target.host):
@@ -350,9 +351,9 @@ def master_by_address(container: Container, key: Key) -> HostPort | None:
     return HostPort(target.host, target.port)
 
 
-def _wrong_master(host: str, key: Key, fix: str) -> str:
+def _wrong_master(host: str, place: Place, fix: str) -> str:
     if is_proxy_name(host):
-        return f"names the proxy of another master, not {proxy_name(key)}. {fix}"
+        return f"names the proxy of another master, not {proxy_name(place)}. {fix}"
     if is_loopback(host):
         return f"means the container itself. {fix}"
     if is_address(host):
@@ -360,7 +361,7 @@ def _wrong_master(host: str, key: Key, fix: str) -> str:
             "is an address, so the nodes bypass the proxy, and outside can't reach them. "
             f"{fix}, or use the name of the master's host"
         )
-    return f"is not the container's master {key.master_uri}, so the nodes bypass the proxy. {fix}"
+    return f"is not the container's {place.graph}, so the nodes bypass the proxy. {fix}"
 
 
 def _names_proxy(host: str, proxies: Collection[str]) -> bool:

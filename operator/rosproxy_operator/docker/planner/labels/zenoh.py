@@ -28,11 +28,12 @@ from rosproxy_operator.docker.planner.labels.readers import (
     UnusableLabel,
     quoted,
 )
-from rosproxy_operator.docker.planner.model import ZENOH, Container, HostState, Member
+from rosproxy_operator.docker.planner.model import Container, HostState, Member
 from rosproxy_operator.docker.planner.network_owner import by_reference, network_owner
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.zenoh_redirect import LOCAL_ROUTER, as_client
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.place import ZENOH
 
 _PROXIES = (ALIAS, proxy_name(ZENOH))
 """The names of the proxy on the networks of containers."""
@@ -122,7 +123,7 @@ def with_bounded_containers(
     beyond that limit gets a problem. All members of other proxies stay.
     """
     every = tuple(members)
-    excess = [member for member in every if member.key == ZENOH][MOST_ZENOH_PORTS:]
+    excess = [member for member in every if member.place == ZENOH][MOST_ZENOH_PORTS:]
     text = (
         f"a proxy for rmw_zenoh serves at most {MOST_ZENOH_PORTS} containers. Remove labels "
         f"{readers.ENABLE} of other containers"
