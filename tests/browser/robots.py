@@ -220,8 +220,8 @@ def _broken(robot: Robot, topic: str, subscriber: str, link: PageLink) -> PageLi
     if (topic, subscriber) == ("detections", "joystick"):
         machine = robot.name(subscriber)
         text = f"{machine} has not connected to {HOST}:{link.port}"
-        fix = f"on the machine of {machine}: nc -vz {HOST} {link.port}; a firewall or a broken "
-        fix += "network"
+        fix = f"test on the machine of {machine}: nc -vz {HOST} {link.port}. If nc fails, let the "
+        fix += "firewalls on the way accept the port"
     elif (topic, robot.proxy) == ("object_pose", "cell-b"):
         text = "reliability differs: the publisher offers BEST_EFFORT, the subscription requests "
         text += "RELIABLE"

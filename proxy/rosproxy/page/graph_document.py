@@ -303,8 +303,10 @@ class _Ros1Links:
         if subscriber in self._inside:
             fix = f"restart {quoted(subscriber)}"
         elif port:
-            fix = f"on the machine of {quoted(subscriber)}: nc -vz {quoted(host)} {port}; "
-            fix += "a firewall or a broken network"
+            fix = (
+                f"test on the machine of {quoted(subscriber)}: nc -vz {quoted(host)} {port}. If "
+                "nc fails, let the firewalls on the way accept the port"
+            )
         return error("pair", f"{topic} from {publisher} to {subscriber}", text, fix)
 
     def _way(self, key: Key) -> tuple[str, int | None]:

@@ -187,7 +187,7 @@ def test_a_link_that_carries_nothing_is_broken_and_names_the_command() -> None:
     link = made(judge(facts), measures=measures)["links"][LINK]
     assert (link["state"], link["since"]) == ("broken", 962)
     assert "no message of /talker arrives at /listener" in link["text"]
-    assert link["fix"].startswith("on the machine of /listener: nc -vz robot-host 45000")
+    assert link["fix"].startswith("test on the machine of /listener: nc -vz robot-host 45000. If")
 
 
 def test_before_anybody_was_asked_the_status_tells() -> None:
