@@ -63,10 +63,12 @@ bench: $(VENV)/.bench ## speed and memory next to a direct connection, socat, HA
 	@$(BIN)/python -m tests.bench $(BENCH)
 
 .PHONY: screenshot
-screenshot: $(VENV)/.dev ## paint docs/live-page.png anew: the live page with real nodes and a broken link, and docs/live-page with made-up robots; as root on Debian, installs ROS and Chromium
+screenshot: $(VENV)/.dev ## paint docs/live-page.png and docs/live-page anew: the live page with real nodes and a broken link, and with made-up robots; as root on Debian, installs ROS, Docker and Chromium
 	@scripts/install-ros.sh
 	@scripts/install-browser.sh
+	@scripts/install-docker.sh
 	@$(BIN)/python -m tests.browser.screenshot docs/live-page.png
+	@$(BIN)/python -m tests.browser.screenshot --containers docs/live-page
 	@$(BIN)/python -m tests.browser.screenshot --made-up docs/live-page
 
 .PHONY: check

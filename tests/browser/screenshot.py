@@ -1,9 +1,11 @@
 """Make pictures of the live page: ``make screenshot``.
 
 python -m tests.browser.screenshot FILE
+python -m tests.browser.screenshot --containers FOLDER
 python -m tests.browser.screenshot --made-up FOLDER
 
-The first has real nodes and a broken link. The others have made-up robots (`tests.browser.robots`).
+The first has six real nodes and a broken link. The second have forty real nodes in containers and
+on machines (`tests.browser.containers`). The third have made-up robots (`tests.browser.robots`).
 """
 
 from __future__ import annotations
@@ -13,9 +15,11 @@ import tempfile
 from itertools import product
 from pathlib import Path
 
+from tests.browser.containers import firewall, fleet
 from tests.browser.page import DETAILS, THIS_MACHINE, URL, cut, made_up, play, row, rows
 from tests.browser.test_picture import geometry
 from tests.browser.webdriver import Browser
+from tests.docker.controller import ADMIN_BIND
 from tests.ros.cpp import compiled_node
 from tests.ros.forks import Forks
 from tests.ros.lab import Lab
@@ -87,15 +91,28 @@ def paint_made_up(target: Path) -> None:
         try:
             for nodes in SIZES:
                 with made_up(browser, Path(folder), nodes, "robots"):
-                    paint_all(browser, target, nodes)
+                    paint_all(browser, target, str(nodes))
             with made_up(browser, Path(folder), 30, "robots"):
                 (target / "chosen.webp").write_bytes(paint_chosen(browser))
         finally:
             browser.close()
 
 
-def paint_all(browser: Browser, target: Path, nodes: int) -> None:
-    """Write the pictures of a number of nodes, for each device and scheme.
+def paint_containers(target: Path) -> None:
+    """Write the pictures of an operator's page with forty real nodes and a broken link."""
+    target.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder, fleet(Path(folder)):
+        browser = Browser(THIS_MACHINE, Path(folder))
+        try:
+            browser.open(f"http://{ADMIN_BIND[1]}/")
+            with firewall():
+                paint_all(browser, target, "containers")
+        finally:
+            browser.close()
+
+
+def paint_all(browser: Browser, target: Path, name: str) -> None:
+    """Write the pictures with a name, for each device and scheme.
 
     Raises AssertionError if the graph has a fault, such as labels that overlap.
     """
@@ -105,7 +122,7 @@ def paint_all(browser: Browser, target: Path, nodes: int) -> None:
         browser.prefer(scheme)
         wait_until("the picture has this width", lambda: not geometry(browser))
         picture = browser.small_screenshot(QUALITY)
-        (target / f"{nodes}-{device}-{scheme}.webp").write_bytes(picture)
+        (target / f"{name}-{device}-{scheme}.webp").write_bytes(picture)
 
 
 def paint_chosen(browser: Browser) -> bytes:
@@ -121,6 +138,8 @@ def paint_chosen(browser: Browser) -> bytes:
 
 def main() -> int:
     match sys.argv[1:]:
+        case ["--containers", folder]:
+            paint_containers(Path(folder))
         case ["--made-up", folder]:
             paint_made_up(Path(folder))
         case [file]:
