@@ -54,6 +54,28 @@ def test_another_selector(net: Namespace) -> None:
     wait_until(lambda: {p.on for p in made.proxies} == {"node1", "node2"}, 60, made.tell)
 
 
+def test_a_second_rosproxy_takes_no_node_of_running_pods(net: Namespace, robot: Robot) -> None:
+    """Several RosProxies select the pod, and the pod stays with the first one."""
+    topic = f"/{unique('second').replace('-', '_')}"
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8, graceSeconds=2)
+    name = talker(net, topic)
+    listener = robot.node("listener_second", "rospy", "sub", "--topic", topic)
+    listener.wait_for("inside", seconds=START)
+    before = made.the_proxy()
+
+    second = rosproxy(net.name, "second", master=NOWHERE, ports=4)
+    second.wait_status(
+        lambda s: any(c["reason"] == "Ambiguous" for c in s.get("conditions", [])), "it is told"
+    )
+    started = time.time()
+    listener.wait_for("inside", count=200, since=started, seconds=60)  # 10 s, longer than the grace
+
+    assert made.the_proxy().uid_then == before.uid_then
+    assert robot.knows_proxied(name)
+    assert listener.lost("inside", started) == 0
+    second.remove()
+
+
 def test_node_selector(net: Namespace) -> None:
     labels = {"kubernetes.io/hostname": "node2"}
     made = rosproxy(net.name, master=NOWHERE, ports=4, nodeSelector=labels)

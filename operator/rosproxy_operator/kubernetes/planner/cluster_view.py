@@ -11,7 +11,12 @@ from typing import TypeVar
 import msgspec
 
 from rosproxy.telemetry.text import listed
-from rosproxy_operator.kubernetes.planner.pods.selection import on_node, select_rosproxy, selects
+from rosproxy_operator.kubernetes.planner.pods.selection import (
+    ambiguity_warning,
+    on_node,
+    select_rosproxy,
+    selects,
+)
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
     HelperPod,
@@ -26,7 +31,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import is_own, proxy_id
-from rosproxy_operator.kubernetes.status.findings import finding
+from rosproxy_operator.kubernetes.status.findings import finding, pod_finding
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -145,6 +150,13 @@ def _selected_pods(
     findings = [
         replace(choice, of=r.id)
         for choice, pod in refused
+        for r in rosproxies.values()
+        if selects(r, pod)
+    ]
+    findings += [
+        pod_finding(pod, r, "Ambiguous", text, fatal=False)
+        for choice, pod in choices
+        if isinstance(choice, RosProxy) and (text := ambiguity_warning(pod, rosproxies.values()))
         for r in rosproxies.values()
         if selects(r, pod)
     ]

@@ -81,6 +81,23 @@ def test_when_all_is_there_nothing_is_done() -> None:
     assert (second.actions, second.next_look_in) == ((), None)
 
 
+def test_a_second_rosproxy_takes_no_proxy_from_a_wired_pod() -> None:
+    """Not even after the grace: the nodes of the pod would be unregistered for good."""
+    of = rosproxy(cluster_ip="10.96.1.1", grace=2.0)
+    second = rosproxy("second", cluster_ip="10.96.1.2")
+    wired = replace(pod(), wired_master_uri=names.master_uri("10.96.1.1"))
+    services = (service(of), service(second, "10.96.1.2"))
+    seen = observed(of, second, wired, proxy(), *services)
+
+    first = look(seen)
+    later = look(seen, first.state, 200.0)
+
+    assert done(first) == done(later) == []
+    texts = told(later, "Ambiguous")
+    assert len(texts) == len([of, second])
+    assert all("stays with robot, but a new pod" in text for text in texts)
+
+
 @pytest.mark.parametrize(
     "other_pod",
     [
@@ -332,7 +349,8 @@ def test_each_of_two_rosproxies_names_the_pod_that_both_select() -> None:
         assert ready["message"] == (
             "no pod has a proxy. pod ros/talker: is selected by RosProxy arm and leg, so the pod "
             "gets no proxy. Set the label to the name of one RosProxy, such as "
-            "rosproxy.io/inject=arm"
+            "rosproxy.io/inject=arm in the template, then run kubectl -n ros delete pod talker, "
+            "and create the pod again"
         )
 
 

@@ -1,16 +1,20 @@
 """The pods that a RosProxy selects."""
 
+from typing import Any
+
 import pytest
 from msgspec.structs import replace
 
+from rosproxy_operator.common.zenoh import tcp_endpoint
 from rosproxy_operator.kubernetes.planner.pods.selection import (
+    ambiguity_warning,
     matches,
     on_node,
     select_rosproxy,
     why_not_selected,
 )
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, ClusterNode, Name, Selector
-from rosproxy_operator.kubernetes.resources.names import own_labels
+from rosproxy_operator.kubernetes.resources.names import own_labels, router_of
 from tests.unit.operator.kubernetes.builders_api import pod, rosproxy
 
 INJECT = "rosproxy.io/inject"
@@ -100,6 +104,37 @@ def test_a_pod_that_two_select_has_none(labels):
     assert (finding.about.kind, finding.about.uid) == ("Pod", "uid-talker")
     assert "arm and leg" in finding.text
     assert f"{INJECT}=arm" in finding.text
+
+
+@pytest.mark.parametrize(
+    "wired",
+    [
+        {"wired_master_uri": "http://10.96.0.7:11311"},
+        {"static_peers": "10.96.0.7"},
+        {"router_endpoint": tcp_endpoint(router_of("10.96.0.7"))},
+    ],
+)
+def test_a_wired_pod_stays_when_a_second_rosproxy_selects_the_pod(wired):
+    """Without its proxy, the nodes of the pod would be unregistered at the master for good."""
+    arm = rosproxy("arm", ALL, cluster_ip="10.96.0.7")
+    leg = rosproxy("leg", ALL, cluster_ip="10.96.0.8")
+    talker = pod(workload="deployment/talker", **wired)
+
+    assert select_rosproxy(talker, [leg, arm]) is arm
+    text = ambiguity_warning(talker, [leg, arm])
+    assert "is selected by RosProxy arm and leg. This pod stays with arm, but a new pod" in text
+    assert f"{INJECT}=arm in the template: kubectl -n robots edit deployment/talker" in text
+
+
+def test_a_clear_choice_has_no_warning():
+    arm = rosproxy("arm", ALL, cluster_ip="10.96.0.7")
+    leg = rosproxy("leg", ALL, cluster_ip="10.96.0.8")
+    wired: Any = {"wired_master_uri": "http://10.96.0.7:11311"}
+
+    assert ambiguity_warning(pod(**wired), [arm]) == ""
+    assert ambiguity_warning(pod(), [arm, leg]) == ""
+    assert ambiguity_warning(pod(labels={INJECT: "arm"}, **wired), [arm, leg]) == ""
+    assert select_rosproxy(pod(labels={INJECT: "leg"}, **wired), [arm, leg]) is leg
 
 
 def test_a_pod_in_its_nodes_own_network_is_left_out():

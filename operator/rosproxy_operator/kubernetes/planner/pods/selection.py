@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
+from rosproxy_operator.common.zenoh import tcp_endpoint
 from rosproxy_operator.kubernetes.planner.pods.wiring import edit_fix, recreate_fix
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
@@ -10,7 +11,14 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
     Selector,
 )
-from rosproxy_operator.kubernetes.resources.names import COMPONENT_LABEL, INJECT, NAME_LABEL, is_own
+from rosproxy_operator.kubernetes.resources.names import (
+    COMPONENT_LABEL,
+    INJECT,
+    NAME_LABEL,
+    is_own,
+    master_uri,
+    router_of,
+)
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 LABEL_OFF_VALUES = ("", "false")
@@ -40,21 +48,20 @@ def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | Clus
     """Return the RosProxy that takes a pod, or the reason why a selected pod gets no proxy.
 
     If several RosProxies select the pod, the pod's label has to name one of them: otherwise the
-    result is a finding with the reason Ambiguous. For a pod in the host's network, the result is a
-    finding with the reason HostNetwork. If no RosProxy selects the pod, the result is None.
+    result is a finding with the reason Ambiguous. But a pod that was wired to a single one of them
+    stays there: without its proxy, the ROS 1 nodes of the pod would be unregistered for good. For a
+    pod in the host's network, the result is a finding with the reason HostNetwork. If no RosProxy
+    selects the pod, the result is None.
     """
-    taking = sorted((r for r in rosproxies if selects(r, pod)), key=lambda r: r.id)
-    named = [r for r in taking if r.id.name == pod.labels.get(INJECT)]
+    taking = _taking(pod, rosproxies)
     if not taking:
         return None
-    if not named and len(taking) > 1:
-        names = [r.id.name for r in taking]
-        text = (
-            f"is selected by RosProxy {' and '.join(names)}, so the pod gets no proxy. Set the "
-            f"label to the name of one RosProxy, such as {INJECT}={names[0]}"
-        )
-        return pod_finding(pod, taking[0], "Ambiguous", text)
-    rosproxy = (named or taking)[0]
+    named = _named(pod, taking)
+    wired = [r for r in taking if _is_wired_to(pod, r)]
+    if not named and len(taking) > 1 and len(wired) != 1:
+        text = f"is selected by RosProxy {_names(taking)}, so the pod gets no proxy"
+        return pod_finding(pod, taking[0], "Ambiguous", f"{text}. {_choice_fix(pod, taking[0])}")
+    rosproxy = (named or (wired if len(wired) == 1 else taking))[0]
     if pod.host_network:
         text = (
             "is on the node's own network (hostNetwork), where ROS nodes need no proxy and get "
@@ -62,6 +69,22 @@ def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | Clus
         )
         return pod_finding(pod, rosproxy, "HostNetwork", text)
     return rosproxy
+
+
+def ambiguity_warning(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
+    """Return the text about a pod that stays with its RosProxy though several select the pod.
+
+    The result is empty if the choice is clear, or if `select_rosproxy` chooses no RosProxy.
+    """
+    taking = _taking(pod, rosproxies)
+    wired = [r for r in taking if _is_wired_to(pod, r)]
+    if len(taking) <= 1 or len(wired) != 1 or _named(pod, taking):
+        return ""
+    kept = wired[0]
+    return (
+        f"is selected by RosProxy {_names(taking)}. This pod stays with {kept.id.name}, but a new "
+        f"pod with this label gets no proxy. {_choice_fix(pod, kept)}"
+    )
 
 
 def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
@@ -115,6 +138,36 @@ def selects(rosproxy: RosProxy, pod: Pod) -> bool:
     if selector is None:
         return label in own_values(rosproxy.id.name)
     return matches(selector, pod.labels)
+
+
+def _taking(pod: Pod, rosproxies: Iterable[RosProxy]) -> list[RosProxy]:
+    """Return the RosProxies that select a pod, sorted."""
+    return sorted((r for r in rosproxies if selects(r, pod)), key=lambda r: r.id)
+
+
+def _named(pod: Pod, rosproxies: Iterable[RosProxy]) -> list[RosProxy]:
+    """Return the RosProxy that the label of a pod names, in a list; empty without one."""
+    return [r for r in rosproxies if r.id.name == pod.labels.get(INJECT)]
+
+
+def _names(rosproxies: Iterable[RosProxy]) -> str:
+    return " and ".join(r.id.name for r in rosproxies)
+
+
+def _choice_fix(pod: Pod, rosproxy: RosProxy) -> str:
+    label = f"{INJECT}={rosproxy.id.name}"
+    change = f"Set the label to the name of one RosProxy, such as {label} in the template"
+    return edit_fix(change, pod)
+
+
+def _is_wired_to(pod: Pod, rosproxy: RosProxy) -> bool:
+    """Whether a variable that the webhook set in a pod has the address of the RosProxy."""
+    address = rosproxy.cluster_ip
+    if not address:
+        return False
+    router = tcp_endpoint(router_of(address))
+    wired = (pod.wired_master_uri, pod.static_peers, pod.router_endpoint)
+    return bool({*wired} & {master_uri(address), address, router})
 
 
 def _is_ours(labels: Mapping[str, str]) -> bool:
