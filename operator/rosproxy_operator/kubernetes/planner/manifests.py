@@ -371,7 +371,10 @@ def _spec(site: ProxySite, settings: ClusterSettings, local_ports: PortRange) ->
     return {
         **bound_to(site.node.name, spec, settings),
         "terminationGracePeriodSeconds": TERMINATION_GRACE_S,
-        "securityContext": {**pod_security_context(settings), "sysctls": sysctls},
+        "securityContext": {
+            **pod_security_context(settings, forwards=spec.proxy.data_plane == "kernel"),
+            "sysctls": sysctls,
+        },
         **({"hostAliases": aliases} if aliases else {}),
         **(hub if spec.zenoh else {}),
         **({"volumes": [_link_volume(link)]} if (link := _link_of(spec)) else {}),
@@ -393,14 +396,18 @@ def _link_volume(link: LinkSpec) -> Json:
     return {"name": LINK_VOLUME, "secret": secret}
 
 
-def pod_security_context(settings: ClusterSettings) -> dict[str, Any]:
+def pod_security_context(settings: ClusterSettings, forwards: bool = False) -> dict[str, Any]:
     """The ``securityContext`` of pods with the proxy's image.
 
-    The process has to be in the image's group, to which the programs for the kernel plane belong.
-    Container runtimes refuse runAsGroup without runAsUser: then the group is a supplemental group.
+    With ``forwards``, for the kernel plane, the process has to be in the image's group, to which
+    the programs for the kernel plane belong. Container runtimes refuse runAsGroup without
+    runAsUser: then the group is a supplemental group. Without the kernel plane the pod names no
+    group then, since OpenShift's SCCs may refuse groups outside the range of the namespace.
     """
     user = settings.pod.run_as_user
-    in_group = {"runAsUser": user, "runAsGroup": USER} if user else {"supplementalGroups": [USER]}
+    in_group: dict[str, Any] = {"runAsUser": user, "runAsGroup": USER} if user else {}
+    if forwards and not user:
+        in_group = {"supplementalGroups": [USER]}
     return {
         "runAsNonRoot": True,
         **in_group,
