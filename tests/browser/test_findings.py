@@ -63,13 +63,19 @@ def test_one_fix_in_one_place_is_one_cause(browser: Browser, tmp_path: Path) -> 
             ("/c", "/d", "on the machine of /d: nc -vz 10.0.0.1 11413"),
         )
     }
-    finding = {"severity": "warning", "subject": "ports", "text": "few are free", "fix": "more"}
+    findings = [
+        {"severity": "warning", "subject": "ports", "text": "few are free", "fix": "more"},
+        *({"severity": "warning", "subject": f"container {name}", "text": f"label x{n} is unknown",
+           "fix": ""} for name, n in (("talker", 1), ("talker", 2), ("listener", 3))),
+    ]  # fmt: skip
     with made_up(browser, tmp_path, 10):
-        assert browser.run(CAUSES, nodes, links, [finding]) == [
+        assert browser.run(CAUSES, nodes, links, findings) == [
             f"4 at 172.18.0.2: /a, …: {CLEANUP}",
             "2 at 172.18.0.3: /t from /c to /d, …: on the machine of /d: nc -vz 10.0.0.1 11413",
             f"/c: {CLEANUP}",
+            "2 at talker: container talker, …: ",
             "ports: more",
+            "container listener: ",
         ]
 
 

@@ -1,6 +1,7 @@
 """Faults on a host in the doctor's report: the first cause, and the fix."""
 
 import json
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from functools import partial
@@ -45,6 +46,16 @@ def page() -> dict[str, Any]:
     with urllib.request.urlopen(f"http://{OPTIONS[-1]}/graph", timeout=30) as reply:
         graph: dict[str, Any] = json.loads(reply.read())
     return graph
+
+
+def warnings_on_page(container: str) -> list[str]:
+    """The texts of the warnings about a container on the live page; none without a page yet."""
+    wanted = ("warning", f"container {container}")
+    try:
+        findings = page()["findings"]
+    except urllib.error.URLError:
+        return []
+    return [f["text"] for f in findings if (f["severity"], f["subject"]) == wanted]
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +167,11 @@ def test_a_misspelt_label(process: Process, net: Inside) -> None:
     assert "label ros-proxy.enable is unknown and ignored" in told["text"]
     assert "Did you mean rosproxy.enable?" in told["text"]
     assert "Did you mean rosproxy.enable?" in process.once("status", check=False)
+    process.start()
+    try:
+        wait_until(lambda: told["text"] in warnings_on_page(node.name), 30, process.logs)
+    finally:
+        process.stop()
 
 
 def test_a_masters_name_that_leads_nowhere_and_its_fix(

@@ -5,7 +5,7 @@ merged page shows each node and each link once. A node outside one proxy may be 
 master on loopback is a different master on each host. A participant of ROS 2 has the same key at
 all proxies: the domain and the unique GUID prefix. The same holds for a node of rmw_zenoh, whose
 key has the domain and the zenoh ID of its session. If a proxy does not answer, the page shows the
-proxy as a node with the reason.
+proxy as a node with the reason. The problems that the operator finds by itself are findings, too.
 
 An attacker may control a proxy. So each proxy gets a fair share of the nodes, links and findings.
 The operator shortens all texts as a proxy of this release does. A proxy can't forge the key of
@@ -13,7 +13,7 @@ another proxy or of a node inside another proxy. The operator drops a link if ne
 the proxy that reports the link.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from itertools import islice
 from operator import itemgetter
 from types import MappingProxyType
@@ -49,6 +49,7 @@ from rosproxy.page.page_document import (
 )
 from rosproxy.page.zenoh_graph import HUB, NODE, ROUTER
 from rosproxy.telemetry.text import plural
+from rosproxy_operator.common.problem import Problem
 
 Json = dict[str, Any]
 PROXY = "proxy"
@@ -56,6 +57,8 @@ PARTICIPANT = "participant"
 """Kinds of nodes on the page (`PageNode.kind`)."""
 _SHARED_KINDS = frozenset({PARTICIPANT, NODE, ROUTER, HUB})
 """Kinds of nodes with the same key at all proxies."""
+_OPERATOR = ""
+"""The owner of the operator's own findings, in place of the name of a proxy."""
 _LONG_TEXT_FIELDS = ("text", "fix", "detail")
 _MOST_LEFT_OUT = 10**9
 Row = TypeVar("Row", PageNode, PageLink, PageFinding, PageProxy)
@@ -77,24 +80,26 @@ def merged(
     version: str,
     logs: Callable[[str], str],
     places: Mapping[str, str] = MappingProxyType({}),
+    problems: Sequence[Problem] = (),
 ) -> Json:
     """Return a single document from the documents of all proxies.
 
     ``documents`` has a document for each proxy name, or a text that says why the proxy does not
     answer. ``logs`` returns the command that shows the logs of a proxy. ``places`` has the names of
-    containers or pods inside, by address.
+    containers or pods inside, by address. ``problems`` are the problems of the operator.
     """
     nodes: dict[str, PageNode] = {}
     links: dict[str, PageLink] = {}
-    findings: list[tuple[str, PageFinding]] = []
+    silent = _silent(documents, problems)
+    findings = [*_own_findings(p for p in problems if p not in silent.values())]
     shares = _shares(documents)
     left_out = sum(_size(whole) - _size(shares[name]) for name, whole in documents.items())
     documents = shares
     inside = _inside(documents)
     for name, document in documents.items():
         if isinstance(document, str):
-            text = f"no data from this proxy: {document}"
-            nodes[name] = PageNode(HOST, PROXY, name, BROKEN, text, logs(name))
+            reason = silent[name].text if name in silent else document
+            nodes[name] = _silent_proxy(name, reason, logs(name))
             continue
         others = documents.keys() - {name}
         page_keys = {
@@ -121,6 +126,38 @@ def merged(
         "findings": msgspec.to_builtins([f for _, f in shown_findings]),
         "left_out": left_out + len(nodes) - len(shown) + len(links) - len(kept),
     }
+
+
+def _silent(
+    documents: Mapping[str, Document | str], problems: Sequence[Problem]
+) -> dict[str, Problem]:
+    """Return the operator's problems about proxies that do not answer, by proxy name.
+
+    The page shows such a problem at the proxy, because a finding would repeat the fault.
+    """
+    return {
+        name: problem
+        for name, reason in documents.items()
+        if isinstance(reason, str)
+        for problem in problems
+        if problem.subject.startswith("proxy ") and reason in problem.text
+    }
+
+
+def _silent_proxy(name: str, reason: str, fix: str) -> PageNode:
+    text = shown_text(f"no data from this proxy: {reason}")
+    return PageNode(HOST, PROXY, name, BROKEN, text, fix)
+
+
+def _own_findings(problems: Iterable[Problem]) -> Iterator[tuple[str, PageFinding]]:
+    """Yield the operator's problems as findings, fatal problems first, each with the owner.
+
+    A problem has the fix in the text, as in the operator's doctor.
+    """
+    for problem in sorted(problems, key=lambda p: not p.fatal):
+        severity = "error" if problem.fatal else "warning"
+        subject = shown_name(problem.subject)
+        yield _OPERATOR, PageFinding(severity, subject, shown_text(problem.text))
 
 
 def _placed(name: str, key: str, node: PageNode, places: Mapping[str, str]) -> PageNode:

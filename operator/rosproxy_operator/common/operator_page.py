@@ -8,7 +8,7 @@ token of a single proxy must not see all proxies.
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
 from rosproxy import __version__
@@ -18,6 +18,7 @@ from rosproxy.page.page_document import Document
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
 from rosproxy_operator.common.merged_page import merged
+from rosproxy_operator.common.problem import Problem
 
 ROUND_PAUSE_S = 2.0
 """Seconds from the end of a round to the next round."""
@@ -29,18 +30,19 @@ def operator_page(
     documents: Documents,
     logs: Callable[[str], str],
     places: Callable[[], Mapping[str, str]] = dict,
+    problems: Callable[[], Sequence[Problem]] = tuple,
 ) -> Page:
     """Return the page. ``documents`` requests the documents of all proxies.
 
     ``logs`` returns the command that shows the logs of a proxy. ``places`` returns the names of
-    containers or pods inside, by address.
+    containers or pods inside, by address. ``problems`` returns the problems of the operator.
     """
 
     async def make() -> AsyncGenerator[dict[str, Any]]:
         while True:
             proxy_documents = await documents()
-            names = places()
-            yield await asyncio.to_thread(merged, proxy_documents, __version__, logs, names)
+            own = places(), tuple(problems())
+            yield await asyncio.to_thread(merged, proxy_documents, __version__, logs, *own)
             await asyncio.sleep(ROUND_PAUSE_S)
 
     return Page(Feed(Tasks(), make), Visitors(None, time.monotonic, local=True))

@@ -102,7 +102,9 @@ async def _run(
 ) -> None:
     metrics = DockerMetrics()
     controller = DockerController(settings, resync, metrics, mistakes=mistakes)
-    page = operator_page(controller.documents, "docker logs {}".format, controller.places)
+    page = operator_page(
+        controller.documents, "docker logs {}".format, controller.places, controller.problems
+    )
     admin_server = OperatorAdminServer(
         metrics.registry, controller.dead, controller.unready, page, controller.status
     )
@@ -197,6 +199,10 @@ class DockerController:
     def places(self) -> dict[str, str]:
         """Return the names of the containers at each address, from the last look."""
         return container_names(self._last[0].state) if self._last else {}
+
+    def problems(self) -> list[Problem]:
+        """Return the problems of the last look."""
+        return self._shown
 
     async def status(self) -> Json:
         """Look anew, ask all proxies, and return the status document. Raises LookFailed."""

@@ -16,7 +16,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 from msgspec.structs import replace
 
@@ -51,6 +51,7 @@ from rosproxy_operator.kubernetes.resources.model import ClusterFinding
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.status.events import stamp
+from rosproxy_operator.kubernetes.status.findings import WARNS
 from rosproxy_operator.kubernetes.status.rosproxy_status import participants
 from rosproxy_operator.kubernetes.watch.reflector import Reflector, watched_collections
 from rosproxy_operator.kubernetes.watch.store import ClusterStore
@@ -163,6 +164,13 @@ class KubernetesController:
     def places(self) -> dict[str, str]:
         """Return the names of pods by address, in namespaces with a RosProxy."""
         return self._store.pod_names()
+
+    def problems(self) -> list[Problem]:
+        """Return the problems of the last look for the live page; none on standby.
+
+        Warnings of the proxies are left out: the operator only repeats these warnings.
+        """
+        return [*self._findings(WARNS), *self._own_problems()] if self._acting else []
 
     async def look(self) -> float | None:
         """Look and act. Return the seconds until the next look. Raises LookFailed.
@@ -290,9 +298,7 @@ class KubernetesController:
             reflector.relist()
 
     def _report(self, observed: ClusterSnapshot) -> None:
-        own_problems = (*self._applier.problems.values(), *self._key.problems)
-        findings = [finding for _, group in sorted(self._problems.items()) for finding in group]
-        problems: list[Problem] = [*findings, *own_problems]
+        problems: list[Problem] = [*self._findings(), *self._own_problems()]
         self._log.update(problems)
         metrics = self._metrics
         metrics.rosproxies.set(len(observed.rosproxies))
@@ -300,6 +306,15 @@ class KubernetesController:
         metrics.problems.set(len(problems))
         metrics.show_proxies(map(_proxy_state, observed.proxies))
         metrics.show_participants(participants(observed))
+
+    def _findings(self, *without: str) -> Iterator[ClusterFinding]:
+        """Yield the findings of all RosProxies, except findings with the reasons ``without``."""
+        for _, group in sorted(self._problems.items()):
+            yield from (finding for finding in group if finding.reason not in without)
+
+    def _own_problems(self) -> tuple[Problem, ...]:
+        """Return the failures of requests, and the problems with the key of the tokens."""
+        return (*self._applier.problems.values(), *self._key.problems)
 
 
 def _proxy_state(proxy: ProxyPod) -> str:

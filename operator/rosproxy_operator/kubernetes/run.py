@@ -14,6 +14,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from rosproxy import __version__
+from rosproxy.page.routes import Page
 from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.operator_page import operator_page
@@ -77,7 +78,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     webhook_since = server.serving_since if server else lambda: ""
     controller = KubernetesController(settings, api, metrics, election.term, webhook_since)
     webhook = (Injector(api, settings.plan, metrics, controller.wake), server) if server else None
-    page = operator_page(controller.documents, logs_command, controller.places)
+    page = _page(controller)
     unready = _first_reason(controller.unready, *([server.unready] if server else []))
     admin_server = OperatorAdminServer(metrics.registry, controller.dead, unready, page)
     await admin_server.start(settings.admin)
@@ -107,6 +108,10 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     serving.stop()
     for task in done:
         task.result()  # raises the error of a failed task
+
+
+def _page(controller: KubernetesController) -> Page:
+    return operator_page(controller.documents, logs_command, controller.places, controller.problems)
 
 
 async def hand_over(api: Api, controller: KubernetesController, election: LeaderElection) -> None:

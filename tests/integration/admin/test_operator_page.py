@@ -14,12 +14,14 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.page.page_document import Document
 from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_page import operator_page
+from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import ProxyClient
 from tests.integration.conftest import MakeProxy
 from tests.integration.net import NODE, until
 from tests.integration.proxy import Proxy
 
 TOKEN = "0123456789abcdef"
+MISSPELT = Problem("container talker-1", "label x is unknown. Did you mean y?", fatal=False)
 
 
 @pytest.fixture
@@ -41,7 +43,9 @@ async def opened(
         CollectorRegistry(),
         lambda: None,
         lambda: None,
-        operator_page(documents, "docker logs {}".format, lambda: {NODE: "talker-1"}),
+        operator_page(
+            documents, "docker logs {}".format, lambda: {NODE: "talker-1"}, lambda: [MISSPELT]
+        ),
     )
 
 
@@ -63,12 +67,15 @@ async def test_all_proxies_stand_on_one_page(
     try:
         async with aiohttp.ClientSession() as session:
             async with session.get(f"http://{address}/graph") as reply:
-                nodes = json.loads(await reply.read())["nodes"]
+                document = json.loads(await reply.read())
+            nodes = document["nodes"]
             assert nodes["one /talker"]["label"] == "/talker"
             assert nodes["one /talker"]["place"] == "talker-1"
             assert nodes["two rosproxy"]["label"] == "two"
             assert nodes["gone"]["state"] == "broken"
             assert f"{gone} refuses connections" in nodes["gone"]["text"]
+            own = {"subject": MISSPELT.subject, "text": MISSPELT.text}
+            assert {"severity": "warning", "fix": "", **own} in document["findings"]
             async with session.get(f"http://{address}/", headers={"Host": "evil.example"}) as reply:
                 assert reply.status == 403
             async with session.get(f"http://{address}/events") as reply:

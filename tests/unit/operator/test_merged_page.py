@@ -17,6 +17,7 @@ from rosproxy.page.page_document import (
     PageNode,
 )
 from rosproxy_operator.common.merged_page import merged, read_document
+from rosproxy_operator.common.problem import Problem
 
 MASTER = "http://robot:11311"
 LOGS = "docker logs {}".format
@@ -199,6 +200,42 @@ def test_a_proxy_that_cannot_be_asked_says_why() -> None:
         "no data from this proxy: 10.0.0.1:11312 refuses connections",
         "docker logs one",
     )
+
+
+def test_the_operators_own_problems_are_findings() -> None:
+    """Fatal problems come first, and the texts are as short as the texts of a proxy."""
+    warning = Problem("container talker", "label x is unknown. Did you mean y?\x1b", fatal=False)
+    fatal = Problem("master robot", "long" * LONGEST_TEXT)
+    findings = merged({"one": shown("a")}, "1", LOGS, {}, [warning, fatal])["findings"]
+    assert [(f["severity"], f["subject"], f["fix"]) for f in findings] == [
+        ("error", "master robot", ""),
+        ("warning", "container talker", ""),
+        ("error", "one: ports", "x"),
+    ]
+    assert len(findings[0]["text"]) == LONGEST_TEXT
+    assert findings[1]["text"] == "label x is unknown. Did you mean y?\\x1b"
+
+
+def test_proxies_and_the_operator_share_the_room_for_findings() -> None:
+    problems = [Problem(f"container {number}", "x", fatal=False) for number in range(500)]
+    problems.append(Problem("container last", "x"))
+    documents = {"evil": hostile(), "good": shown("a")}
+    findings = merged(documents, "1", LOGS, {}, problems)["findings"]
+    assert len(findings) == MOST_FINDINGS
+    subjects = [finding["subject"] for finding in findings]
+    assert subjects[0] == "container last"
+    assert "good: ports" in subjects
+    assert "evil: s" in subjects
+
+
+def test_a_silent_proxy_is_reported_once() -> None:
+    """The operator's problem has more to do about the proxy than the reason alone."""
+    reason = "10.0.0.1:11312 refuses connections"
+    advice = f"admin endpoint {reason}. Attach the operator to network uplink"
+    problems = [Problem("proxy one", advice), Problem("proxy one", "port 11412 is taken")]
+    document = merged({"one": reason}, "1", LOGS, {}, problems)
+    assert document["nodes"]["one"]["text"] == f"no data from this proxy: {advice}"
+    assert [finding["text"] for finding in document["findings"]] == ["port 11412 is taken"]
 
 
 def test_what_is_broken_stays_where_not_all_fits() -> None:

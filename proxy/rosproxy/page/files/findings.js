@@ -19,7 +19,7 @@ export function causesOf({ nodes, links, findings }) {
     if (ids.link) cause.links.add(ids.link);
   };
   for (const one of findings) {
-    add(one.severity === "error" ? "broken" : "warning", "", { what: one.subject, text: one.text, fix: one.fix }, {});
+    add(one.severity === "error" ? "broken" : "warning", subjectPlace(one.subject), { what: one.subject, text: one.text, fix: one.fix }, {});
   }
   for (const [id, node] of nodes) {
     if (isWrong(node)) add(node.state, hostOf(node.address), { what: labelOf(id, node) + behind([node]), text: node.text || "", fix: node.fix || "" }, { node: id }, [id, labelOf(id, node)]);
@@ -32,6 +32,12 @@ export function causesOf({ nodes, links, findings }) {
     add(link.state, placeOf(link, ends, nodes), { what, text: link.text || "", fix: link.fix || "" }, { link: id }, [...ends, ...labels]);
   }
   return [...causes.values()].sort((a, b) => RANK[b.kind] - RANK[a.kind] || b.count - a.count);
+}
+
+// The container or pod in the subject of an operator's finding, such as "container talker".
+function subjectPlace(subject) {
+  const [kind, name] = subject.split(" ");
+  return (kind === "container" || kind === "pod") && name || "";
 }
 
 function isWrong({ state }) {

@@ -11,6 +11,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.master_resolver import MasterResolver
 from rosproxy_operator.common.operator_metrics import DockerMetrics
+from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker import snapshot
 from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.engine_client import DockerClient
@@ -311,6 +312,21 @@ async def test_the_page_tells_of_a_proxy_that_has_ended(
     await controller.look()
     wanted = {proxy_name(PLACE): "the proxy's container is exited"} if is_told else {}
     assert await controller.documents() == wanted
+
+
+async def test_the_page_tells_of_problems_of_the_operator(engine: FakeEngine) -> None:
+    """An unknown variable, and a container with an unknown label."""
+    mistake = Problem("variable ROSPROXY_X", "unknown", fatal=False)
+    controller = DockerController(SETTINGS, 30.0, DockerMetrics(), mistakes=[mistake])
+    assert controller.problems() == []
+    row = captured.running() | {"Id": "c" * 64, "Names": ["/odd"]}
+    row["Labels"] = {"ros-proxy.enable": "true"}
+    inspected = captured.inspected()
+    inspected["Config"]["Labels"] = row["Labels"]
+    engine.add(row, inspected)
+    await controller.look()
+    subjects = {problem.subject for problem in controller.problems()}
+    assert subjects >= {"variable ROSPROXY_X", "container odd"}
 
 
 async def test_once_tells_what_is_not_as_wanted(engine: FakeEngine) -> None:

@@ -227,6 +227,22 @@ async def test_an_operator_without_the_lead_only_looks(server: ApiServer, runnin
     await until(lambda: len(proxies(server)) == 2)
 
 
+async def test_the_page_of_the_leader_tells_of_problems_of_the_operator(
+    server: ApiServer, running: Running
+) -> None:
+    """A Secret that is missing, and a pod with a misspelt label."""
+
+    def subjects() -> set[str]:
+        return {problem.subject for problem in running.controller.problems()}
+
+    put_all(server)
+    server.put("pods", pod_obj("odd", {"rosproxy.io/injct": "true"}), NAMESPACE)
+    await until(lambda: subjects() >= {"proxies' tokens", f"pod {NAMESPACE}/odd"})
+    running.term = 0
+    running.controller.wake()
+    await until(lambda: not subjects())
+
+
 async def test_an_api_server_that_is_away(
     server: ApiServer, running: Running, caplog: pytest.LogCaptureFixture
 ) -> None:
