@@ -52,7 +52,9 @@ def broken(fix: str, **more: str) -> Json:
 def test_one_fix_in_one_place_is_one_cause(browser: Browser, tmp_path: Path) -> None:
     inside = {"lane": "container", "address": "172.18.0.2:1"}
     nodes: dict[str, Any] = {name: broken(CLEANUP, **inside) for name in ("/a", "/b")}
-    nodes["/c"] = broken(CLEANUP, lane="container", address="172.18.0.3:1")
+    camera = {"lane": "container", "address": "172.18.0.3:1", "place": "camera"}
+    nodes["/c"] = broken(CLEANUP, proxy="ros1", **camera)
+    nodes["/e"] = broken(CLEANUP, proxy="ros2", **camera)
     nodes["/d"] = {"lane": "robot", "address": "10.0.0.2"}
     links = {
         f"{source} {target}": broken(fix, name="/t", source=source, target=target)
@@ -71,8 +73,10 @@ def test_one_fix_in_one_place_is_one_cause(browser: Browser, tmp_path: Path) -> 
     with made_up(browser, tmp_path, 10):
         assert browser.run(CAUSES, nodes, links, findings) == [
             f"4 at 172.18.0.2: /a, …: {CLEANUP}",
-            "2 at 172.18.0.3: /t from /c to /d, …: on the machine of /d: nc -vz 10.0.0.1 11413",
-            f"/c: {CLEANUP}",
+            "2 at camera: /t from /c to /d, behind ros1, …: "
+            "on the machine of /d: nc -vz 10.0.0.1 11413",
+            f"/c, behind ros1, in camera: {CLEANUP}",
+            f"/e, behind ros2, in camera: {CLEANUP}",
             "2 at talker: container talker, …: ",
             "ports: more",
             "container listener: ",

@@ -6,6 +6,7 @@ behind px2.
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests.browser.page import (
+    CHOOSE,
     box_colour,
     colour,
     line,
@@ -109,7 +111,8 @@ def operator(
 ) -> Iterator[Process]:
     """The operator, with the page open in the browser. The proxies are named `one` and `two`."""
     addresses = {"one": lab.place("px").address, "two": lab.place("px2").address}
-    words = ["tests.browser.merged", TOKEN]
+    places = {lab.place(name).address: f"box-{name}" for name in ("c1", "c2")}
+    words = ["tests.browser.merged", TOKEN, json.dumps(places)]
     words += [f"{name}={address}:{ADMIN_PORT}" for name, address in addresses.items()]
     with serving(browser, machine, tmp_path / "operator.log", OPERATOR_PORT, *words) as server:
         yield server
@@ -133,8 +136,8 @@ def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: B
         "the page shows each link once", lambda: hearers(browser) == ["/hearer", "/listener"]
     )
     for name, where in (
-        ("/talker", "container, inside of one"),
-        ("/hearer", "container, inside of two"),
+        ("/talker", "box-c1, inside of one"),
+        ("/hearer", "box-c2, inside of two"),
         ("/listener", "robot, outside"),
         ("master (master)", "robot, outside"),
     ):
@@ -143,6 +146,8 @@ def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: B
     red = colour(browser, "broken")
     assert box_colour(browser, "two") == ok
     assert line(browser, "/talker", "/hearer")["colour"] == ok
+    told = "/chatter from /talker at box-c1 to /hearer at box-c2"
+    assert told in browser.run(CHOOSE, "/talker", "/hearer")
 
     second.process.kill()
     wait_until("the page shows proxy two as broken", lambda: "BROKEN: two\n" in trouble(browser))
@@ -154,7 +159,7 @@ def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: B
     assert box_colour(browser, "two") == red
     assert title(browser) == "(1 broken) rosproxy"
     assert node_rows(browser, "one (proxy)")[0][0] == "ok"
-    assert node_rows(browser, "/talker")[0][2] == "container, inside of one"
+    assert node_rows(browser, "/talker")[0][2] == "box-c1, inside of one"
 
     second.start_again()
     wait_until("nothing is broken", lambda: title(browser) == "rosproxy")
@@ -163,5 +168,5 @@ def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: B
     row(browser, "/chatter", State="ok", From="/talker", To="/hearer")
     wait_until(
         "/hearer is back behind proxy two",
-        lambda: [c[2] for c in node_rows(browser, "/hearer")] == ["container, inside of two"],
+        lambda: [c[2] for c in node_rows(browser, "/hearer")] == ["box-c2, inside of two"],
     )

@@ -1,35 +1,35 @@
 // What is wrong, one entry for each cause, and what happened: pure functions, without a DOM.
 
-import { hostOf, labelOf, RANK } from "./view.js";
+import { labelOf, placeOf, RANK } from "./view.js";
 
 const MOST_EVENTS = 50;
 
 // The causes, the worst first. What has one fix and one place (a container or a machine) is one
 // cause: a container that ends, or a firewall, leaves many links with a problem. Names of nodes and
-// numbers, such as ports, make no other fix.
+// numbers, such as ports, make no other fix. Pods behind two proxies may have the same name.
 export function causesOf({ nodes, links, findings }) {
   const causes = new Map();
-  const add = (kind, place, { what, text, fix }, ids, names = []) => {
+  const add = (kind, { place, proxy = "", container = "" }, { what, text, fix }, ids, names = []) => {
     const shape = names.reduce((rest, name) => rest.replaceAll(name, ""), fix || text).replace(/\d+/g, "");
-    const key = `f:${JSON.stringify([kind, place, shape])}`;
-    if (!causes.has(key)) causes.set(key, { key, kind, place, what, text, fix, count: 0, nodes: new Set(), links: new Set() });
+    const key = `f:${JSON.stringify([kind, proxy, place, shape])}`;
+    if (!causes.has(key)) causes.set(key, { key, kind, place, container, what, text, fix, count: 0, nodes: new Set(), links: new Set() });
     const cause = causes.get(key);
     cause.count += 1;
     if (ids.node) cause.nodes.add(ids.node);
     if (ids.link) cause.links.add(ids.link);
   };
   for (const one of findings) {
-    add(one.severity === "error" ? "broken" : "warning", subjectPlace(one.subject), { what: one.subject, text: one.text, fix: one.fix }, {});
+    add(one.severity === "error" ? "broken" : "warning", { place: subjectPlace(one.subject) }, { what: one.subject, text: one.text, fix: one.fix }, {});
   }
   for (const [id, node] of nodes) {
-    if (isWrong(node)) add(node.state, hostOf(node.address), { what: labelOf(id, node) + behind([node]), text: node.text || "", fix: node.fix || "" }, { node: id }, [id, labelOf(id, node)]);
+    if (isWrong(node)) add(node.state, whereOf(node), { what: labelOf(id, node) + behind([node]), text: node.text || "", fix: node.fix || "" }, { node: id }, [id, labelOf(id, node)]);
   }
   for (const [id, link] of links) {
     if (!isWrong(link)) continue;
     const ends = [link.source, link.target].filter(Boolean);
     const labels = ends.map((end) => labelOf(end, nodes.get(end)));
     const what = `${link.name} from ${labels.join(" to ")}${behind(ends.map((end) => nodes.get(end)))}`;
-    add(link.state, placeOf(link, ends, nodes), { what, text: link.text || "", fix: link.fix || "" }, { link: id }, [...ends, ...labels]);
+    add(link.state, whereOf(nodeOf(link, ends, nodes)), { what, text: link.text || "", fix: link.fix || "" }, { link: id }, [...ends, ...labels]);
   }
   return [...causes.values()].sort((a, b) => RANK[b.kind] - RANK[a.kind] || b.count - a.count);
 }
@@ -50,16 +50,20 @@ function behind(ends) {
   return inside ? `, behind ${inside.proxy}` : "";
 }
 
-// The place of the end that has the same problem, else of the end inside.
-function placeOf(link, ends, nodes) {
-  const known = ends.map((end) => nodes.get(end)).filter(Boolean);
-  const node = known.find((one) => one.state === link.state && one.fix === link.fix)
-    || known.find((one) => one.lane === "container") || known[0];
-  return node ? hostOf(node.address) : "";
+function whereOf(node = {}) {
+  return { place: placeOf(node), proxy: node.proxy, container: node.place };
 }
 
-export function titleOf({ what, count, place }) {
-  return count > 1 ? `${count}${place ? ` at ${place}` : " times"}: ${what}, …` : what;
+// The end of a link that has the same problem, else the end inside.
+function nodeOf(link, ends, nodes) {
+  const known = ends.map((end) => nodes.get(end)).filter(Boolean);
+  return known.find((one) => one.state === link.state && one.fix === link.fix)
+    || known.find((one) => one.lane === "container") || known[0];
+}
+
+export function titleOf({ what, count, place, container }) {
+  if (count > 1) return `${count}${place ? ` at ${place}` : " times"}: ${what}, …`;
+  return container ? `${what}, in ${container}` : what;
 }
 
 // Note which causes are new and which are over. `seen`: the causes by their keys, with the time of

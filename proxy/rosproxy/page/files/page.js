@@ -6,7 +6,7 @@
 import { causesOf, follow, titleOf } from "./findings.js";
 import { curveOf, emptyHistory, lastMinute, minuteText, record } from "./history.js";
 import { boxesOf, DIRECT, hasFix, joined, layout, linesOf, selection } from "./picture.js";
-import { age, apply, duration, frequency, hertz, isKnown, labelOf, megabytes, rateOf, visibleLinks, visibleNodes, WORDS } from "./view.js";
+import { age, apply, duration, frequency, hertz, isKnown, labelOf, megabytes, placeOf, rateOf, visibleLinks, visibleNodes, WORDS } from "./view.js";
 
 const AT_MOST_EVERY = 500;
 const MOST_ROWS = 400;
@@ -206,7 +206,7 @@ function showNodes(on) {
   const listed = found.slice(0, MOST_ROWS);
   showRows($("node-rows"), nodeRows, NODE_HEADS, listed.map(({ id, node, label }) => {
     const kind = (node.kind || "node") === "node" ? "" : ` (${node.kind})`;
-    const where = PLACES[node.lane] + (node.proxy ? ` of ${node.proxy}` : "");
+    const where = (node.place ? `${node.place}, inside` : PLACES[node.lane]) + (node.proxy ? ` of ${node.proxy}` : "");
     return { id, one: node, key: `n:${id}`, on: on.has(id), texts: [label + kind, where, node.address || "–", node.ports || "–", megabytes(node)] };
   }));
   put($("more-nodes"), tellRest(found.length - listed.length));
@@ -447,13 +447,20 @@ function details(on) {
   for (const { id, link, from, to } of links.slice(0, MOST_CHOSEN)) {
     const minute = lastMinute(rates, id, link);
     const type = link.type ? ` (${link.type})` : "";
-    parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name}${type} from ${from}${to ? ` to ${to}` : ""}, ${frequency(link) || "– Hz"}, ` +
+    const ends = [withPlace(from, link.source), to && withPlace(to, link.target)].filter(Boolean).join(" to ");
+    parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name}${type} from ${ends}, ${frequency(link) || "– Hz"}, ` +
       `${megabytes(link)} MB/s, last message ${age(link, now)}, carried by ${link.carried || "–"}, port ${link.port || "–"}`],
     ["figure", minute.length ? minuteText(minute, link.shared) : "", curveOf(minute, CURVE.width, CURVE.height)],
     ["p", link.text || ""], ["code", link.text && !cause ? link.fix || "" : ""]);
   }
   if (links.length > MOST_CHOSEN) parts.push(["p", `${links.length - MOST_CHOSEN} more are marked in the table.`]);
   return parts.filter(([, text]) => text);
+}
+
+// The label of a node, with the container, pod or address. The label may begin with the place.
+function withPlace(label, id) {
+  const place = placeOf(state.nodes.get(id));
+  return place && !label.startsWith(place) ? `${label} at ${place}` : label;
 }
 
 // The address of the page has what is shown, and can be sent to others.

@@ -70,6 +70,11 @@ export function hostOf(address = "") {
   return parts.length === 2 ? parts[0] : plain;
 }
 
+// The container or pod of a node if the document has the name, else the host in the address.
+export function placeOf(node = {}) {
+  return node.place || hostOf(node.address);
+}
+
 // Messages per second; of ROS 2 datagrams per second.
 export function hertz(link) {
   if (isKnown(link.datagrams)) return `${atMost(link, link.datagrams)}${link.datagrams} datagrams/s`;
