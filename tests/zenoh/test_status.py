@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+
+from rosproxy.zenoh.findings import routers_without_node
 from tests.ros.processes import wait_until
 from tests.zenoh.lab import PORTS, ROUTER_PORT, Lab
 
 VERSION = "1.6.2"
+LATER_VERSION = "1.10.2"
 
 
 def test_a_laptop_reaches_containers_at_the_published_port(lab: Lab) -> None:
@@ -63,3 +67,39 @@ def test_two_containers_at_one_port_are_told(lab: Lab) -> None:
     assert lab.proxy is not None
     told = lab.proxy.wait_for("zenoh port 7448: nodes at (.*) are peers of the same router", 30)
     assert told[1] == ", ".join(lab.topology.places[role].address for role in sorted(PORTS))
+
+
+def test_a_session_without_a_node_is_told(lab: Lab) -> None:
+    lab.start_proxy(with_robot=False)
+    lab.redirect("c1")
+    lab.node(VERSION, "c1", "mute").wait_for("ready")
+    node = lab.node(VERSION, "c2", "pub")
+    assert lab.proxy is not None
+    address = lab.topology.places["c1"].address
+    told = lab.proxy.wait_for(
+        "zenoh sessions at port (.*): programs at (.*) are connected, but", 30
+    )
+    assert (told[1], told[2]) == (str(PORTS["c1"]), address)
+    silent = {s.remote.partition(":")[0] for s in lab.zenoh().sessions if s.without_node}
+    assert silent == {address}
+    assert [known.name for known in lab.zenoh().nodes] == [f"/{node.title}"]
+
+
+def test_a_router_that_loses_the_tokens_of_nodes_is_told(lab: Lab) -> None:
+    """A router of zenoh 1.9 or later, with nodes of 1.8 or earlier that start before it."""
+    router = lab.start_router(LATER_VERSION)
+    lab.start_proxy()
+    lab.redirect("c1")
+    lab.wait_for_link()
+    publisher = lab.node(VERSION, "out", "pub")
+    subscriber = lab.node(VERSION, "c1", "sub")
+    subscriber.wait_for_count("^got hello ", 5, timeout=30)
+    wait_until("both nodes are known", lambda: len(lab.zenoh().nodes) == 2, 30)
+    os.kill(router.pid, 9)
+    router.wait()
+    lab.start_router(LATER_VERSION)
+    mark = subscriber.mark()
+    subscriber.wait_for_count("^got hello ", 5, timeout=30, since=mark)
+    assert f"/{publisher.title}" not in {node.name for node in lab.zenoh().nodes}
+    wait_until("the link has been up for long", lambda: routers_without_node(lab.zenoh()), 60)
+    assert [*routers_without_node(lab.zenoh())] == [f"zenoh peer {lab.topology.plan.robot}:7447"]

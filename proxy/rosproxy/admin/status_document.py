@@ -423,7 +423,9 @@ class ZenohSessionStatus(msgspec.Struct, frozen=True):
     """A session of a router of the proxy: both addresses, and the ``mode`` of the other end.
 
     ``port``: the port of a router for containers; None: another router. ``mode``: client, peer or
-    router. ``link``: the router is the one of the links to other sites.
+    router. ``link``: the router is the one of the links to other sites. ``without_node``: how long
+    the proxy has known no node of the session, or none behind the router at the other end. This is
+    0 if a node is known, and for sessions that are not at a port for containers.
     """
 
     port: Count | None = None
@@ -432,6 +434,7 @@ class ZenohSessionStatus(msgspec.Struct, frozen=True):
     local: str = ""
     remote: str = ""
     link: bool = False
+    without_node: Seconds = 0.0
 
 
 class ZenohNodeStatus(msgspec.Struct, frozen=True):

@@ -48,4 +48,5 @@ def _domain(domain: DomainStatus) -> object:
 def _zenoh(zenoh: ZenohStatus) -> object:
     links = [(link.title, link.up, link.error) for link in zenoh.links]
     files = [(certificate.file, certificate.error) for certificate in zenoh.certificates]
-    return zenoh.failure, links, zenoh.link_listens, files, zenoh.sessions, zenoh.nodes
+    sessions = [replace(s, without_node=0.0) if s.without_node else s for s in zenoh.sessions]
+    return zenoh.failure, links, zenoh.link_listens, files, sessions, zenoh.nodes

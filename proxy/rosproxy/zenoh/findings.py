@@ -24,8 +24,13 @@ from rosproxy.zenoh.matching import DURABILITY, TYPE, TYPE_HASH
 ROUTERS = "zenoh routers"
 PEER = "peer"
 """The mode of a session whose router passes no data on to other peers of this router."""
+ROUTER = "router"
 LINK_GRACE_S = 5.0
 """Seconds in which a link has to come up before it counts as a fault."""
+NODE_GRACE_S = 10.0
+"""Seconds in which a session of a node has to announce the node."""
+GRAPH_GRACE_S = 30.0
+"""Seconds in which a node behind a router should be known."""
 WARNING_DAYS = (1, 3, 7, 14)
 """Days before the end of a certificate at which a warning begins, or changes."""
 MOST_LIMIT_COMPARISONS = 20_000
@@ -43,6 +48,14 @@ _MISMATCH_FIXES = {
     DURABILITY: "make the publisher TRANSIENT_LOCAL (latched) if the subscription needs messages "
     "from before its start",
 }
+_LOST_TOKENS = (
+    "a router of zenoh 1.9 or later loses the liveliness tokens of nodes with 1.8 or earlier when "
+    "it restarts, or if nodes start before it"
+)
+_SAME_VERSION = (
+    "run the rmw_zenohd of the nodes' own distribution (Kilted: zenoh 1.6.2, Lyrical: 1.8.0), and "
+    "restart the nodes"
+)
 _CHECK_PEER = "check the address, the port and the firewall of the peer"
 _LINK_FAULTS = {
     LinkFault.UNRESOLVABLE: (
@@ -147,6 +160,7 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
         if not link.up and is_fault and is_tried and link.since >= LINK_GRACE_S:
             yield _link_fault(link)
     yield from shared_ports(zenoh).values()
+    yield from _sessions_without_node(zenoh)
 
 
 def _certificate(certificate: ZenohCertificateStatus) -> DoctorFinding | None:
@@ -211,6 +225,51 @@ def _shared_port(zenoh: ZenohStatus, port: int | None, hosts: set[str]) -> Docto
     if port is not None:
         fix = f"give each container a port of its own ({quoted(zenoh.ports)}); or {fix}"
     return warning("shared port", f"zenoh {at_port}", text, fix)
+
+
+def _sessions_without_node(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
+    """Yield a warning for each port for containers with sessions that announce no node.
+
+    A status with parts left out may lack the nodes.
+    """
+    hosts_by_port: dict[int, set[str]] = {}
+    for session in () if zenoh.left_out else zenoh.sessions:
+        remote = parse_host_port(session.remote)
+        is_silent = session.mode != ROUTER and session.without_node > NODE_GRACE_S
+        if session.port is not None and remote and is_silent:
+            hosts_by_port.setdefault(session.port, set()).add(remote.host)
+    for port, hosts in hosts_by_port.items():
+        text = f"programs at {listed(sorted(hosts))} are connected, but announce no node. A node "
+        text += "that still starts, or a program other than a node of rmw_zenoh, is no fault. "
+        text += f"Otherwise liveliness tokens are lost: {_LOST_TOKENS}"
+        fix = "if the program is a node, restart the node. If a router is between the node and the "
+        fix += f"proxy, {_SAME_VERSION}"
+        yield warning("nodes", f"zenoh sessions at port {port}", text, fix)
+
+
+def routers_without_node(zenoh: ZenohStatus) -> dict[str, DoctorFinding]:
+    """A note for each router behind which no node is known, by subject.
+
+    The proxy knows which nodes are behind routers, but not behind which router. So a node behind
+    any router, also behind another hub, counts for all.
+    """
+    addresses = {node.address for node in zenoh.nodes}
+    if zenoh.left_out or "" in addresses:
+        return {}
+    silent = [
+        link_subject(link)
+        for link in zenoh.links
+        if link.up and not link.hub and link.since > GRAPH_GRACE_S
+    ]
+    silent += [
+        f"zenoh router {session.remote}"
+        for session in zenoh.sessions
+        if session.mode == ROUTER and session.without_node > GRAPH_GRACE_S
+    ]
+    text = "linked, but no node is known behind this router. If nodes run there, their liveliness "
+    text += f"tokens are lost: {_LOST_TOKENS}"
+    fix = f"if nodes run there, {_SAME_VERSION}"
+    return {subject: note("nodes", subject, text, fix) for subject in silent}
 
 
 def shared_limits(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:

@@ -2,8 +2,9 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from operator import attrgetter
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 from msgspec.structs import replace
@@ -35,7 +36,8 @@ from rosproxy.zenoh.protocol.report import (
 )
 from rosproxy.zenoh.router_policy import InsideName
 
-MODES = ("client", "peer", "router")
+ROUTER = "router"
+MODES = ("client", "peer", ROUTER)
 MOST_LISTED_MISMATCHES = 100
 """Mismatches that the status lists, with fair shares by the address inside. As many pairs that
 differ in durability alone are listed, too; further ones are not counted."""
@@ -62,8 +64,9 @@ class Reading(NamedTuple):
 
     ``routers`` are the ends of the sessions with other routers, and whether each is of the router
     of the links. ``names`` are the topics and services of nodes inside, and ``counts`` the numbers
-    of nodes inside and outside. The other fields have the listed rows. ``mismatches`` are also
-    pairs that differ in durability alone.
+    of nodes inside and outside. ``without_node`` has the times since which no node is known of a
+    session at a port for containers, by port and zenoh ID. The other fields have the listed rows.
+    ``mismatches`` are also pairs that differ in durability alone.
     """
 
     sessions: tuple[_PlacedSession, ...] = ()
@@ -73,6 +76,7 @@ class Reading(NamedTuple):
     left_out: int = 0
     comparison: Comparison = Comparison()
     inside: frozenset[str] | None = None
+    without_node: Mapping[tuple[int, str], float] = MappingProxyType({})
     nodes: tuple[ZenohNodeStatus, ...] = ()
     rows: tuple[ZenohSessionStatus, ...] = ()
     rows_left_out: int = 0
@@ -135,7 +139,7 @@ class ZenohState(Collector):
             routers=tuple(
                 (placed.at_link, ends)
                 for placed in sessions
-                if placed.port is None and placed.session.whatami == "router"
+                if placed.port is None and placed.session.whatami == ROUTER
                 for ends in all_ends_of(placed.session)
             ),
         )
@@ -151,6 +155,8 @@ class ZenohState(Collector):
         if graph is not None or inside != former.inside:
             comparison = compare(reading.graph.entities, inside)
             reading = reading._replace(comparison=comparison, inside=inside)
+        known = _without_node(former.without_node, sessions, reading.graph.nodes, self._now())
+        reading = reading._replace(without_node=known)
         return reading if graph is None and sessions == former.sessions else _with_rows(reading)
 
     def is_up(self, link: Link) -> bool:
@@ -186,7 +192,7 @@ class ZenohState(Collector):
             )
         return replace(
             self._status_of_routers(failure),
-            sessions=reading.rows,
+            sessions=tuple(self._with_age(row, reading.without_node) for row in reading.rows),
             nodes=nodes,
             left_out=reading.left_out + reading.rows_left_out,
             mismatches=reading.mismatches,
@@ -264,6 +270,14 @@ class ZenohState(Collector):
                 if ends and session.peer not in own:
                     yield _PlacedSession(port, session, ends, index == at_link)
 
+    def _with_age(
+        self, row: ZenohSessionStatus, without_node: Mapping[tuple[int, str], float]
+    ) -> ZenohSessionStatus:
+        """The row of a session, with the time in which no node is known."""
+        since = None if row.port is None else without_node.get((row.port, row.zid))
+        age = 0.0 if since is None else round(max(self._now() - since, 0.0), 1)
+        return replace(row, without_node=age) if age else row
+
     def _link(self, link: Link) -> ZenohLinkStatus:
         return ZenohLinkStatus(
             peer=str(link.peer),
@@ -273,6 +287,27 @@ class ZenohState(Collector):
             hub=link.is_hub,
             protocol=link.protocol,
         )
+
+
+def _without_node(
+    former: Mapping[tuple[int, str], float],
+    sessions: Sequence[_PlacedSession],
+    nodes: Iterable[ZenohNode],
+    now: float,
+) -> dict[tuple[int, str], float]:
+    """The times since which no node is known of a session, as in `Reading`.
+
+    ``former``: these times before. The nodes behind a router have sessions with that router, which
+    the proxy does not see. So the first node without a session here counts for each router.
+    """
+    announced = {node.session for node in nodes}
+    is_any_behind = bool(announced.difference(placed.session.peer for placed in sessions))
+    silent: dict[tuple[int, str], float] = {}
+    for port, session, *_ in sessions:
+        is_known = is_any_behind if session.whatami == ROUTER else session.peer in announced
+        if port is not None and not is_known:
+            silent[port, session.peer] = former.get((port, session.peer), now)
+    return silent
 
 
 def _with_rows(reading: Reading) -> Reading:

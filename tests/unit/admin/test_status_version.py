@@ -14,7 +14,8 @@ MEMBER = {
     "leases": [{"port": 11401, "datagrams": 3}],
 }
 LINK = {"peer": "robot:7447", "up": True, "since": 3.0}
-ZENOH: dict[str, Any] = {"ports": "7448-7467", "links": [LINK]}
+SESSION = {"port": 7448, "mode": "peer", "zid": "ab"}
+ZENOH: dict[str, Any] = {"ports": "7448-7467", "links": [LINK], "sessions": [SESSION]}
 STATUS: dict[str, Any] = {
     "instance": "a",
     "uptime": 3.0,
@@ -41,6 +42,7 @@ def version(**more: Any) -> str:
         {"problems": [{"age": 9.0, "subject": "master", "text": "refused"}]},
         {"range_probe": {"reached": True, "age": 300.0}},
         {"zenoh": {**ZENOH, "restarts": 1, "links": [{**LINK, "since": 9.0}]}},
+        {"zenoh": {**ZENOH, "sessions": [{**SESSION, "without_node": 9.0}]}},
     ],
 )
 def test_what_only_passes_makes_no_version(change: dict[str, Any]) -> None:
@@ -67,6 +69,7 @@ def test_what_only_passes_makes_no_version(change: dict[str, Any]) -> None:
         {"zenoh": None},
         {"zenoh": {**ZENOH, "failure": "no report for 10 s"}},
         {"zenoh": {**ZENOH, "links": [{**LINK, "up": False}]}},
+        {"zenoh": {**ZENOH, "sessions": []}},
         {"zenoh": {**ZENOH, "nodes": [{"name": "/talker"}]}},
     ],
 )

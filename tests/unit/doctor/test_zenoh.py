@@ -84,6 +84,14 @@ def test_a_hub_without_the_certificate_is_one_error() -> None:
     assert told[0].subject == "zenoh hub b"
 
 
+def test_a_link_without_a_node_behind_it_is_a_note_in_place_of_a_success() -> None:
+    told = findings(replace(GOOD, nodes=GOOD.nodes[:1]))
+    assert [finding.severity for finding in told] == [Severity.INFO, Severity.OK]
+    assert f"{told[0].subject}: {told[0].text}".startswith(
+        "zenoh peer robot:7447: linked, but no node is known behind this router."
+    )
+
+
 def test_names_that_the_user_asks_for() -> None:
     told = texts(GOOD, "/chatter", "/cmd_vel", "/add", "/robot", "/nothing")[2:]
     assert told == [

@@ -13,12 +13,15 @@ from rosproxy.admin.status_document import (
     ZenohStatus,
 )
 from rosproxy.zenoh.findings import (
+    GRAPH_GRACE_S,
     LINK_GRACE_S,
     MOST_LIMIT_COMPARISONS,
     MOST_REPORTED_MISMATCHES,
+    NODE_GRACE_S,
     WARNING_DAYS,
     faults,
     first_mismatches,
+    routers_without_node,
     shared_limits,
 )
 from rosproxy.zenoh.links import LinkFault
@@ -97,6 +100,56 @@ def test_peers_of_two_containers_at_a_port_are_told() -> None:
     (finding,) = faults(replace(GOOD, listen=7447, sessions=tuple(outside)))
     assert finding.subject == "zenoh port 7447"
     assert "a port of its own" not in finding.fix
+
+
+def test_sessions_that_announce_no_node_are_told() -> None:
+    silent = replace(SESSION, without_node=NODE_GRACE_S + 0.1)
+    (finding,) = faults(replace(GOOD, sessions=(silent,)))
+    assert finding.severity is Severity.WARNING
+    assert finding.subject == "zenoh sessions at port 7448"
+    assert finding.text.startswith("programs at 172.18.0.3 are connected, but announce no node.")
+    assert "zenoh 1.9 or later loses the liveliness tokens of nodes with 1.8" in finding.text
+    assert "Lyrical: 1.8.0" in finding.fix
+
+
+@pytest.mark.parametrize(
+    "zenoh",
+    [
+        replace(GOOD, sessions=(replace(SESSION, without_node=NODE_GRACE_S),)),
+        replace(GOOD, sessions=(replace(SESSION, mode="router", without_node=60.0),)),
+        replace(GOOD, sessions=(replace(SESSION, without_node=60.0),), left_out=1),
+    ],
+    ids=["still starts", "a router", "nodes are left out of the status"],
+)
+def test_a_session_may_have_no_node(zenoh: ZenohStatus) -> None:
+    assert not [*faults(zenoh)]
+
+
+AWAY = ZenohNodeStatus("/away")
+HERE = ZenohNodeStatus("/here", address="172.18.0.3", port=7448)
+LAPTOP = ZenohNodeStatus("/laptop", address="192.0.2.9")
+
+
+def test_a_router_without_a_node_behind_it_is_a_note() -> None:
+    router = ZenohSessionStatus(
+        7449, "router", "cd", "172.18.0.2:7449", "172.18.0.4:50000", without_node=31.0
+    )
+    hub = replace(LINK, peer="hub:7447", hub=True)
+    zenoh = replace(GOOD, links=(LINK, hub), sessions=(SESSION, router), nodes=(HERE, LAPTOP))
+    noted = routers_without_node(zenoh)
+    assert [*noted] == ["zenoh peer robot:7447", "zenoh router 172.18.0.4:50000"]
+    for finding in noted.values():
+        assert finding.severity is Severity.INFO
+        assert finding.text.startswith("linked, but no node is known behind this router.")
+        assert "zenoh 1.9 or later" in finding.text
+    assert not [*faults(zenoh)], "a robot whose nodes do not run yet is no fault"
+    assert not routers_without_node(replace(zenoh, nodes=(HERE, AWAY)))
+    assert not routers_without_node(replace(zenoh, left_out=1))
+
+
+@pytest.mark.parametrize("link", [replace(LINK, since=GRAPH_GRACE_S), replace(LINK, up=False)])
+def test_a_router_has_time_to_tell_the_first_node(link: ZenohLinkStatus) -> None:
+    assert not routers_without_node(replace(GOOD, links=(link,)))
 
 
 SITE = ZenohLinkStatus("cloud.example:7447", True, "", 60.0, protocol="tls")

@@ -34,6 +34,16 @@ TOKENS = (
 
 
 @dataclass
+class Clock:
+    """The time of a state."""
+
+    time: float = 10.0
+
+    def __call__(self) -> float:
+        return self.time
+
+
+@dataclass
 class FakeProcess:
     """A process of routers."""
 
@@ -69,13 +79,13 @@ REPORT = Report(
 )
 
 
-def make_state(process: FakeProcess) -> ZenohState:
+def make_state(process: FakeProcess, clock: Clock | None = None) -> ZenohState:
     options = {
         "ros": ("zenoh",),
         "zenoh_ports": "7448-7449",
         "zenoh_peer": ("192.0.2.7", "192.0.2.8"),
     }
-    state = ZenohState(parse_settings(options), process, lambda: 10.0)
+    state = ZenohState(parse_settings(options), process, clock or Clock())
     for link in state.links:
         link.addresses = (link.peer.host,)
     state.take(REPORT, graph_of(TOKENS))
@@ -126,6 +136,50 @@ def test_nodes_here_have_an_address() -> None:
     assert (talker.port, talker.mode, talker.key) == (7448, "peer", f"0 {NODE_ZID}.0/talker")
     assert talker.types == (NamedTypeStatus("/chatter", "T_"),)
     assert (robot.name, robot.address, robot.port, robot.mode) == ("/robot", "", None, "")
+
+
+def without_node(state: ZenohState) -> dict[str, float]:
+    return {session.zid: session.without_node for session in state.status().sessions}
+
+
+def test_a_session_has_the_time_without_a_node() -> None:
+    clock = Clock()
+    state = make_state(FakeProcess(), clock)
+    clock.time = 15.0
+    assert without_node(state) == {NODE_ZID: 0.0, "04": 0.0}
+    state.take(Report(REPORT.routers), graph_of(()))
+    clock.time = 21.0
+    state.take(Report(REPORT.routers), None)
+    clock.time = 22.0
+    assert without_node(state) == {NODE_ZID: 7.0, "04": 0.0}
+    state.take(Report(REPORT.routers), graph_of(TOKENS))
+    assert without_node(state) == {NODE_ZID: 0.0, "04": 0.0}
+    state.take(Report(REPORT.routers), graph_of(()))
+    assert without_node(state) == {NODE_ZID: 0.0, "04": 0.0}, "the time begins again"
+
+
+def test_the_time_without_a_node_ends_with_the_session() -> None:
+    clock = Clock()
+    state = make_state(FakeProcess(), clock)
+    state.take(Report(REPORT.routers), graph_of(()))
+    clock.time = 20.0
+    state.take(Report((RouterReport("01"), *REPORT.routers[1:])), None)
+    state.take(Report(REPORT.routers), None)
+    clock.time = 21.0
+    assert without_node(state)[NODE_ZID] == 1.0
+
+
+def test_a_router_at_a_port_for_containers_has_a_node_if_a_node_has_no_session_here() -> None:
+    clock = Clock()
+    state = make_state(FakeProcess(), clock)
+    own_router = session("05", "router", "172.18.0.2:7449", "172.18.0.4:50002")
+    routers = (REPORT.routers[0], RouterReport("02", (own_router,)), HUB)
+    state.take(Report(routers), graph_of(TOKENS))
+    clock.time = 20.0
+    assert without_node(state)["05"] == 0.0, "the node /robot may be behind this router"
+    state.take(Report(routers), graph_of(TOKENS[:2]))
+    clock.time = 25.0
+    assert without_node(state) == {NODE_ZID: 0.0, "05": 5.0, "04": 0.0}
 
 
 def test_nodes_that_do_not_match_are_pairs_with_a_node_inside() -> None:

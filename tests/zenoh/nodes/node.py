@@ -1,8 +1,8 @@
 """A replacement for a node of rmw_zenoh: session, keys and liveliness tokens.
 
 `python node.py KIND NAME TOPIC`, where KIND is pub, shout, sub, latch, late, serve, call, probe,
-graph or crowd. Prints a line for each event, and runs until killed. NODE_TYPE: another type, as in
-keys. NODE_PERIOD_S: the time between two messages. NODE_TOKENS, NODE_LETTER: see `crowd`.
+graph, crowd or mute. Prints a line for each event, and runs until killed. NODE_TYPE: another type,
+as in keys. NODE_PERIOD_S: the time between two messages. NODE_TOKENS, NODE_LETTER: see `crowd`.
 """
 
 import os
@@ -99,8 +99,10 @@ def main(kind: str, name: str, topic: str) -> None:
     session = open_session(NODE)
     zid = session.info.zid()
     key = f"0/{topic}/{TYPE}/{HASH}"
-    node = session.liveliness().declare_token(f"@ros2_lv/0/{zid}/0/0/NN/%/%/{name}")
-    held = [node]
+    held = []
+    if kind != "mute":  # as a program that is no node
+        node = f"@ros2_lv/0/{zid}/0/0/NN/%/%/{name}"
+        held.append(session.liveliness().declare_token(node))
     if kind in ENTITIES:
         mangled = f"/{topic}".replace("/", "%")
         token = (

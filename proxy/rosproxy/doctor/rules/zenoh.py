@@ -22,6 +22,7 @@ from rosproxy.zenoh.findings import (
     link_subject,
     mismatch_findings,
     place,
+    routers_without_node,
     shared_limits,
 )
 from rosproxy.zenoh.links import CERTIFICATE_FAULTS, LinkFault
@@ -59,10 +60,12 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def _outside(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
+    without_node = routers_without_node(zenoh)
+    yield from without_node.values()
     for link in zenoh.links:
-        if link.up:
+        if link.up and link_subject(link) not in without_node:
             yield ok("link", link_subject(link), "linked")
-        elif link.hub and link.error not in _NOT_NOTED:
+        elif not link.up and link.hub and link.error not in _NOT_NOTED:
             text = f"not linked ({link.error}). The hub tries again"
             yield note("link", link_subject(link), text, how_to("zenoh hub"))
     listens = zenoh.listen is not None or zenoh.hub_listen is not None or zenoh.link_listen
