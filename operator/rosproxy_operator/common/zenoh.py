@@ -23,6 +23,7 @@ LINK_FILES = {"zenoh_certificate": "tls.crt", "zenoh_key": "tls.key", "zenoh_ca"
 
 A Secret of type kubernetes.io/tls has the first two names. cert-manager adds the third.
 """
+_UNSPECIFIED = ("0.0.0.0", "::")
 _WAIT = "connect/timeout_ms=-1"
 # No part can take characters of the next, so a variable without the last quote takes no longer.
 _ENDPOINT = re.compile(r"[\"']([a-z]+)/([^\"'/?#;]{1,300})(?:[/?#;][^\"']*)?[\"']")
@@ -112,6 +113,16 @@ def connect_endpoints(override: str) -> list[Endpoint]:
     return _endpoints("connect", override)
 
 
+def listens_beyond_loopback(override: str) -> bool:
+    """Whether the sessions of a container listen at an address that other containers reach.
+
+    zenoh takes the unspecified address for all addresses of the container.
+    """
+    # The port may be 0, so this text is no `HostPort`.
+    hosts = (text.rpartition(":")[0].strip("[]") for _, text in _texts("listen", override))
+    return any(host in _UNSPECIFIED or not is_loopback(host) for host in hosts)
+
+
 def router_port(override: str) -> int:
     """Return the first TCP port on which a container's router listens; ZENOH_PORT without one."""
     ports = [e.address.port for e in _endpoints("listen", override) if e.protocol == "tcp"]
@@ -119,14 +130,19 @@ def router_port(override: str) -> int:
 
 
 def _endpoints(kind: str, override: str) -> list[Endpoint]:
-    texts = re.findall(rf"(?:^|;)\s*{kind}/endpoints\s*=([^;]*)", override)
-    found = _ENDPOINT.findall(texts[-1])[:MOST_ENDPOINTS] if texts else []
+    found = _texts(kind, override)
     addresses = ((protocol, parse_host_port(text)) for protocol, text in found)
     return [
         Endpoint(protocol, HostPort(address.host.lower(), address.port))
         for protocol, address in addresses
         if address
     ]
+
+
+def _texts(kind: str, override: str) -> list[tuple[str, str]]:
+    """The protocols and the addresses, as text, of the endpoints that count."""
+    values = re.findall(rf"(?:^|;)\s*{kind}/endpoints\s*=([^;]*)", override)
+    return _ENDPOINT.findall(values[-1])[:MOST_ENDPOINTS] if values else []
 
 
 def runs_router(command: Iterable[str]) -> bool:

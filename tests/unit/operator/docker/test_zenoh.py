@@ -363,6 +363,79 @@ def test_what_the_variable_names(override: str, peers: set[str], text: str) -> N
     assert bool(text) == bool(told)
 
 
+ROUTER = replace(node("router", address="172.18.0.8", router=True), labels={})
+AT_ROUTER = 'connect/endpoints=["tcp/router:7447"]'
+CLIENT = f'mode="client";{AT_ROUTER}'
+
+
+def listener(override: str, **more: Any) -> Container:
+    return node("listener", override=override, address="172.18.0.4", **more)
+
+
+def test_peers_of_the_same_router_in_a_container_are_told() -> None:
+    other = listener(AT_ROUTER.replace("router", "172.18.0.8"))
+    _, problems = read_members(observed(node(override=AT_ROUTER), other, ROUTER), SETTINGS)
+    assert [problem.subject for problem in problems] == ["container listener", "container talker"]
+    assert not any(problem.fatal for problem in problems)
+    assert problems[1].text == (
+        "the nodes are peers of the same router ('router:7447') as the nodes of container "
+        "listener. Messages between these containers do not pass: rmw_zenohd passes none between "
+        'its peers, and neither does zenohd from 1.9 on. Add mode="client" to the variable '
+        "ZENOH_CONFIG_OVERRIDE of these containers. Or remove connect/endpoints from the "
+        "variables, and add the label rosproxy.peers=router:7447: a router of the proxy then "
+        "serves each of these containers"
+    )
+
+
+def test_without_the_redirect_client_mode_is_the_only_fix() -> None:
+    settings = replace(SETTINGS, redirect=False)
+    _, told = read(node(override=AT_ROUTER), listener(AT_ROUTER), ROUTER, settings=settings)
+    (text,) = (text for text in told if "as the nodes of container listener" in text)
+    assert "mode" in text
+    assert "remove connect/endpoints" not in text
+
+
+def test_a_node_beside_the_router_is_a_peer_as_well() -> None:
+    driver = node("driver", mode="container:id-router")
+    _, told = read(driver, node(override=AT_ROUTER), ROUTER)
+    assert ["as the nodes of container talker" in told[0], len(told)] == [True, 2]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        listener(""),
+        listener(CLIENT),
+        listener('connect/endpoints=["tcp/router:7448"]'),
+        listener(f'listen/endpoints=["tcp/[::]:0"];{AT_ROUTER}'),
+        node("listener", override=AT_ROUTER, mode="container:id-talker"),
+        replace(listener(AT_ROUTER), labels={}),
+        replace(listener(AT_ROUTER), state="exited"),
+        replace(
+            listener(AT_ROUTER),
+            variables={
+                **VARIABLES,
+                "ZENOH_CONFIG_OVERRIDE": AT_ROUTER,
+                "ZENOH_SESSION_CONFIG_URI": "/session.json5",
+            },
+        ),
+    ],
+    ids=[
+        "the proxy's router",
+        "a client",
+        "another router",
+        "reached directly",
+        "in the same network namespace",
+        "not labelled",
+        "exited",
+        "a session file",
+    ],
+)
+def test_two_containers_that_are_not_peers_of_one_router(other: Container) -> None:
+    _, told = read(node(override=AT_ROUTER), other, ROUTER)
+    assert not [text for text in told if "peers of the same router" in text]
+
+
 class CountedNames(frozenset[str]):
     """The names of a container on a network; counts the readings."""
 

@@ -24,7 +24,7 @@ from rosproxy_operator.docker.planner.labels.readers import (
     NoMaster,
     UnusableLabel,
 )
-from rosproxy_operator.docker.planner.labels.zenoh import zenoh_member
+from rosproxy_operator.docker.planner.labels.zenoh import peers_of_one_router, zenoh_member
 from rosproxy_operator.docker.planner.model import ALIVE, Container, HostState, Member
 from rosproxy_operator.docker.planner.specs import MANAGED, unresolved_master
 from rosproxy_operator.docker.settings import PlanSettings
@@ -76,6 +76,8 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
         except UnusableLabel as error:
             wrong.append(_unusable(container, str(error)))
         problems += wrong if container.alive else []
+    shared = peers_of_one_router(requests, observed)
+    problems += (_problem(container, text, False) for container, text in shared)
     return LabelReading(tuple(requests), tuple(problems))
 
 

@@ -5,7 +5,7 @@ The proxy connects to these routers. If the container itself runs a router, the 
 that router, too. The router goes on serving its own clients.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from rosproxy.access.layers import PolicyLayer
@@ -13,9 +13,17 @@ from rosproxy.access.rules import Rule
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.setting_kinds import read_zenoh_peer
 from rosproxy.settings import MOST_ZENOH_PORTS
+from rosproxy.telemetry.text import listed
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, router_port
+from rosproxy_operator.common.zenoh import (
+    OVERRIDE,
+    SESSION_FILE,
+    connect_endpoints,
+    is_client,
+    listens_beyond_loopback,
+    router_port,
+)
 from rosproxy_operator.docker.planner.labels import readers
 from rosproxy_operator.docker.planner.labels.bounds import is_allowed_link, is_allowed_router
 from rosproxy_operator.docker.planner.labels.readers import (
@@ -41,6 +49,10 @@ _NEEDS_REDIRECT = (
     "has no effect without the redirect, since the container then has no port of its own. Remove "
     "--no-redirect of the operator and the label rosproxy.redirect, or remove the rules"
 )
+
+
+_RouterPort = tuple[str, int]
+"""A router in a container: the id of the container with the network namespace, and the port."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +119,68 @@ def zenoh_member(
         return member, [*warnings, _redirect_warning()]
     addresses = (LOCAL_ROUTER, *(router.address for router in redirected))
     return replace(member, redirected=tuple(dict.fromkeys(addresses))), warnings
+
+
+def peers_of_one_router(
+    members: Iterable[Member], observed: HostState
+) -> Iterator[tuple[Container, str]]:
+    """Yield a warning for each container whose nodes are peers of the router of other containers.
+
+    A router of rmw_zenohd passes no data between two of its peers, in any version of zenoh.
+    Peers could connect to each other, but nodes of rmw_zenoh listen on loopback only.
+    """
+    containers = by_reference(observed.containers)
+    owners = {c.id: network_owner(c, containers).id for c in observed.containers}
+    peers_by_router: dict[_RouterPort, list[Member]] = {}
+    for member in members:
+        for router in _routers_of_peer(member, observed, owners):
+            peers_by_router.setdefault(router, []).append(member)
+    for (owner, port), peers in peers_by_router.items():
+        router_name = str(HostPort(containers[owner].name, port))
+        for member in peers:
+            own = owners[member.container.id]
+            far = [p.container.name for p in peers if owners[p.container.id] != own]
+            if far:
+                yield member.container, _shared_router_warning(member, router_name, far)
+
+
+def _routers_of_peer(
+    member: Member, observed: HostState, owners: Mapping[str, str]
+) -> set[_RouterPort]:
+    """Return the routers in containers to which the nodes of a member connect as peers.
+
+    ``owners`` has the owner of the network namespace of each container, by id. A container with a
+    session file has no routers here, since the file may make the nodes clients.
+    """
+    container = member.container
+    override = container.variables.get(OVERRIDE, "")
+    is_peer = not is_client(override) and not container.variables.get(SESSION_FILE)
+    if not is_peer or listens_beyond_loopback(override):
+        return set()
+    if member.place != ZENOH or container.is_zenoh_router or not container.alive:
+        return set()
+    own = owners[container.id]
+    has_router = any(
+        owners[c.id] == own and c.is_zenoh_router and c.alive for c in observed.containers
+    )
+    endpoints = [address for _, address in connect_endpoints(override)] or [LOCAL_ROUTER]
+    near = {(own, a.port) for a in endpoints if has_router and is_loopback(a.host)}
+    named = _routers_of_variable(member, observed)
+    return near | {(owners[r.neighbour.id], r.address.port) for r in named if r.neighbour}
+
+
+def _shared_router_warning(member: Member, router: str, others: Collection[str]) -> str:
+    fix = f'Add mode="client" to the variable {OVERRIDE} of these containers'
+    if member.redirected:
+        fix += (
+            ". Or remove connect/endpoints from the variables, and add the label "
+            f"{PEERS}={router}: a router of the proxy then serves each of these containers"
+        )
+    return (
+        f"the nodes are peers of the same router ({quoted(router)}) as the nodes of container "
+        f"{listed(others)}. Messages between these containers do not pass: rmw_zenohd passes none "
+        f"between its peers, and neither does zenohd from 1.9 on. {fix}"
+    )
 
 
 def _is_allowed(router: _Router, settings: PlanSettings) -> bool:
