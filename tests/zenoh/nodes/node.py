@@ -1,8 +1,9 @@
 """A replacement for a node of rmw_zenoh: session, keys and liveliness tokens.
 
 `python node.py KIND NAME TOPIC`, where KIND is pub, shout, sub, latch, late, serve, call, probe,
-graph, crowd or mute. Prints a line for each event, and runs until killed. NODE_TYPE: another type,
-as in keys. NODE_PERIOD_S: the time between two messages. NODE_TOKENS, NODE_LETTER: see `crowd`.
+graph, crowd, mute, offer or use. Prints a line for each event, and runs until killed. NODE_TYPE:
+another type, as in keys. NODE_PERIOD_S: the time between two messages. NODE_TOKENS, NODE_LETTER:
+see `crowd`. For `offer` and `use`, which gets names of nodes as TOPIC, see `matrix.py`.
 """
 
 import os
@@ -12,16 +13,12 @@ import time
 from typing import Any
 
 import zenoh
+from matrix import HASH, offer, say, use
 from sessions import NODE, open_session
 from zenoh import ext
 
-HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 TYPE = os.environ.get("NODE_TYPE", "std_msgs::msg::dds_::String_")
 PERIOD_S = float(os.environ.get("NODE_PERIOD_S", "0.1"))
-
-
-def say(*words: object) -> None:
-    print(*words, flush=True)
 
 
 def graph_change(sample: Any) -> None:
@@ -109,6 +106,9 @@ def main(kind: str, name: str, topic: str) -> None:
             f"@ros2_lv/0/{zid}/0/1/{ENTITIES[kind]}/%/%/{name}/{mangled}/{TYPE}/{HASH}/::,10:,:,:,,"
         )
         held.append(session.liveliness().declare_token(token))
+    if kind in MATRIX:
+        held.append(watch_graph(session, topic, name))
+        MATRIX[kind](session, name, topic)
     say("ready")
     if kind in RUNS:
         RUNS[kind](session, key)
@@ -120,6 +120,8 @@ def main(kind: str, name: str, topic: str) -> None:
 ENTITIES = {"pub": "MP", "latch": "MP", "sub": "MS", "late": "MS", "serve": "SS", "call": "SC"}
 RUNS = {"pub": publish, "shout": publish, "call": call, "probe": call}
 """`shout` and `probe` have no token, so their topic may have wildcards."""
+MATRIX = {"offer": offer, "use": use}
+"""Both watch the graph, as each node of rmw_zenoh does."""
 DECLARES = {
     "sub": subscribe,
     "serve": serve,

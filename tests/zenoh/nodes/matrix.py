@@ -1,0 +1,285 @@
+"""What nodes offer each other: a topic, a latched topic, a service, parameters and an action.
+
+Keys, tokens, attachments and options of queries are those of rmw_zenoh (rmw_publisher_data.cpp,
+rmw_client_data.cpp, rmw_service_data.cpp, liveliness_utils.cpp, attachment_helpers.cpp). The
+payloads are text in place of CDR, and all types have the same hash.
+"""
+
+import itertools
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import zenoh
+from zenoh import ext
+
+HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+PERIOD_S = 0.1
+CALL_TIMEOUT_S = 120.0
+ENOUGH_MESSAGES = 5
+SHORT_GOAL_STEPS = 5
+LONG_GOAL_STEPS = 10_000
+"""A goal that ends only if a client cancels the goal."""
+
+
+class Kind(NamedTuple):
+    """A topic or service below the name of a node."""
+
+    name: str
+    type: str
+    latched: bool = False
+
+    @property
+    def qos(self) -> str:
+        """The QoS in tokens: reliable, volatile and ten messages, or transient_local and one."""
+        return ":1:,1:,:,:,," if self.latched else "::,10:,:,:,,"
+
+
+CHATTER = Kind("chatter", "std_msgs::msg::dds_::String_")
+MAP = Kind("map", "std_msgs::msg::dds_::String_", latched=True)
+ADD = Kind("add", "example_interfaces::srv::dds_::AddTwoInts_")
+PARAMETERS = {
+    name: Kind(name, f"rcl_interfaces::srv::dds_::{name.title().replace('_', '')}_")
+    for name in (
+        "describe_parameters",
+        "get_parameter_types",
+        "get_parameters",
+        "list_parameters",
+        "set_parameters",
+        "set_parameters_atomically",
+    )
+}
+_ACTION = "example_interfaces::action::dds_::Fibonacci"
+SEND_GOAL = Kind("fibonacci/_action/send_goal", f"{_ACTION}_SendGoal_")
+GET_RESULT = Kind("fibonacci/_action/get_result", f"{_ACTION}_GetResult_")
+CANCEL_GOAL = Kind("fibonacci/_action/cancel_goal", "action_msgs::srv::dds_::CancelGoal_")
+FEEDBACK = Kind("fibonacci/_action/feedback", f"{_ACTION}_FeedbackMessage_")
+STATUS = Kind("fibonacci/_action/status", "action_msgs::msg::dds_::GoalStatusArray_", latched=True)
+
+
+def say(*words: object) -> None:
+    """Print a line, by a single write: several threads print."""
+    print(" ".join(map(str, words)) + "\n", end="", flush=True)
+
+
+class Node:
+    """A node with its entities and their tokens."""
+
+    def __init__(self, session: Any, name: str) -> None:
+        self.session = session
+        self.name = name
+        self.gid = name.encode()[:16].ljust(16, b"\0")
+        self._held: list[Any] = []
+        self._entities = itertools.count(1)
+        self._numbers = itertools.count(1)
+
+    def publisher(self, kind: Kind) -> Any:
+        key = self._declare("MP", kind, self.name)
+        if not kind.latched:
+            return self.session.declare_publisher(key)
+        cache = ext.CacheConfig(1)
+        return ext.declare_advanced_publisher(
+            self.session, key, cache=cache, publisher_detection=True
+        )
+
+    def subscribe(self, kind: Kind, owner: str, take: Callable[[str], None]) -> None:
+        """Have ``take`` called with each message of another node."""
+        key = self._declare("MS", kind, owner)
+
+        def callback(sample: Any) -> None:
+            take(sample.payload.to_string())
+
+        if kind.latched:
+            history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+            self._held.append(
+                ext.declare_advanced_subscriber(self.session, key, callback, history=history)
+            )
+        else:
+            self._held.append(self.session.declare_subscriber(key, callback))
+
+    def serve(self, kind: Kind, answer: Callable[[str], str]) -> None:
+        """Answer calls. Each answer has a thread, since the answer may take long."""
+        key = self._declare("SS", kind, self.name)
+
+        def reply(query: Any) -> None:
+            asked = bytes(query.attachment)
+            attachment = attachment_of(number_in(asked), asked[-16:])
+            query.reply(key, answer(query.payload.to_string()), attachment=attachment)
+
+        def callback(query: Any) -> None:
+            threading.Thread(target=reply, args=(query,), daemon=True).start()
+
+        self._held.append(self.session.declare_queryable(key, callback, complete=True))
+
+    def client(self, kind: Kind, owner: str) -> Callable[[str], str]:
+        """A function that calls a service of another node until there is an answer."""
+        key = self._declare("SC", kind, owner)
+
+        def call(payload: str) -> str:
+            while True:
+                for answer in self._ask(key, payload):
+                    return answer
+                time.sleep(PERIOD_S)
+
+        return call
+
+    def _ask(self, key: str, payload: str) -> Iterable[str]:
+        number = next(self._numbers)
+        replies = self.session.get(
+            key,
+            target=zenoh.QueryTarget.ALL_COMPLETE,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=CALL_TIMEOUT_S,
+            payload=payload,
+            attachment=attachment_of(number, self.gid),
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                told = bytes(reply.ok.attachment)
+                assert (number_in(told), told[-16:]) == (number, self.gid)
+                yield reply.ok.payload.to_string()
+
+    def _declare(self, entity: str, kind: Kind, owner: str) -> str:
+        """Declare the token of an entity. Return the key of its messages or calls."""
+        name = f"{owner}/{kind.name}"
+        start = f"@ros2_lv/0/{self.session.info.zid()}/0/{next(self._entities)}/{entity}/%/%"
+        mangled = f"/{name}".replace("/", "%")
+        token = f"{start}/{self.name}/{mangled}/{kind.type}/{HASH}/{kind.qos}"
+        self._held.append(self.session.liveliness().declare_token(token))
+        return f"0/{name}/{kind.type}/{HASH}"
+
+
+def attachment_of(number: int, gid: bytes) -> bytes:
+    """Sequence number, source timestamp, and the length and bytes of the source's id."""
+    return struct.pack("<qqB16s", number, time.time_ns(), len(gid), gid)
+
+
+def number_in(attachment: bytes) -> int:
+    """The sequence number in an attachment."""
+    number, _, length, _ = struct.unpack("<qqB16s", attachment)
+    assert length == 16
+    return int(number)
+
+
+class Goal:
+    """A goal of an action with so many steps."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+        self.state = "accepted"
+        self.canceled = threading.Event()
+        self.ended = threading.Event()
+
+
+class ActionServer:
+    """The three services and two topics of an action, as rcl_action has them."""
+
+    def __init__(self, node: Node) -> None:
+        self._goals: dict[str, Goal] = {}
+        self._lock = threading.Lock()
+        self._feedback = node.publisher(FEEDBACK)
+        self._status = node.publisher(STATUS)
+        node.serve(SEND_GOAL, self._accept)
+        node.serve(GET_RESULT, self._result)
+        node.serve(CANCEL_GOAL, self._cancel)
+
+    def _accept(self, request: str) -> str:
+        name, steps = request.split()
+        goal = Goal(int(steps))
+        self._goals[name] = goal
+        threading.Thread(target=self._execute, args=(name, goal), daemon=True).start()
+        return "accepted"
+
+    def _result(self, name: str) -> str:
+        goal = self._goals[name]
+        goal.ended.wait()
+        return goal.state
+
+    def _cancel(self, name: str) -> str:
+        self._goals[name].canceled.set()
+        return "canceling"
+
+    def _execute(self, name: str, goal: Goal) -> None:
+        self._note(goal, "executing")
+        for step in range(goal.steps):
+            self._feedback.put(f"{name} {step}")
+            if goal.canceled.wait(PERIOD_S):
+                break
+        self._note(goal, "canceled" if goal.canceled.is_set() else "succeeded")
+        goal.ended.set()
+
+    def _note(self, goal: Goal, state: str) -> None:
+        with self._lock:
+            goal.state = state
+            states = (f"{name}={goal.state}" for name, goal in self._goals.items())
+            self._status.put(" ".join(states))
+
+
+def offer(session: Any, name: str, _: str) -> None:
+    """Offer all kinds. Print ``latched`` when the latched message is published."""
+    node = Node(session, name)
+    node.serve(ADD, lambda payload: f"sum of {payload}")
+    for kind in PARAMETERS.values():
+        node.serve(kind, lambda payload, kind=kind: f"{kind.name} of {payload}")
+    ActionServer(node)
+    latched = node.publisher(MAP)
+    latched.put("latched")
+    say("latched")
+    publisher = node.publisher(CHATTER)
+    while True:
+        publisher.put("hello")
+        time.sleep(PERIOD_S)
+
+
+def use(session: Any, name: str, owners: str) -> None:
+    """Use all kinds of each of ``owners``, which are nodes. Print what has arrived."""
+    node = Node(session, name)
+    for owner in owners.split(","):
+        subscribe(node, owner)
+        threading.Thread(target=call, args=(node, owner), daemon=True).start()
+    threading.Event().wait()
+
+
+def subscribe(node: Node, owner: str) -> None:
+    """Subscribe to both topics of a node."""
+    numbers = itertools.count(1)
+
+    def take(_: str) -> None:
+        if next(numbers) == ENOUGH_MESSAGES:
+            say("got", owner, "topic")
+
+    node.subscribe(CHATTER, owner, take)
+    node.subscribe(MAP, owner, lambda text: say("got", owner, text))
+
+
+def call(node: Node, owner: str) -> None:
+    """Call the services of a node, ask for its parameters, and use its action."""
+    say("got", owner, node.client(ADD, owner)("1 2"))
+    get_parameters = node.client(PARAMETERS["get_parameters"], owner)
+    say("got", owner, get_parameters("use_sim_time"))
+    act(node, owner)
+
+
+def act(node: Node, owner: str) -> None:
+    """Send a goal and await its end, then send another goal and cancel that."""
+    goals = {f"{node.name}_short": SHORT_GOAL_STEPS, f"{node.name}_long": LONG_GOAL_STEPS}
+    seen: set[str] = set()
+
+    def note(word: str, text: str) -> None:
+        """Print the feedback and the states of own goals, each once."""
+        for told in text.split():
+            goal = told.partition("=")[0]
+            if goal in goals and f"{word} {told}" not in seen:
+                seen.add(f"{word} {told}")
+                say("got", owner, word, told.removeprefix(f"{node.name}_"))
+
+    node.subscribe(FEEDBACK, owner, lambda text: note("feedback", text))
+    node.subscribe(STATUS, owner, lambda text: note("status", text))
+    calls = {kind: node.client(kind, owner) for kind in (SEND_GOAL, GET_RESULT, CANCEL_GOAL)}
+    for goal, steps in goals.items():
+        calls[SEND_GOAL](f"{goal} {steps}")
+        if steps == LONG_GOAL_STEPS:
+            say("got", owner, calls[CANCEL_GOAL](goal))
+        say("got", owner, "result", calls[GET_RESULT](goal))
