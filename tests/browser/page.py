@@ -24,12 +24,13 @@ ROWS = """
 return [...document.querySelectorAll("#rows tr")].map((row) => ({
   ...Object.fromEntries([...row.cells].slice(0, 9)
     .map((cell) => [cell.dataset.head, cell.textContent])),
-  text: row.lastChild.firstChild.textContent, fix: row.lastChild.lastChild.textContent,
+  text: row.lastChild.firstChild.textContent, fix: row.lastChild.querySelector(".fix").textContent,
   colour: getComputedStyle(row.cells[0]).color }));
 """
 NODES = """
-return [...document.querySelectorAll("#node-rows tr")].map((row) =>
-  [...row.cells].map((cell) => cell.textContent));
+const textOf = (cell) => [...cell.childNodes].map((child) =>
+  child.className === "copy" ? "" : child.textContent).join("");
+return [...document.querySelectorAll("#node-rows tr")].map((row) => [...row.cells].map(textOf));
 """
 LINE = """
 const row = [...document.querySelectorAll("#boxes .line")].find((line) =>

@@ -36,6 +36,15 @@ const { state } = window.rosproxyPage;
 const broken = [...state.nodes.values()].filter((node) => node.text);
 for (const node of broken) Object.assign(node, { state: "ok", text: "", fix: "" });
 """
+BUTTON = """
+const button = document.querySelector(arguments[0]);
+return [button.textContent, button.ariaLabel, button.hidden];
+"""
+NOTE_COPIES = """
+document.addEventListener("copy", () => { window.copied = String(getSelection()); });
+"""
+FIXES = ("#findings li", "#rows tr", "#node-rows tr", "#details")
+"""The places of fixes, each with a button that copies the fix."""
 CLEANUP = "run rosnode cleanup (answer y)"
 
 
@@ -103,12 +112,35 @@ def test_a_finding_is_shown_in_graph_and_table_and_leaves(browser: Browser, tmp_
         assert len(texts(browser, MARKED_BOXES)) == 3
         assert len(texts(browser, "#node-rows tr[aria-current]")) == 3
         assert not texts(browser, MARKED_ROWS), "a link is marked without this problem"
-        browser.run("document.querySelector('#findings .copy').focus()")
-        browser.press("\ue007")  # a script alone may not copy
-        assert texts(browser, "#findings .copy")[0] == "Copied"
         browser.run(MEND)
         wait_until("the finding is over", lambda: len(texts(browser, "#events li")) == 1)
         (event,) = texts(browser, "#events li")
         assert "over after" in event
         assert first[0].removeprefix("BROKEN: ") in event
         assert not texts(browser, MARKED_BOXES)
+
+
+def test_each_fix_has_a_button_that_copies_it(browser: Browser, tmp_path: Path) -> None:
+    """Enter and the space bar press the button. This chooses no row."""
+    with fleet(browser, tmp_path, 30):
+        browser.run(NOTE_COPIES)
+        browser.run("document.querySelector('#rows tr').click()")
+        chosen = texts(browser, MARKED_ROWS)
+        for place, key in zip(FIXES, ("\ue007", " ", "\ue007", " "), strict=True):
+            check_copies(browser, place, key)
+        assert texts(browser, MARKED_ROWS) == chosen
+        browser.press("\ue00c")
+        assert not texts(browser, "#rows tr:last-child .copy:not([hidden])")
+
+
+def check_copies(browser: Browser, place: str, key: str) -> None:
+    """Press a key at the first button of a place, which has to copy the first fix there."""
+    button = f"{place} .copy"
+    text, label, hidden = browser.run(BUTTON, button)
+    assert (text, hidden) == ("Copy", False)
+    assert label.startswith("Copy the fix for ")
+    browser.run("document.querySelector(arguments[0]).focus()", button)
+    browser.press(key)  # a script alone may not copy
+    assert browser.run(BUTTON, button) == ["Copied", "Copied", False]
+    assert browser.run("return window.copied") == texts(browser, f"{place} .fix")[0]
+    wait_until("the label is back", lambda: browser.run(BUTTON, button)[1] == label)

@@ -146,24 +146,39 @@ function makeFinding({ key, kind }) {
     li.append(make("span", "", "what"));
     return li;
   }
-  const [cause, fix, copyButton] = [make("button", "", "cause"), make("code", "", "fix"), make("button", "Copy", "copy")];
+  const cause = make("button", "", "cause");
+  cause.type = "button";
   cause.append(make("span", "", "what"), make("span", "", "text"));
   cause.addEventListener("click", () => choose(key, true));
-  copyButton.addEventListener("click", () => copy(fix, copyButton));
-  for (const button of [cause, copyButton]) button.type = "button";
   const since = make("span", "", "since");
   since.setAttribute("aria-hidden", "true");
-  li.append(cause, fix, copyButton, since);
+  li.append(cause, ...makeFix(), since);
   return li;
+}
+
+// A fix and the button that copies the fix.
+function makeFix() {
+  const [fix, button] = [make("code", "", "fix"), make("button", "Copy", "copy")];
+  button.type = "button";
+  button.addEventListener("click", () => copy(fix, button));
+  return [fix, button];
+}
+
+// `what`: what the fix is for, which screen readers say at the button.
+function putFix(parent, text, what) {
+  const button = parent.querySelector(".copy");
+  put(parent.querySelector(".fix"), text);
+  button.hidden = !text;
+  const label = button.textContent === "Copy" ? `Copy the fix for ${what}` : button.textContent;
+  if (button.ariaLabel !== label) button.ariaLabel = label;
 }
 
 function updateFinding(li, { key, isOn, what, text, fix, since }) {
   put(li.querySelector(".what"), what);
   if (!key) return;
   put(li.querySelector(".text"), text);
-  put(li.querySelector(".fix"), fix);
+  putFix(li, fix, what);
   put(li.querySelector(".since"), since);
-  li.querySelector(".copy").hidden = !fix;
   mark(li, isOn);
 }
 
@@ -171,6 +186,7 @@ function updateFinding(li, { key, isOn, what, text, fix, since }) {
 function copy(element, button) {
   getSelection().selectAllChildren(element);
   put(button, document.execCommand("copy") ? "Copied" : "Not copied");
+  button.ariaLabel = button.textContent;
   getSelection().removeAllRanges();
   setTimeout(() => put(button, "Copy"), 2000);
 }
@@ -194,7 +210,7 @@ function showLinks(found, on) {
   const listed = found.slice(0, MOST_ROWS);
   showRows($("rows"), rows, LINK_HEADS, listed.map(({ id, link, from, to }) => {
     const kind = link.kind === "topic" ? "" : ` (${link.kind})`;
-    return { id, one: link, key: `k:${id}`, on: on.has(id), texts: [link.name + kind, from, to || "–", link.carried || "–", link.port || "–",
+    return { id, one: link, key: `k:${id}`, what: `${link.name} from ${from}${to ? ` to ${to}` : ""}`, on: on.has(id), texts: [link.name + kind, from, to || "–", link.carried || "–", link.port || "–",
       hertz(link), megabytes(link), age(link, now)] };
   }));
   put($("more"), [tellRest(found.length - listed.length),
@@ -207,7 +223,7 @@ function showNodes(on) {
   showRows($("node-rows"), nodeRows, NODE_HEADS, listed.map(({ id, node, label }) => {
     const kind = (node.kind || "node") === "node" ? "" : ` (${node.kind})`;
     const where = (node.place ? `${node.place}, inside` : PLACES[node.lane]) + (node.proxy ? ` of ${node.proxy}` : "");
-    return { id, one: node, key: `n:${id}`, on: on.has(id), texts: [label + kind, where, node.address || "–", node.ports || "–", megabytes(node)] };
+    return { id, one: node, key: `n:${id}`, what: label, on: on.has(id), texts: [label + kind, where, node.address || "–", node.ports || "–", megabytes(node)] };
   }));
   put($("more-nodes"), tellRest(found.length - listed.length));
 }
@@ -218,7 +234,7 @@ function tellRest(count) {
 
 // The rows of a table, in this order: each with its state first, and with what is wrong last.
 function showRows(body, elements, heads, listed) {
-  arrange(body, elements, new Map(listed.map((row) => [row.id, row])), ({ key }) => makeRow(heads, key), (row, { one, on, texts }) => {
+  arrange(body, elements, new Map(listed.map((row) => [row.id, row])), ({ key }) => makeRow(heads, key), (row, { one, on, what, texts }) => {
     const kind = one.state || "unknown";
     [WORDS[kind], ...texts].forEach((text, index) => putName(row.cells[index], String(text)));
     if (row.dataset.state !== kind) {
@@ -227,14 +243,14 @@ function showRows(body, elements, heads, listed) {
     }
     mark(row, on);
     put(row.lastChild.firstChild, one.text || "");
-    put(row.lastChild.lastChild, one.fix || "");
+    putFix(row.lastChild, one.fix || "", what);
   });
 }
 
 // Its roles are said: on a phone rows and cells are blocks, which have none of their own.
 function makeRow(heads, key) {
   const row = make("tr");
-  row.addEventListener("click", () => { if (!String(getSelection())) choose(key, true); });
+  row.addEventListener("click", ({ target }) => { if (!target.closest("button") && !String(getSelection())) choose(key, true); });
   row.setAttribute("role", "row");
   heads.forEach((head) => {
     const cell = make("td", "", head === "State" ? "state" : NUMBERS.has(head) ? "number" : "");
@@ -242,7 +258,7 @@ function makeRow(heads, key) {
     cell.dataset.head = head;
     row.append(cell);
   });
-  row.lastChild.append(make("span"), make("code", "", "fix"));
+  row.lastChild.append(make("span"), ...makeFix());
   return row;
 }
 
@@ -401,13 +417,21 @@ function showDetails(on) {
   if (selected && !isFirst && !on.nodes.size && !on.links.size && !seen.has(selected)) selected = "";
   const parts = selected ? details(on) : [];
   const kinds = parts.map(([kind]) => kind).join(" ");
-  if ($("details").dataset.kinds !== kinds) $("details").replaceChildren(...parts.map(([kind]) => kind === "figure" ? makeCurve() : make(kind)));
+  if ($("details").dataset.kinds !== kinds) $("details").replaceChildren(...parts.map(([kind]) => makePart(kind)));
   $("details").dataset.kinds = kinds;
-  parts.forEach(([kind, text, curve], index) => {
+  parts.forEach(([kind, text, more], index) => {
     const element = $("details").children[index];
+    if (kind === "fix") return putFix(element, text, more);
     put(kind === "figure" ? element.lastChild : element, text);
-    if (kind === "figure") setAll([[element.querySelector("path"), "d", curve]]);
+    if (kind === "figure") setAll([[element.querySelector("path"), "d", more]]);
   });
+}
+
+function makePart(kind) {
+  if (kind === "figure") return makeCurve();
+  const part = make(kind === "fix" ? "p" : kind);
+  if (kind === "fix") part.append(...makeFix());
+  return part;
 }
 
 // A curve and, for all users, the same in words.
@@ -432,7 +456,7 @@ function details(on) {
   const { cause } = seen.get(selected) || {};
   if (cause) {
     const names = [...cause.nodes].slice(0, MOST_CHOSEN).map((id) => labelOf(id, state.nodes.get(id)));
-    parts.push(["p", cause.text], ["code", cause.fix], ["p", names.length > 1 ? names.join(", ") : ""]);
+    parts.push(["p", cause.text], ["fix", cause.fix, on.title], ["p", names.length > 1 ? names.join(", ") : ""]);
   }
   if (selected.startsWith("n:")) {
     const id = selected.slice(2);
@@ -441,7 +465,7 @@ function details(on) {
     const rate = node.rate === undefined ? "" : `${megabytes(node)} MB/s through it`;
     const period = node.since === undefined ? "" : ` for ${duration(now - node.since)}`;
     parts.push(["h3", on.title ? "" : labelOf(id, node)], ["p", `${node.detail || ""}${period}`], ["p", [node.place, node.address, ports, rate].filter(Boolean).join(" · ")],
-      ["p", node.text || ""], ["code", node.fix || ""]);
+      ["p", node.text || ""], ["fix", node.fix || "", labelOf(id, node)]);
   }
   const links = [...on.links.values()];
   for (const { id, link, from, to } of links.slice(0, MOST_CHOSEN)) {
@@ -451,7 +475,7 @@ function details(on) {
     parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name}${type} from ${ends}, ${frequency(link) || "– Hz"}, ` +
       `${megabytes(link)} MB/s, last message ${age(link, now)}, carried by ${link.carried || "–"}, port ${link.port || "–"}`],
     ["figure", minute.length ? minuteText(minute, link.shared) : "", curveOf(minute, CURVE.width, CURVE.height)],
-    ["p", link.text || ""], ["code", link.text && !cause ? link.fix || "" : ""]);
+    ["p", link.text || ""], ["fix", link.text && !cause ? link.fix || "" : "", link.name]);
   }
   if (links.length > MOST_CHOSEN) parts.push(["p", `${links.length - MOST_CHOSEN} more are marked in the table.`]);
   return parts.filter(([, text]) => text);
