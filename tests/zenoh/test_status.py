@@ -38,6 +38,9 @@ def test_nodes_outside_are_told_with_their_topics(lab: Lab) -> None:
     (node,) = lab.zenoh().nodes
     assert (node.name, node.address) == (f"/{publisher.title}", "")
     assert node.publishes == ("/chatter",)
+    assert [(qos.name, qos.reliability, qos.depth) for qos in node.qos] == [
+        ("/chatter", "RELIABLE", 10)
+    ]
     (session,) = lab.zenoh().sessions
     assert session.remote == f"{lab.topology.plan.robot}:{ROUTER_PORT}"
     assert session.local.startswith(lab.topology.places["px"].address)

@@ -35,8 +35,8 @@ _OTHER_COUNTERS_BYTES = 4096
 """Bytes by which all other counters together may grow: counters that belong to no row."""
 _FIRST_TABLES = ("nodes", "inside", "outside", "sessions", "stand_ins", "udpros", "layers", "peers")
 """Tables, in the order in which an owner keeps the rows; rows of other tables come last."""
-_UNCOUNTED_LIST = "types"
-"""The list whose entries ``left_out`` does not count: each entry belongs to a name."""
+_UNCOUNTED_LISTS = ("types", "qos")
+"""The lists whose entries ``left_out`` does not count: each entry belongs to a name."""
 _DELETE = b"\x7f"
 _ESCAPED = (
     (_DELETE, 5),
@@ -273,7 +273,7 @@ def _shortened(row: Row, room: int) -> Row:
             used = list(takewhile(room.__ge__, sizes))
             lists[name] = entries[: len(used)]
             room -= used[-1] if used else 0
-            left_out += 0 if name == _UNCOUNTED_LIST else len(entries) - len(used)
+            left_out += 0 if name in _UNCOUNTED_LISTS else len(entries) - len(used)
     if not lists:
         return row
     return msgspec.structs.replace(row, **lists, left_out=row.left_out + left_out)

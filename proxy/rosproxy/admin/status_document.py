@@ -437,6 +437,20 @@ class ZenohSessionStatus(msgspec.Struct, frozen=True):
     without_node: Seconds = 0.0
 
 
+class ZenohQosStatus(msgspec.Struct, frozen=True):
+    """The QoS of a publisher or a subscription of a node. ``name``: the topic.
+
+    ``kind`` is publisher or subscription. The other values are the names of ROS, as RELIABLE.
+    """
+
+    name: str = ""
+    kind: str = ""
+    reliability: str = ""
+    durability: str = ""
+    history: str = ""
+    depth: Count = 0
+
+
 class ZenohNodeStatus(msgspec.Struct, frozen=True):
     """A node of rmw_zenoh; ``address`` is empty if the node is beyond a router outside.
 
@@ -444,6 +458,7 @@ class ZenohNodeStatus(msgspec.Struct, frozen=True):
     port for containers; None: the node is outside. ``calls``: the services of which the node has a
     client. ``key`` is the same at all proxies, since several nodes may have the same name.
     ``not_judged``: the proxy has still to compare names of the node with the rules of the policy.
+    ``qos``: of the node's publishers and subscriptions.
     """
 
     name: str = ""
@@ -459,6 +474,7 @@ class ZenohNodeStatus(msgspec.Struct, frozen=True):
     mode: str = ""
     key: str = ""
     not_judged: bool = False
+    qos: tuple[ZenohQosStatus, ...] = ()
 
 
 class ZenohStatus(msgspec.Struct, frozen=True):

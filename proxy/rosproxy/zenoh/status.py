@@ -19,13 +19,14 @@ from rosproxy.admin.status_document import (
     ZenohCertificateStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
+    ZenohQosStatus,
     ZenohSessionStatus,
     ZenohStatus,
 )
 from rosproxy.settings import Settings
 from rosproxy.zenoh.links import Link, is_linked
 from rosproxy.zenoh.matching import Comparison, compare
-from rosproxy.zenoh.protocol.liveliness import TokenGraph, ZenohNode
+from rosproxy.zenoh.protocol.liveliness import TokenGraph, TopicQos, ZenohNode
 from rosproxy.zenoh.protocol.report import (
     Ends,
     Report,
@@ -373,4 +374,10 @@ def _node_status(node: ZenohNode, placed: _PlacedSession | None) -> ZenohNodeSta
         port=port,
         mode=session.whatami if session else "",
         key=node.key,
+        qos=tuple(map(_qos_status, node.qos)),
     )
+
+
+def _qos_status(of_topic: TopicQos) -> ZenohQosStatus:
+    kind = "publisher" if of_topic.is_publisher else "subscription"
+    return ZenohQosStatus(of_topic.name, kind, *of_topic.qos)

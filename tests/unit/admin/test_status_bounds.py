@@ -36,6 +36,7 @@ from rosproxy.admin.status_document import (
     StandInStatus,
     UdprosStatus,
     ZenohNodeStatus,
+    ZenohQosStatus,
     ZenohSessionStatus,
     ZenohStatus,
     parse_status,
@@ -190,6 +191,19 @@ def test_what_zenoh_tells_is_bounded(flood: dict[str, Any]) -> None:
     assert good_session in shown.zenoh.sessions
     assert good_mismatch in shown.zenoh.mismatches
     assert left_out(shown) > 0
+
+
+def test_the_qos_of_a_node_goes_before_its_names() -> None:
+    """A QoS belongs to a name, so ``left_out`` does not count it."""
+    names = tuple(f"/t{number:04}" for number in range(9000))
+    qos = tuple(ZenohQosStatus(n, "publisher", "RELIABLE", "VOLATILE", "KEEP_LAST") for n in names)
+    node = ZenohNodeStatus("/crowd", address=EVIL, publishes=names, qos=qos)
+    shown = bounded(ProxyStatus(zenoh=ZenohStatus(nodes=(node,))))
+    assert len(encode(shown)) <= MOST_BYTES
+    assert shown.zenoh is not None
+    assert shown.zenoh.nodes[0].publishes == names
+    assert 4000 < len(shown.zenoh.nodes[0].qos) < 9000
+    assert left_out(shown) == 0
 
 
 def _rows(status: ProxyStatus) -> int:

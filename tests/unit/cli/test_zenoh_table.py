@@ -1,14 +1,19 @@
 """The routers for rmw_zenoh in ``rosproxy status``."""
 
+from msgspec.structs import replace
+
 from rosproxy.admin.status_document import (
+    NamedTypeStatus,
     ProxyStatus,
     StatusSettings,
     ZenohLinkStatus,
     ZenohNodeStatus,
+    ZenohQosStatus,
     ZenohSessionStatus,
     ZenohStatus,
 )
 from rosproxy.cli.status_table import render
+from rosproxy.cli.zenoh_table import MOST_NAMES, MOST_TYPE_COLUMNS, zenoh_lines
 
 STATUS = ProxyStatus(
     version="0.1.0",
@@ -48,7 +53,12 @@ NODE            DOMAIN  ADDRESS     PUB  SUB  SRV
     services   /add
 /driver         0       outside       0    1    0
     subscribes /cmd_vel
-    not shown  3 names"""
+    not shown  3 names
+TOPIC     DOMAIN  TYPE  PUB  SUB
+/chatter  0               1    0
+/cmd_vel  0               0    1
+SERVICE  DOMAIN  TYPE  SRV  CLI
+/add     0               1    0"""
 
 
 def test_the_routers() -> None:
@@ -74,3 +84,77 @@ def test_links_to_other_sites_have_their_protocol() -> None:
     shown = render(ProxyStatus(settings=StatusSettings(ros=("zenoh",)), zenoh=zenoh), 200)
     assert "\n192.0.2.9:7447  router  172.18.0.2:40000  link" in shown
     assert "; port quic/7449 for other sites; links to outside: tls/cloud:7447 up for" in shown
+
+
+STRING = "std_msgs/msg/String"
+SMALL = ZenohQosStatus("/chatter", "publisher", "RELIABLE", "VOLATILE", "KEEP_LAST", 10)
+TALKER = ZenohNodeStatus(
+    *("/talker", 0, "172.18.0.3", ("/chatter",)),
+    services=("/add", "/talker/get_parameters"),
+    types=(
+        NamedTypeStatus("/add", "example_interfaces/srv/AddTwoInts"),
+        NamedTypeStatus("/chatter", STRING),
+    ),
+    qos=(SMALL,),
+)
+LISTENER = ZenohNodeStatus(
+    *("/listener", 0, "172.18.0.4", (), ("/chatter",)),
+    services=("/listener/get_parameters",),
+    calls=("/add", "/talker/get_parameters"),
+    types=(NamedTypeStatus("/chatter", STRING),),
+    qos=(ZenohQosStatus("/chatter", "subscription", "BEST_EFFORT", "VOLATILE", "KEEP_ALL"),),
+)
+NAMES = """\
+    services   /listener/get_parameters
+    calls      /add  /talker/get_parameters
+TOPIC     DOMAIN  TYPE                 PUB  SUB
+/chatter  0       std_msgs/msg/String    1    1
+    PUB        RELIABLE VOLATILE KEEP_LAST(10)
+    SUB        BEST_EFFORT VOLATILE KEEP_ALL
+SERVICE                 DOMAIN  TYPE                               SRV  CLI
+/add                    0       example_interfaces/srv/AddTwoInts    1    1
+/talker/get_parameters  0                                            1    1
+    not shown  1 service of parameters and types"""
+
+
+def test_topics_have_types_and_qos_and_services_have_servers_and_clients() -> None:
+    shown = "\n".join(zenoh_lines(ZenohStatus(nodes=(TALKER, LISTENER)), 100))
+    assert shown.endswith(NAMES)
+
+
+def test_the_same_qos_of_both_sides_is_one_line() -> None:
+    alike = replace(LISTENER, qos=(replace(SMALL, kind="subscription"),), calls=(), services=())
+    shown = [*zenoh_lines(ZenohStatus(nodes=(TALKER, alike)), 100)]
+    assert "    QoS        RELIABLE VOLATILE KEEP_LAST(10)" in shown
+    assert not [line for line in shown if line.startswith("    PUB")]
+
+
+def test_domains_are_apart() -> None:
+    far = replace(LISTENER, domain=7)
+    shown = [*zenoh_lines(ZenohStatus(nodes=(TALKER, far)), 100)]
+    rows = [line.split() for line in shown if line.startswith("/chatter")]
+    assert rows == [["/chatter", "0", STRING, "1", "0"], ["/chatter", "7", STRING, "0", "1"]]
+
+
+def test_the_tables_of_names_are_bounded() -> None:
+    many = tuple(f"/t{number:04}" for number in range(MOST_NAMES + 7))
+    types = (NamedTypeStatus("/t0000", "x" * 500),)
+    qos = tuple(replace(SMALL, name="/t0000", depth=depth) for depth in range(5))
+    node = ZenohNodeStatus("/crowd\x1b", 0, "", many, (), many, types=types, qos=qos)
+    shown = [*zenoh_lines(ZenohStatus(nodes=(node,)), 100)]
+    rows = [line for line in shown if line.startswith("/t")]
+    assert len(rows) == 2 * MOST_NAMES
+    assert "x" * MOST_TYPE_COLUMNS not in rows[0]
+    assert shown[-1] == "    not shown  7 services"
+    assert "    not shown  7 topics" in shown
+    assert any("KEEP_LAST(2) and 2 more" in line for line in shown)
+
+
+def test_names_of_types_and_qos_are_harmless() -> None:
+    bad = "\x1b[2J"
+    node = ZenohNodeStatus(
+        *("/n", 0, "", (bad,)),
+        types=(NamedTypeStatus(bad, bad),),
+        qos=(ZenohQosStatus(bad, "publisher", bad, bad, bad),),
+    )
+    assert "\x1b" not in "\n".join(zenoh_lines(ZenohStatus(nodes=(node,)), 100))

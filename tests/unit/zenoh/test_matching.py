@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import MismatchStatus
 from rosproxy.zenoh.matching import MOST_COMPARISONS, MOST_MISMATCHES_OF_NAME, Comparison, compare
-from rosproxy.zenoh.protocol.liveliness import Entity, EntityKind
+from rosproxy.zenoh.protocol.liveliness import Entity, EntityKind, Qos
 
 STRING = "std_msgs::msg::dds_::String_"
 NUMBER = "std_msgs::msg::dds_::Int32_"
+LATCHED = Qos(durability="TRANSIENT_LOCAL")
 INSIDE = "aa"
 OUTSIDE = "bb"
 
@@ -40,7 +41,7 @@ def test_nodes_with_the_same_key_match() -> None:
     [
         ({"type": NUMBER}, "type", "std_msgs/msg/String", "std_msgs/msg/Int32"),
         ({"type_hash": "H2"}, "type hash", "H1", "H2"),
-        ({"is_transient_local": True}, "durability", "VOLATILE", "TRANSIENT_LOCAL"),
+        ({"qos": LATCHED}, "durability", "VOLATILE", "TRANSIENT_LOCAL"),
     ],
 )
 def test_what_differs_is_named(
@@ -63,19 +64,19 @@ def test_a_service_has_a_server_and_a_client() -> None:
         f"0 {INSIDE}.1/server",
         f"0 {OUTSIDE}.1/client",
     )
-    latched = client._replace(type=STRING, is_transient_local=True)
+    latched = client._replace(type=STRING, qos=LATCHED)
     assert not found(server, latched), "services keep no messages"
 
 
 def test_the_best_pair_of_two_nodes_counts() -> None:
     assert not found(publisher(type=NUMBER), publisher(), subscription())
-    late = subscription(is_transient_local=True)
-    assert not found(publisher(), publisher(is_transient_local=True), late)
+    late = subscription(qos=LATCHED)
+    assert not found(publisher(), publisher(qos=LATCHED), late)
     assert not found(publisher(), late, subscription()), "one subscription gets all it asks for"
 
 
 def test_a_publisher_that_keeps_messages_also_serves_those_that_want_none() -> None:
-    assert not found(publisher(is_transient_local=True), subscription())
+    assert not found(publisher(qos=LATCHED), subscription())
 
 
 def test_other_domains_and_pairs_outside_are_not_compared() -> None:
@@ -86,7 +87,7 @@ def test_other_domains_and_pairs_outside_are_not_compared() -> None:
 
 def test_nodes_with_the_same_entities_are_compared_once() -> None:
     many = [publisher(f"/p{n}") for n in range(300)]
-    many += [subscription(f"/s{n}", is_transient_local=n == 0) for n in range(300)]
+    many += [subscription(f"/s{n}", qos=Qos() if n else LATCHED) for n in range(300)]
     comparison = compare((*many, subscription(type=NUMBER)), {INSIDE})
     assert len(comparison.mismatches) == len(comparison.late) == MOST_MISMATCHES_OF_NAME
     assert comparison.left_out == 300 - MOST_MISMATCHES_OF_NAME, "late pairs are not counted"
@@ -134,7 +135,7 @@ ENTITIES = st.builds(
     st.sampled_from(["/x", "/y"]),
     st.sampled_from([STRING, NUMBER]),
     st.sampled_from(["H1", "H2"]),
-    st.booleans(),
+    st.sampled_from([Qos(), LATCHED]),
 )
 
 

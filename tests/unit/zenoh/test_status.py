@@ -10,6 +10,7 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.admin.status_document import (
     NamedTypeStatus,
     ZenohCertificateStatus,
+    ZenohQosStatus,
     ZenohSessionStatus,
 )
 from rosproxy.zenoh.protocol.liveliness import graph_of
@@ -135,6 +136,9 @@ def test_nodes_here_have_an_address() -> None:
     )
     assert (talker.port, talker.mode, talker.key) == (7448, "peer", f"0 {NODE_ZID}.0/talker")
     assert talker.types == (NamedTypeStatus("/chatter", "T_"),)
+    assert talker.qos == (
+        ZenohQosStatus("/chatter", "publisher", "RELIABLE", "VOLATILE", "KEEP_LAST", 10),
+    )
     assert (robot.name, robot.address, robot.port, robot.mode) == ("/robot", "", None, "")
 
 

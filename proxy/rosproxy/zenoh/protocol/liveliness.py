@@ -11,6 +11,7 @@ In names, ``%`` stands for ``/``.
 import re
 from collections.abc import Iterable, Sequence
 from enum import Enum
+from functools import lru_cache
 from typing import NamedTuple
 
 ALL_TOKENS = "@ros2_lv/**"
@@ -27,10 +28,15 @@ _TOPIC_OR_SERVICE_PARTS = 13
 _TYPE_PART = 10
 _HASH_PART = 11
 _QOS_PART = 12
-_TRANSIENT_LOCAL = "1"
-"""The durability in the QoS of a token, ``reliability:durability:...``. A default is an empty text:
-since March 2025 the default of rmw_zenoh is volatile, before it was transient local (rmw_zenoh
-#521)."""
+_COMMON = {"0": "SYSTEM_DEFAULT", "4": "BEST_AVAILABLE"}
+_RELIABILITY = {**_COMMON, "": "RELIABLE", "1": "RELIABLE", "2": "BEST_EFFORT"}
+_DURABILITY = {**_COMMON, "": "VOLATILE", "1": "TRANSIENT_LOCAL", "2": "VOLATILE"}
+_HISTORY = {"0": "SYSTEM_DEFAULT", "": "KEEP_LAST", "1": "KEEP_LAST", "2": "KEEP_ALL"}
+"""Names of values by number (rmw/types.h). A default value is an empty text in a token
+(liveliness_utils.cpp, qos_to_keyexpr; qos.cpp). Before March 2025, the default of the durability
+was TRANSIENT_LOCAL (rmw_zenoh #521)."""
+_UNKNOWN = "UNKNOWN"
+_DEFAULT_DEPTH = 42
 _NUMBER = re.compile(r"[0-9]{1,9}")
 _SESSION = re.compile(r"[0-9a-f]{1,32}")
 
@@ -52,6 +58,24 @@ _KINDS_OF_NAMES = (
     EntityKind.SERVICE,
     EntityKind.SERVICE_CLIENT,
 )
+_KINDS_OF_TOPICS = (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
+
+
+class Qos(NamedTuple):
+    """The QoS in a token, ``reliability:durability:history,depth:...``. Values are names of ROS."""
+
+    reliability: str = _RELIABILITY[""]
+    durability: str = _DURABILITY[""]
+    history: str = _HISTORY[""]
+    depth: int = _DEFAULT_DEPTH
+
+
+class TopicQos(NamedTuple):
+    """The QoS of a publisher or a subscription of a node. ``name``: the topic."""
+
+    name: str
+    is_publisher: bool
+    qos: Qos
 
 
 class Entity(NamedTuple):
@@ -70,7 +94,12 @@ class Entity(NamedTuple):
     name: str = ""
     type: str = ""
     type_hash: str = ""
-    is_transient_local: bool = False
+    qos: Qos = Qos()
+
+    @property
+    def is_transient_local(self) -> bool:
+        """Whether a publisher keeps messages for later subscriptions, or one asks for them."""
+        return self.qos.durability == "TRANSIENT_LOCAL"
 
     @property
     def node_key(self) -> str:
@@ -82,6 +111,7 @@ class ZenohNode(NamedTuple):
     """A ROS node with its publishers, subscriptions, services and service clients.
 
     The full names of topics and services are sorted. ``types`` has each name with its ROS type.
+    ``qos`` has the QoS of publishers and subscriptions, each once.
     """
 
     domain: int
@@ -93,6 +123,7 @@ class ZenohNode(NamedTuple):
     calls: tuple[str, ...] = ()
     types: tuple[tuple[str, str], ...] = ()
     node_id: int = 0
+    qos: tuple[TopicQos, ...] = ()
 
     @property
     def key(self) -> str:
@@ -138,7 +169,20 @@ def parse_token(key: str) -> Entity | None:
         _ros_name(parts[9]),
         parts[_TYPE_PART],
         parts[_HASH_PART],
-        is_transient_local=parts[_QOS_PART].split(":")[1:2] == [_TRANSIENT_LOCAL],
+        _qos(parts[_QOS_PART]),
+    )
+
+
+@lru_cache(maxsize=1024)
+def _qos(text: str) -> Qos:
+    """The QoS in a token; UNKNOWN for other numbers than those of ROS."""
+    reliability, durability, history, *_ = [*text.split(":"), "", "", ""]
+    kind, _, depth = history.partition(",")
+    return Qos(
+        _RELIABILITY.get(reliability, _UNKNOWN),
+        _DURABILITY.get(durability, _UNKNOWN),
+        _HISTORY.get(kind, _UNKNOWN),
+        int(depth) if _NUMBER.fullmatch(depth) else _DEFAULT_DEPTH,
     )
 
 
@@ -175,6 +219,11 @@ def _node_of(entities: Sequence[Entity]) -> ZenohNode:
         tuple(sorted(names[kind])) for kind in _KINDS_OF_NAMES
     )
     types = {(entity.name, ros_type(entity.type)) for entity in entities if entity.name}
+    qos = {
+        TopicQos(entity.name, entity.kind is EntityKind.PUBLISHER, entity.qos)
+        for entity in entities
+        if entity.kind in _KINDS_OF_TOPICS
+    }
     return ZenohNode(
         first.domain,
         first.session,
@@ -185,6 +234,7 @@ def _node_of(entities: Sequence[Entity]) -> ZenohNode:
         calls,
         tuple(sorted(types)),
         first.node_id,
+        tuple(sorted(qos)),
     )
 
 

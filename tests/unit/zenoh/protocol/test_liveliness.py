@@ -13,6 +13,8 @@ from rosproxy.zenoh.protocol.liveliness import (
     MOST_TOKENS,
     Entity,
     EntityKind,
+    Qos,
+    TopicQos,
     ZenohNode,
     is_kept,
     nodes_of,
@@ -32,7 +34,9 @@ NAMES = st.lists(NAME, min_size=1, max_size=3).map(lambda parts: "/" + "/".join(
 
 def test_a_node_and_its_publisher() -> None:
     assert parse_token(NODE) == Entity(0, ZID, 0, EntityKind.NODE, "/talker")
-    publisher = Entity(0, ZID, 0, EntityKind.PUBLISHER, "/talker", "/chatter", STRING, HASH)
+    publisher = Entity(
+        *(0, ZID, 0, EntityKind.PUBLISHER, "/talker", "/chatter", STRING, HASH, Qos(depth=10))
+    )
     assert parse_token(PUBLISHER) == publisher
     assert publisher.node_key == f"0 {ZID}.0/talker"
 
@@ -53,17 +57,29 @@ def test_what_rmw_zenoh_writes_is_read(
     key = (
         f"@ros2_lv/{domain}/{session}/3/4/{kind.value}/%/{mangled}/{node}/{named}/T_/H/::,1:,:,:,,"
     )
-    entity = Entity(domain, session, 3, kind, f"{namespace}/{node}", topic, "T_", "H")
+    entity = Entity(domain, session, 3, kind, f"{namespace}/{node}", topic, "T_", "H", Qos(depth=1))
     assert parse_token(key) == entity
 
 
 @pytest.mark.parametrize(
-    ("qos", "is_latched"), [("1:1:1,10", True), (":1:,", True), (":2:,1", False), ("x", False)]
+    ("text", "qos"),
+    [
+        ("::,:,:,:,,", Qos()),
+        ("::,10:,:,:,,", Qos(depth=10)),
+        ("2:1:2,10", Qos("BEST_EFFORT", "TRANSIENT_LOCAL", "KEEP_ALL", 10)),
+        ("1:2:1,7", Qos("RELIABLE", "VOLATILE", "KEEP_LAST", 7)),
+        ("4:0:0,0", Qos("BEST_AVAILABLE", "SYSTEM_DEFAULT", "SYSTEM_DEFAULT", 0)),
+        (":1:,", Qos(durability="TRANSIENT_LOCAL")),
+        ("2", Qos("BEST_EFFORT")),
+        ("x:9:7,y", Qos("UNKNOWN", "UNKNOWN", "UNKNOWN")),
+        ("::,99999999999999999999", Qos()),
+    ],
 )
-def test_the_durability_of_a_token(qos: str, is_latched: bool) -> None:
-    entity = parse_token(PUBLISHER.replace("::,10", qos))
+def test_the_qos_of_a_token(text: str, qos: Qos) -> None:
+    entity = parse_token(PUBLISHER.replace("::,10:,:,:,,", text))
     assert entity is not None
-    assert entity.is_transient_local is is_latched
+    assert entity.qos == qos
+    assert entity.is_transient_local is (qos.durability == "TRANSIENT_LOCAL")
 
 
 @pytest.mark.parametrize(
@@ -108,12 +124,21 @@ def test_what_is_no_token(key: str) -> None:
 
 def test_entities_become_nodes() -> None:
     keys = [NODE, PUBLISHER, PUBLISHER.replace("MP", "MS"), PUBLISHER.replace("MP", "SC")]
+    keys += [
+        PUBLISHER.replace("MP", "MS").replace(",10:", ",5:"),
+        PUBLISHER.replace("/10/", "/11/"),
+    ]
     keys.append(NODE.replace("/0/", "/5/", 1))
     entities = [entity for key in keys if (entity := parse_token(key))]
     assert nodes_of(reversed(entities)) == (
         ZenohNode(
             *(0, ZID, "/talker", ("/chatter",), ("/chatter",), (), ("/chatter",)),
             types=(("/chatter", "std_msgs/msg/String"),),
+            qos=(
+                TopicQos("/chatter", False, Qos(depth=5)),
+                TopicQos("/chatter", False, Qos(depth=10)),
+                TopicQos("/chatter", True, Qos(depth=10)),
+            ),
         ),
         ZenohNode(5, ZID, "/talker", (), (), ()),
     )
