@@ -31,6 +31,25 @@ return import("/findings.js").then(({ follow, titleOf }) => {
   return events.map(({ at, over, title, since }) => [at, over, title, since]);
 });
 """
+FOLLOW_NODES = """
+return import("/findings.js").then(({ connect, emptyMemory, followNodes }) => {
+  const memory = emptyMemory();
+  let events = [];
+  for (const [second, nodes, left_out] of arguments[0]) {
+    if (nodes === null) connect(memory, 1000 * second);
+    else {
+      const state = { nodes: new Map(Object.entries(nodes)), left_out };
+      events = followNodes(memory, state, events, 1000 * second);
+    }
+  }
+  return events.map(({ at, title }) => `${at / 1000} ${title}`);
+});
+"""
+ADD_NODE = """
+const name = `/new${Math.floor(Date.now() / 1000)}`;
+window.rosproxyPage.state.nodes.set(name, { lane: "container", address: "172.18.9.9:1" });
+return [...document.querySelectorAll("#events li")].map((item) => item.textContent);
+"""
 MEND = """
 const { state } = window.rosproxyPage;
 const broken = [...state.nodes.values()].filter((node) => node.text);
@@ -101,6 +120,95 @@ def test_what_comes_and_goes_is_an_event(browser: Browser, tmp_path: Path) -> No
             [1000, False, "b", 1000],
         ]
         assert len(browser.run(FOLLOW, [[], *([[str(n)] for n in range(90)])])) == 50
+
+
+Look = tuple[float, Json | None, int]
+"""The time in seconds, the nodes by key (None: a new connection), and ``left_out``."""
+ONE = {"kind": "proxy", "lane": "host", "label": "one"}
+TALKER = {"label": "/talker", "lane": "container", "place": "box", "proxy": "one"}
+LISTENER = {"label": "/listener", "lane": "robot", "address": "10.0.0.2:1"}
+HERE = {"one rosproxy": ONE, "one /talker": TALKER, "/listener": LISTENER}
+CONNECTED: tuple[Look, ...] = ((0, None, 0), (10, HERE, 0))
+
+
+def nodes_at(place: str, *names: str) -> Json:
+    """Nodes in a container."""
+    return {name: {**TALKER, "label": name, "place": place} for name in names}
+
+
+@pytest.mark.parametrize(
+    ("looks", "events"),
+    [
+        ([(11, {"one rosproxy": ONE, "/listener": LISTENER}, 0)],
+         ["11 /talker went at box, behind one"]),
+        ([(11, {**HERE, "/x": {**LISTENER, "label": "/x"}}, 0)], ["11 /x came at 10.0.0.2"]),
+        ([(11, HERE | nodes_at("a", "/x", "/y"), 0), (12, HERE | nodes_at("a", "/y", "/z"), 0)],
+         ["12 /z came, /x went at a, behind one", "11 2 nodes came (/x, …) at a, behind one"]),
+        ([(11, {f"/n{n}": {**LISTENER, "address": f"10.0.1.{n}:1"} for n in range(9)} | HERE, 0)],
+         ["11 9 nodes came at 9 machines or containers"]),
+        ([(11, {**HERE, "x": {**LISTENER, "label": "/t"}}, 0), (12, HERE | nodes_at("a", "/t"), 0)],
+         ["11 /t came at 10.0.0.2"]),
+        ([(11, {"one rosproxy": ONE}, 5), (12, HERE, 0), (13, HERE, 0)], []),
+    ],
+)  # fmt: skip
+def test_nodes_that_come_and_go_are_events(
+    browser: Browser, tmp_path: Path, looks: list[Look], events: list[str]
+) -> None:
+    """Each machine or container has one event in a look, and many machines share one event.
+
+    A node that was outside at first, and nodes that are left out, make no event.
+    """
+    with made_up(browser, tmp_path, 10):
+        assert browser.run(FOLLOW_NODES, [*CONNECTED, *looks]) == events
+
+
+@pytest.mark.parametrize(
+    ("looks", "events"),
+    [
+        ([(0, {"one rosproxy": ONE}, 0), (9, HERE, 0), (10, HERE, 0), (11, HERE, 0)], []),
+        ([*CONNECTED[1:], (20, None, 0), (20, {}, 0), (21, {"one rosproxy": ONE}, 0),
+          (22, HERE, 0), (40, HERE, 0)], []),
+        ([*CONNECTED[1:], (20, None, 0), (20, {"one rosproxy": ONE}, 0), (30, HERE, 0),
+          (31, {"one rosproxy": ONE, "one /talker": TALKER}, 0)],
+         ["31 /listener went at 10.0.0.2"]),
+    ],
+)  # fmt: skip
+def test_a_new_connection_is_no_event(
+    browser: Browser, tmp_path: Path, looks: list[Look], events: list[str]
+) -> None:
+    """The first documents lack nodes until the proxy has asked all nodes."""
+    with made_up(browser, tmp_path, 10):
+        assert browser.run(FOLLOW_NODES, [(0, None, 0), *looks]) == events
+
+
+def test_a_proxy_that_is_replaced_is_one_event(browser: Browser, tmp_path: Path) -> None:
+    """Its nodes and the nodes outside are not known to be gone while the proxy does not answer."""
+    silent = {"one": {**ONE, "state": "broken", "text": "no data from this proxy"}}
+    told = "proxy one: gone for {} s and back (replaced, restarted or not reachable)"
+    looks = [
+        *CONNECTED, (11, HERE, 0), (12, silent, 0), (60, silent, 0), (61, {"one rosproxy": ONE}, 0),
+        (64, HERE, 0), (72, HERE, 0), (80, {"/listener": LISTENER}, 0), (83, HERE, 0),
+        (99, HERE, 0),
+    ]  # fmt: skip
+    with made_up(browser, tmp_path, 10):
+        assert browser.run(FOLLOW_NODES, looks) == [f"83 {told.format(3)}", f"61 {told.format(49)}"]
+
+
+def test_nodes_that_flap_leave_room_for_fifty_events(browser: Browser, tmp_path: Path) -> None:
+    flapping = [(11 + n, HERE | nodes_at("a", *["/x"][: n % 2]), 0) for n in range(90)]
+    with made_up(browser, tmp_path, 10):
+        assert len(browser.run(FOLLOW_NODES, [*CONNECTED, *flapping])) == 50
+
+
+def test_a_node_that_comes_is_an_event_on_the_page(browser: Browser, tmp_path: Path) -> None:
+    """The page reports only nodes that come after the first seconds."""
+    with fleet(browser, tmp_path, 30):
+        wait_until(
+            "the page reports a node",
+            lambda: any("at 172.18.9.9" in event for event in browser.run(ADD_NODE)),
+            60,
+        )
+        assert not [event for event in texts(browser, "#events li") if "172.18.9.9" not in event]
 
 
 def test_a_finding_is_shown_in_graph_and_table_and_leaves(browser: Browser, tmp_path: Path) -> None:

@@ -165,6 +165,8 @@ def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: B
     wait_until("nothing is broken", lambda: title(browser) == "rosproxy")
     assert node_rows(browser, "two (proxy)")[0][0] == "ok"
     assert box_colour(browser, "two") == ok
+    events = browser.run("return document.querySelector('#events').textContent")
+    assert "proxy two: gone for " in events
     row(browser, "/chatter", State="ok", From="/talker", To="/hearer")
     wait_until(
         "/hearer is back behind proxy two",

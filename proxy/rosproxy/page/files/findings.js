@@ -1,8 +1,12 @@
 // What is wrong, one entry for each cause, and what happened: pure functions, without a DOM.
 
-import { labelOf, placeOf, RANK } from "./view.js";
+import { duration, labelOf, placeOf, RANK } from "./view.js";
 
 const MOST_EVENTS = 50;
+const MOST_PLACES = 8; // with an entry of their own in a look
+const MOST_GONE = 200;
+const SETTLED = 10000; // a proxy first asks all nodes, and until then the document lacks nodes outside
+const PLAIN_KINDS = new Set(["node", "participant", "zenoh node"]);
 
 // The causes, the worst first. What has one fix and one place (a container or a machine) is one
 // cause: a container that ends, or a firewall, leaves many links with a problem. Names of nodes and
@@ -83,4 +87,105 @@ export function follow(seen, causes, events, now, isFirst) {
     seen.set(cause.key, { cause, since, old });
   }
   return [...found, ...events].slice(0, MOST_EVENTS);
+}
+
+// What a page remembers of nodes and proxies from one look to the next. `known`: the nodes of the
+// last look, none before the page has settled. `answering`: the names of proxies. `gone`: the proxies
+// that answer no more, with the time. Times are in milliseconds.
+export function emptyMemory() {
+  return { known: null, answering: null, gone: new Map(), settled: Infinity };
+}
+
+// After a new connection, the first documents may lack proxies and nodes.
+export function connect(memory, now) {
+  memory.answering = null;
+  memory.settled = now + SETTLED;
+}
+
+// Note which nodes came and went, and which proxies are back. Returns the events, the newest first.
+export function followNodes(memory, { nodes, left_out }, events, now) {
+  const found = followProxies(memory, nodes, now);
+  if (now >= memory.settled && nodes.size) {
+    const current = new Map([...nodes].map(([id, node]) => [idOf(id, node), { ...node, label: labelOf(id, node) }]));
+    if (memory.known && !left_out) found.push(...changesOf(memory.known, current, silentOf(nodes), now));
+    memory.known = left_out ? null : current; // a node that is left out did not go
+  }
+  return [...found, ...events].slice(0, MOST_EVENTS);
+}
+
+// A proxy without an answer has another key than the same proxy with an answer.
+function idOf(id, node) {
+  return node.kind === "proxy" ? `proxy ${labelOf(id, node)}` : id;
+}
+
+function silentOf(nodes) {
+  const proxies = [...nodes].filter(([, node]) => node.kind === "proxy");
+  return new Set(proxies.filter((one) => !answers(one)).map(([id, node]) => labelOf(id, node)));
+}
+
+// On the page of an operator, only a proxy without a document has its name as the key.
+function answers([id, node]) {
+  return node.state !== "broken" || id !== labelOf(id, node);
+}
+
+function followProxies(memory, nodes, now) {
+  const { answering: before, gone } = memory;
+  const proxies = [...nodes].filter(([, node]) => node.kind === "proxy");
+  const after = memory.answering = new Set(proxies.filter(answers).map(([id, node]) => labelOf(id, node)));
+  if (!before) return [];
+  const lost = [...before].filter((name) => !after.has(name));
+  const fresh = [...after].filter((name) => !before.has(name));
+  const back = fresh.filter((name) => gone.has(name)).map((name) => ({ at: now,
+    title: `proxy ${name}: gone for ${duration((now - gone.get(name)) / 1000)} and back (replaced, restarted or not reachable)` }));
+  for (const name of fresh) gone.delete(name);
+  for (const name of lost) gone.set(name, now);
+  for (const name of [...gone.keys()].slice(0, Math.max(0, gone.size - MOST_GONE))) gone.delete(name);
+  // The nodes of these proxies come and go with their documents.
+  if (lost.length || fresh.length) memory.settled = Math.max(memory.settled, now + SETTLED);
+  return back;
+}
+
+// The events of a look. While a proxy does not answer, its nodes and nodes outside are not known to
+// be gone, and stay in `current`. A node that is outside for one proxy and then inside did not move.
+function changesOf(known, current, silent, now) {
+  const isHidden = (node) => silent.has(node.proxy) || (silent.size > 0 && node.lane !== "container");
+  const came = [...current].filter(([id]) => !known.has(id)).map(([, node]) => node);
+  const went = [];
+  for (const [id, node] of known) {
+    if (current.has(id)) continue;
+    if (isHidden(node)) current.set(id, node);
+    else went.push(node);
+  }
+  const places = new Map();
+  const add = (verb, nodes, others) => {
+    const lanes = new Map(others.map(({ label, lane }) => [label, lane]));
+    for (const node of nodes) {
+      if (lanes.has(node.label) && lanes.get(node.label) !== node.lane) continue;
+      const key = JSON.stringify([node.proxy, placeOf(node), node.lane]);
+      if (!places.has(key)) places.set(key, { node, came: [], went: [] });
+      places.get(key)[verb].push(node);
+    }
+  };
+  add("came", came, went);
+  add("went", went, came);
+  return titlesOf([...places.values()]).map((title) => ({ at: now, title }));
+}
+
+function titlesOf(places) {
+  if (places.length > MOST_PLACES) {
+    const [came, went] = ["came", "went"].map((verb) => places.reduce((sum, place) => sum + place[verb].length, 0));
+    const parts = [came && `${came} nodes came`, went && `${went} nodes went`].filter(Boolean);
+    return [`${parts.join(", ")} at ${places.length} machines or containers`];
+  }
+  return places.map(({ node, came, went }) => {
+    const parts = [verbOf(came, "came"), verbOf(went, "went")].filter(Boolean);
+    return `${parts.join(", ")}${placeOf(node) ? ` at ${placeOf(node)}` : ""}${behind([node])}`;
+  });
+}
+
+function verbOf(nodes, verb) {
+  if (!nodes.length) return "";
+  const [{ kind = "node", label }] = nodes;
+  const name = PLAIN_KINDS.has(kind) || kind === label ? label : `${kind} ${label}`;
+  return nodes.length > 1 ? `${nodes.length} nodes ${verb} (${name}, …)` : `${name} ${verb}`;
 }

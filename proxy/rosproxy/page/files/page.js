@@ -3,7 +3,7 @@
 // All that comes from nodes goes through textContent, or into attributes; nothing is parsed.
 // However many changes come, it is drawn twice a second at most, and only what differs is touched.
 
-import { causesOf, follow, titleOf } from "./findings.js";
+import { causesOf, connect, emptyMemory, follow, followNodes, titleOf } from "./findings.js";
 import { curveOf, emptyHistory, lastMinute, minuteText, record } from "./history.js";
 import { boxesOf, DIRECT, hasFix, joined, layout, linesOf, selection } from "./picture.js";
 import { age, apply, duration, frequency, hertz, isKnown, labelOf, megabytes, placeOf, rateOf, visibleLinks, visibleNodes, WORDS } from "./view.js";
@@ -26,6 +26,7 @@ const nodeRows = new Map();
 const findings = new Map();
 const eventRows = new Map();
 const seen = new Map(); // causes, with the time at which this page first saw them
+const memory = emptyMemory(); // of nodes and proxies
 let events = [];
 let isFirst = true; // no document was shown yet
 const boxes = new Map();
@@ -54,6 +55,7 @@ function listen() {
   on("all", (data) => {
     state.nodes.clear();
     state.links.clear();
+    connect(memory, heard);
     take(JSON.parse(data));
     put($("connection"), "Live");
   });
@@ -98,7 +100,8 @@ function draw() {
 function show() {
   const found = visibleLinks(state.links, state.nodes, chosen);
   const causes = causesOf(state);
-  events = follow(seen, causes, events, Date.now(), isFirst);
+  const now = Date.now();
+  events = followNodes(memory, state, follow(seen, causes, events, now, isFirst), now);
   isFirst = isFirst && state.nodes.size === 0;
   showHead(found, causes);
   const on = showGraph(found, causes.find(({ key }) => key === selected));
@@ -196,7 +199,8 @@ function showEvents() {
   put($("happened").firstElementChild, events.length ? `What happened (${events.length})` : "What happened: nothing since this page was opened");
   arrange($("events"), eventRows, shown, () => make("li"), (li, { at, over, kind, title, since }) => {
     const time = new Date(at).toLocaleTimeString();
-    put(li, over ? `${time} over after ${duration((at - since) / 1000)}: ${title}` : `${time} ${WORDS[kind]}: ${title}`);
+    const begin = over ? `over after ${duration((at - since) / 1000)}: ` : kind ? `${WORDS[kind]}: ` : "";
+    put(li, `${time} ${begin}${title}`);
   });
 }
 
