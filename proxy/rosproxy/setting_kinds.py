@@ -33,6 +33,8 @@ Direction = Literal["out", "both"]
 """Which side reaches the other through the proxy: out: outside reaches inside. both: both sides."""
 SlaveControl = Literal["any", "master"]
 """Which callers outside may call shutdown, publisherUpdate and paramUpdate at inside nodes."""
+LogLevel = Literal["debug", "info", "warning", "error"]
+"""The lowest severity of messages in a log."""
 DAY_S = 86400
 ZENOH_PORT = 7447
 """The port at which rmw_zenohd listens by default."""
@@ -86,6 +88,7 @@ class Option:
     decides. ``variables``: the environment variables; if empty, the name of the option decides.
     ``repeatable``: the option may occur several times. ``default``: the effect without the option,
     if the default value does not say so. ``note``: how to write several values in the variable.
+    ``any_case``: a choice of words that may be in upper case, too.
     """
 
     help: str
@@ -95,6 +98,7 @@ class Option:
     repeatable: bool = False
     default: str = ""
     note: str = ""
+    any_case: bool = False
 
 
 class Setting(NamedTuple):

@@ -19,6 +19,7 @@ from rosproxy.setting_kinds import (
     DataPlane,
     Direction,
     LinkPort,
+    LogLevel,
     Option,
     SettingError,
     SiteLink,
@@ -521,6 +522,10 @@ class Settings:
             note="rules separated by `;`",
         ),
     ] = ()
+    log_level: Annotated[
+        LogLevel,
+        Option("Lowest severity that is logged.", any_case=True),
+    ] = "info"
 
     def __post_init__(self) -> None:
         if self.admin_token and self.admin_token_hash:

@@ -38,6 +38,7 @@ def test_the_defaults() -> None:
     assert (settings.master_address, settings.admin_token) == (None, None)
     assert (settings.probe_interval, settings.probe_timeout) == (5, 3)
     assert (settings.cleanup_after, settings.linger, settings.master_interval) == (30, 30, 2)
+    assert settings.log_level == "info"
     assert (settings.bind, settings.slave_control, settings.data_plane) == (
         "0.0.0.0",
         "any",
@@ -63,6 +64,8 @@ GOOD = [
     ("probe_interval", 0.05, "probe_interval", 0.05),
     ("probe_timeout", 86400, "probe_timeout", 86400.0),
     ("slave_control", "master", "slave_control", "master"),
+    ("log_level", "debug", "log_level", "debug"),
+    ("log_level", "Warning", "log_level", "warning"),
     ("master_address", "192.0.2.7", "master_address", "192.0.2.7"),
     ("master_address", "::ffff:192.0.2.7", "master_address", "192.0.2.7"),
     ("master_address", "FD00::9", "master_address", "fd00::9"),

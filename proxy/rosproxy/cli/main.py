@@ -23,7 +23,7 @@ def main() -> None:
 
 @main.command(context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True})
 @options.settings_options(Settings)
-@options.log_options
+@options.log_format_option
 @options.config_option
 @click.option(
     "--check",
@@ -38,7 +38,7 @@ def main() -> None:
     help="With --check: also look up the hosts, bind the ports, ask the master, and try the range "
     "from outside. Exit with 0 if no error was found, else with 1.",
 )
-def run(check: bool, deep: bool, log_format: str, log_level: str, **given: Any) -> None:
+def run(check: bool, deep: bool, log_format: str, **given: Any) -> None:
     """Run the proxy.
 
     The command line overrides the environment variable, and the variable overrides the file of
@@ -50,7 +50,7 @@ def run(check: bool, deep: bool, log_format: str, log_level: str, **given: Any) 
         raise click.UsageError("--deep needs --check")
     with options.setting_errors():
         settings = kinds.make_settings(Settings, given)
-        logs.set_up(log_format, log_level)
+        logs.set_up(log_format, settings.log_level)
         unknown = options.unknown_variables(main)
         if not check:
             from rosproxy.app import process

@@ -11,7 +11,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, get_args
 
 import click
 
@@ -109,7 +109,9 @@ def _form(setting: Setting) -> dict[str, Any]:
     if setting.option.kind:
         return {"type": click_type(setting.option.kind)}
     words = [word for word in setting.words if word]  # an empty word stands for the default
-    return {"type": click.Choice(words)} if words else {"is_flag": True}
+    if not words:
+        return {"is_flag": True}
+    return {"type": click.Choice(words, case_sensitive=not setting.option.any_case)}
 
 
 def plain(markdown: str) -> str:
@@ -181,21 +183,28 @@ def with_options(command: Command, options: Sequence[Callable[[Command], Command
     return command
 
 
-def log_options(command: Command) -> Command:
-    """A decorator that adds the options ``--log-format`` and ``--log-level``."""
-    form = click.option(
+def log_format_option(command: Command) -> Command:
+    """A decorator that adds the option ``--log-format``."""
+    return click.option(
         "--log-format",
         type=click.Choice(["text", "json"]),
         default="text",
         help="Format of the log.",
-    )
+    )(command)
+
+
+def log_options(command: Command) -> Command:
+    """A decorator that adds the options ``--log-format`` and ``--log-level``.
+
+    ``rosproxy run`` has ``--log-level`` from its settings.
+    """
     level = click.option(
         "--log-level",
-        type=click.Choice(["debug", "info", "warning", "error"], case_sensitive=False),
+        type=click.Choice(get_args(kinds.LogLevel), case_sensitive=False),
         default="info",
         help="Lowest severity that is logged.",
     )
-    return form(level(command))
+    return log_format_option(level(command))
 
 
 def config_option(command: Command) -> Command:
