@@ -24,7 +24,7 @@ class Wish:
     - ``precedence``: of several values that the containers ask for, the first one here counts.
     - ``yields``: a container without the label accepts any value. If False, such a container asks
       for the default.
-    - ``ros``: the only version of ROS with this option; empty for both versions.
+    - ``ros``: the versions of ROS with this option, in the words of the proxy's ``--ros``.
     - ``fix``: the text after ``label=`` in a fix.
     - ``free``: the values that need no permission of the administrator; empty: no value needs it.
     """
@@ -33,7 +33,7 @@ class Wish:
     field: str
     precedence: tuple[Any, ...]
     yields: bool = False
-    ros: str = ""
+    ros: tuple[str, ...] = ("1", "2")
     fix: str = ""
     free: tuple[Any, ...] = ()
 
@@ -67,7 +67,7 @@ class ProxySpec(msgspec.Struct, frozen=True):
             fix="both if the nodes reach outside only through the proxy, or remove the label",
         ),
     ] = "out"
-    udp: Annotated[bool, Wish("rosproxy.udp", "udp", (True, False), ros="1")] = False
+    udp: Annotated[bool, Wish("rosproxy.udp", "udp", (True, False), ros=("1",))] = False
     slave_control: Annotated[
         SlaveControl,
         Wish(
@@ -75,7 +75,7 @@ class ProxySpec(msgspec.Struct, frozen=True):
             "policy.slaveControl",
             # The label of another container must not open a node to all hosts.
             ("master", "any"),
-            ros="1",
+            ros=("1",),
             fix="master to let only the master's host call shutdown, publisherUpdate and "
             "paramUpdate, or remove the label",
         ),
@@ -92,6 +92,11 @@ WISHES: Mapping[str, Wish] = {name: hint.__metadata__[0] for name, hint in _HINT
 def words(name: str) -> tuple[str, ...]:
     """The words that a user may give as the value of an option; empty for a flag."""
     return get_args(get_args(_HINTS[name])[0])
+
+
+def options(spec: ProxySpec, ros: str) -> dict[str, Any]:
+    """The options of a proxy that serves only ROS version ``ros``, by the fields of `ProxySpec`."""
+    return {name: getattr(spec, name) for name, wish in WISHES.items() if ros in wish.ros}
 
 
 def merged(wishes: Iterable[Wishes], defaults: ProxySpec) -> ProxySpec:

@@ -10,7 +10,7 @@ from rosproxy_operator.docker.planner.model import THIS_HOST, Desired, HostState
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Place
-from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, merged
+from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec, merged, options
 
 ROUTERS_STEP = 32
 """The routers of a proxy for rmw_zenoh come in groups of this size. A router takes 0.5 MB."""
@@ -69,9 +69,7 @@ def desire(
 
 def proxy_spec(place: Place, members: Iterable[Member], settings: PlanSettings) -> ProxySpec:
     """Return the options of a proxy with these containers."""
-    if place == ZENOH:  # no option is for routers of rmw_zenoh
-        return OWN_SPEC
-    names = (name for name, wish in WISHES.items() if wish.ros in ("", place.graph.ros))
+    names = options(OWN_SPEC, place.graph.ros)
     defaults = ProxySpec(**{name: getattr(settings, name) for name in names})
     return merged([member.wishes for member in members], defaults)
 

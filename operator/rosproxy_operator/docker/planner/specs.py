@@ -37,6 +37,7 @@ from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.environment import environment
 from rosproxy_operator.proxy_spec.fingerprint import LIVE_VARIABLES, digest
 from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Graph, Master, Place, ZenohNetwork
+from rosproxy_operator.proxy_spec.spec import options
 
 MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"
@@ -436,6 +437,7 @@ def _settings_fields(
             "ros": (graph.ros,),
             "zenoh_ports": action.range,
             "zenoh_peer": action.peers,
+            **options(action.spec, graph.ros),
             "await_policy": POLICY_WAIT_S,
             "policy_layers": as_variable((*settings.policy, *action.policy)),
             **_link_fields(action, settings),
@@ -446,7 +448,7 @@ def _settings_fields(
         "port_range": own_range(place, action.range),
         "master_port": graph.port if isinstance(graph, Master) else None,
         "admin": HostPort("0.0.0.0", admin_port(place)),
-        **asdict(action.spec),
+        **options(action.spec, graph.ros),
         "admin_token_hash": hash_token(proxy_token(place, secret)),
         "master_address": master_address,
         **(asdict(settings.proxy_bounds) if isinstance(graph, Master) else {}),

@@ -50,7 +50,7 @@ from rosproxy_operator.kubernetes.resources.pod_defaults import USER
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.proxy_spec.environment import environment, variable
 from rosproxy_operator.proxy_spec.fingerprint import LIVE_VARIABLES, digest
-from rosproxy_operator.proxy_spec.spec import WISHES
+from rosproxy_operator.proxy_spec.spec import WISHES, options
 
 TERMINATION_GRACE_S = 5
 """Seconds from the deletion of a proxy until the kubelet kills the proxy, `_LINGER_S` included."""
@@ -555,6 +555,7 @@ def _zenoh_settings_fields(site: ProxySite, spec: ZenohSpec) -> Mapping[str, Any
         "zenoh_hub_listen": HUB_PORT,
         "zenoh_hub_certificate": site.hub_certificate,
         "zenoh_listen": OUTSIDE_PORT if spec.listen else None,
+        **options(site.rosproxy.spec.proxy, "zenoh"),
         **(link_settings(spec.link.to, spec.link.limits, spec.link.rules) if spec.link else {}),
     }
 

@@ -232,7 +232,7 @@ def _check_zenoh(field: Field, spec: RosProxySpec) -> None:
     """Raise InvalidField for a field that has no effect on rmw_zenoh, or that zenoh can't hold."""
     default = RosProxySpec(MasterSpec(), OWN_PORTS, _WINDOW)
     unused = [f for f, n in _NOT_OF_ZENOH.items() if getattr(spec, n) != getattr(default, n)]
-    wishes = ((w.field, name) for name, w in WISHES.items())
+    wishes = ((w.field, name) for name, w in WISHES.items() if "zenoh" not in w.ros)
     unused += [f for f, name in wishes if getattr(spec.proxy, name) != getattr(OWN_SPEC, name)]
     if unused:
         raise _at(field, unused[0]).error("has no effect with spec.ros: zenoh", "Remove the field")

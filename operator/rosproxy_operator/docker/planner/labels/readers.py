@@ -116,13 +116,14 @@ def wishes(
     """Return the options that the labels ask for, for nodes of ROS version ``ros``.
 
     If one of the ``joined`` networks is internal, the container may have no route outwards. So the
-    direction is ``both`` unless the label sets the direction.
+    direction is ``both`` unless the label sets the direction. rmw_zenoh has no direction.
     """
-    internal = any(n.internal and n.name in joined for n in networks)
+    has_direction = ros in WISHES["direction"].ros
+    internal = has_direction and any(n.internal and n.name in joined for n in networks)
     asked = {
         name: _wish(wish, words(name), labels)
         for name, wish in WISHES.items()
-        if wish.label in labels and wish.ros in ("", ros)
+        if wish.label in labels and ros in wish.ros
     }
     return {**({"direction": "both"} if internal else {}), **asked}
 

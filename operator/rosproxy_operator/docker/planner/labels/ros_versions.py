@@ -40,12 +40,12 @@ from rosproxy_operator.docker.planner.labels.readers import (
 from rosproxy_operator.docker.planner.model import Container, HostState
 from rosproxy_operator.proxy_spec.spec import WISHES
 
-_ROS1_LABELS = (MASTER_URI, REDIRECT, *(w.label for w in WISHES.values() if w.ros == "1"))
+_ROS1_LABELS = (MASTER_URI, REDIRECT, *(w.label for w in WISHES.values() if w.ros == ("1",)))
 _ROS2_LABELS = (RMW, DOMAIN, PEERS)
 _NOT_DDS_LABELS = (LINK,)
 _NOT_ZENOH_LABELS = (
     *(DOMAIN, PORTS, ADVERTISE_HOST, MASTER_URI),
-    *(wish.label for wish in WISHES.values()),
+    *(wish.label for wish in WISHES.values() if "zenoh" not in wish.ros),
 )
 _OF_ZENOH = (
     "the label is for rmw_zenoh, the container is not. Remove the label, or set "

@@ -84,11 +84,13 @@ def zenoh_member(
     """Return what a container with rmw_zenoh asks for, and warnings. Raises UnusableLabel."""
     labels = container.labels
     rules = _rules(labels, settings)
+    networks = readers.networks(container, observed, settings.uplink)
     member = Member(
         container,
         ZENOH,
         policy=rules,
-        networks=readers.networks(container, observed, settings.uplink),
+        networks=networks,
+        wishes=readers.wishes(labels, "zenoh", networks, observed.networks),
         redirect=readers.redirect(labels),
     )
     owner = readers.network_owner(container, observed)
