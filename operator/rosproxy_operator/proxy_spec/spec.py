@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 import msgspec
 
-from rosproxy.setting_kinds import DataPlane, Direction, SlaveControl
+from rosproxy.setting_kinds import DataPlane, Direction, LogLevel, SlaveControl
 
 Wishes = Mapping[str, Any]
 """The values that a container asks for, by the fields of `ProxySpec`."""
@@ -80,6 +80,18 @@ class ProxySpec(msgspec.Struct, frozen=True):
             "paramUpdate, or remove the label",
         ),
     ] = "any"
+    log_level: Annotated[
+        LogLevel,
+        Wish(
+            "rosproxy.log-level",
+            "logLevel",
+            # debug first: a user that looks for a fault needs all messages. A container without
+            # the label asks for info: the label of another container hides none of its warnings.
+            ("debug", "info", "warning", "error"),
+            ros=("1", "2", "zenoh"),
+            fix="debug to see all messages of the proxy, or remove the label",
+        ),
+    ] = "info"
 
 
 OWN_SPEC = ProxySpec()

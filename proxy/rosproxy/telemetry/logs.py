@@ -62,8 +62,7 @@ class LogRateLimit(logging.Filter):
 
     Messages of one kind come from the same call: logger, level and template are the same. The
     subject is the first argument of the template. Each kind has a bound. Warnings and errors of a
-    kind about one subject have a lower bound. Long messages count several times. Debug messages
-    have no bound, because a user reads them at once.
+    kind about one subject have a lower bound. Long messages count several times.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -75,8 +74,6 @@ class LogRateLimit(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether to write a record. Sets ``left_out`` if records before it were left out."""
-        if record.levelno < logging.INFO:
-            return True
         kind = record.name, record.levelno, str(record.msg)[:LONGEST]
         weight = 1 + min(len(record.getMessage()), LONGEST) // USUAL_CHARACTERS
         with self._lock:

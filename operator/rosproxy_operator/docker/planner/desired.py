@@ -69,7 +69,8 @@ def desire(
 
 def proxy_spec(place: Place, members: Iterable[Member], settings: PlanSettings) -> ProxySpec:
     """Return the options of a proxy with these containers."""
-    names = options(OWN_SPEC, place.graph.ros)
+    # The log level has no default in the settings: the operator's --log-level is for its own log.
+    names = (name for name in options(OWN_SPEC, place.graph.ros) if hasattr(settings, name))
     defaults = ProxySpec(**{name: getattr(settings, name) for name in names})
     return merged([member.wishes for member in members], defaults)
 

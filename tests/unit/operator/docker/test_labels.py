@@ -74,6 +74,12 @@ def test_a_labelled_container_wishes_for_a_proxy() -> None:
     )
 
 
+@pytest.mark.parametrize("value", ["debug", " DEBUG "])
+def test_a_label_asks_for_a_log_level(value: str) -> None:
+    member = good(container(labels={**ENABLED, "rosproxy.log-level": value}))
+    assert member.wishes == {"log_level": "debug"}
+
+
 @pytest.mark.parametrize("value", ["true", "True", " TRUE "])
 def test_the_label_alone_is_enough(value: str) -> None:
     member = good(container(labels={"rosproxy.enable": value}, env=ROBOT))
@@ -102,6 +108,10 @@ BAD = {
     "rosproxy.data-plane": (
         "is none of auto, kernel, splice, copy. Write rosproxy.data-plane=kernel to let the "
         "kernel forward topics, or remove the label", ["", "fast", "kernel,splice", "true"],
+    ),
+    "rosproxy.log-level": (
+        "is none of debug, info, warning, error. Write rosproxy.log-level=debug to see all "
+        "messages of the proxy, or remove the label", ["", "warn", "10"],
     ),
 }  # fmt: skip
 
@@ -148,6 +158,7 @@ def test_a_label_without_enable_is_ignored_and_told() -> None:
         ("Rosproxy.Ports", "rosproxy.ports"),
         ("rosproxy_ports", "rosproxy.ports"),
         ("rosproxy.dataplane", "rosproxy.data-plane"),
+        ("rosproxy.loglevel", "rosproxy.log-level"),
     ],
 )
 def test_an_unknown_label_and_the_nearest_right_one(name: str, near: str) -> None:

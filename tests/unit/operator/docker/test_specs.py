@@ -139,6 +139,18 @@ def test_a_proxy_is_told_who_may_control_its_nodes() -> None:
     assert "SLAVE_CONTROL" not in str(container_config(PROXY, SETTINGS, SECRET, ""))
 
 
+def test_a_log_level_recreates_the_proxy_and_keeps_its_ports() -> None:
+    spec = ProxySpec(log_level="debug")
+    wordy = structs.replace(PROXY, spec=spec)
+    body = container_config(wordy, SETTINGS, SECRET, "")
+    assert settings_of(dict(pair.split("=", 1) for pair in body["Env"])).log_level == "debug"
+    assert "LOG_LEVEL" not in str(container_config(PROXY, SETTINGS, SECRET, ""))
+    proxies = {proxy_fingerprint(each, SETTINGS, IMAGE, SECRET) for each in (PROXY, wordy)}
+    sandboxes = {SANDBOX, structs.replace(SANDBOX, spec=spec)}
+    assert len(proxies) == 2
+    assert len({sandbox_fingerprint(each, SETTINGS) for each in sandboxes}) == 1
+
+
 def test_ports_are_published_on_each_address_asked_for() -> None:
     settings = replace(SETTINGS, publish_address=("192.0.2.10", "::"))
     bindings = sandbox_config(SANDBOX, settings)["HostConfig"]["PortBindings"]

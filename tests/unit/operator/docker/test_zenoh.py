@@ -50,6 +50,7 @@ from rosproxy_operator.docker.planner.specs import (
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.place import ZENOH
+from rosproxy_operator.proxy_spec.spec import ProxySpec
 from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import (
     IMAGE,
@@ -558,6 +559,19 @@ def test_the_proxy_publishes_nothing_and_is_told_its_routers() -> None:
     }
     assert "CapAdd" not in config["HostConfig"]
     assert str(made) == "create container n: proxy of the zenoh network, ports 7448-7479 of box"
+
+
+def test_one_label_gives_the_proxy_a_log_level() -> None:
+    wordy = node("wordy", labels={"rosproxy.log-level": "debug"})
+    (created,) = [a for a in look(observed(node(), wordy)).actions if isinstance(a, Create)]
+    assert created.spec == ProxySpec(log_level="debug")
+    config = container_config(created, SETTINGS, SECRET, "")
+    assert [text for text in config["Env"] if "LOG" in text] == ["ROSPROXY_LOG_LEVEL=debug"]
+
+
+def test_an_internal_network_asks_for_nothing() -> None:
+    (member,), _ = read(node(), networks=[UPLINK, Network("n1", "app", internal=True)])
+    assert member.wishes == {}
 
 
 @pytest.mark.parametrize("role", ["ports", "proxy", "redirect"])

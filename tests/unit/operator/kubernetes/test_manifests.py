@@ -83,6 +83,13 @@ def test_it_is_told_how_to_forward(plane: str) -> None:
     assert ("ROSPROXY_DATA_PLANE" in variables) == (plane != "auto")
 
 
+def test_a_log_level_recreates_the_pod() -> None:
+    made = body(log_level="debug")
+    assert settings_of(env_of(made)).log_level == "debug"
+    assert "ROSPROXY_LOG_LEVEL" not in env()
+    assert manifests.fingerprint_of(made) != manifests.fingerprint_of(body())
+
+
 def test_clean_up_can_be_switched_off() -> None:
     assert settings_of(env(cleanup_after=0.0)).cleanup_after == 0.0
 

@@ -50,6 +50,7 @@ def test_all_fields():
                 "graceSeconds": 5,
                 "policy": {"slaveControl": "Master"},
                 "dataPlane": "Kernel",
+                "logLevel": "Debug",
                 "image": "rosproxy:2",
                 "imagePullPolicy": "Never",
                 "imagePullSecrets": [{"name": "pull"}],
@@ -73,6 +74,7 @@ def test_all_fields():
     assert (spec.advertise, spec.proxy.slave_control) == (Advertise.HOSTNAME, "master")
     assert (spec.cleanup_after, spec.grace, spec.proxy.data_plane) == (0.0, 5.0, "kernel")
     assert (spec.image, spec.image_pull_policy) == ("rosproxy:2", "Never")
+    assert spec.proxy.log_level == "debug"
     assert spec.image_pull_secrets == ({"name": "pull"},)
     assert spec.resources == {"requests": {"cpu": 1}}
     assert spec.host_aliases == ({"ip": "192.0.2.7", "hostnames": ["robot", "robot.example"]},)
@@ -196,6 +198,7 @@ def _selector(key: str = "app", operator: str = "In", values: Any = ("a",)) -> d
         ({"graceSeconds": "1m"}, "spec.graceSeconds"),
         ({"policy": {"slaveControl": "any"}}, "spec.policy.slaveControl"),
         ({"dataPlane": "kernel"}, "spec.dataPlane"),
+        ({"logLevel": "debug"}, "spec.logLevel"),
         ({"imagePullPolicy": "Maybe"}, "spec.imagePullPolicy"),
         ({"hostAliases": {"robot": "192.0.2.7"}}, "spec.hostAliases"),
         ({"hostAliases": [{"ip": "robot", "hostnames": []}]}, "spec.hostAliases[0].ip"),
@@ -270,7 +273,7 @@ _FIELDS = [
     *("master", "uri", "address", "service", "publish", "ports", "portWindow", "first", "last"),
     *("podSelector", "matchLabels", "matchExpressions", "key", "operator", "values", "advertise"),
     *("nodeSelector", "tolerations", "policy", "slaveControl", "cleanupAfterSeconds", "image"),
-    *("dataPlane", "direction", "podEgress", "udp"),
+    *("dataPlane", "direction", "podEgress", "udp", "logLevel"),
     *("imagePullSecrets", "resources", "hostAliases", "ip", "hostnames"),
 ]
 _json = st.recursive(

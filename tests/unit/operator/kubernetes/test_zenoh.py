@@ -80,6 +80,7 @@ DEFAULTS = {
     "direction": "Out",
     "udp": False,
     "policy": {"slaveControl": "Any"},
+    "logLevel": "Info",
 }
 """What the API server fills in."""
 EXCEPTION = [
@@ -266,6 +267,14 @@ def test_a_proxy_understands_its_variables_and_has_no_hostport():
     assert not {"ROSPROXY_PORT_RANGE", "ROS_MASTER_URI"} & env_of(body).keys()
     security = body["spec"]["containers"][0]["securityContext"]
     assert security["capabilities"] == {"drop": ["ALL"]}
+
+
+def test_a_proxy_gets_its_log_level():
+    of = replace(ofz(), spec=specified(ros="zenoh", logLevel="Debug"))
+    body = manifests.proxy_pod(site(of, node(), names.ROUTERS), SETTINGS)
+    assert settings_of(env_of(body)).log_level == "debug"
+    default = manifests.proxy_pod(site(ofz(), node(), names.ROUTERS), SETTINGS)
+    assert "ROSPROXY_LOG_LEVEL" not in env_of(default)
 
 
 def test_the_pod_has_the_name_that_other_hubs_dial():
