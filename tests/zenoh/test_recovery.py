@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from itertools import pairwise
 
 import pytest
 
@@ -14,6 +15,13 @@ VERSION = "1.6.2"
 """Nodes of Kilted."""
 BACK_WITHIN_S = 15.0
 """Nodes dial again 1, 3, 7 and 11 s after the end of a connection."""
+KILLS = 3
+LONGEST_GAP_S = 2.0
+"""Seconds without messages after the end of the routers, if nodes connect at the first try.
+
+On a machine without free CPU, the routers may be back too late for this try. So only the median of
+several kills has this bound.
+"""
 
 
 def started(lab: Lab, version: str) -> None:
@@ -55,12 +63,16 @@ def test_all_is_back_after_the_end_of_the_routers(
 ) -> None:
     started(lab, version)
     watched = Watched(lab, version, source, target)
+    clock = lab.node(version, target, "clock", f"chatter_{source}")
+    clock.wait_for("^at ", timeout=30)
     watched.wait()
-    os.kill(lab.router_process(), 9)
-    began = time.monotonic()
-    watched.wait(BACK_WITHIN_S)
-    print(f"back after {time.monotonic() - began:.1f} s")
-    assert lab.zenoh().restarts == 1
+    gaps = []
+    for _ in range(KILLS):
+        gaps.append(gap_after_kill(lab, clock))
+        watched.wait(BACK_WITHIN_S)
+    print(f"without messages for {', '.join(f'{gap:.2f} s' for gap in gaps)}")
+    assert sorted(gaps)[KILLS // 2] <= LONGEST_GAP_S
+    assert lab.zenoh().restarts == KILLS
     assert lab.proxy is not None
     lab.proxy.wait_for("zenoh routers ended: the process was ended by SIGKILL")
 
@@ -113,6 +125,21 @@ def test_nodes_may_start_before_the_routers(lab: Lab, version: str) -> None:
     lab.start_router(version)
     for pair in (watched, outward):
         pair.wait(BACK_WITHIN_S)
+
+
+def gap_after_kill(lab: Lab, clock: Process) -> float:
+    """Kill the routers. Return the longest time in seconds between two messages after that."""
+    before = times(clock)[-1]
+    os.kill(lab.router_process(), 9)
+    killed = time.monotonic()
+    # What the dead routers have passed on arrives within milliseconds.
+    wait_until("messages arrive", lambda: times(clock)[-1] > killed + 0.3, BACK_WITHIN_S)
+    return max(late - early for early, late in pairwise(t for t in times(clock) if t >= before))
+
+
+def times(clock: Process) -> list[float]:
+    """The times at which messages have arrived, in seconds."""
+    return [float(line.split()[1]) for line in clock.output().splitlines() if line[:3] == "at "]
 
 
 def told(lab: Lab) -> dict[str, str]:

@@ -1,9 +1,10 @@
 """A replacement for a node of rmw_zenoh: session, keys and liveliness tokens.
 
-`python node.py KIND NAME TOPIC`, where KIND is pub, shout, sub, latch, late, serve, call, probe,
-graph, crowd, mute, offer or use. Prints a line for each event, and runs until killed. NODE_TYPE:
-another type, as in keys. NODE_PERIOD_S: the time between two messages. NODE_TOKENS, NODE_LETTER:
-see `crowd`. For `offer` and `use`, which gets names of nodes as TOPIC, see `matrix.py`.
+`python node.py KIND NAME TOPIC`, where KIND is pub, shout, sub, clock, latch, late, serve, call,
+probe, graph, crowd, mute, offer or use. Prints a line for each event, and runs until killed.
+NODE_TYPE: another type, as in keys. NODE_PERIOD_S: the time between two messages. NODE_TOKENS,
+NODE_LETTER: see `crowd`. For `offer` and `use`, which gets names of nodes as TOPIC, see
+`matrix.py`.
 """
 
 import os
@@ -51,6 +52,11 @@ def publish(session: Any, key: str) -> None:
 
 def subscribe(session: Any, key: str, _: str) -> Any:
     return session.declare_subscriber(key, lambda s: say("got", s.payload.to_string()))
+
+
+def clock(session: Any, key: str, _: str) -> Any:
+    """Subscribe, and print the time of each message in seconds, on the clock of the machine."""
+    return session.declare_subscriber(key, lambda _: say("at", f"{time.monotonic():.3f}"))
 
 
 def serve(session: Any, key: str, name: str) -> Any:
@@ -117,13 +123,19 @@ def main(kind: str, name: str, topic: str) -> None:
     threading.Event().wait()
 
 
-ENTITIES = {"pub": "MP", "latch": "MP", "sub": "MS", "late": "MS", "serve": "SS", "call": "SC"}
+ENTITIES = {
+    **dict.fromkeys(("pub", "latch"), "MP"),
+    **dict.fromkeys(("sub", "clock", "late"), "MS"),
+    "serve": "SS",
+    "call": "SC",
+}
 RUNS = {"pub": publish, "shout": publish, "call": call, "probe": call}
 """`shout` and `probe` have no token, so their topic may have wildcards."""
 MATRIX = {"offer": offer, "use": use}
 """Both watch the graph, as each node of rmw_zenoh does."""
 DECLARES = {
     "sub": subscribe,
+    "clock": clock,
     "serve": serve,
     "graph": watch_graph,
     "crowd": crowd,
