@@ -15,8 +15,7 @@ proxy does not read long requests of this kind, which usually set parameters.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Iterable, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from rosproxy.net.http_client import LongReply
@@ -128,7 +127,8 @@ class MasterApi:
         """The reply to a parsed request. A request without changes passes as the original bytes."""
         policy = self._context.policy
         upstream = self._context.upstream
-        if not request.is_address_free:
+        is_address_free = request.is_address_free
+        if not is_address_free:
             # Without the recovery, a node of a former process of the proxy would get another port.
             # rosmaster would shut the node down for the new URI (registrations.py,
             # _register_node_api).
@@ -137,52 +137,64 @@ class MasterApi:
             return await upstream.pass_to_master(request.body)
         version = policy.rules.version
         answers = await policy.check_request(request)
-        if request.is_address_free and not any(answers) and not policy.reads_reply(request):
+        if is_address_free and not any(answers) and not policy.reads_reply(request):
             return await upstream.pass_to_master(request.body)
-        async with self._admitted(request, answers, incoming) as outcomes:
-            exported = master_api.export_request(request, outcomes, self._context.addressing)
-            self._record(exported.registry_changes(), request.caller)
-            if exported.body is None:
-                return exported.local_reply()
-            reply = await self._call_master(exported, exported.body)
-            self._record(reply.registry_changes(self._context.now()), request.caller)
-            await self._memory.write()  # `_record` has just learnt a service's port
-            await self._stand_ins.listen_for(reply.uris(), request.caller)
-            if policy.rules.version != version:  # new rules may deny the request
-                policy.must_enforce = True
-            return master_api.import_reply(reply, self._context.addressing, policy.filter_result)
-
-    @asynccontextmanager
-    async def _admitted(
-        self,
-        request: Request,
-        answers: Sequence[LocalAnswer | None],
-        incoming: IncomingCall,
-    ) -> AsyncIterator[Sequence[CallOutcome]]:
-        """The outcomes of a request's calls, in order. ``answers``: the answers of the policy.
-
-        In the context, the endpoints that the calls register are *pending*, so their leases do not
-        end. Raises Unreachable if the caller closes the connection before the call of the master.
-        """
-        self._context.refresh_networks()
-        outcomes = list[CallOutcome]()
         pending = list[PendingRegistration]()
         try:
-            # In order, because two calls may register the same new node.
-            for call, answer in zip(request.calls, answers, strict=True):
-                if incoming.gone:
-                    raise Unreachable("the caller has closed the connection")
-                outcome: CallOutcome = answer or Passing.NO_REGISTRATION
-                if call and answer is None:
-                    outcome = await self._outcome(call, request, pending)
-                outcomes.append(outcome)
-                await asyncio.sleep(0)  # with many rules, a call may take milliseconds
-            yield outcomes
+            outcomes = await self._outcomes(request, answers, incoming, pending)
+            return await self._forward(request, outcomes, version)
         finally:
             for endpoint, registration in pending:
                 endpoint.pending -= 1
                 if registration is not None:
                     self._context.registry.end_promise(endpoint, registration)
+
+    async def _forward(
+        self, request: Request, outcomes: Sequence[CallOutcome], version: int
+    ) -> bytes:
+        """The reply to a request whose calls have these outcomes. Raises XmlRpcError, Unreachable.
+
+        ``version``: the version of the policy that has checked the request.
+        """
+        context = self._context
+        policy = context.policy
+        exported = master_api.export_request(request, outcomes, context.addressing)
+        self._record(exported.registry_changes(), request.caller)
+        if exported.body is None:
+            return exported.local_reply()
+        reply = await self._call_master(exported, exported.body)
+        self._record(reply.registry_changes(context.now()), request.caller)
+        await self._memory.write()  # `_record` has just learnt a service's port
+        await self._stand_ins.listen_for(reply.uris(), request.caller)
+        if policy.rules.version != version:  # new rules may deny the request
+            policy.must_enforce = True
+        return master_api.import_reply(reply, context.addressing, policy.filter_result)
+
+    async def _outcomes(
+        self,
+        request: Request,
+        answers: Sequence[LocalAnswer | None],
+        incoming: IncomingCall,
+        pending: list[PendingRegistration],
+    ) -> Sequence[CallOutcome]:
+        """The outcomes of a request's calls, in order. ``answers``: the answers of the policy.
+
+        The endpoints that the calls register become *pending*, so their leases do not end, and the
+        method adds them to ``pending``. Raises Unreachable if the caller closes the connection
+        before the call of the master.
+        """
+        outcomes = list[CallOutcome]()
+        # In order, because two calls may register the same new node.
+        for call, answer in zip(request.calls, answers, strict=True):
+            if outcomes:
+                await asyncio.sleep(0)  # with many rules, a call may take milliseconds
+            if incoming.gone:
+                raise Unreachable("the caller has closed the connection")
+            outcome: CallOutcome = answer or Passing.NO_REGISTRATION
+            if call and answer is None:
+                outcome = await self._outcome(call, request, pending)
+            outcomes.append(outcome)
+        return outcomes
 
     async def _outcome(
         self, call: Call, request: Request, pending: list[PendingRegistration]
