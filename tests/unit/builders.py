@@ -10,9 +10,8 @@ from xml.sax.saxutils import escape
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.master_methods import Kind, method_spec
+from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.values import Edit
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
@@ -22,6 +21,7 @@ from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.rewriting.master_calls import (
     CallOutcome,
     CallResult,
+    MasterCall,
     Passing,
     RegistryChange,
     refusal,
@@ -217,11 +217,11 @@ def note(registry: Registry, fact: RegistryChange) -> None:
 
 
 def _outcome(
-    addressing: Addressing, call: Call | None, caller: Caller, refuse: Refuse
+    addressing: Addressing, call: MasterCall | None, caller: Caller, refuse: Refuse
 ) -> CallOutcome:
-    if call and method_spec(call.method).unregisters:
+    if call and call.spec.unregisters:
         return master_api.unregistering_endpoint(call, caller, addressing)
-    return _admit(addressing, master_calls.registering_uri(call), caller, refuse)
+    return _admit(addressing, call.registering_uri if call else None, caller, refuse)
 
 
 def _admit(addressing: Addressing, uri: str | None, caller: Caller, refuse: Refuse) -> CallOutcome:

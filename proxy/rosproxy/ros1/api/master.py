@@ -25,7 +25,6 @@ from rosproxy.ros1.protocol.master_methods import NO_SPEC, method_spec
 from rosproxy.ros1.protocol.name_lengths import LONGEST_NAME, too_long_to_register
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import fast, passing
-from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.limits import Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
@@ -35,13 +34,12 @@ from rosproxy.ros1.rewriting.master_calls import (
     CallOutcome,
     ExportedRequest,
     LocalAnswer,
+    MasterCall,
     MasterReply,
     Passing,
     RegistryChange,
     Request,
-    caller_id_of,
     refusal,
-    registration_of,
 )
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.long_calls import LongCall
@@ -197,29 +195,28 @@ class MasterApi:
         return outcomes
 
     async def _outcome(
-        self, call: Call, request: Request, pending: list[PendingRegistration]
+        self, call: MasterCall, request: Request, pending: list[PendingRegistration]
     ) -> CallOutcome:
         """The outcome of a call. Makes the endpoint that the call registers pending."""
         caller = request.caller
         policy = self._context.policy
-        if method_spec(call.method).unregisters:
+        if call.spec.unregisters:
             ended = master_api.unregistering_endpoint(call, caller, self._context.addressing)
-            return policy.answer_unregistration(call, ended, caller) or ended
+            return policy.answer_unregistration(call, ended) or ended
         admission = await self._admit(call, request)
         if isinstance(admission, LocalAnswer) or admission is Passing.NO_REGISTRATION:
             return admission
         if isinstance(admission, Endpoint):
             # Pending before the first await. Otherwise the lease could end meanwhile.
             admission.pending += 1
-            registration = registration_of(call, self._context.now(), caller.address)
-            if registration is not None:
-                self._context.registry.promise(admission, registration)
-            pending.append((admission, registration))
-            await self._adopter.take_over(admission, caller_id_of(call))
+            if call.registration is not None:
+                self._context.registry.promise(admission, call.registration)
+            pending.append((admission, call.registration))
+            await self._adopter.take_over(admission, call.caller_id)
         denial = policy.check_registration(call, admission, caller, self._context.now())
         return denial.answer if denial else admission
 
-    async def _admit(self, call: Call, request: Request) -> CallOutcome:
+    async def _admit(self, call: MasterCall, request: Request) -> CallOutcome:
         """Admit a call, or refuse a name that is too long or exceeds the bound of an endpoint."""
         caller = request.caller
         may_be_long = len(request.body) > LONGEST_NAME
@@ -228,12 +225,12 @@ class MasterApi:
         admission = await self._admission.admit(call, caller)
         if not isinstance(admission, Endpoint):
             return admission
-        registration = registration_of(call, self._context.now(), caller.address)
+        registration = call.registration
         if registration and (text := self._context.registry.reason_full(admission, registration)):
             return self._refuse("too_many_names", call, caller, text)
         return admission
 
-    def _refuse(self, reason: str, call: Call, caller: Caller, text: str) -> LocalAnswer:
+    def _refuse(self, reason: str, call: MasterCall, caller: Caller, text: str) -> LocalAnswer:
         """Report a call over a bound, and return the refusal."""
         description = f"{call.method} of {caller.caller_id}: {text}"
         self._context.refusals.note(reason, caller.address, description)

@@ -23,7 +23,6 @@ from rosproxy.ros1.policy.service_finder import ServiceFinder
 from rosproxy.ros1.protocol.master_methods import (
     GRAPH_METHODS,
     Kind,
-    method_spec,
     prefix,
     resolve_name,
 )
@@ -38,10 +37,9 @@ from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.rewriting.master_calls import (
     CallResult,
     LocalAnswer,
+    MasterCall,
     Passing,
     Request,
-    registration_of,
-    second_parameter_name,
 )
 from rosproxy.ros1.rewriting.slave_api import MASTER_ONLY
 
@@ -127,13 +125,13 @@ class Ros1Policy:
         return self._denial(verdict, use.kind, f"of {caller_id}", source)
 
     def check_registration(
-        self, call: Call, admission: Endpoint | Passing, caller: Caller, now: float
+        self, call: MasterCall, admission: Endpoint | Passing, caller: Caller, now: float
     ) -> Denial | None:
         """Check a call that registers, after admission.
 
         A denied registration becomes hidden. At the URI of another node, the registration fails.
         """
-        affected = None if self.idle else registration_of(call, now, caller.address)
+        affected = None if self.idle else call.registration
         if affected is None or affected.kind is Kind.PARAM:  # already checked
             return None
         endpoint = admission if isinstance(admission, Endpoint) else None
@@ -144,17 +142,17 @@ class Ros1Policy:
             return None
         if endpoint is None:  # the URI of another node, which the proxy can't hide
             return denied(verdict.reason)
-        hidden = replace(affected, hidden=True)
+        hidden = replace(affected, since=now, hidden=True)
         answer = self._hidden.answer_registration(hidden, endpoint, caller)
         return Denial(verdict.reason, answer)
 
     def answer_unregistration(
-        self, call: Call, ended_at: Endpoint | Passing, caller: Caller
+        self, call: MasterCall, ended_at: Endpoint | Passing
     ) -> LocalAnswer | None:
         """The answer to a call that ends a hidden registration; None for any other call."""
         if self.idle or not isinstance(ended_at, Endpoint):
             return None
-        ended = registration_of(call, 0.0, caller.address)
+        ended = call.registration
         current = ended_at.registrations.get(ended.key) if ended else None
         return self._hidden.answer_unregistration(current) if current and current.hidden else None
 
@@ -184,8 +182,8 @@ class Ros1Policy:
         if call.method in GRAPH_METHODS and self._registry.has_hidden:
             graph = self._hidden.complete_graph(call, xmlrpc.python_value(value))
             return [value.replaced_by(xmlrpc.dump_value(graph))]
-        if method_spec(call.method).registers is Kind.SUBSCRIBER and result.endpoint:
-            extra = self.publishers_for(result.endpoint, second_parameter_name(call), [])
+        if call.spec.registers is Kind.SUBSCRIBER and result.endpoint:
+            extra = self.publishers_for(result.endpoint, call.second_name, [])
             uris = [*(item.text for item in value.items), *extra]
             imported = dict.fromkeys(self._addressing.import_slave(uri, caller) for uri in uris)
             return [value.replaced_by(xmlrpc.dump_value([*imported]))] if extra else ()
@@ -326,17 +324,17 @@ class Ros1Policy:
         return self.check_inside("topic", relay.name, relay.peer, relay.caller_id) is None
 
     async def _answer(
-        self, call: Call, caller: Caller, params: "_ParamNames"
+        self, call: MasterCall, caller: Caller, params: "_ParamNames"
     ) -> LocalAnswer | None:
         if call.method == "lookupNode":
-            return self._hidden.find_node(call, caller)
+            return self._hidden.find_node(call.second_name, caller)
         if call.method == "lookupService":
             return await self._answer_lookup(call, caller)
         denial = await self._check_parameters(call, caller, params)
         return denial.answer if denial else None
 
-    async def _answer_lookup(self, call: Call, caller: Caller) -> LocalAnswer | None:
-        name = second_parameter_name(call)
+    async def _answer_lookup(self, call: MasterCall, caller: Caller) -> LocalAnswer | None:
+        name = call.second_name
         await self._services.find(name)
         provider = self._registry.services.get(name)
         # Rules for `call` concern services of outside (docs/reference/policy.md). After the proxy
@@ -344,18 +342,18 @@ class Ros1Policy:
         if provider and not provider[0].health.cleaned:
             is_hidden = provider[1].hidden
             return self._hidden.find_service(name, provider[0], caller) if is_hidden else None
-        callers = [call.string(0) or ""]
+        callers = [call.caller_id]
         verdict = self.rules.ask(RuleKind.CALL, name, callers, caller.address)
         return None if verdict.allowed else no_provider(verdict.reason).answer
 
     async def _check_parameters(
-        self, call: Call, caller: Caller, params: "_ParamNames"
+        self, call: MasterCall, caller: Caller, params: "_ParamNames"
     ) -> Denial | None:
         """Check how a call uses parameters. Raises Unreachable."""
         use = param_use_of(call)
         if use is None:
             return None
-        caller_id = call.string(0) or ""
+        caller_id = call.caller_id
         verdict = self._verdict_on_use(use, caller_id, caller.address)
         # The rules for existing names decide about a namespace, except in two cases. rosmaster also
         # sends a subscriber parameters that are set below the namespace later (paramserver.py,

@@ -23,7 +23,7 @@ from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import read_types
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
-from rosproxy.ros1.rewriting.master_calls import LocalAnswer, RegistryChange, second_parameter_name
+from rosproxy.ros1.rewriting.master_calls import LocalAnswer, RegistryChange
 
 _TABLES = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 """The tables of getSystemState, in order."""
@@ -68,9 +68,8 @@ class HiddenAnswers:
         imported = self._addressing.import_service(uri, name, caller)
         return LocalAnswer(1, f"rosrpc URI: [{imported}]", imported)
 
-    def find_node(self, call: Call, caller: Caller) -> LocalAnswer | None:
+    def find_node(self, caller_id: str, caller: Caller) -> LocalAnswer | None:
         """The answer to lookupNode for a node without shown registrations; None for other nodes."""
-        caller_id = second_parameter_name(call)
         endpoint = self._registry.by_caller.get(caller_id)
         if endpoint is None or endpoint.health.cleaned:
             return None

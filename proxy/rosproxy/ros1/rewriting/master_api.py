@@ -15,10 +15,9 @@ from collections.abc import Callable, Iterator, Sequence
 
 from msgspec.structs import replace
 
-from rosproxy.ros1.protocol.master_methods import Reply, method_spec
+from rosproxy.ros1.protocol.master_methods import Reply
 from rosproxy.ros1.protocol.uris import parse_service_uri, with_caller_address
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.multicall import insert_items
 from rosproxy.ros1.protocol.xmlrpc.values import Edit, Value
 from rosproxy.ros1.registry.endpoint import Endpoint
@@ -28,12 +27,11 @@ from rosproxy.ros1.rewriting.master_calls import (
     CallResult,
     ExportedRequest,
     LocalAnswer,
+    MasterCall,
     MasterReply,
     Passing,
     Request,
-    caller_id_of,
     read_reply,
-    second_parameter_name,
 )
 from rosproxy.ros1.rewriting.slave_api import replace_value
 
@@ -92,25 +90,25 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
         if not (result.triple and result.value):
             continue
         text = result.value.string()
-        if method_spec(result.call.method).reply is Reply.MASTER_URI and text:
+        if result.call.spec.reply is Reply.MASTER_URI and text:
             edits += replace_value(result.triple, f"http://{master}/")
     return xmlrpc.apply(reply, edits)
 
 
 def unregistering_endpoint(
-    call: Call, caller: Caller, addressing: Addressing
+    call: MasterCall, caller: Caller, addressing: Addressing
 ) -> Endpoint | Passing:
     """The endpoint of the registration that a call ends.
 
     FOREIGN_URI if the call does not have the URI of this endpoint.
     """
-    spec = method_spec(call.method)
-    endpoint = addressing.registry.by_caller.get(caller_id_of(call))
+    spec = call.spec
+    endpoint = addressing.registry.by_caller.get(call.caller_id)
     if endpoint is None:
         return Passing.FOREIGN_URI
     if spec.caller_api is None:
         uri = addressing.export_service(
-            call.string(spec.service_api) or "", second_parameter_name(call), caller
+            call.string(spec.service_api) or "", call.second_name, caller
         )
         is_own = uri == addressing.advertised_service(endpoint)
         return endpoint if is_own else Passing.FOREIGN_URI
@@ -119,10 +117,10 @@ def unregistering_endpoint(
 
 
 def _export_call(
-    call: Call, outcome: CallOutcome, caller: Caller, addressing: Addressing
+    call: MasterCall, outcome: CallOutcome, caller: Caller, addressing: Addressing
 ) -> Iterator[Edit]:
-    caller_api = call.string_value(method_spec(call.method).caller_api)
-    service_api = call.string_value(method_spec(call.method).service_api)
+    caller_api = call.string_value(call.spec.caller_api)
+    service_api = call.string_value(call.spec.service_api)
     if isinstance(outcome, Endpoint):
         if caller_api:
             yield caller_api.with_text(addressing.advertised_uri(outcome))
@@ -132,7 +130,7 @@ def _export_call(
     if caller_api:
         yield caller_api.with_text(addressing.export_slave(caller_api.text, caller))
     if service_api:
-        text = addressing.export_service(service_api.text, second_parameter_name(call), caller)
+        text = addressing.export_service(service_api.text, call.second_name, caller)
         yield service_api.with_text(text)
 
 
@@ -140,7 +138,7 @@ def _import_result(result: CallResult, caller: Caller, addressing: Addressing) -
     triple = result.triple
     if triple is None or not result.accepted:
         return []
-    if method_spec(result.call.method).reply is Reply.SLAVE_URIS:
+    if result.call.spec.reply is Reply.SLAVE_URIS:
         return [
             item.with_text(addressing.import_slave(item.text, caller))
             for item in triple.items[2].items
@@ -149,13 +147,15 @@ def _import_result(result: CallResult, caller: Caller, addressing: Addressing) -
     return _import_uri(result.call, triple, caller, addressing)
 
 
-def _import_uri(call: Call, triple: Value, caller: Caller, addressing: Addressing) -> list[Edit]:
+def _import_uri(
+    call: MasterCall, triple: Value, caller: Caller, addressing: Addressing
+) -> list[Edit]:
     text = triple.items[2].string()
-    kind = method_spec(call.method).reply
+    kind = call.spec.reply
     if text and kind is Reply.SLAVE_URI:
         return replace_value(triple, addressing.import_slave(text, caller))
     if text and kind is Reply.SERVICE_URI:
-        uri = addressing.import_service(text, second_parameter_name(call), caller)
+        uri = addressing.import_service(text, call.second_name, caller)
         return replace_value(triple, uri)
     if text and kind is Reply.MASTER_URI and caller.master:
         return replace_value(triple, f"http://{caller.master}/")

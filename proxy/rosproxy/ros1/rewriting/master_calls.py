@@ -6,6 +6,7 @@ reply contains, and what the registry has to record. `rosproxy.ros1.rewriting.ma
 the URIs.
 """
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from enum import Enum
 
@@ -15,6 +16,7 @@ from msgspec.structs import replace
 from rosproxy.ros1.protocol.master_methods import (
     GRAPH_METHODS,
     NO_SPEC,
+    MethodSpec,
     Reply,
     method_spec,
     resolve_name,
@@ -65,30 +67,47 @@ CallOutcome = Endpoint | LocalAnswer | Passing
 answer, or the reason why the call passes without an endpoint."""
 
 
+class MasterCall(Call, frozen=True):
+    """A call of the master API, with what the proxy reads from its parameters.
+
+    ``spec`` is the row of the method. ``caller_id`` is the name of the node that makes the call; ""
+    without a name. ``registration`` is what the call registers or ends; None for any other call.
+    """
+
+    spec: MethodSpec
+    caller_id: str
+    registration: Registration | None
+
+    @property
+    def second_name(self) -> str:
+        """The topic, service or node in the second parameter, as a global name."""
+        return resolve_name(self.string(1) or "", self.caller_id)
+
+    @property
+    def registering_uri(self) -> str | None:
+        """The slave URI, if the call registers; None for any other call, or without a URI."""
+        return self.string(self.spec.caller_api) if self.spec.registers else None
+
+
 class Request(msgspec.Struct, frozen=True):
     """A parsed request of a node inside: a single call, or the calls of a ``system.multicall``.
 
-    ``calls`` has None for an element of a multicall that is no call. ``items`` are the elements of
-    a multicall as sent.
+    ``method`` is the name of the outer method. ``calls`` has None for an element of a multicall
+    that is no call. ``items`` are the elements of a multicall as sent. ``tells_graph``: whether the
+    reply has the graph of all nodes.
     """
 
     body: bytes
-    calls: tuple[Call | None, ...]
-    multicall: bool
+    method: str
+    calls: tuple[MasterCall | None, ...]
     caller: Caller
-    items: Sequence[Value] = ()
+    items: Sequence[Value]
+    tells_graph: bool
 
     @property
-    def method(self) -> str:
-        """The name of the outer method."""
-        if self.multicall:
-            return MULTICALL
-        return self.calls[0].method if self.calls and self.calls[0] else ""
-
-    @property
-    def tells_graph(self) -> bool:
-        """Whether the reply has the graph of all nodes."""
-        return any(call and call.method in GRAPH_METHODS for call in self.calls)
+    def multicall(self) -> bool:
+        """Whether the request is a ``system.multicall``."""
+        return self.method == MULTICALL
 
     @property
     def reply_limits(self) -> Limits:
@@ -108,7 +127,7 @@ class Request(msgspec.Struct, frozen=True):
 
         A policy may refuse such a request all the same, or filter the reply.
         """
-        return all(call is None or method_spec(call.method) == NO_SPEC for call in self.calls)
+        return all(call is None or call.spec == NO_SPEC for call in self.calls)
 
 
 class ExportedRequest(msgspec.Struct, frozen=True):
@@ -138,7 +157,7 @@ class CallResult(msgspec.Struct, frozen=True):
     ``triple`` is None if the reply has nothing to rewrite, and was not parsed.
     """
 
-    call: Call
+    call: MasterCall
     status: int | None
     triple: Value | None
     endpoint: Endpoint | None
@@ -183,29 +202,32 @@ class MasterReply(msgspec.Struct, frozen=True):
         """
         changes = []
         for result in self.results:
-            affected = registration_of(result.call, now, self.exported.request.caller.address)
+            affected = result.call.registration
             if affected and result.accepted and result.endpoint:
-                registers = method_spec(result.call.method).registers is not None
-                changes.append(RegistryChange(affected, result.endpoint if registers else None))
+                endpoint = result.endpoint if result.call.spec.registers else None
+                changes.append(RegistryChange(dataclasses.replace(affected, since=now), endpoint))
         return changes
 
     def uris(self) -> Iterator[str]:
         """The URIs in the reply for a node inside, in the form that the master has."""
         for result in self.results:
             value = result.value
-            if value and result.accepted and method_spec(result.call.method).reply in _URI_REPLIES:
+            if value and result.accepted and result.call.spec.reply in _URI_REPLIES:
                 texts = (item.string() for item in (value.items or [value]))
                 yield from (text for text in texts if text)
 
 
 def read_request(body: bytes, caller: Caller, limits: Limits = OWN_REPLY) -> Request:
     """Parse a request within limits. Raises XmlRpcError if it is malformed or too large."""
-    call = xmlrpc.parse_call(body, limits)
-    if call.method != MULTICALL:
-        return Request(body, (call,), False, replace(caller, caller_id=caller_id_of(call)))
-    calls = tuple(inner_calls(call))
-    caller_id = next((caller_id_of(inner) for inner in calls if inner), "")
-    return Request(body, calls, True, replace(caller, caller_id=caller_id), inner_items(call))
+    outer = xmlrpc.parse_call(body, limits)
+    is_multicall = outer.method == MULTICALL
+    parsed = inner_calls(outer) if is_multicall else [outer]
+    items = inner_items(outer) if is_multicall else ()
+    calls = tuple(_read_call(call, caller.address) if call else None for call in parsed)
+    caller_id = next((call.caller_id for call in calls if call), "")
+    tells_graph = any(call and call.method in GRAPH_METHODS for call in calls)
+    caller = replace(caller, caller_id=caller_id)
+    return Request(body, outer.method, calls, caller, items, tells_graph)
 
 
 def read_reply(exported: ExportedRequest, reply: bytes) -> MasterReply:
@@ -224,37 +246,21 @@ def read_reply(exported: ExportedRequest, reply: bytes) -> MasterReply:
     return MasterReply(exported, reply, value, tuple(_results(exported, value)) if value else ())
 
 
-def registering_uri(call: Call | None) -> str | None:
-    """The slave URI in a call that registers; None for any other call, or without a URI."""
-    if call is None or method_spec(call.method).registers is None:
-        return None
-    return call.string(method_spec(call.method).caller_api)
-
-
-def registration_of(call: Call, now: float, source: str) -> Registration | None:
-    """The registration that a call from an address makes or ends; None for any other call."""
+def _read_call(call: Call, source: str) -> MasterCall:
+    """A call from an address, with what the proxy reads from its parameters."""
     spec = method_spec(call.method)
-    caller_id = caller_id_of(call)
+    caller_id = call.string(0) or ""
     kind = spec.registers or spec.unregisters
     name = call.string(spec.name)
-    if kind is None or not name:
-        return None
-    name = resolve_name(name, caller_id)
-    type_ = call.string(spec.type) or "*"
-    service_api = call.string(spec.service_api)
-    if service_api is not None:
-        service_api = with_caller_address(service_api, source)
-    return Registration(kind, name, caller_id, type_, service_api, now)
-
-
-def second_parameter_name(call: Call) -> str:
-    """The topic, service or node in the second parameter of a call, as a global name."""
-    return resolve_name(call.string(1) or "", caller_id_of(call))
-
-
-def caller_id_of(call: Call) -> str:
-    """The name of the node that makes a call; "" if the call has none."""
-    return call.string(0) or ""
+    registration = None
+    if kind is not None and name:
+        type_ = call.string(spec.type) or "*"
+        service_api = call.string(spec.service_api)
+        if service_api is not None:
+            service_api = with_caller_address(service_api, source)
+        name = resolve_name(name, caller_id)
+        registration = Registration(kind, name, caller_id, type_, service_api)
+    return MasterCall(call.method, call.params, spec, caller_id, registration)
 
 
 def _results(exported: ExportedRequest, value: Value) -> Iterator[CallResult]:

@@ -27,9 +27,7 @@ from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.leases import Leases
-from rosproxy.ros1.protocol.master_methods import method_spec
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, with_caller_address
-from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.node_health import ProbeResult
@@ -38,9 +36,9 @@ from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.rewriting.master_calls import (
     CallOutcome,
     LocalAnswer,
+    MasterCall,
     Passing,
     refusal,
-    registering_uri,
 )
 
 log = logging.getLogger(__name__)
@@ -85,12 +83,12 @@ class NodeAdmission:
         self._verification = verification
         self._making_room = asyncio.Lock()
 
-    async def admit(self, call: Call, caller: Caller) -> CallOutcome:
+    async def admit(self, call: MasterCall, caller: Caller) -> CallOutcome:
         """The endpoint of a call that registers, or the reason why there is none.
 
         Raises Unreachable if the master is needed and does not answer.
         """
-        uri = registering_uri(call)
+        uri = call.registering_uri
         if uri is None:
             return Passing.NO_REGISTRATION
         if self._context.retired:
@@ -110,13 +108,13 @@ class NodeAdmission:
         return await self._admit_new(uri, node, call, caller)
 
     async def _admit_again(
-        self, endpoint: Endpoint, uri: str, call: Call, caller: Caller
+        self, endpoint: Endpoint, uri: str, call: MasterCall, caller: Caller
     ) -> Endpoint | LocalAnswer:
         """The endpoint that a URI has meant before, for a node that registers again.
 
         If another node behind the same source registers, that node has to confirm its name as well.
         """
-        caller_id = call.string(0) or ""
+        caller_id = call.caller_id
         location = endpoint.location
         if location.address != caller.address and caller_id not in endpoint.caller_ids:
             name = await self._context.nodes.name(endpoint.slave, _service(call, caller))
@@ -131,7 +129,9 @@ class NodeAdmission:
         self._welcome_back(endpoint, caller)
         return endpoint
 
-    async def _admit_new(self, uri: str, node: HostPort, call: Call, caller: Caller) -> CallOutcome:
+    async def _admit_new(
+        self, uri: str, node: HostPort, call: MasterCall, caller: Caller
+    ) -> CallOutcome:
         """The endpoint of a node that is new at this URI; see `admit`."""
         location = await self._locate(node, call, caller)
         if location is None:
@@ -285,7 +285,9 @@ class NodeAdmission:
         if endpoint.health.down or (names and caller.caller_id not in names):
             endpoint.health.suspect()
 
-    async def _locate(self, node: HostPort, call: Call, caller: Caller) -> NodeLocation | None:
+    async def _locate(
+        self, node: HostPort, call: MasterCall, caller: Caller
+    ) -> NodeLocation | None:
         """The location of a node that gives ``node`` as its address; None if this is outside.
 
         The node usually is at the source of the call. But NAT on the way to the proxy may hide the
@@ -295,7 +297,7 @@ class NodeAdmission:
         proxy opens no port for such a node.
         """
         source = caller.address
-        caller_id = call.string(0) or ""
+        caller_id = call.caller_id
         addresses = await resolve(self._context.upstream.reach(node).host, source)
         candidates = [address for address in addresses if not is_loopback(address)]
         if source in addresses or not candidates:
@@ -340,9 +342,9 @@ class NodeAdmission:
         log.warning("%s: %s %s", endpoint.source, caller_id, text)
 
 
-def _service(call: Call, caller: Caller) -> tuple[str, int] | None:
+def _service(call: MasterCall, caller: Caller) -> tuple[str, int] | None:
     """The service that a call registers, and its port; None if the call registers no service."""
-    spec = method_spec(call.method)
+    spec = call.spec
     service = parse_service_uri(
         with_caller_address(call.string(spec.service_api) or "", caller.address)
     )

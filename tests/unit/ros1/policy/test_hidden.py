@@ -14,11 +14,11 @@ from rosproxy.ros1.policy.denial import no_provider
 from rosproxy.ros1.policy.hidden import HiddenAnswers
 from rosproxy.ros1.policy.parameters import ParamUse, param_use
 from rosproxy.ros1.protocol.master_methods import Kind, resolve_name
-from rosproxy.ros1.protocol.xmlrpc.document import Call, parse_call
+from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry.endpoint import NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
-from tests.unit.builders import make_stand_ins, py_call
+from tests.unit.builders import make_stand_ins
 
 PORTS = PortRange(11000, 11009)
 OUTSIDE = "http://robot:40001/"
@@ -39,10 +39,6 @@ def make(*registrations: tuple[str, Kind, str, bool]) -> Addressing:
 
 def hidden_in(addressing: Addressing) -> HiddenAnswers:
     return HiddenAnswers(addressing.registry, addressing)
-
-
-def look_up_node(name: str) -> Call:
-    return parse_call(py_call("lookupNode", "/me", name))
 
 
 @pytest.mark.parametrize(
@@ -111,10 +107,10 @@ def test_what_is_hidden_is_known_by_kind_and_name() -> None:
     caller = Caller("10.0.0.9", "10.0.0.100")
     assert dict(registry.hidden_holders(Kind.PUBLISHER, "/t")) == {"/a": a}
     assert [(e, r.name) for e, r in registry.hidden_registrations()] == [(a, "/t"), (b, "/s")]
-    assert hidden.find_node(look_up_node("/a"), caller)
-    assert hidden.find_node(look_up_node("/c"), caller) is None
+    assert hidden.find_node("/a", caller)
+    assert hidden.find_node("/c", caller) is None
     a.health.note_cleaned(1.0)
-    assert hidden.find_node(look_up_node("/a"), caller) is None
+    assert hidden.find_node("/a", caller) is None
     assert hidden.publishers_for(c, "/t", []) == []
     registry.register(b, replace(b.registrations[Kind.SERVICE, "/s", "/b"], hidden=False))
     registry.remove(a)

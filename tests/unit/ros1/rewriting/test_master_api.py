@@ -232,9 +232,9 @@ def test_the_caller_is_known_by_its_name() -> None:
     ],
 )
 def test_which_calls_need_a_lease(method: str, params: list[Any], uri: str | None) -> None:
-    request = master_calls.read_request(py_call(method, *params), NODE)
-    assert master_calls.registering_uri(request.calls[0]) == uri
-    assert master_calls.registering_uri(None) is None
+    [call] = master_calls.read_request(py_call(method, *params), NODE).calls
+    assert call
+    assert call.registering_uri == uri
 
 
 NOTED = [
