@@ -151,8 +151,10 @@ class MasterClient:
         target = self.reach(self._master_host_port)
         path = self._master_path
         name = self._netloc
-        with _FailuresOf(f"master {self.master_uri}"):
+        try:
             return await self._master.post(target, path, name, body, MASTER_TIMEOUT_S, limits.size)
+        except _FAILURES as error:
+            raise _unreachable(f"master {self.master_uri}", error) from error
 
     async def pass_to_master(self, body: bytes | LongBody) -> bytes | LongReply:
         """The master's reply to a call; the proxy reads neither the call nor the reply.
@@ -162,8 +164,12 @@ class MasterClient:
         target = self.reach(self._master_host_port)
         path = self._master_path
         name = self._netloc
-        with _FailuresOf(f"master {self.master_uri}"):
+        try:
             return await self._master.pass_on(target, path, name, body, MASTER_TIMEOUT_S)
+        except xmlrpc.XmlRpcError:
+            raise
+        except _FAILURES as error:
+            raise _unreachable(f"master {self.master_uri}", error) from error
 
     async def call_master(self, method: str, *params: Any, limits: Limits = OWN_REPLY) -> Any:
         """Call the master and return the value. Raises Unreachable, MasterError.
@@ -253,19 +259,25 @@ class MasterClient:
         if they differ from the address.
         """
         called = name or str(slave)
-        with _FailuresOf(f"node at {called}"):
-            target = self.reach(slave)
+        target = self.reach(slave)
+        try:
             return await self._nodes.post(target, path, called, body, within, limits.size)
+        except _FAILURES as error:
+            raise _unreachable(f"node at {called}", error) from error
 
     async def pass_to_node(self, slave: HostPort, body: bytes | LongBody) -> bytes | LongReply:
         """A node's reply to a call; the proxy reads neither the call nor the reply.
 
         Raises Unreachable, and XmlRpcError if a long body raises that.
         """
-        with _FailuresOf(f"node at {slave}"):
-            target = self.reach(slave)
-            name = str(slave)
+        target = self.reach(slave)
+        name = str(slave)
+        try:
             return await self._nodes.pass_on(target, "/", name, body, NODE_TIMEOUT_S)
+        except xmlrpc.XmlRpcError:
+            raise
+        except _FAILURES as error:
+            raise _unreachable(f"node at {name}", error) from error
 
     async def call_node(
         self, slave: HostPort, within: float, method: str, *params: Any, limits: Limits = REPLY
@@ -301,27 +313,8 @@ class MasterClient:
 _FAILURES = (aiohttp.ClientError, OSError, TimeoutError, ValueError)
 
 
-class _FailuresOf:
-    """Raises failures as Unreachable, with the name of the peer.
-
-    This is a class, because a context manager of a generator takes four times as long.
-    """
-
-    __slots__ = ("_peer",)
-
-    def __init__(self, peer: str) -> None:
-        self._peer = peer
-
-    def __enter__(self) -> None:
-        """Begin to call the peer."""
-
-    def __exit__(self, _: object, error: BaseException | None, trace: object) -> None:
-        """Raise Unreachable for a failure of the peer. An error of a long body passes unchanged."""
-        if isinstance(error, _FAILURES) and not isinstance(error, xmlrpc.XmlRpcError):
-            raise _unreachable(self._peer, error) from error
-
-
-def _unreachable(peer: str, error: BaseException) -> Unreachable:
+def _unreachable(peer: str, error: Exception) -> Unreachable:
+    """A failure of the call of a peer."""
     probe = ProbeResult.SILENT
     if isinstance(error, ConnectionRefusedError):
         probe = ProbeResult.REFUSED
