@@ -77,12 +77,13 @@ class MasterApi:
             return await count_reply(metrics, "master", method, upstream.pass_to_master(call.body))
         # The reply to getUri has the address by which the node calls the proxy.
         caller = Caller(call.source, call.local.host, master=call.host_header or str(call.local))
-        reads_params = self._context.policy.reads_parameters(call.source)
         # roslaunch sets all parameters by a single multicall (launch.py, _load_parameters).
-        if not reads_params and await _is_long_and_passes(call.body):
-            return await count_reply(
-                metrics, "master", MULTICALL, upstream.pass_to_master(call.body)
-            )
+        if len(call.body) > passing.SHORT_BYTES:
+            reads_params = self._context.policy.reads_parameters(call.source)
+            if not reads_params and await _is_multicall_that_passes(call.body):
+                return await count_reply(
+                    metrics, "master", MULTICALL, upstream.pass_to_master(call.body)
+                )
         try:
             request = master_calls.read_request(call.body, caller, self._context.master_call)
         except xmlrpc.XmlRpcError:
@@ -280,7 +281,7 @@ class PublishedMaster:
     async def __call__(self, call: IncomingCall) -> bytes | LongReply:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
         upstream = self._context.upstream
-        if await _is_long_and_passes(call.body):
+        if len(call.body) > passing.SHORT_BYTES and await _is_multicall_that_passes(call.body):
             return await upstream.pass_to_master(call.body)
         caller = Caller(call.source, call.local.host, master=self._address)
         request = master_calls.read_request(call.body, caller, self._context.master_call)
@@ -308,9 +309,9 @@ def _watch(method: str, size: int, limits: Limits) -> passing.CallWatch | None:
     return passing.CallWatch() if _passes(method) else None
 
 
-async def _is_long_and_passes(body: bytes) -> bool:
-    """Whether a body is a long multicall that the proxy need not read."""
-    if len(body) <= passing.SHORT_BYTES or passing.method_of(body) != MULTICALL:
+async def _is_multicall_that_passes(body: bytes) -> bool:
+    """Whether a long body is a multicall that the proxy need not read."""
+    if passing.method_of(body) != MULTICALL:
         return False
     watch = passing.MulticallWatch(_passes)
     if watch.passes(body):
