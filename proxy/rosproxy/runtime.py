@@ -5,6 +5,7 @@ The process creates the runtime once, before the stacks.
 
 import asyncio
 import uuid
+from collections.abc import Callable
 
 from rosproxy.access.access_policy import AccessPolicy
 from rosproxy.net.tasks import Tasks
@@ -18,14 +19,15 @@ class Runtime:
     """The shared objects of a proxy. Needs a running event loop.
 
     ``instance`` is a random name of this process. ``refusals`` reports refusals above a bound.
-    ``policy``: what outside may see and do. ``outside_changed``: set the event when the last proof
-    that outside reaches the range may no longer hold. The proxy then tests again.
+    ``policy``: what outside may see and do. ``now`` returns seconds of the event loop's monotonic
+    clock, which timers use, too. ``outside_changed``: set the event when the last proof that
+    outside reaches the range may no longer hold. The proxy then tests again.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.instance = uuid.uuid4().hex
-        self._loop = asyncio.get_running_loop()
+        self.now: Callable[[], float] = asyncio.get_running_loop().time
         self._started = self.now()
         self.metrics = Metrics()
         self.tasks = Tasks()
@@ -35,10 +37,6 @@ class Runtime:
         self.policy = AccessPolicy(
             settings.policy, settings.policy_layers, self.metrics, self.refusals
         )
-
-    def now(self) -> float:
-        """Seconds of the event loop's monotonic clock, which timers use, too."""
-        return self._loop.time()
 
     def uptime(self) -> float:
         """Seconds since the start of the proxy."""

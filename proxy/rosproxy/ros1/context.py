@@ -40,6 +40,7 @@ PASSING_PER_SOURCE = 64
 class Context:
     """The state and the tools of ROS 1 in a proxy that is about to start.
 
+    - ``now``: the clock of the proxy; see `Runtime`.
     - ``retired``: the proxy makes no more registrations, for nodes or by itself.
     - ``lease_call``, ``master_call``: bounds of a call from outside and from inside.
     - ``gate`` counts connections.
@@ -52,7 +53,7 @@ class Context:
     def __init__(self, runtime: Runtime) -> None:
         self.settings = settings = runtime.settings
         self.instance = runtime.instance
-        self._runtime = runtime
+        self.now = runtime.now
         self.metrics = runtime.metrics
         self.tasks = runtime.tasks
         self.problems = runtime.problems
@@ -99,14 +100,6 @@ class Context:
         """Close the connections to the master and the nodes, and the socket to the kernel."""
         self._network_changes.close()
         await self.upstream.close()
-
-    def now(self) -> float:
-        """Seconds of the event loop's clock, which is monotonic."""
-        return self._runtime.now()
-
-    def uptime(self) -> float:
-        """Seconds since the proxy was made."""
-        return self._runtime.uptime()
 
     async def yield_to_others(self) -> None:
         """Wait for a turn to read or rewrite a document of more than MANY_VALUES.
