@@ -279,7 +279,8 @@ class NodeAdmission:
         if not endpoint.location.confirmed and endpoint.location.address == caller.address:
             endpoint.confirm()
             self._context.problems.solved_at(endpoint.port)
-        if endpoint.trusted:  # otherwise the node still has to confirm its registrations
+        # A node that is not trusted still has to confirm its registrations.
+        if endpoint.trusted and not self._leases.is_open(endpoint):
             self._leases.open(endpoint)
         names = endpoint.caller_ids
         if endpoint.health.down or (names and caller.caller_id not in names):
