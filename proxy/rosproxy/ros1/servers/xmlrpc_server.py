@@ -214,7 +214,8 @@ class XmlRpcServer(HttpServer):
     def connection_lost(self, connection: HttpConnection) -> None:
         """Forget a connection."""
         super().connection_lost(connection)
-        self._mute.pop(connection, _nothing)()
+        if end_wait := self._mute.pop(connection, None):
+            end_wait()
         port = connection.local.port
         if connection in self._by_port[port]:
             self._by_port[port].discard(connection)
@@ -222,7 +223,8 @@ class XmlRpcServer(HttpServer):
 
     async def answer(self, request: HttpRequest) -> None:
         """Answer a request. Raises ConnectionError."""
-        self._mute.pop(request.connection, _nothing)()
+        if end_wait := self._mute.pop(request.connection, None):
+            end_wait()
         reply = await self._reply(request)
         if reply is not None:
             await request.send(reply)
@@ -388,7 +390,3 @@ class XmlRpcServer(HttpServer):
             request.reset()
         finally:
             reply.close()
-
-
-def _nothing() -> None:
-    pass
