@@ -142,14 +142,27 @@ class ClientConnection(HttpProtocol):
         super().connection_lost(exc)
         self._fail(exc if isinstance(exc, OSError) else aiohttp.ServerDisconnectedError())
 
-    async def response(self) -> tuple[RawResponseMessage, aiohttp.StreamReader]:
-        """The next response. Raises OSError, aiohttp.ClientError, ValueError."""
-        while not self._messages:
-            if self._failure is not None:
-                raise self._failure
-            self._arrival = self._loop.create_future()
-            await self._arrival
-        return self._messages.popleft()
+    async def answer(self) -> tuple[aiohttp.StreamReader, int | None]:
+        """The body of the next response, and the length if the header has ``Content-Length``.
+
+        Skips responses with status 1xx. Raises BadResponse for another status than 200, OSError,
+        aiohttp.ClientError, ValueError.
+        """
+        status = 100
+        while 100 <= status < 200:
+            while not self._messages:
+                if self._failure is not None:
+                    raise self._failure
+                self._arrival = self._loop.create_future()
+                await self._arrival
+            message, payload = self._messages.popleft()
+            status = message.code
+        if status != 200:
+            raise BadResponse(f"HTTP status {status}")
+        if not is_plain(message.headers):
+            raise BadResponse("the body is compressed")
+        length = None if message.chunked else message.headers.get("Content-Length")
+        return payload, int(length) if length else None
 
     def close(self) -> None:
         """Close the connection."""
@@ -301,7 +314,7 @@ class HttpClient:
         self, connection: ClientConnection
     ) -> tuple[aiohttp.StreamReader, int | None]:
         try:
-            return await _answer(connection)
+            return await connection.answer()
         except asyncio.CancelledError:  # timeout, or the caller has gone
             self._used.discard(connection)
             self.late.wait(partial(_drain_answer, connection), connection.close)
@@ -360,10 +373,6 @@ class HttpClient:
         self._used.discard(connection)  # the caller has gone, and the peer still writes the reply
         self.late.wait(partial(_drain_body, stream), connection.close)
 
-    def _finish(self, peer: HostPort, connection: ClientConnection) -> None:
-        self._used.discard(connection)
-        self._keep(peer, connection)
-
     async def _connect(self, peer: HostPort) -> ClientConnection:
         """A new connection to ``peer``, by the first address that accepts. Raises OSError."""
         if self._closed:
@@ -391,7 +400,9 @@ class HttpClient:
             connection.close()
         return None
 
-    def _keep(self, peer: HostPort, connection: ClientConnection) -> None:
+    def _finish(self, peer: HostPort, connection: ClientConnection) -> None:
+        """Keep a connection for other calls, if it can carry another call."""
+        self._used.discard(connection)
         if not connection.reusable or self._closed:
             connection.close()
             return
@@ -469,24 +480,8 @@ async def _upload(connection: ClientConnection, head: bytes, body: LongBody) -> 
             await connection.drain()
 
 
-async def _answer(connection: ClientConnection) -> tuple[aiohttp.StreamReader, int | None]:
-    """The body of a response, and the length if the header has ``Content-Length``.
-
-    Skips responses with status 1xx. Raises BadResponse for another status than 200.
-    """
-    message, payload = await connection.response()
-    while 100 <= message.code < 200:
-        message, payload = await connection.response()
-    if message.code != 200:
-        raise BadResponse(f"HTTP status {message.code}")
-    if not is_plain(message.headers):
-        raise BadResponse("the body is compressed")
-    length = None if message.chunked else message.headers.get("Content-Length")
-    return payload, int(length) if length else None
-
-
 async def _drain_answer(connection: ClientConnection) -> None:
-    stream, _ = await _answer(connection)
+    stream, _ = await connection.answer()
     await _drain_body(stream)
 
 
