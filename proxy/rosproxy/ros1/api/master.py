@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from rosproxy.net.http_client import LongReply
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.master_methods import NO_SPEC, method_spec
+from rosproxy.ros1.protocol.master_methods import MASTER_METHODS
 from rosproxy.ros1.protocol.name_lengths import LONGEST_NAME, too_long_to_register
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import fast, passing
@@ -126,8 +126,7 @@ class MasterApi:
         """The reply to a parsed request. A request without changes passes as the original bytes."""
         policy = self._context.policy
         upstream = self._context.upstream
-        is_address_free = request.is_address_free
-        if not is_address_free:
+        if not request.is_address_free:
             # Without the recovery, a node of a former process of the proxy would get another port.
             # rosmaster would shut the node down for the new URI (registrations.py,
             # _register_node_api).
@@ -136,7 +135,7 @@ class MasterApi:
             return await upstream.pass_to_master(request.body)
         version = policy.rules.version
         answers = await policy.check_request(request)
-        if is_address_free and not any(answers) and not policy.reads_reply(request):
+        if request.is_address_free and not any(answers) and not policy.reads_reply(request):
             return await upstream.pass_to_master(request.body)
         pending = list[PendingRegistration]()
         try:
@@ -300,7 +299,7 @@ class PublishedMaster:
 
 
 def _passes(method: str) -> bool:
-    return method_spec(method) == NO_SPEC
+    return method not in MASTER_METHODS
 
 
 def _watch(method: str, size: int, limits: Limits) -> passing.CallWatch | None:

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from rosproxy.ros1.protocol.master_methods import (
     GRAPH_METHODS,
-    NO_SPEC,
+    MASTER_METHODS,
     MethodSpec,
     Reply,
     method_spec,
@@ -92,42 +92,29 @@ class MasterCall(Call, frozen=True):
 class Request(msgspec.Struct, frozen=True):
     """A parsed request of a node inside: a single call, or the calls of a ``system.multicall``.
 
-    ``method`` is the name of the outer method. ``calls`` has None for an element of a multicall
-    that is no call. ``items`` are the elements of a multicall as sent. ``tells_graph``: whether the
-    reply has the graph of all nodes.
+    - ``method``: the name of the outer method.
+    - ``calls``: None stands for an element of a multicall that is no call.
+    - ``items``: the elements of a multicall as sent.
+    - ``is_address_free``: neither the request nor the reply has an address or a registration. A
+      policy may refuse such a request all the same, or filter the reply.
+    - ``tells_graph``: the reply has the graph of all nodes.
+    - ``reply_passes``: the proxy changes nothing in the reply.
     """
 
     body: bytes
     method: str
+    multicall: bool
     calls: tuple[MasterCall | None, ...]
     caller: Caller
     items: Sequence[Value]
+    is_address_free: bool
     tells_graph: bool
-
-    @property
-    def multicall(self) -> bool:
-        """Whether the request is a ``system.multicall``."""
-        return self.method == MULTICALL
+    reply_passes: bool
 
     @property
     def reply_limits(self) -> Limits:
         """The limits of the reply."""
         return OWN_REPLY if self.tells_graph or self.reply_passes else REPLY
-
-    @property
-    def reply_passes(self) -> bool:
-        """Whether the proxy changes nothing in the reply."""
-        if self.multicall or self.tells_graph or self.method == "getParamNames":
-            return False
-        return method_spec(self.method).reply is Reply.OTHER
-
-    @property
-    def is_address_free(self) -> bool:
-        """Whether neither the request nor the reply has an address or a registration.
-
-        A policy may refuse such a request all the same, or filter the reply.
-        """
-        return all(call is None or call.spec == NO_SPEC for call in self.calls)
 
 
 class ExportedRequest(msgspec.Struct, frozen=True):
@@ -147,8 +134,7 @@ class ExportedRequest(msgspec.Struct, frozen=True):
 
     def registry_changes(self) -> "list[RegistryChange]":
         """What the registry has to record for the calls that the proxy answers."""
-        local = (o for o in self.outcomes if isinstance(o, LocalAnswer))
-        return [o.change for o in local if o.change]
+        return [o.change for o in self.outcomes if isinstance(o, LocalAnswer) and o.change]
 
 
 class CallResult(msgspec.Struct, frozen=True):
@@ -220,14 +206,25 @@ class MasterReply(msgspec.Struct, frozen=True):
 def read_request(body: bytes, caller: Caller, limits: Limits = OWN_REPLY) -> Request:
     """Parse a request within limits. Raises XmlRpcError if it is malformed or too large."""
     outer = xmlrpc.parse_call(body, limits)
-    is_multicall = outer.method == MULTICALL
-    parsed = inner_calls(outer) if is_multicall else [outer]
-    items = inner_items(outer) if is_multicall else ()
-    calls = tuple(_read_call(call, caller.address) if call else None for call in parsed)
-    caller_id = next((call.caller_id for call in calls if call), "")
-    tells_graph = any(call and call.method in GRAPH_METHODS for call in calls)
-    caller = replace(caller, caller_id=caller_id)
-    return Request(body, outer.method, calls, caller, items, tells_graph)
+    method = outer.method
+    multicall = method == MULTICALL
+    parsed = inner_calls(outer) if multicall else [outer]
+    calls = [_read_call(call, caller.address) if call else None for call in parsed]
+    caller_ids = [call.caller_id for call in calls if call]
+    methods = {call.method for call in calls if call}
+    tells_graph = not GRAPH_METHODS.isdisjoint(methods)
+    changes_reply = multicall or tells_graph or method == "getParamNames"
+    return Request(
+        body,
+        method,
+        multicall,
+        tuple(calls),
+        replace(caller, caller_id=caller_ids[0] if caller_ids else ""),
+        inner_items(outer) if multicall else (),
+        is_address_free=methods.isdisjoint(MASTER_METHODS),
+        tells_graph=tells_graph,
+        reply_passes=not changes_reply and method_spec(method).reply is Reply.OTHER,
+    )
 
 
 def read_reply(exported: ExportedRequest, reply: bytes) -> MasterReply:
