@@ -60,7 +60,7 @@ class ServiceFinder:
     async def _ask(self, endpoint: Endpoint, name: str) -> None:
         for port in endpoint.node_ports:
             caller_id = await self._nodes.provider(HostPort(endpoint.address, port), name)
-            if caller_id is not None and caller_id in endpoint.caller_ids:
+            if caller_id is not None and caller_id in endpoint.callers:
                 api = service_uri(HostPort(endpoint.node.host, port))
                 registration = Registration(
                     Kind.SERVICE, name, caller_id, "*", api, self._now(), hidden=True

@@ -86,7 +86,7 @@ def resolve_name(name: str, caller_id: str) -> str:
     else:
         resolved = f"{caller_id.rpartition('/')[0]}/{name}"
     # As in rosgraph (rosgraph/names.py, canonicalize_name).
-    return "/" + "/".join(segment for segment in resolved.split("/") if segment)
+    return "/" + "/".join(filter(None, resolved.split("/")))
 
 
 def prefix(name: str) -> str:

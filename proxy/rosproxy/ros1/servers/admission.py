@@ -116,7 +116,7 @@ class NodeAdmission:
         """
         caller_id = call.caller_id
         location = endpoint.location
-        if location.address != caller.address and caller_id not in endpoint.caller_ids:
+        if location.address != caller.address and caller_id not in endpoint.callers:
             name = await self._context.nodes.name(endpoint.slave, _service(call, caller))
             if name != caller_id:
                 return refusal(
@@ -282,7 +282,7 @@ class NodeAdmission:
         # A node that is not trusted still has to confirm its registrations.
         if endpoint.trusted and not self._leases.is_open(endpoint):
             self._leases.open(endpoint)
-        names = endpoint.caller_ids
+        names = endpoint.callers
         if endpoint.health.down or (names and caller.caller_id not in names):
             endpoint.health.suspect()
 

@@ -87,7 +87,7 @@ class Adopter:
         Otherwise the master would call shutdown at the node's own URI. Raises Unreachable.
         """
         # The name is known and has never bypassed the proxy, so the master is not asked each time.
-        if caller_id in endpoint.caller_ids and not endpoint.has_registered_directly:
+        if caller_id in endpoint.callers and not endpoint.has_registered_directly:
             return
         uri = await self._look_up(caller_id)
         advertised = self._context.addressing.advertised_uri(endpoint)
@@ -185,7 +185,7 @@ class Adopter:
         finally:
             for endpoint in endpoints:
                 endpoint.pending -= 1
-        adopted = {name: e for name, (e, _) in former.items() if name in e.caller_ids}
+        adopted = {name: e for name, (e, _) in former.items() if name in e.callers}
         for name, endpoint in adopted.items():
             uri = self._context.addressing.advertised_uri(endpoint)
             log.info("%s adopted: advertised as %s", name, uri)
