@@ -238,6 +238,8 @@ def check_chart(release: Release) -> None:
         adapt(chart, release)
         run(helm, "lint", "--strict", "--kube-version", "1.30.0", chart)
         run(helm, "package", chart, "--destination", DIST)
+        for name in ("alerts.yaml", "dashboard.json"):
+            shutil.copy(chart / "files" / name, DIST)
     package = DIST / f"rosproxy-operator-{release.version}.tgz"
     with tarfile.open(package) as archive:
         if f"{CHART.name}/LICENSE" not in archive.getnames():
@@ -253,10 +255,7 @@ def check_chart(release: Release) -> None:
                       f"--proxy-image={release.image('rosproxy')}"):  # fmt: skip
             if f"{image}\n" not in objects:
                 raise ReleaseFault(f"{file_name} does not pull {image}")
-    alerts = (CHART / "files/alerts.yaml").read_text()
-    alerts = alerts.replace("runbook_url: docs/guide/alerts.md", f"runbook_url: {release.runbook}")
-    (DIST / "alerts.yaml").write_text(alerts)
-    shutil.copy(CHART / "files/dashboard.json", DIST)
+    alerts = (DIST / "alerts.yaml").read_text()
     if f"runbook_url: {release.runbook}#" not in made or release.runbook not in alerts:
         raise ReleaseFault(f"the alerts of {package.name} do not link to {release.runbook}")
 
@@ -264,14 +263,15 @@ def check_chart(release: Release) -> None:
 def adapt(chart: Path, release: Release) -> None:
     """Write images, links, licence and changes into a chart."""
     shutil.copy(ROOT / "LICENSE", chart)
+    alerts = chart / "files/alerts.yaml"
+    link = "runbook_url: docs/guide/alerts.md"
+    alerts.write_text(alerts.read_text().replace(link, f"runbook_url: {release.runbook}"))
     values = chart / "values.yaml"
     about = chart / "Chart.yaml"
     text = values.read_text()
     if release.registry:
         to = rf"\1{release.registry}/\2"
         text = re.sub(r"(?m)^( +repository: )(rosproxy.*)$", to, text)
-    if release.repository:
-        text = text.replace('  runbook: ""', f"  runbook: {release.runbook}")
     described = describe(yaml.safe_load(about.read_text()), release)
     about.write_text(yaml.safe_dump(described, sort_keys=False, allow_unicode=True))
     values.write_text(text)

@@ -1,6 +1,7 @@
 """All parts of a release have the same version, and the workflow uses the tested versions."""
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -44,8 +45,7 @@ def test_a_release_has_its_entry_in_the_changelog(tmp_path: Path) -> None:
 
 
 def test_the_published_chart_is_described(tmp_path: Path) -> None:
-    (tmp_path / "Chart.yaml").write_text((CHART / "Chart.yaml").read_text())
-    (tmp_path / "values.yaml").write_text((CHART / "values.yaml").read_text())
+    shutil.copytree(CHART, tmp_path, dirs_exist_ok=True)
     version = project_version()
     adapt(tmp_path, Release(version, "", "", "ghcr.io/me", "https://github.com/me/rosproxy"))
     about = yaml.safe_load((tmp_path / "Chart.yaml").read_text())
@@ -62,6 +62,9 @@ def test_the_published_chart_is_described(tmp_path: Path) -> None:
     assert annotations["artifacthub.io/license"] == "Apache-2.0"
     assert (tmp_path / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
     assert "repository: ghcr.io/me/rosproxy-operator\n" in (tmp_path / "values.yaml").read_text()
+    alerts = (tmp_path / "files/alerts.yaml").read_text()
+    runbook = f"https://github.com/me/rosproxy/blob/v{version}/docs/guide/alerts.md"
+    assert alerts.count("runbook_url: ") == alerts.count(f"runbook_url: {runbook}#") > 0
 
 
 def test_changes_of_the_chart_are_those_of_kubernetes() -> None:
