@@ -8,7 +8,7 @@ import pytest
 import yaml  # type: ignore[import-untyped]
 
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, words
-from tests.chart.chart import CHART, Json, helm
+from tests.chart.chart import CHART, Json, helm, objects
 
 BAD: list[tuple[Json, str]] = [
     ({"imag": {}}, "imag"),
@@ -107,16 +107,56 @@ NO_EFFECT: list[tuple[Json, str]] = [
     ({"metricsPort": 8080}, "livenessPort: the ports [9443 8080 8080] are not different. Choose"),
     (
         {"networkPolicy": {"metricsFrom": [{"podSelector": {}}]}},
-        "networkPolicy.metricsFrom: no NetworkPolicy has these peers. Set networkPolicy.enabled:",
+        " networkPolicy.metricsFrom: has an effect only with networkPolicy.enabled: true. Set",
     ),
     (
         {"proxy": {"networkPolicy": {"enabled": False, "metricsFrom": [{"podSelector": {}}]}}},
-        "proxy.networkPolicy.metricsFrom: no NetworkPolicy has these peers. Set",
+        "proxy.networkPolicy.metricsFrom: has an effect only with proxy.networkPolicy.enabled",
     ),
     (
         {"webhook": {"certificate": {"certManager": {"issuerRef": {"name": "ca"}}}}},
-        "issuerRef: the operator creates the certificate itself. Set webhook.certificate.source:",
+        "certManager.issuerRef: has an effect only with webhook.certificate.source: cert-manager",
     ),
+    (
+        {"webhook": {"certificate": {"certManager": {"duration": "1h"}}}},
+        "certManager.duration: has an effect only with webhook.certificate.source: cert-manager",
+    ),
+    *(
+        ({"webhook": {"enabled": False, **values}}, "has an effect only with webhook.enabled: true")
+        for values in (
+            {"timeoutSeconds": 6},
+            {"failurePolicy": "Fail"},
+            {"objectSelector": {"matchLabels": {"a": "b"}}},
+            {"annotations": {"a": "b"}},
+            {"port": 9444},
+            {"certificate": {"source": "cert-manager"}},
+        )
+    ),
+    *(
+        ({group: {"labels": {"a": "b"}}}, f"{group}.labels: has an effect only with {group}.")
+        for group in ("serviceMonitor", "podMonitor", "prometheusRule", "dashboard")
+    ),
+    (
+        {"prometheusRule": {"runbook": "https://docs.example/alerts"}},
+        "prometheusRule.runbook: has an effect only with prometheusRule.enabled: true. Set",
+    ),
+    (
+        {"podDisruptionBudget": {"enabled": False, "maxUnavailable": 2}},
+        "maxUnavailable: has an effect only with podDisruptionBudget.enabled: true. Set this",
+    ),
+    *(
+        ({"tests": {"ros": ros, "image": "a"}}, "tests.image: has an effect only with tests.ros: 1")
+        for ros in (2, "zenoh")
+    ),
+    *(
+        (
+            {"tests": {"ros": ros, "ros2Image": "a"}},
+            "ros2Image: has an effect only with tests.ros: ",
+        )
+        for ros in (1, "zenoh")
+    ),
+    ({"policy": {"mode": "Audit"}}, "policy.mode: has no effect without rules. Add policy.rules"),
+    ({"crds": {"install": False, "keep": False}}, "crds.keep: has no effect if the release does"),
     ({"serviceAccount": {"create": False}}, "serviceAccount.name: is empty, and the chart"),
     (
         {"serviceAccount": {"create": False, "name": "a", "annotations": {"b": "c"}}},
@@ -131,6 +171,23 @@ def test_values_without_effect_are_refused(values: Json, told: str) -> None:
     done = helm("template", "x", CHART, "--kube-version", "1.30.0", values=values)
     assert done.returncode != 0
     assert told in done.stderr
+
+
+def off(*names: str) -> Json:
+    """Values that switch these groups off."""
+    return {name: {"enabled": False} for name in names}
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {**off("webhook", "podDisruptionBudget"), "proxy": off("networkPolicy")},
+        *({"tests": {"ros": ros}} for ros in (1, 2, "zenoh")),
+    ],
+)
+def test_defaults_without_effect_are_accepted(values: Json) -> None:
+    """`helm upgrade --reuse-values` gives all of them."""
+    objects(values)
 
 
 def test_values_about_the_options_of_a_proxy_are_the_operators() -> None:

@@ -35,7 +35,6 @@ _IMAGES: Json = {
     "crds": {"keep": False},
     "tests": {
         "image": "rosproxy-test-ros:latest",
-        "ros2Image": "rosproxy-test-ros2:latest",
         "imagePullPolicy": "Never",
         "namespace": "default",
     },

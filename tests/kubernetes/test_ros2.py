@@ -313,7 +313,8 @@ def test_a_node_is_stopped_and_comes_back(world: World) -> None:
 
 def test_helm_test(robot2: Robot2) -> None:
     """Through a proxy on either node: the test's two pods keep away from each other."""
-    release.upgrade(tests={"ros": 2})
+    image = "rosproxy-test-ros2:latest"
+    release.upgrade(tests={"ros": 2, "image": None, "ros2Image": image})
     told = release.helm("test", release.NAME, "--namespace", release.NAMESPACE, seconds=300)
     assert re.search("PASSED: a message went to the pod on node node[12] and back", told), told
     assert "both pods are on node" not in told

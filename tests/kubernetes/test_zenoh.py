@@ -306,7 +306,7 @@ def test_a_pod_that_goes_its_own_way_is_told(world: World) -> None:
 
 def test_helm_test() -> None:
     """The test's two pods keep away from each other, so the answer passes two hubs."""
-    release.upgrade(tests={"ros": "zenoh"})
+    release.upgrade(tests={"ros": "zenoh", "image": None})
     told = release.helm("test", release.NAME, "--namespace", release.NAMESPACE, seconds=300)
     assert re.search("PASSED: a question went to the pod on node node[12]", told), told
     assert "both pods are on node" not in told
