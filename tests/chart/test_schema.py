@@ -1,14 +1,16 @@
 """The schema refuses wrong values, with a message that names the value."""
 
 import json
+import shutil
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml  # type: ignore[import-untyped]
 
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, words
-from tests.chart.chart import CHART, Json, helm, objects
+from tests.chart.chart import CHART, Json, helm, objects, of_kind
 
 BAD: list[tuple[Json, str]] = [
     ({"imag": {}}, "imag"),
@@ -155,6 +157,7 @@ NO_EFFECT: list[tuple[Json, str]] = [
         )
         for ros in (1, "zenoh")
     ),
+    ({"global": {"imageRegistri": "a"}}, "global.imageRegistri: is unknown, and the release has"),
     ({"policy": {"mode": "Audit"}}, "policy.mode: has no effect without rules. Add policy.rules"),
     ({"crds": {"install": False, "keep": False}}, "crds.keep: has no effect if the release does"),
     ({"serviceAccount": {"create": False}}, "serviceAccount.name: is empty, and the chart"),
@@ -188,6 +191,16 @@ def off(*names: str) -> Json:
 def test_defaults_without_effect_are_accepted(values: Json) -> None:
     """`helm upgrade --reuse-values` gives all of them."""
     objects(values)
+
+
+def test_global_values_of_other_charts_of_a_parent_are_accepted(tmp_path: Path) -> None:
+    about = {"apiVersion": "v2", "name": "parent", "version": "0.1.0"}
+    (tmp_path / "Chart.yaml").write_text(json.dumps(about))
+    shutil.copytree(CHART, tmp_path / "charts" / CHART.name)
+    manifests = objects({"global": {"imageRegistry": "a.example", "other": 1}}, chart=tmp_path)
+    images = {container["image"].partition("/")[0] for manifest in of_kind(manifests, "Deployment")
+              for container in manifest["spec"]["template"]["spec"]["containers"]}  # fmt: skip
+    assert images == {"a.example"}
 
 
 def test_values_about_the_options_of_a_proxy_are_the_operators() -> None:

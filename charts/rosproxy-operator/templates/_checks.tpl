@@ -3,6 +3,11 @@ Combinations of values that have no effect, or that can't work. Which values the
 each may be, is in values.schema.json.
 */}}
 {{- define "rosproxy.checks" -}}
+{{- if .Chart.IsRoot }}
+{{- range $key := keys (omit .Values.global "imageRegistry" "imagePullSecrets") | sortAlpha }}
+{{- fail (printf "global.%s: is unknown, and the release has no other chart. Use global.imageRegistry or global.imagePullSecrets, or remove global.%s" $key $key) }}
+{{- end }}
+{{- end }}
 {{- $ports := list (int .Values.webhook.port) (int .Values.metricsPort) (int .Values.livenessPort) }}
 {{- if ne (len (uniq $ports)) 3 }}
 {{- fail (printf "webhook.port, metricsPort, livenessPort: the ports %v are not different. Choose three different ports" $ports) }}
