@@ -71,6 +71,8 @@ OPTIONS: dict[str, dict[str, Values]] = {
                 "interval": "15s",
                 "scrapeTimeout": "5s",
                 "relabelings": [{"targetLabel": "cluster", "replacement": "c"}],
+                "spec": {"targetLabels": ["team"], "sampleLimit": 5000},
+                "endpoint": {"scheme": "https", "tlsConfig": {"caFile": "/ca.crt"}},
             },
             "podMonitor": {
                 "enabled": True,
@@ -78,9 +80,20 @@ OPTIONS: dict[str, dict[str, Values]] = {
                 "interval": "1m30s",
                 "honorLabels": True,
                 "metricRelabelings": [{"action": "labeldrop", "regex": "x"}],
+                "spec": {"podTargetLabels": ["team"], "attachMetadata": {"node": True}},
+                "endpoint": {"enableHttp2": False},
             },
-            "prometheusRule": {"enabled": True, "runbook": "https://docs.example/alerts"},
-            "dashboard": {"enabled": True, "annotations": {"grafana_folder": "Robots"}},
+            "prometheusRule": {
+                "enabled": True,
+                "namespace": "monitoring",
+                "annotations": {"a": "b"},
+                "runbook": "https://docs.example/alerts",
+            },
+            "dashboard": {
+                "enabled": True,
+                "namespace": "monitoring",
+                "annotations": {"grafana_folder": "Robots"},
+            },
             "podDisruptionBudget": {"enabled": False},
             "networkPolicy": {
                 "enabled": True,

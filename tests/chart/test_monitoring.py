@@ -11,7 +11,7 @@ import pytest
 import yaml  # type: ignore[import-untyped]
 
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, own_labels
-from tests.chart.chart import ROOT, Json, objects, of_kind
+from tests.chart.chart import OPTIONS, ROOT, Json, objects, of_kind
 from tests.chart.monitoring import (
     ALERTS,
     DASHBOARD,
@@ -61,6 +61,33 @@ def test_alerts_link_to_where_the_values_say() -> None:
     (group,) = rule["spec"]["groups"]
     links = [alert["annotations"]["runbook_url"] for alert in group["rules"]]
     assert links == [f"{runbook}#{alert['alert'].lower()}" for alert in alerts()]
+
+
+def test_more_fields_of_the_monitors_keep_those_of_the_chart() -> None:
+    plain = objects(ALL)
+    more = objects(OPTIONS["extras"]["all"])
+    for kind, endpoints in (
+        ("ServiceMonitor", "endpoints"),
+        ("PodMonitor", "podMetricsEndpoints"),
+    ):
+        (before,) = of_kind(plain, kind)
+        (after,) = of_kind(more, kind)
+        values = OPTIONS["extras"]["all"][f"{kind[0].lower()}{kind[1:]}"]
+        added = {key: after["spec"][key] for key in after["spec"].keys() - before["spec"].keys()}
+        assert added == values["spec"]
+        (endpoint,) = after["spec"][endpoints]
+        assert endpoint.items() >= values["endpoint"].items()
+        for relabeling in before["spec"][endpoints][0]["relabelings"]:
+            assert relabeling in endpoint["relabelings"]
+
+
+def test_alerts_and_dashboard_may_be_in_the_namespace_of_prometheus() -> None:
+    manifests = objects(OPTIONS["extras"]["all"])
+    (rule,) = of_kind(manifests, "PrometheusRule")
+    (dashboard,) = dashboards(manifests)
+    for metadata in (rule["metadata"], dashboard["metadata"]):
+        assert metadata["namespace"] == "monitoring"
+    assert rule["metadata"]["annotations"] == {"a": "b"}
 
 
 @pytest.mark.parametrize(

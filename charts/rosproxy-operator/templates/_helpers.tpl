@@ -135,4 +135,7 @@ scrapeTimeout: {{ . }}
 metricRelabelings:
   {{- toYaml . | nindent 2 }}
 {{- end }}
+{{- with .endpoint }}
+{{ toYaml . }}
+{{- end }}
 {{- end -}}
