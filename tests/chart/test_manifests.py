@@ -94,6 +94,17 @@ def test_every_value_has_a_comment() -> None:
     assert [path for path, _, meaning in rows if not meaning] == []
 
 
+def test_comparison_names_values_of_the_chart() -> None:
+    table = README.read_text().partition("\n| capability |")[2]
+    cells = [row.strip(" |").rpartition("|")[2] for row in table.splitlines()[2:]]
+    named = set(re.findall(r"`([a-z][\w.]+)`", " ".join(cells))) - {"null", "valueFrom", "signKey"}
+    values = yaml.safe_load((CHART / "values.yaml").read_text())
+    paths = [path.split(".") for path in leaves(values)]
+    known = {".".join(path[:length]) for path in paths for length in range(1, len(path) + 1)}
+    assert len(named) > 30
+    assert named <= known
+
+
 def leaves(values: Json, path: str = "") -> Iterator[str]:
     for name, value in values.items():
         if isinstance(value, dict) and value:
