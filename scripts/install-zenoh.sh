@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs the requirements of the zenoh layer (tests/zenoh), on Debian or Ubuntu, as root: three
-# versions of the zenoh library, each in a separate environment in the user's cache, and the tools for
-# network namespaces. Does nothing if all are installed.
+# versions of the zenoh library and zenoh-ros2-sdk, each in a separate environment in the user's
+# cache, and the tools for network namespaces. Does nothing if all are installed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/debian.sh

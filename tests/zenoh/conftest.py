@@ -16,13 +16,13 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 from tests.ros.topology import Topology, remove_leftovers  # noqa: E402
-from tests.zenoh.lab import ENVIRONMENTS, PLAN, VERSIONS, Lab  # noqa: E402
+from tests.zenoh.lab import ENVIRONMENTS, PLAN, SDK, VERSIONS, Lab  # noqa: E402
 
 
 def missing() -> str | None:
     """The obstacle for this layer with the command against it, or None."""
     gone = [name for name in ("ip", "nft", "unshare", "sysctl") if shutil.which(name) is None]
-    gone += [version for version in VERSIONS if not (ENVIRONMENTS / version / "pins").exists()]
+    gone += [name for name in (*VERSIONS, SDK) if not (ENVIRONMENTS / name / "pins").exists()]
     if gone:
         return f"this layer needs zenoh: run `scripts/install-zenoh.sh` as root (missing: {gone})"
     if os.geteuid() != 0:

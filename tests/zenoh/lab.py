@@ -6,7 +6,7 @@ import itertools
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
@@ -22,6 +22,8 @@ VERSIONS = ("1.6.2", "1.7.2", "1.10.2")
 """The library of the nodes and of the robot's router."""
 OWN_VERSION = "1.7.2"
 """The library of the proxy, which the extra `zenoh` pins."""
+SDK = "zenoh-ros2-sdk"
+"""The environment of `nodes/sdk_node.py`."""
 NODES = Path(__file__).parent / "nodes"
 ROUTER_PORT = 7447
 PLAN = Plan("z", (("c1", "c2"),), PortMap(ROUTER_PORT, ROUTER_PORT, ROUTER_PORT))
@@ -87,11 +89,18 @@ class Lab:
         """Start a node with its name as the title. In a container without a redirect, the node is a
         client.
         """
-        name = self.unique(kind)
+        return self._node(version, role, "node.py", kind, self.unique(kind), topic, **environment)
+
+    def sdk_node(self, role: str, owners: Iterable[str]) -> Process:
+        """Start a node of the other library, which uses what ``owners`` offer."""
+        return self._node(SDK, role, "sdk_node.py", self.unique("sdk"), ",".join(owners))
+
+    def _node(self, version: str, role: str, *words: str, **environment: str) -> Process:
+        """Start a program, of which the argument before the last is the name of the node."""
         if not environment and role != "out" and not self.is_redirected(role):
             environment = self.as_client()
-        node = self._program(version, role, "node.py", kind, name, topic, **environment)
-        node.title = name
+        node = self._program(version, role, *words, **environment)
+        node.title = words[-2]
         return node
 
     def as_client(self, port: int = min(PORTS.values())) -> dict[str, str]:

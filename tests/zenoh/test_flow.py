@@ -16,7 +16,7 @@ ARRIVE_WITHIN_S = 60.0
 USES = (
     "topic",
     "latched",
-    "sum of 1 2",
+    "sum 3",
     "get_parameters of use_sim_time",
     "feedback short",
     "status short=executing",

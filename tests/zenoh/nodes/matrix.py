@@ -1,8 +1,9 @@
 """What nodes offer each other: a topic, a latched topic, a service, parameters and an action.
 
 Keys, tokens, attachments and options of queries are those of rmw_zenoh (rmw_publisher_data.cpp,
-rmw_client_data.cpp, rmw_service_data.cpp, liveliness_utils.cpp, attachment_helpers.cpp). The
-payloads are text in place of CDR, and all types have the same hash.
+rmw_client_data.cpp, rmw_service_data.cpp, liveliness_utils.cpp, attachment_helpers.cpp). Both
+topics and the service `add` have the payloads and type hashes of ROS, so that nodes of another
+library can use them (`sdk_node.py`). All other payloads are text, and have the hash of a string.
 """
 
 import itertools
@@ -16,6 +17,11 @@ import zenoh
 from zenoh import ext
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+"""The type hash of std_msgs/msg/String."""
+ADD_HASH = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
+"""The type hash of example_interfaces/srv/AddTwoInts."""
+_CDR = b"\0\1\0\0"
+"""The encapsulation header of CDR in little endian."""
 PERIOD_S = 0.1
 CALL_TIMEOUT_S = 120.0
 ENOUGH_MESSAGES = 5
@@ -24,12 +30,46 @@ LONG_GOAL_STEPS = 10_000
 """A goal that ends only if a client cancels the goal."""
 
 
+class Codec(NamedTuple):
+    """How a payload stands for a text."""
+
+    encode: Callable[[str], bytes]
+    decode: Callable[[bytes], str]
+
+
+def _string_to_cdr(text: str) -> bytes:
+    encoded = text.encode() + b"\0"
+    return _CDR + struct.pack("<I", len(encoded)) + encoded
+
+
+def _string_from_cdr(payload: bytes) -> str:
+    (length,) = struct.unpack_from("<I", payload, len(_CDR))
+    return payload[len(_CDR) + 4 :][: length - 1].decode()
+
+
+def _integers_to_cdr(text: str) -> bytes:
+    integers = [int(word) for word in text.split()]
+    return _CDR + struct.pack(f"<{len(integers)}q", *integers)
+
+
+def _integers_from_cdr(payload: bytes) -> str:
+    return " ".join(str(integer) for (integer,) in struct.iter_unpack("<q", payload[len(_CDR) :]))
+
+
+TEXT = Codec(str.encode, bytes.decode)
+STRING = Codec(_string_to_cdr, _string_from_cdr)
+INTEGERS = Codec(_integers_to_cdr, _integers_from_cdr)
+"""The request and the response of AddTwoInts: int64 with spaces between."""
+
+
 class Kind(NamedTuple):
     """A topic or service below the name of a node."""
 
     name: str
     type: str
     latched: bool = False
+    codec: Codec = TEXT
+    hash: str = HASH
 
     @property
     def qos(self) -> str:
@@ -37,9 +77,9 @@ class Kind(NamedTuple):
         return ":1:,1:,:,:,," if self.latched else "::,10:,:,:,,"
 
 
-CHATTER = Kind("chatter", "std_msgs::msg::dds_::String_")
-MAP = Kind("map", "std_msgs::msg::dds_::String_", latched=True)
-ADD = Kind("add", "example_interfaces::srv::dds_::AddTwoInts_")
+CHATTER = Kind("chatter", "std_msgs::msg::dds_::String_", codec=STRING)
+MAP = Kind("map", "std_msgs::msg::dds_::String_", latched=True, codec=STRING)
+ADD = Kind("add", "example_interfaces::srv::dds_::AddTwoInts_", codec=INTEGERS, hash=ADD_HASH)
 PARAMETERS = {
     name: Kind(name, f"rcl_interfaces::srv::dds_::{name.title().replace('_', '')}_")
     for name in (
@@ -75,21 +115,24 @@ class Node:
         self._entities = itertools.count(1)
         self._numbers = itertools.count(1)
 
-    def publisher(self, kind: Kind) -> Any:
+    def publisher(self, kind: Kind) -> Callable[[str], None]:
+        """A function that publishes a message."""
         key = self._declare("MP", kind, self.name)
-        if not kind.latched:
-            return self.session.declare_publisher(key)
-        cache = ext.CacheConfig(1)
-        return ext.declare_advanced_publisher(
-            self.session, key, cache=cache, publisher_detection=True
-        )
+        if kind.latched:
+            cache = ext.CacheConfig(1)
+            publisher = ext.declare_advanced_publisher(
+                self.session, key, cache=cache, publisher_detection=True
+            )
+        else:
+            publisher = self.session.declare_publisher(key)
+        return lambda text: publisher.put(kind.codec.encode(text))
 
     def subscribe(self, kind: Kind, owner: str, take: Callable[[str], None]) -> None:
         """Have ``take`` called with each message of another node."""
         key = self._declare("MS", kind, owner)
 
         def callback(sample: Any) -> None:
-            take(sample.payload.to_string())
+            take(kind.codec.decode(sample.payload.to_bytes()))
 
         if kind.latched:
             history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
@@ -106,7 +149,8 @@ class Node:
         def reply(query: Any) -> None:
             asked = bytes(query.attachment)
             attachment = attachment_of(number_in(asked), asked[-16:])
-            query.reply(key, answer(query.payload.to_string()), attachment=attachment)
+            told = answer(kind.codec.decode(query.payload.to_bytes()))
+            query.reply(key, kind.codec.encode(told), attachment=attachment)
 
         def callback(query: Any) -> None:
             threading.Thread(target=reply, args=(query,), daemon=True).start()
@@ -119,13 +163,13 @@ class Node:
 
         def call(payload: str) -> str:
             while True:
-                for answer in self._ask(key, payload):
-                    return answer
+                for answer in self._ask(key, kind.codec.encode(payload)):
+                    return kind.codec.decode(answer)
                 time.sleep(PERIOD_S)
 
         return call
 
-    def _ask(self, key: str, payload: str) -> Iterable[str]:
+    def _ask(self, key: str, payload: bytes) -> Iterable[bytes]:
         number = next(self._numbers)
         replies = self.session.get(
             key,
@@ -139,16 +183,16 @@ class Node:
             if reply.ok is not None:
                 told = bytes(reply.ok.attachment)
                 assert (number_in(told), told[-16:]) == (number, self.gid)
-                yield reply.ok.payload.to_string()
+                yield reply.ok.payload.to_bytes()
 
     def _declare(self, entity: str, kind: Kind, owner: str) -> str:
         """Declare the token of an entity. Return the key of its messages or calls."""
         name = f"{owner}/{kind.name}"
         start = f"@ros2_lv/0/{self.session.info.zid()}/0/{next(self._entities)}/{entity}/%/%"
         mangled = f"/{name}".replace("/", "%")
-        token = f"{start}/{self.name}/{mangled}/{kind.type}/{HASH}/{kind.qos}"
+        token = f"{start}/{self.name}/{mangled}/{kind.type}/{kind.hash}/{kind.qos}"
         self._held.append(self.session.liveliness().declare_token(token))
-        return f"0/{name}/{kind.type}/{HASH}"
+        return f"0/{name}/{kind.type}/{kind.hash}"
 
 
 def attachment_of(number: int, gid: bytes) -> bytes:
@@ -204,7 +248,7 @@ class ActionServer:
     def _execute(self, name: str, goal: Goal) -> None:
         self._note(goal, "executing")
         for step in range(goal.steps):
-            self._feedback.put(f"{name} {step}")
+            self._feedback(f"{name} {step}")
             if goal.canceled.wait(PERIOD_S):
                 break
         self._note(goal, "canceled" if goal.canceled.is_set() else "succeeded")
@@ -214,22 +258,22 @@ class ActionServer:
         with self._lock:
             goal.state = state
             states = (f"{name}={goal.state}" for name, goal in self._goals.items())
-            self._status.put(" ".join(states))
+            self._status(" ".join(states))
 
 
 def offer(session: Any, name: str, _: str) -> None:
     """Offer all kinds. Print ``latched`` when the latched message is published."""
     node = Node(session, name)
-    node.serve(ADD, lambda payload: f"sum of {payload}")
+    node.serve(ADD, lambda payload: str(sum(map(int, payload.split()))))
     for kind in PARAMETERS.values():
         node.serve(kind, lambda payload, kind=kind: f"{kind.name} of {payload}")
     ActionServer(node)
-    latched = node.publisher(MAP)
-    latched.put("latched")
+    publish_map = node.publisher(MAP)
+    publish_map("latched")
     say("latched")
-    publisher = node.publisher(CHATTER)
+    publish_chatter = node.publisher(CHATTER)
     while True:
-        publisher.put("hello")
+        publish_chatter("hello")
         time.sleep(PERIOD_S)
 
 
@@ -256,7 +300,7 @@ def subscribe(node: Node, owner: str) -> None:
 
 def call(node: Node, owner: str) -> None:
     """Call the services of a node, ask for its parameters, and use its action."""
-    say("got", owner, node.client(ADD, owner)("1 2"))
+    say("got", owner, "sum", node.client(ADD, owner)("1 2"))
     get_parameters = node.client(PARAMETERS["get_parameters"], owner)
     say("got", owner, get_parameters("use_sim_time"))
     act(node, owner)
