@@ -1,5 +1,6 @@
 """The examples with the operator, started as in the READMEs, with real nodes."""
 
+import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,12 +10,17 @@ from pathlib import Path
 import pytest
 
 from tests.docker.controller import MANAGED, UPLINK, remove_proxies, the_proxy
-from tests.docker.engine import ROOT, compose, containers, docker, inspect, wait_until
+from tests.docker.engine import ROOT, compose, containers, docker, inspect, logs, wait_until
+from tests.docker.machines import machine
+from tests.docker.nodes import Log
 from tests.docker.robot import Robot
 from tests.docker.ros2 import HERE, THERE, Outside, wait_for_line
+from tests.docker.zenoh import NODE, Node, node_on
 
 EXAMPLES = ROOT / "examples/docker"
 ROS2 = EXAMPLES / "ros2"
+ZENOH = EXAMPLES / "zenoh"
+ZENOH_NUMBER = 95
 SOCKET_PROXY = EXAMPLES / "socket-proxy"
 
 
@@ -187,9 +193,31 @@ def test_example_with_ros_2(
         lan.end()
 
 
+@pytest.mark.usefixtures("_no_other_controller")
+def test_example_with_zenoh(images: dict[str, str], zenoh_image: str, tmp_path: Path) -> None:
+    """Sessions with the defaults of rmw_zenoh stand for the programs of the nodes."""
+    commands = {"talker": (*NODE, "pub", "talker"), "listener": (*NODE, "sub", "listener")}
+    services = {name: {"command": [*words, "chatter"]} for name, words in commands.items()}
+    extra = tmp_path / "commands.yaml"
+    extra.write_text(json.dumps({"services": services}))
+    with machine(zenoh_image, "example", ZENOH_NUMBER) as robot:
+        robot.start("rmw_zenohd")
+        variables = {"ROBOT": robot.address, "ROS2_ZENOH_IMAGE": zenoh_image, **images}
+        project = Example(ZENOH, variables, extra)
+        with running(project):
+            container = project.container("listener")
+            listener = Node("listener", Log(lambda: logs(container)))
+            outside = node_on(robot, "outside", "sub", "chatter")
+            outside.wait_for("got hello ")
+            listener.wait_for("got hello ")
+            status = project.compose(*STATUS)
+            assert f"{robot.address}:7447" in status
+            assert status.count("127.0.0.1:7447 is redirected to the proxy") == 2
+
+
 def test_examples_need_no_more_than_their_readme_says() -> None:
     """The README tells to set exactly the variables without a default."""
-    for directory in (EXAMPLES, SOCKET_PROXY, ROS2):
+    for directory in (EXAMPLES, SOCKET_PROXY, ROS2, ZENOH):
         needed = set(re.findall(r"\$\{(\w+):\?", (directory / "compose.yaml").read_text()))
         told = set(re.findall(r"export (\w+)=", (directory / "README.md").read_text()))
         assert needed == told, directory

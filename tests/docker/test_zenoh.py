@@ -19,9 +19,8 @@ from tests.docker.controller import (
 from tests.docker.engine import docker, inspect, run, wait_until
 from tests.docker.inside import ENABLE, Container, Inside, inside, unique
 from tests.docker.machines import Machine, machine
-from tests.docker.nodes import Log
 from tests.docker.redirects import rules
-from tests.docker.zenoh import NODE, Node
+from tests.docker.zenoh import NODE, Node, node_on
 
 NUMBER = 92
 _numbers = itertools.count(1)
@@ -38,12 +37,7 @@ class Sides:
 
     def outside(self, kind: str, topic: str = "chatter") -> Node:
         """Start a node on the robot."""
-        name = f"outside_{next(_numbers)}"
-        words = " ".join((*NODE, kind, name, topic))
-        file = f"/tmp/{name}.log"
-        self.robot.start("sh", "-c", f"echo $$ >/tmp/{name}.pid; exec {words} >{file} 2>&1")
-        path = self.robot.root / file.lstrip("/")
-        return Node(name, Log(lambda: path.read_text() if path.exists() else ""))
+        return node_on(self.robot, f"outside_{next(_numbers)}", kind, topic)
 
     def inside(self, kind: str, topic: str = "chatter", **more: Any) -> Node:
         """Start a node in a container with only the labels."""

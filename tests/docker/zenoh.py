@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tests.docker.engine import wait_until
 from tests.docker.inside import Container
+from tests.docker.machines import Machine
 from tests.docker.nodes import Log
 
 NODE = ("python", "/nodes/node.py")
@@ -50,6 +51,15 @@ class Node:
         return max(
             map(int, re.findall(r"^got hello (\d+)$", self.log.read(), re.MULTILINE)), default=-1
         )
+
+
+def node_on(machine: Machine, name: str, kind: str, topic: str) -> Node:
+    """Start a node on a machine."""
+    words = " ".join((*NODE, kind, name, topic))
+    file = f"/tmp/{name}.log"
+    machine.start("sh", "-c", f"echo $$ >/tmp/{name}.pid; exec {words} >{file} 2>&1")
+    path = machine.root / file.lstrip("/")
+    return Node(name, Log(lambda: path.read_text() if path.exists() else ""))
 
 
 @dataclass(frozen=True)
