@@ -500,6 +500,22 @@ def test_a_container_that_is_a_router_is_dialed_and_left_as_it_is() -> None:
     }
 
 
+@pytest.mark.parametrize("variables", [{"ROS_DISTRO": "kilted"}, {}])
+def test_a_router_needs_no_variable(variables: dict[str, str]) -> None:
+    """Images of zenohd do not set ROS_DISTRO, and rmw_zenohd runs without RMW_IMPLEMENTATION."""
+    router = replace(node("router", router=True), variables=variables)
+    (member,), told = read(router)
+    assert member.place == ZENOH
+    assert member.peers == {"router:7447"}
+    assert told == []
+
+
+def test_a_router_beside_nodes_of_dds_does_not_change_their_kind() -> None:
+    variables = {"ROS_DISTRO": "kilted", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
+    (member,), _ = read(replace(node("bridge", router=True), variables=variables))
+    assert member.place != ZENOH
+
+
 @pytest.mark.parametrize(
     ("command", "is_router"),
     [

@@ -5,10 +5,12 @@ The first source that states the version counts:
 1. The label ``rosproxy.ros``.
 2. The variables ROS_VERSION and ROS_DISTRO, which most images with ROS have.
 3. The label ``rosproxy.master-uri`` or the variable ROS_MASTER_URI: ROS 1.
-4. A label or non-empty variable that only ROS 2 has, such as ROS_DOMAIN_ID: ROS 2.
+4. A label or non-empty variable that only ROS 2 has, such as ROS_DOMAIN_ID, or a command that runs
+   a router of zenoh: ROS 2.
 
 Without such a source, the operator assumes ROS 1. The label ``rosproxy.rmw`` or the variable
-RMW_IMPLEMENTATION states that the ROS 2 nodes use rmw_zenoh instead of DDS.
+RMW_IMPLEMENTATION states that the ROS 2 nodes use rmw_zenoh instead of DDS. Without both, a command
+that runs a router of zenoh states that.
 """
 
 import re
@@ -71,7 +73,9 @@ def _has_zenoh(container: Container) -> bool:
     if RMW in labels and labels[RMW].strip().lower() != "zenoh":
         fix = f"Write {RMW}=zenoh, or remove the label: the proxy then serves DDS"
         raise UnusableLabel(f"{named(RMW, labels)} is not zenoh. {fix}")
-    return RMW in labels or not is_dds(container.variables.get("RMW_IMPLEMENTATION", ""))
+    # rmw_zenohd itself does not need the variable.
+    stated = container.variables.get("RMW_IMPLEMENTATION", "")
+    return RMW in labels or (not is_dds(stated) if stated else container.is_zenoh_router)
 
 
 def _ros_versions(container: Container) -> frozenset[str]:
@@ -103,9 +107,9 @@ def _is_marked_ros2(container: Container) -> bool:
     """
     if MASTER_URI in container.labels or container.master_uri:
         return False
-    return any(name in container.labels for name in _ROS2_LABELS) or any(
-        container.variables.get(name) for name in ROS2_VARIABLES
-    )
+    has_label = any(name in container.labels for name in _ROS2_LABELS)
+    has_variable = any(container.variables.get(name) for name in ROS2_VARIABLES)
+    return has_label or has_variable or container.is_zenoh_router
 
 
 def domain(container: Container) -> int:
