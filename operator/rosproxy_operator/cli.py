@@ -27,7 +27,10 @@ from rosproxy.cli.options import (
 from rosproxy.cli.variables import UnknownVariable
 from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy_operator.common.command_errors import exit_on_error, exit_with, fail
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    UNKNOWN_NAME,
+    Problem,
+)
 from rosproxy_operator.common.proxy_options import policy_options, proxy_bound_options
 from rosproxy_operator.docker import commands as docker_commands
 from rosproxy_operator.docker.settings import DEFAULT_ADMIN, PlanSettings, make_plan_settings
@@ -130,7 +133,9 @@ def docker(
         settings, options["admin_bind"], ParameterSource.COMMANDLINE in sources, options["resync"]
     )
     if runs:
-        mistakes = [Problem(f"variable {v.name}", v.text, fatal=False) for v in unknown]
+        mistakes = [
+            Problem(f"variable {v.name}", v.text, False, reason=UNKNOWN_NAME) for v in unknown
+        ]
         _run(settings, options["resync"], options["admin_bind"], once, mistakes)
     elif once:
         raise click.UsageError(

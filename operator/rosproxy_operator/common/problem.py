@@ -2,9 +2,28 @@
 
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 log = logging.getLogger(__name__)
+
+# Reasons of problems (`Problem.reason`) that both engines have.
+CONFLICT = "PortConflict"
+EXHAUSTED = "PortsExhausted"
+FAILED = "OperatorFailed"
+INVALID = "Invalid"
+LAN_RELAY_STUCK = "LanRelayStuck"
+MASTER_UNKNOWN = "MasterUnknown"
+NO_ADVERTISE_HOST = "NoAdvertiseHost"
+NO_LAN_ADDRESS = "NoLanAddress"
+NOT_ADMITTED = "ProxyNotAdmitted"
+NOT_ALLOWED = "NotAllowed"
+NOT_WIRED = "NotWired"
+OPTION_IGNORED = "OptionIgnored"
+REFUSES = "PolicyRefused"
+SILENT = "ProxyUnreachable"
+STUCK = "ProxyStuck"
+TOO_MANY = "TooMany"
+UNKNOWN_NAME = "UnknownName"
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,17 +32,31 @@ class Problem:
 
     ``subject`` names the object: ``container talker``, ``network app``, ``proxy rosproxy-…``.
     ``fatal``: the object does not get what its user wants. Otherwise the problem is a warning.
+    ``reason`` is a CamelCase word for the kind of the problem, for programs: the word stays the
+    same in later releases.
     """
 
     subject: str
     text: str
     fatal: bool = True
+    reason: str = field(kw_only=True)
 
     @property
     def log_fields(self) -> dict[str, str]:
         """The fields of a log entry about the problem, for ``extra``."""
         kind, _, name = self.subject.partition(" ")
-        return {kind: name} if kind in ("container", "pod", "proxy") else {}
+        own = {kind: name} if kind in ("container", "pod", "proxy") else {}
+        return {**own, "reason": self.reason}
+
+
+def ends_again(error: str, command: str) -> str:
+    """Say that the container of a proxy ends again and again. ``command`` prints the log."""
+    return f"the container ends again and again ({error}). Read {command}"
+
+
+def silent(error: str, fix: str) -> str:
+    """Say that a proxy does not answer the operator."""
+    return f"does not answer the operator ({error}). {fix}"
 
 
 def bounded(text: str, most: int) -> str:

@@ -17,6 +17,12 @@ def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str:
     return _nearest(name.lower(), known, cutoff) if len(name) <= longest else ""
 
 
+def unknown_name(shown: str, near: str, known: str) -> str:
+    """Say that a name is unknown. ``near`` is the name that is probably meant, or empty."""
+    fix = f"Did you mean {near}?" if near else f"Known: {known}"
+    return f"{shown} is unknown and ignored. {fix}"
+
+
 @lru_cache(maxsize=1024)
 def _nearest(name: str, known: tuple[str, ...], cutoff: float) -> str:
     """Return the most similar known name. Cached: hundreds of objects have the same few names."""

@@ -31,7 +31,11 @@ from rosproxy_operator.common.master_resolver import UNRESOLVED_RETRY_S, MasterR
 from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_metrics import DockerMetrics
 from rosproxy_operator.common.operator_page import operator_page
-from rosproxy_operator.common.problem import Problem, ProblemLog
+from rosproxy_operator.common.problem import (
+    SILENT,
+    Problem,
+    ProblemLog,
+)
 from rosproxy_operator.common.proxy_client import Json, ProxyClient
 from rosproxy_operator.docker import engine_json
 from rosproxy_operator.docker.engine_client import DockerClient, listen
@@ -291,21 +295,19 @@ class DockerController:
         """Return the fatal problems, also those of silent proxies and of steps that are left."""
         if self._last is None:
             reason = self._loop.unready() or "the operator has not looked at the engine yet"
-            return [Problem("engine", reason)]
+            return [Problem("engine", reason, reason="EngineUnreachable")]
         snapshot, planned = self._last
         problems = [problem for problem in self._current(snapshot, planned) if problem.fatal]
         subjects = {problem.subject for problem in problems}
         problems += [
-            Problem(
-                f"proxy {name}", "does not answer. Read the logs of this container (docker logs)"
-            )
+            Problem(f"proxy {name}", f"does not answer. Read docker logs {name}", reason=SILENT)
             for name in self._silent(planned)
             if f"proxy {name}" not in subjects
         ]
         unfinished = _required(planned) or planned.deferred or snapshot.state.busy
         if unfinished and not problems:
             text = "not all steps were done in time. Run this command again"
-            problems.append(Problem("operator", text))
+            problems.append(Problem("operator", text, reason="StepsLeft"))
         return problems
 
     def _port_taken(self, name: str, port: int | None) -> None:

@@ -16,7 +16,11 @@ from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
 
 from rosproxy.net.tasks import Tasks
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    FAILED,
+    NOT_ADMITTED,
+    Problem,
+)
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker import engine_json
@@ -204,7 +208,9 @@ class Executor:
             problem = next(filter(None, problems), None)
         except Exception as error:  # a fault of the operator: wait as after other failures
             log.exception("work for %s failed", _problem_subject(job))
-            problem = Problem(_problem_subject(job), f"the operator failed: {error!r}")
+            problem = Problem(
+                _problem_subject(job), f"the operator failed: {error!r}", reason=FAILED
+            )
         finally:
             previous = self._failures.pop(job, None)
             if problem is not None:
@@ -234,7 +240,7 @@ class Executor:
                 subject = _problem_subject((group.place, group.subject))
                 text = f"{action}: {error}{fix}"
                 # A later failure may be a consequence of the first. The log has both.
-                problem = problem or Problem(subject, text, group.fatal)
+                problem = problem or Problem(subject, text, group.fatal, reason=NOT_ADMITTED)
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem

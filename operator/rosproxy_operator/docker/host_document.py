@@ -13,7 +13,10 @@ from rosproxy import __version__
 from rosproxy.admin.status_document import ParticipantStatus, ProxyStatus, ZenohNodeStatus
 from rosproxy.net.addresses import parse_host_port, plain_address
 from rosproxy.telemetry.text import brief, listed
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    NOT_WIRED,
+    Problem,
+)
 from rosproxy_operator.common.proxy_client import Json
 from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
 from rosproxy_operator.common.ros2_variables import MOST_VALUE_CHARACTERS, discovery_obstacle
@@ -234,7 +237,7 @@ def _undiscovered(
         reason = discovery_obstacle(container.variables)
         if reason and settled and not participants_by_address(status).keys() & {*addresses}:
             text = "the proxy has discovered no participant of this container. Possible cause: "
-            yield Problem(f"container {container.name}", f"{text}{reason}")
+            yield Problem(f"container {container.name}", f"{text}{reason}", reason=NOT_WIRED)
 
 
 def _unconnected(
@@ -256,6 +259,7 @@ def _unconnected(
                 "no node of this container has connected to the proxy. Possible cause: variable "
                 f"{SESSION_FILE}={brief(file, MOST_VALUE_CHARACTERS)}. The file may name other "
                 "endpoints than tcp/localhost:7447. Unset the variable, or change the file",
+                reason=NOT_WIRED,
             )
 
 

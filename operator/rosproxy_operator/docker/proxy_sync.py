@@ -23,7 +23,12 @@ from collections.abc import Callable, Collection
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.tasks import Tasks
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    REFUSES,
+    SILENT,
+    Problem,
+    silent,
+)
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 from rosproxy_operator.common.proxy_status import Leases, inside_addresses, leases
@@ -270,11 +275,11 @@ def silent_proxy_problem(
 ) -> Problem:
     """Return the problem and the fix for a proxy that does not answer, or answers an error."""
     if isinstance(error, PolicyRefused):
-        return Problem(f"proxy {name}", str(error))
+        return Problem(f"proxy {name}", str(error), reason=REFUSES)
     if error.is_unreachable and not snapshot.at_host:
         advice = (
             f"Attach the operator to network {uplink}, or run the operator with network_mode: host"
         )
     else:
         advice = f"Read docker logs {name}"
-    return Problem(f"proxy {name}", f"admin endpoint {error}. {advice}")
+    return Problem(f"proxy {name}", silent(str(error), advice), reason=SILENT)

@@ -132,7 +132,9 @@ class ClusterApplier:
                 self.problems.pop(name, None)
                 if error is not None:
                     text = f"the operator can't write the status: {error}"
-                    self.problems[name] = Problem(f"rosproxy {name}", text)
+                    self.problems[name] = Problem(
+                        f"rosproxy {name}", text, reason="StatusNotWritten"
+                    )
         # A Normal Event reports that an action was done. An Emit does not name the action, so after
         # any failure the operator makes no Normal Event.
         emits = [action for action in actions if isinstance(action, Emit)]

@@ -21,7 +21,9 @@ from tests.integration.net import NODE, until
 from tests.integration.proxy import Proxy
 
 TOKEN = "0123456789abcdef"
-MISSPELT = Problem("container talker-1", "label x is unknown. Did you mean y?", fatal=False)
+MISSPELT = Problem(
+    "container talker-1", "label x is unknown. Did you mean y?", fatal=False, reason="X"
+)
 
 
 @pytest.fixture

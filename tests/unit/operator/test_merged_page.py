@@ -204,8 +204,10 @@ def test_a_proxy_that_cannot_be_asked_says_why() -> None:
 
 def test_the_operators_own_problems_are_findings() -> None:
     """Fatal problems come first, and the texts are as short as the texts of a proxy."""
-    warning = Problem("container talker", "label x is unknown. Did you mean y?\x1b", fatal=False)
-    fatal = Problem("master robot", "long" * LONGEST_TEXT)
+    warning = Problem(
+        "container talker", "label x is unknown. Did you mean y?\x1b", fatal=False, reason="X"
+    )
+    fatal = Problem("master robot", "long" * LONGEST_TEXT, reason="X")
     findings = merged({"one": shown("a")}, "1", LOGS, {}, [warning, fatal])["findings"]
     assert [(f["severity"], f["subject"], f["fix"]) for f in findings] == [
         ("error", "master robot", ""),
@@ -217,8 +219,10 @@ def test_the_operators_own_problems_are_findings() -> None:
 
 
 def test_proxies_and_the_operator_share_the_room_for_findings() -> None:
-    problems = [Problem(f"container {number}", "x", fatal=False) for number in range(500)]
-    problems.append(Problem("container last", "x"))
+    problems = [
+        Problem(f"container {number}", "x", fatal=False, reason="X") for number in range(500)
+    ]
+    problems.append(Problem("container last", "x", reason="X"))
     documents = {"evil": hostile(), "good": shown("a")}
     findings = merged(documents, "1", LOGS, {}, problems)["findings"]
     assert len(findings) == MOST_FINDINGS
@@ -232,7 +236,10 @@ def test_a_silent_proxy_is_reported_once() -> None:
     """The operator's problem has more to do about the proxy than the reason alone."""
     reason = "10.0.0.1:11312 refuses connections"
     advice = f"admin endpoint {reason}. Attach the operator to network uplink"
-    problems = [Problem("proxy one", advice), Problem("proxy one", "port 11412 is taken")]
+    problems = [
+        Problem("proxy one", advice, reason="X"),
+        Problem("proxy one", "port 11412 is taken", reason="X"),
+    ]
     document = merged({"one": reason}, "1", LOGS, {}, problems)
     assert document["nodes"]["one"]["text"] == f"no data from this proxy: {advice}"
     assert [finding["text"] for finding in document["findings"]] == ["port 11412 is taken"]

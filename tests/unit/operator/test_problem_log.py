@@ -6,8 +6,8 @@ import pytest
 
 from rosproxy_operator.common.problem import Problem, ProblemLog
 
-FATAL = Problem("container talker", "no master is known")
-WARNING = Problem("container talker", "label x is unknown", fatal=False)
+FATAL = Problem("container talker", "no master is known", reason="X")
+WARNING = Problem("container talker", "label x is unknown", fatal=False, reason="X")
 
 
 def test_each_problem_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -25,6 +25,8 @@ def test_each_problem_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_what_a_problem_is_about_is_a_field_of_the_record(caplog: pytest.LogCaptureFixture) -> None:
-    ProblemLog().update([FATAL, Problem("proxy rosproxy-a", "ends"), Problem("uplink", "is gone")])
-    fields = [(vars(r).get("container"), vars(r).get("proxy")) for r in caplog.records]
-    assert fields == [("talker", None), (None, "rosproxy-a"), (None, None)]
+    proxy = Problem("proxy rosproxy-a", "ends", reason="ProxyStuck")
+    ProblemLog().update([FATAL, proxy, Problem("uplink", "is gone", reason="Y")])
+    names = ("container", "proxy", "reason")
+    fields = [tuple(vars(record).get(name) for name in names) for record in caplog.records]
+    assert fields == [("talker", None, "X"), (None, "rosproxy-a", "ProxyStuck"), (None, None, "Y")]

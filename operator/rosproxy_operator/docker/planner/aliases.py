@@ -213,7 +213,7 @@ def _problems(claim: _Claim, common: _Claim | None) -> Iterator[Problem]:
                 f"the nodes look for the proxy by the name {claim.alias}, but "
                 f"{_obstacle(claim, place, fix)}"
             )
-            yield Problem(f"container {member.container.name}", text, fatal=False)
+            yield Problem(f"container {member.container.name}", text, False, reason="NameTaken")
 
 
 def _obstacle(claim: _Claim, place: Place, fix: str) -> str:

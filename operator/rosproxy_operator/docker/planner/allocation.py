@@ -8,6 +8,7 @@ from rosproxy_operator.common.port_ranges import (
     REFUSED_RANGE_KEPT_S,
     FormerRange,
     Move,
+    PortsExhausted,
     RangeRequest,
     advice_after_move,
     assign_ranges,
@@ -16,7 +17,11 @@ from rosproxy_operator.common.port_ranges import (
     new_moves,
     overlap,
 )
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    CONFLICT,
+    EXHAUSTED,
+    Problem,
+)
 from rosproxy_operator.docker.planner.model import SERVING, STARTED, Container, Desired, HostState
 from rosproxy_operator.docker.planner.specs import proxy_name, reserved_ports
 from rosproxy_operator.docker.planner.state import DockerMemory
@@ -136,15 +141,7 @@ def allocate(
     if frozen:
         requests |= {p: replace(requests[p], count=len(ports)) for p, ports in kept.items()}
     ranges, exhausted = assign_ranges(requests, kept)
-    problems = [
-        _problem(
-            place,
-            f"{error}. Lower --ports or the label rosproxy.ports ({error.count}), widen "
-            f"--port-window ({error.window}), or stop programs that hold ports there",
-            fatal=True,
-        )
-        for place, error in exhausted.items()
-    ]
+    problems = [_no_range(place, error) for place, error in exhausted.items()]
     problems += _too_short(requests, ranges, observed.ephemeral)
     if routers:
         ranges[ZENOH] = _router_ports(routers.ports, memory)
@@ -159,8 +156,16 @@ def allocate(
                 f"has left ports {moved[place].ports} for {ports}, since another program or "
                 f"container has taken the old ports. {advice}"
             )
-            problems.append(_problem(place, text))
+            problems.append(_problem(place, text, CONFLICT))
     return replace(memory, served=served, planned=ranges, moved=moved), problems
+
+
+def _no_range(place: Place, error: PortsExhausted) -> Problem:
+    text = (
+        f"{error}. Lower --ports or the label rosproxy.ports ({error.count}), widen "
+        f"--port-window ({error.window}), or stop programs that hold ports there"
+    )
+    return _problem(place, text, EXHAUSTED, fatal=True)
 
 
 def _too_short(
@@ -196,7 +201,7 @@ def _too_short(
             f"has only the {len(ports)} ports {ports}, although --ports or the label "
             f"rosproxy.ports asks for {count}: {why}"
         )
-        yield _problem(place, text)
+        yield _problem(place, text, EXHAUSTED)
 
 
 def _router_ports(count: int, memory: DockerMemory) -> PortRange:
@@ -208,5 +213,5 @@ def _router_ports(count: int, memory: DockerMemory) -> PortRange:
     return PortRange(FIRST_PORT, FIRST_PORT + max(count, len(former) if former else 0) - 1)
 
 
-def _problem(place: Place, text: str, fatal: bool = False) -> Problem:
-    return Problem(f"proxy {proxy_name(place)}", text, fatal)
+def _problem(place: Place, text: str, reason: str, fatal: bool = False) -> Problem:
+    return Problem(f"proxy {proxy_name(place)}", text, fatal, reason=reason)

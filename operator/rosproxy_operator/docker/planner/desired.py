@@ -3,7 +3,10 @@
 from collections.abc import Collection, Iterable, Iterator
 
 from rosproxy.settings import MOST_ZENOH_PORTS
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    OPTION_IGNORED,
+    Problem,
+)
 from rosproxy_operator.common.ros2 import LEAST_PORTS
 from rosproxy_operator.docker.planner.labels.readers import BUILT_IN_NETWORKS
 from rosproxy_operator.docker.planner.model import THIS_HOST, Desired, HostState, Member
@@ -131,6 +134,7 @@ def _refused_network(name: str, uplink: str) -> Problem:
         f"proxies can't join this network: its name sorts before the name of the uplink network "
         f"{uplink}, so the engine would move the published ports of the proxies there. Create the "
         "network under another name, or start the operator with an --uplink that sorts first",
+        reason="NetworkUnusable",
     )
 
 
@@ -143,6 +147,7 @@ def _preferred_network(name: str, uplink: str) -> Problem:
         "connections. Create the network without IPv6, or start the operator with --uplink and the "
         "name of a bridge that has IPv6 and sorts first",
         fatal=False,
+        reason="NetworkUnusable",
     )
 
 
@@ -161,6 +166,7 @@ def _option_warnings(desired: Iterable[Desired]) -> Iterator[Problem]:
                     "directions. Add the label rosproxy.direction=both, or remove the label "
                     "rosproxy.udp",
                     fatal=False,
+                    reason=OPTION_IGNORED,
                 )
             if (asked := member.wishes.get("data_plane", plane)) != plane:
                 yield Problem(
@@ -168,4 +174,5 @@ def _option_warnings(desired: Iterable[Desired]) -> Iterator[Problem]:
                     f"label rosproxy.data-plane={asked} is ignored: the proxy also serves {rival}, "
                     f"whose label asks for {plane}. Give both containers the same value",
                     fatal=False,
+                    reason=OPTION_IGNORED,
                 )

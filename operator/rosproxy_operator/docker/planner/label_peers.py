@@ -11,7 +11,10 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 
 from rosproxy.settings import MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    TOO_MANY,
+    Problem,
+)
 from rosproxy_operator.docker.planner.labels.readers import LINK, PEERS
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.settings import PlanSettings
@@ -79,7 +82,7 @@ def _ignored(
 
 def _problems(ignored: Collection[Member], text: Callable[[Place], str]) -> tuple[Problem, ...]:
     return tuple(
-        Problem(f"container {member.container.name}", text(member.place), fatal=False)
+        Problem(f"container {member.container.name}", text(member.place), False, reason=TOO_MANY)
         for member in ignored
         if member.container.alive
     )

@@ -13,7 +13,11 @@ from msgspec import structs
 from rosproxy.access.layers import LONGEST_LAYER_NAME, MOST_LAYERS, PolicyLayer
 from rosproxy.access.rules import MOST_RULES, format_rules
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.problem import Problem, bounded
+from rosproxy_operator.common.problem import (
+    TOO_MANY,
+    Problem,
+    bounded,
+)
 from rosproxy_operator.docker.planner.labels.readers import POLICY
 from rosproxy_operator.docker.planner.model import Container, HostState, Member
 from rosproxy_operator.docker.planner.network_owner import by_reference, network_owner
@@ -52,7 +56,10 @@ def with_bounded_rules(
     )
     return (
         tuple(member for member in members if member not in refused),
-        tuple(Problem(f"container {member.container.name}", text) for member in refused),
+        tuple(
+            Problem(f"container {member.container.name}", text, reason=TOO_MANY)
+            for member in refused
+        ),
     )
 
 

@@ -12,7 +12,10 @@ from collections.abc import Collection, Iterator
 from msgspec.structs import replace
 
 from rosproxy.net.addresses import HostPort, is_address
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    NO_LAN_ADDRESS,
+    Problem,
+)
 from rosproxy_operator.docker.option_values import NOWHERE
 from rosproxy_operator.docker.planner.actions import (
     Action,
@@ -62,7 +65,7 @@ def missing_lan_relay(place: Place, observed: HostState, settings: PlanSettings)
         "has no LAN relay, since the operator does not know this host's address on the LAN. Start "
         f"the operator with --ros2-lan ADDRESS, or with --ros2-lan {NOWHERE} if peers are enough"
     )
-    return Problem(f"proxy {proxy_name(place)}", text, fatal=False)
+    return Problem(f"proxy {proxy_name(place)}", text, False, reason=NO_LAN_ADDRESS)
 
 
 def _starts(step: Action, sandboxes: Collection[str]) -> bool:

@@ -3,7 +3,13 @@
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    LAN_RELAY_STUCK,
+    MASTER_UNKNOWN,
+    STUCK,
+    Problem,
+    ends_again,
+)
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
@@ -26,7 +32,13 @@ from rosproxy_operator.docker.planner.label_policy import with_bounded_rules
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
 from rosproxy_operator.docker.planner.labels.zenoh import with_bounded_containers
 from rosproxy_operator.docker.planner.lan_relay import missing_lan_relay, with_lan_relay
-from rosproxy_operator.docker.planner.model import Desired, HostState, Member, Proxy
+from rosproxy_operator.docker.planner.model import (
+    Desired,
+    HostState,
+    LanRelayContainer,
+    Member,
+    Proxy,
+)
 from rosproxy_operator.docker.planner.redirect import redirect_steps
 from rosproxy_operator.docker.planner.specs import proxy_name, unresolved_master
 from rosproxy_operator.docker.planner.state import DockerMemory, after_look, with_exited
@@ -163,6 +175,7 @@ def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
             f"proxy image {settings.proxy_image}",
             f"not on this host. Run docker pull {settings.proxy_image}, or in rosproxy's sources "
             f"docker build --target proxy -t {settings.proxy_image} .",
+            reason=STUCK,
         )
     for network in observed.networks:
         if network.name == settings.uplink and (network.internal or network.driver != "bridge"):
@@ -171,6 +184,7 @@ def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
                 "can't be the uplink of the proxies: the uplink must be a bridge, and not "
                 "internal. Remove the network (the operator creates a new one), or name another "
                 "network with --uplink",
+                reason="NetworkUnusable",
             )
     return None
 
@@ -261,10 +275,11 @@ def _container_problems(observed: HostState, live: Collection[Place]) -> Iterato
         name = own.container.name
         if own.place in live and own.container.state == "restarting":
             kind = "proxy" if isinstance(own, Proxy) else "container"  # a sandbox, or a LAN relay
-            text = f"the container has ended and restarts. Read docker logs {name}"
-            yield Problem(f"{kind} {name}", text)
+            reason = LAN_RELAY_STUCK if isinstance(own, LanRelayContainer) else STUCK
+            text = ends_again("the engine restarts it", f"docker logs {name}")
+            yield Problem(f"{kind} {name}", text, reason is STUCK, reason=reason)
     for host in sorted(host for host, address in observed.masters.items() if not address):
-        yield Problem(f"master {host}", unresolved_master(host))
+        yield Problem(f"master {host}", unresolved_master(host), reason=MASTER_UNKNOWN)
 
 
 def _seconds_to_changes(

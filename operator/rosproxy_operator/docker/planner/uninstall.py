@@ -17,7 +17,10 @@ removal then stops with a problem.
 from collections.abc import Iterator
 
 from rosproxy.telemetry.text import listed
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    STUCK,
+    Problem,
+)
 from rosproxy_operator.docker.planner.actions import RemoveNetwork
 from rosproxy_operator.docker.planner.container_steps import removal_steps
 from rosproxy_operator.docker.planner.labels.members import LabelReading
@@ -64,6 +67,7 @@ def _other_operator(observed: HostState, first: frozenset[str]) -> Problem | Non
         f"another operator is running on this host, and has created {listed(new)} meanwhile. Stop "
         "that operator (docker rm -f rosproxy-operator, or docker compose stop operator), then run "
         "uninstall again",
+        reason="OtherOperator",
     )
 
 
@@ -92,6 +96,7 @@ def _remaining(observed: HostState, settings: PlanSettings) -> Iterator[Problem]
                 f"network {network.name}",
                 f"not removed, since containers are on this network: {listed(guests)}. Run docker "
                 f"network disconnect {network.name} {guests[0]}, then run uninstall again",
+                reason="NetworkInUse",
             )
     if observed.redirects and not observed.image_id:
         names = {container.id: container.name for container in observed.containers}
@@ -101,6 +106,7 @@ def _remaining(observed: HostState, settings: PlanSettings) -> Iterator[Problem]
             "not on this host. The operator needs the image to remove the redirects in the networks"
             f" of {listed(sorted({names.get(owner, owner[:12]) for owner in owners}))}. Run docker "
             f"pull {settings.proxy_image}, then run uninstall again",
+            reason=STUCK,
         )
 
 

@@ -22,6 +22,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.setting_kinds import read_peer, read_site_link
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.port_ranges import within
+from rosproxy_operator.common.problem import NOT_ALLOWED
 from rosproxy_operator.kubernetes.resources.checks import quoted
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.model import (
@@ -35,7 +36,6 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.names import ALLOW_FROM
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 
-NOT_ALLOWED = "NotAllowed"
 Consents = Mapping[Name, frozenset[str]]
 """The other namespaces whose RosProxies may name a master's Service, by that Service."""
 MOST_PATTERNS = 5

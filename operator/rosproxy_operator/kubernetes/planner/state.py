@@ -21,6 +21,7 @@ from rosproxy_operator.common.port_ranges import (
     new_moves,
     overlap,
 )
+from rosproxy_operator.common.problem import CONFLICT
 from rosproxy_operator.kubernetes.planner.cluster_view import View, has_ports, place_of, serves
 from rosproxy_operator.kubernetes.planner.former_ports import FormerPorts, remember
 from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
@@ -136,7 +137,7 @@ def moves(
                     why = f"the old ports are taken, or the RosProxy no longer allows them. {lost}"
                 change = f"has left ports {move.ports} for {ranges[place]}"
                 text = f"the proxy on node {place.node} {change}, since {why}"
-                yield finding(rosproxy, "PortConflict", text)
+                yield finding(rosproxy, CONFLICT, text)
 
 
 def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:

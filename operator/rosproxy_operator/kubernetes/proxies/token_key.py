@@ -91,7 +91,7 @@ class TokenKey:
         )
         if isinstance(error, ApiNotFound):
             text += ". Create an empty Secret of this name (the chart does so)"
-        self.problems = (Problem("proxies' tokens", text),)
+        self.problems = (Problem("proxies' tokens", text, reason="KeyNotStored"),)
 
 
 def _read(secret: Json) -> bytes:

@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Literal, NamedTuple
 
 from rosproxy.telemetry.text import clean, shorten
-from rosproxy_operator.common.spelling import LEAST_SIMILARITY, nearest
+from rosproxy_operator.common.spelling import LEAST_SIMILARITY, nearest, unknown_name
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.checks import texts_at
 from rosproxy_operator.kubernetes.resources.model import Json
@@ -75,7 +75,7 @@ def _texts(metadata: Json, kind: Kind) -> Iterator[str]:
             if named:
                 yield f"{shown} is ignored here. The operator reads only {named}"
             elif _is_ours(name) or nearest(name, tuple(_BY_NAME), LEAST_SIMILARITY):
-                yield f"{shown} is unknown and ignored. {_suggestion(name, kind)}"
+                yield unknown_name(shown, *_suggestion(name, kind))
 
 
 def _is_ours(name: str) -> bool:
@@ -83,10 +83,10 @@ def _is_ours(name: str) -> bool:
     return name.lower().startswith(_PREFIXES)
 
 
-def _suggestion(name: str, kind: Kind) -> str:
+def _suggestion(name: str, kind: Kind) -> tuple[str, str]:
+    """Return the name that is probably meant, or an empty text, and all names of the kind."""
     # Only the part after the prefix is compared, because all names have the same prefix.
     _, slash, last = name.rpartition("/")
     near = nearest(last if slash else name.partition(".")[2], tuple(_BY_END), _LEAST_END_SIMILARITY)
-    if near:
-        return f"Did you mean {_BY_END[near]}?"
-    return f"Known: {' and '.join(str(named) for named in _NAMES_FOR_USERS if named.kind == kind)}"
+    known = " and ".join(str(named) for named in _NAMES_FOR_USERS if named.kind == kind)
+    return str(_BY_END[near]) if near else "", known

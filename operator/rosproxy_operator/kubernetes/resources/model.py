@@ -10,7 +10,10 @@ import msgspec
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    INVALID,
+    Problem,
+)
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec
 
 Json = Mapping[str, Any]
@@ -310,11 +313,9 @@ class Reference(msgspec.Struct, frozen=True):
 class ClusterFinding(Problem):
     """A problem that conditions and Kubernetes Events report.
 
-    ``of`` is the RosProxy. ``reason`` is a CamelCase word. ``about`` is the object of the Event;
-    None: no Event.
+    ``of`` is the RosProxy. ``about`` is the object of the Event; None: no Event.
     """
 
-    reason: str
     of: Name
     about: Reference | None = None
 
@@ -330,4 +331,4 @@ class InvalidRosProxy(msgspec.Struct, frozen=True):
     generation: int
     text: str
     status: Json = {}
-    reason: str = "Invalid"
+    reason: str = INVALID

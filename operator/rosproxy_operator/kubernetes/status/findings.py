@@ -7,7 +7,17 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from rosproxy.admin.setup_rules import RANGE
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.common.problem import (
+    CONFLICT,
+    LAN_RELAY_STUCK,
+    NOT_ADMITTED,
+    REFUSES,
+    SILENT,
+    STUCK,
+    bounded,
+    ends_again,
+    silent,
+)
 from rosproxy_operator.kubernetes.resources.cluster import (
     HelperPod,
     PodFailure,
@@ -31,18 +41,12 @@ from rosproxy_operator.kubernetes.status.refusal_fixes import (
     scheduling_fix,
 )
 
-# Reasons of findings, and of the conditions that repeat the findings.
-NOT_ADMITTED = "ProxyNotAdmitted"
-CONFLICT = "PortConflict"
-EXHAUSTED = "PortsExhausted"
-STUCK = "ProxyStuck"
-SILENT = "ProxyUnreachable"
+# Reasons of findings, and of the conditions that repeat the findings, beside the common reasons.
 NO_MASTER = "MasterUnreachable"
 NO_WAY_IN = "PortsUnreachable"
 NO_PEER = "PeerUnreachable"
 NO_SITE = "SiteUnreachable"
 WARNS = "ProxyWarns"
-REFUSES = "PolicyRefused"
 _MOST_TEXT_CHARACTERS = 600
 _OF_ZENOH = {
     "zenoh peer ": NO_PEER,
@@ -137,8 +141,9 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: PodFailure) -> ClusterFin
         f"{scheduling_fix(error)}. Read {command}",
         PodFailure.IMAGE: f"the node can't get the image {proxy.image} ({error}). "
         + image_fix(error),
-        PodFailure.CRASHING: f"the proxy's container ends again and again ({error}). "
-        f"Read kubectl -n {id.namespace} logs --previous {id.name}",
+        PodFailure.CRASHING: ends_again(
+            error, f"kubectl -n {id.namespace} logs --previous {id.name}"
+        ),
         PodFailure.SANDBOX: f"the node can't start the pod ({error}). Read {command}",
     }
     reason = CONFLICT if cause is PodFailure.PORTS else STUCK
@@ -172,7 +177,7 @@ def _lan_relay_stuck(rosproxy: RosProxy, lan_relay: HelperPod) -> ClusterFinding
         f"the proxy. Read kubectl -n {id.namespace} describe pod {id.name}"
     )
     subject = f"LAN relay {id.name} on node {lan_relay.node}"
-    return finding(rosproxy, "LanRelayStuck", bounded(text, _MOST_TEXT_CHARACTERS), subject=subject)
+    return finding(rosproxy, LAN_RELAY_STUCK, bounded(text, _MOST_TEXT_CHARACTERS), subject=subject)
 
 
 def _answered(
@@ -185,12 +190,12 @@ def _answered(
         return
     if not answer.answered:
         if proxy.ready:
-            text = (
-                f"does not answer the operator ({answer.error}). Allow connections from the "
-                f"operator's pods to port {ADMIN_PORT} of this pod (NetworkPolicy)"
+            fix = (
+                "Allow connections from the operator's pods to port "
+                f"{ADMIN_PORT} of this pod (NetworkPolicy)"
             )
             # No Event: an operator that reaches no proxy would create an Event for each proxy.
-            yield ClusterFinding(subject, text, reason=SILENT, of=rosproxy.id)
+            yield ClusterFinding(subject, silent(answer.error, fix), reason=SILENT, of=rosproxy.id)
         return
     if answer.refusal:
         yield _finding(rosproxy, subject, answer.refusal, REFUSES)

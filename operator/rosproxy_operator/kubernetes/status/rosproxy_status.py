@@ -8,7 +8,7 @@ import msgspec
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.telemetry.text import brief, plural, shorten
-from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.common.problem import CONFLICT, EXHAUSTED, bounded
 from rosproxy_operator.common.zenoh import OVERRIDE, client_override, tcp_endpoint
 from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
 from rosproxy_operator.kubernetes.resources.cluster import (
@@ -34,8 +34,6 @@ from rosproxy_operator.kubernetes.resources.names import (
     router_of,
 )
 from rosproxy_operator.kubernetes.status.findings import (
-    CONFLICT,
-    EXHAUSTED,
     NO_MASTER,
     NO_PEER,
     NO_SITE,

@@ -8,7 +8,11 @@ from datetime import datetime
 from pathlib import Path
 
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
-from rosproxy_operator.common.problem import Problem, ProblemLog
+from rosproxy_operator.common.problem import (
+    FAILED,
+    Problem,
+    ProblemLog,
+)
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import (
     WEBHOOKS,
@@ -38,6 +42,7 @@ CA_TRUST_DELAY_S = 10.0
 API servers learn of the CA by a watch.
 """
 _SUBJECT = "webhook"
+_REASON = "CertificateFailed"
 
 
 class CertificateDirectory:
@@ -181,7 +186,7 @@ class SelfSigned:
         text = f"Secret {self._secret}: {error}. The certificate is in memory only"
         if isinstance(error, ApiNotFound):
             text += ". Create an empty Secret of this name (the chart does so)"
-        self.problems.append(Problem(_SUBJECT, text))
+        self.problems.append(Problem(_SUBJECT, text, reason=_REASON))
 
     def _read(self, secret: Json) -> KeyPair | None:
         data = texts_at(secret, "data")
@@ -218,7 +223,7 @@ class SelfSigned:
             if isinstance(error, ApiNotFound):
                 text += ". Without this object no pod is wired. Install the chart again"
             if not isinstance(error, ApiUnavailable):
-                self.problems.append(Problem(_SUBJECT, text))
+                self.problems.append(Problem(_SUBJECT, text, reason=_REASON))
             return False
         return True
 
@@ -268,13 +273,12 @@ class CertificateRotation:
             not_made_yet = True
             problems = [*self._source.problems]
         except (ApiError, InvalidCertificate) as error:
-            problems = [
-                Problem(_SUBJECT, f"the operator could not read or renew the certificate: {error}")
-            ]
+            text = f"the operator could not read or renew the certificate: {error}"
+            problems = [Problem(_SUBJECT, text, reason=_REASON)]
         except Exception as error:  # a bug of ours must not end the checks
             text = "webhook certificate not checked by an internal error, the operator tries again"
             log.exception(text)
-            problems = [Problem(_SUBJECT, f"the operator failed: {error!r}")]
+            problems = [Problem(_SUBJECT, f"the operator failed: {error!r}", reason=FAILED)]
         else:
             problems = [*self._source.problems]
             if pair != self.pair:

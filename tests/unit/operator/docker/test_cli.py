@@ -146,11 +146,13 @@ def test_a_misspelt_variable_is_told_with_the_one_that_was_meant(
         "rosproxy_operator.docker.controller.run", lambda *given: told.extend(given[-1])
     )
     run("docker", ROSPROXY_PORT_WINDO="12000-12999", ROSPROXY_PORT_RANGE="11000-11009")
-    assert told == [Problem("variable ROSPROXY_PORT_WINDO", misspelt, fatal=False)]
+    assert told == [
+        Problem("variable ROSPROXY_PORT_WINDO", misspelt, fatal=False, reason="UnknownName")
+    ]
 
 
 def test_uninstall_says_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    problems = [Problem("network 0-rosproxy", "stays")]
+    problems = [Problem("network 0-rosproxy", "stays", reason="X")]
     monkeypatch.setattr("rosproxy_operator.docker.host_status.ask_operators", lambda _: None)
     monkeypatch.setattr("rosproxy_operator.docker.controller.uninstall", lambda *_: problems)
     result = run("docker", "uninstall")
@@ -206,7 +208,7 @@ def test_once_is_for_the_controller_itself() -> None:
 
 
 def test_a_problem_with_an_odd_name_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    problems = [Problem("container a\nforged", "\x1b[2J is no port")]
+    problems = [Problem("container a\nforged", "\x1b[2J is no port", reason="X")]
     monkeypatch.setattr("rosproxy_operator.docker.controller.run_once", lambda *_: problems)
     result = run("docker", "--once")
     assert result.exit_code == 1

@@ -316,7 +316,7 @@ async def test_the_page_tells_of_a_proxy_that_has_ended(
 
 async def test_the_page_tells_of_problems_of_the_operator(engine: FakeEngine) -> None:
     """An unknown variable, and a container with an unknown label."""
-    mistake = Problem("variable ROSPROXY_X", "unknown", fatal=False)
+    mistake = Problem("variable ROSPROXY_X", "unknown", fatal=False, reason="X")
     controller = DockerController(SETTINGS, 30.0, DockerMetrics(), mistakes=[mistake])
     assert controller.problems() == []
     row = captured.running() | {"Id": "c" * 64, "Names": ["/odd"]}

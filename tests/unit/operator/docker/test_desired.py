@@ -203,6 +203,7 @@ def test_who_looks_for_the_masters_name_then_is_told() -> None:
             "to container robot. So the nodes bypass the proxy. Set "
             "ROS_MASTER_URI=http://rosproxy:11311",
             fatal=False,
+            reason="NameTaken",
         ),
     )
 

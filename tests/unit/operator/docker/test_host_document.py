@@ -115,7 +115,7 @@ def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) 
     own = replace(running.container, name="p", started_at=STARTED_AT)
     state = observed(proxies=[replace(running, container=own)])
     made = planned(state, SETTINGS, DockerMemory(), 0.0)
-    silence = Problem("proxy p", "admin endpoint refuses connections")
+    silence = Problem("proxy p", "admin endpoint refuses connections", reason="X")
     document = host_document(state, made, (), {"p": silence}, SETTINGS, STARTED + age)
     told = [problem["text"] for problem in document["problems"]]
     assert (silence.text in told) is is_told

@@ -168,7 +168,7 @@ def test_an_unknown_label_and_the_nearest_right_one(name: str, near: str) -> Non
 
 def test_an_unknown_label_that_is_near_to_none() -> None:
     text = warning(container(labels={**ENABLED, "rosproxy.colour-scheme": "1"}))
-    assert "Known labels: rosproxy.enable, rosproxy.master-uri, rosproxy.ports," in text
+    assert "Known: rosproxy.enable, rosproxy.master-uri, rosproxy.ports," in text
 
 
 @pytest.mark.parametrize("name", ["rosproxy-test", "rosproxy-version", "rosproxy", "com.rosproxy"])

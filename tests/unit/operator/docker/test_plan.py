@@ -8,6 +8,7 @@ from msgspec import structs
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.port_ranges import Move
+from rosproxy_operator.common.problem import ends_again
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
@@ -231,7 +232,7 @@ def test_a_sandbox_on_a_network_that_was_made_anew_is_made_anew(network_id: str)
             [sandbox(state="restarting", networks=())],
             [],
             None,
-            [f"the container has ended and restarts. Read docker logs {PORTS}"],
+            [ends_again("the engine restarts it", f"docker logs {PORTS}")],
         ),
         ([sandbox(state="removing"), proxy()], [], 1.0, []),
         ([sandbox(state="dead")], [Remove(PORTS, "left over"), *FIRST], None, []),

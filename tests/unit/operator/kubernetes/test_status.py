@@ -147,7 +147,7 @@ def test_a_node_tells_first_why_its_proxy_is_stuck():
     )
     node = state(proxy=stuck, answer=None, lan_relay=relay, image_check=check)
     (line,) = status(node)["perNode"]
-    assert "the proxy's container ends again and again" in line["message"]
+    assert "the container ends again and again" in line["message"]
 
 
 def test_the_wide_output_tells_the_first_problem_of_a_rosproxy_that_is_ready():

@@ -5,12 +5,22 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 from rosproxy.telemetry.text import listed
-from rosproxy_operator.common.problem import Problem, bounded
+from rosproxy_operator.common.problem import (
+    MASTER_UNKNOWN,
+    NO_ADVERTISE_HOST,
+    NOT_ALLOWED,
+    NOT_WIRED,
+    OPTION_IGNORED,
+    UNKNOWN_NAME,
+    Problem,
+    bounded,
+)
 from rosproxy_operator.common.ros2 import read_peer_name
 from rosproxy_operator.common.spelling import (
     LEAST_SIMILARITY,
     LEAST_SIMILARITY_WITH_PREFIX,
     nearest,
+    unknown_name,
 )
 from rosproxy_operator.docker.planner.labels import bounds, readers, ros_versions
 from rosproxy_operator.docker.planner.labels.own_address import wrong_own_address
@@ -67,17 +77,17 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
     for container in sorted(observed.containers, key=lambda c: (c.name, c.id)):
         if container.state not in _READ_STATES:
             continue
-        wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
+        wrong = [*_warnings(container, settings)]
         try:
             if _is_enabled(container, settings):
-                granted, texts = _requests(container, observed, settings, proxies)
+                granted, warnings = _requests(container, observed, settings, proxies)
                 requests += granted
-                wrong += [_problem(container, text, False) for text in texts]
+                wrong += warnings
         except UnusableLabel as error:
-            wrong.append(_unusable(container, str(error)))
+            wrong.append(_unusable(container, str(error), error.reason))
         problems += wrong if container.alive else []
     shared = peers_of_one_router(requests, observed)
-    problems += (_problem(container, text, False) for container, text in shared)
+    problems += (_warning(container, NOT_WIRED, text) for container, text in shared)
     return LabelReading(tuple(requests), tuple(problems))
 
 
@@ -110,11 +120,11 @@ def find_members(
             texts = [text]
             if isinstance(place.graph, Master):
                 texts.append(wrong_own_address(container, place, observed))
-            wrong = [_problem(container, text, False) for text in texts if text]
+            wrong = [_warning(container, NOT_WIRED, text) for text in texts if text]
             members.append(member)
         else:
-            text = _why_no_host(place, observed)
-            wrong = [_unusable(container, text)]
+            text, reason = _why_no_host(place, observed)
+            wrong = [_unusable(container, text, reason)]
         problems += wrong if container.alive else []
     return tuple(members), tuple(problems)
 
@@ -157,8 +167,8 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
     return request, text
 
 
-def _why_no_host(place: Place, observed: HostState) -> str:
-    """Return why the advertised host is unknown, and the fix.
+def _why_no_host(place: Place, observed: HostState) -> tuple[str, str]:
+    """Return why the advertised host is unknown, with the fix, and the reason of the problem.
 
     The address of the Docker host depends on the route to the master. So an unknown address of the
     master is the first cause.
@@ -167,17 +177,17 @@ def _why_no_host(place: Place, observed: HostState) -> str:
     if isinstance(place.graph, Master):
         host = place.graph.host
         if observed.masters.get(host.lower()) == "":
-            return f"no address of the master: {unresolved_master(host)}"
+            return f"no address of the master: {unresolved_master(host)}", MASTER_UNKNOWN
         towards = f" towards the {place.graph}"
     return (
         f"the operator does not know this host's address{towards}. Add the label "
         f"{ADVERTISE_HOST}=ADDRESS, or start the operator with --advertise-host ADDRESS"
-    )
+    ), NO_ADVERTISE_HOST
 
 
 def _requests(
     container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
-) -> tuple[list[Member], list[str]]:
+) -> tuple[list[Member], list[Problem]]:
     """Return a member for each ROS version of a container, within the bounds, and warnings.
 
     Raises UnusableLabel.
@@ -189,17 +199,20 @@ def _requests(
         _request(version, container, observed, settings, proxies) for version in versions_with_range
     ]
     granted = [bounds.narrowed(r, settings) for r in requests]
-    warnings = [*ros_versions.warnings(container, served)]
+    texts = [*ros_versions.warnings(container, served)]
     for request in requests:
         if isinstance(request.place.graph, Domain):
-            warnings += ros_versions.static_peer_warnings(container, request.networks, observed)
-    warnings += dict.fromkeys(text for _, texts in granted for text in texts)
+            texts += ros_versions.static_peer_warnings(container, request.networks, observed)
+    refused = dict.fromkeys(text for _, refusals in granted for text in refusals)
     members = [request for request, _ in granted]
     if "zenoh" in served:
-        member, texts = zenoh_member(container, observed, settings)
+        member, warnings = zenoh_member(container, observed, settings)
         members.append(member)
-        warnings += texts
-    return members, warnings
+        texts += warnings
+    return members, [
+        *(_warning(container, OPTION_IGNORED, text) for text in texts),
+        *(_warning(container, NOT_ALLOWED, text) for text in refused),
+    ]
 
 
 def _request(
@@ -244,13 +257,14 @@ def _master_uri(container: Container, settings: PlanSettings, proxies: Collectio
         ) from None
 
 
-def _problem(container: Container, text: str, fatal: bool) -> Problem:
-    return Problem(f"container {container.name}", text, fatal)
+def _warning(container: Container, reason: str, text: str) -> Problem:
+    return Problem(f"container {container.name}", text, fatal=False, reason=reason)
 
 
-def _unusable(container: Container, text: str) -> Problem:
+def _unusable(container: Container, text: str, reason: str) -> Problem:
     """Return a problem, fatal if a label is for the operator: a variable alone is no request."""
-    return _problem(container, text, fatal=bool(_labels_for_operator(container)))
+    fatal = bool(_labels_for_operator(container))
+    return Problem(f"container {container.name}", text, fatal, reason=reason)
 
 
 def _is_enabled(container: Container, settings: PlanSettings) -> bool:
@@ -283,18 +297,23 @@ def _labels_for_operator(container: Container) -> list[str]:
     return sorted({*prefixed, *near})
 
 
-def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
+def _warnings(container: Container, settings: PlanSettings) -> Iterator[Problem]:
+    """Yield warnings about labels without effect."""
     if container.forged:
-        yield (
+        yield _warning(
+            container,
+            OPTION_IGNORED,
             f"has the labels of the operator's own containers, but {container.forged}. An image "
             "can carry such labels, so the operator ignores them. Remove the container (docker rm "
-            f"-f {container.name}) or the labels"
+            f"-f {container.name}) or the labels",
         )
     elif container.labels.get(MANAGED) == "true":
-        yield (
+        yield _warning(
+            container,
+            OPTION_IGNORED,
             f"has the label {MANAGED}, but not the other labels of the operator's own containers, "
             "so the operator ignores this label. Remove the container (docker rm -f "
-            f"{container.name}) or the label"
+            f"{container.name}) or the label",
         )
     own = _labels_for_operator(container)
     if container.labels.get(ENABLE, "").strip().lower() == "false":
@@ -303,16 +322,18 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
     reported = unknown[:MOST_UNKNOWN_LABELS]
     for name in reported:
         near = nearest(name, LABELS, LEAST_SIMILARITY_WITH_PREFIX)
-        fix = f"Did you mean {near}?" if near else f"Known labels: {', '.join(LABELS)}"
-        yield f"label {bounded(name, MOST_NAME_CHARACTERS)} is unknown and ignored. {fix}"
+        shown = f"label {bounded(name, MOST_NAME_CHARACTERS)}"
+        yield _warning(container, UNKNOWN_NAME, unknown_name(shown, near, ", ".join(LABELS)))
     if left_out := len(unknown) - len(reported):
-        yield f"{left_out} more labels {_PREFIX}.… are unknown and ignored. Remove these labels"
+        text = f"{left_out} more labels {_PREFIX}.… are unknown and ignored. Remove these labels"
+        yield _warning(container, UNKNOWN_NAME, text)
     misspelt = any(
         nearest(name, LABELS, LEAST_SIMILARITY_WITH_PREFIX) == ENABLE for name in reported
     )  # warned of above
     if own and not misspelt and ENABLE not in container.labels and not settings.expose_by_default:
         names = listed(f"label {bounded(name, MOST_NAME_CHARACTERS)}" for name in own)
-        yield f"{names} ignored, since the label {ENABLE}=true is missing. Add that label"
+        text = f"{names} ignored, since the label {ENABLE}=true is missing. Add that label"
+        yield _warning(container, OPTION_IGNORED, text)
 
 
 def _advertised(request: Member, observed: HostState) -> str:

@@ -12,7 +12,12 @@ from rosproxy.access.rules import Rule, parse_rules
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.settings import MOST_ZENOH_LINKS
-from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.common.problem import (
+    INVALID,
+    MASTER_UNKNOWN,
+    NOT_ALLOWED,
+    bounded,
+)
 from rosproxy_operator.common.ros2 import MOST_PEERS
 from rosproxy_operator.common.zenoh import read_link_name
 from rosproxy_operator.docker.option_values import MOST_PORTS
@@ -62,9 +67,19 @@ Peer = TypeVar("Peer")
 class UnusableLabel(Exception):
     """A container gets no proxy. The message says what is wrong, and what to do."""
 
+    reason = INVALID
+
 
 class NoMaster(UnusableLabel):
     """Neither the container nor the operator names a master."""
+
+    reason = MASTER_UNKNOWN
+
+
+class MasterNotAllowed(UnusableLabel):
+    """The administrator does not allow the master of a container."""
+
+    reason = NOT_ALLOWED
 
 
 def quoted(value: str) -> str:
@@ -376,7 +391,7 @@ def _allowed_master(source: str, uri: str, settings: PlanSettings, proxies: Coll
     """
     parsed = _parse_master(source, uri, proxies)
     if refusal := bounds.refused_master(parsed, settings):
-        raise UnusableLabel(f"{source} {refusal}")
+        raise MasterNotAllowed(f"{source} {refusal}")
     return parsed
 
 

@@ -15,7 +15,10 @@ from rosproxy.setting_kinds import read_zenoh_peer
 from rosproxy.settings import MOST_ZENOH_PORTS
 from rosproxy.telemetry.text import listed
 from rosproxy.zenoh.policy.name_sets import check_layers
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import (
+    TOO_MANY,
+    Problem,
+)
 from rosproxy_operator.common.zenoh import (
     OVERRIDE,
     SESSION_FILE,
@@ -204,7 +207,11 @@ def with_bounded_containers(
         f"a proxy for rmw_zenoh serves at most {MOST_ZENOH_PORTS} containers. Remove labels "
         f"{readers.ENABLE} of other containers"
     )
-    problems = (Problem(f"container {m.container.name}", text) for m in excess if m.container.alive)
+    problems = (
+        Problem(f"container {m.container.name}", text, reason=TOO_MANY)
+        for m in excess
+        if m.container.alive
+    )
     return tuple(member for member in every if member not in excess), tuple(problems)
 
 

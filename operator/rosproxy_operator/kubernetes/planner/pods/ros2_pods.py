@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 
 from rosproxy.telemetry.text import clean
+from rosproxy_operator.common.problem import NOT_WIRED
 from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
     UNKNOWN_WEBHOOK,
@@ -48,9 +49,9 @@ def ros2_findings(
         p for c in pod.containers for p in _problems(c, pod, rosproxy, address)
     )
     if (text := _peers_problem(pod, rosproxy, address, webhook)) and not any(
-        r == "NotWired" for r, _ in problems
+        r == NOT_WIRED for r, _ in problems
     ):
-        problems["NotWired", text] = None
+        problems[NOT_WIRED, text] = None
     for reason, text in problems:
         yield pod_finding(pod, rosproxy, reason, text, fatal=False)
 
@@ -87,7 +88,7 @@ def _problems(
     ):
         text = f"variable ROS_STATIC_PEERS={_shown(peers)} of the template does not name the proxy"
         fix = f"Remove the variable from the template, or add {address} to the variable"
-        yield "NotWired", f"{text}. {fix}"
+        yield NOT_WIRED, f"{text}. {fix}"
     domain = get("ROS_DOMAIN_ID")
     number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
     # rcl treats an empty variable as unset (rcl, domain_id.c), and the webhook keeps the variable.

@@ -7,6 +7,7 @@ an Event. If the namespace has RosProxies, the status of the first also reports 
 from collections.abc import Iterator, Mapping
 from heapq import nsmallest
 
+from rosproxy_operator.common.problem import NOT_WIRED
 from rosproxy_operator.kubernetes.planner.cluster_view import View, group_by_key
 from rosproxy_operator.kubernetes.planner.pods.selection import why_not_selected
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Name, Reference
@@ -35,7 +36,7 @@ def unselected_findings(
             about = Reference("Pod", pod.id, pod.uid)
             text = why_not_selected(pod, rosproxies)
             yield ClusterFinding(
-                f"pod {pod.id}", text, fatal=False, reason="NotWired", of=of, about=about
+                f"pod {pod.id}", text, fatal=False, reason=NOT_WIRED, of=of, about=about
             )
 
 

@@ -16,6 +16,7 @@ import msgspec
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
+from rosproxy_operator.common.problem import NOT_WIRED
 from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.common.zenoh import OVERRIDE, tcp_endpoint, with_client_override
 from rosproxy_operator.kubernetes.resources import objects
@@ -162,7 +163,7 @@ def wiring_finding(
     ``cluster_ip`` is the address of the RosProxy's Service.
     """
     text = _why_not_wired(pod, rosproxy, cluster_ip, webhook)
-    return pod_finding(pod, rosproxy, "NotWired", text, fatal=False) if text else None
+    return pod_finding(pod, rosproxy, NOT_WIRED, text, fatal=False) if text else None
 
 
 def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:

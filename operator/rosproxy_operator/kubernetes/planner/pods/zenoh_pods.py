@@ -7,6 +7,7 @@ does not see variables that the image sets.
 from collections.abc import Iterator
 
 from rosproxy.telemetry.text import clean
+from rosproxy_operator.common.problem import NOT_WIRED
 from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, is_client, tcp_endpoint
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
     UNKNOWN_WEBHOOK,
@@ -37,8 +38,8 @@ def zenoh_findings(
         return
     found = dict.fromkeys(p for c in pod.containers for p in _problems(c, pod, rosproxy, address))
     text = _wiring_problem(pod, rosproxy, address, webhook)
-    if text and not any(reason == "NotWired" for reason, _ in found):
-        found["NotWired", text] = None
+    if text and not any(reason == NOT_WIRED for reason, _ in found):
+        found[NOT_WIRED, text] = None
     for reason, text in found:
         yield pod_finding(pod, rosproxy, reason, text, fatal=False)
 
@@ -76,11 +77,11 @@ def _problems(
     if not _leads_to_proxy(override, rosproxy, address, pod.router_endpoint):
         text = f"variable {OVERRIDE} of the template connects the nodes past the proxy"
         fix = "Remove mode and connect/endpoints from the variable, and name routers outside in "
-        yield "NotWired", f"{text}. {edit_fix(f'{fix}spec.peers', pod)}"
+        yield NOT_WIRED, f"{text}. {edit_fix(f'{fix}spec.peers', pod)}"
     elif not is_client(override):
         text = f"variable {OVERRIDE} of the template makes the nodes peers of the proxy's router, "
         text += "which passes no messages between two peers"
-        yield "NotWired", f"{text}. {edit_fix('Add mode=client to the variable', pod)}"
+        yield NOT_WIRED, f"{text}. {edit_fix('Add mode=client to the variable', pod)}"
 
 
 def _leads_to_proxy(override: str, rosproxy: RosProxy, address: str, wired: str) -> bool:

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import hash_token
 from rosproxy.settings import MOST_ZENOH_HUBS
+from rosproxy_operator.common.problem import EXHAUSTED, MASTER_UNKNOWN, NO_ADVERTISE_HOST
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
 from rosproxy_operator.kubernetes.planner.cluster_view import View
 from rosproxy_operator.kubernetes.planner.manifests import TERMINATION_GRACE_S, ProxySite
@@ -166,7 +167,7 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
         return Obstacle("NodeNotReady", f"{text} kubectl describe node {node.name}")
     master, problem = master_of(rosproxy, context.observed)
     if master is None:
-        return Obstacle("MasterUnknown", problem)
+        return Obstacle(MASTER_UNKNOWN, problem)
     host, problem = advertise_host(rosproxy, node)
     if rosproxy.spec.ros2 and ":" in host:
         problem = (
@@ -175,9 +176,9 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
             f"{node.name} rosproxy.io/advertise-host=ADDRESS"
         )
     if problem:
-        return Obstacle("NoAdvertiseHost", problem)
+        return Obstacle(NO_ADVERTISE_HOST, problem)
     if place in context.ranges.exhausted:
-        return Obstacle("PortsExhausted", context.ranges.exhausted[place])
+        return Obstacle(EXHAUSTED, context.ranges.exhausted[place])
     name = proxy_id(place.of, place.node)
     if name in context.view.other_pod_names:
         text = f"a pod {name} exists already that {NOT_OURS}"
