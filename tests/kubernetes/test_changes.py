@@ -11,6 +11,7 @@ from tests.kubernetes.measured import note
 from tests.kubernetes.pods import INJECT, Namespace, unique
 from tests.kubernetes.robot import Robot, robot_with_master
 from tests.kubernetes.rosproxies import NOWHERE, RosProxy, rosproxy
+from tests.kubernetes.test_doctor import doctor
 from tests.kubernetes.test_mistakes import Site, restart_as_told
 from tests.kubernetes.traffic import START, wait_for_service
 
@@ -145,6 +146,44 @@ def test_rosproxy_deleted_and_created_at_once(who: str, net: Namespace, robot: R
     listener.wait_for("inside", since=time.time(), seconds=START)
     gap = listener.longest_gap("inside", deleted, time.time())
     note(f"RosProxy deleted and created, pods restarted by the {who}: {gap:.1f} s without messages")
+
+
+@pytest.mark.parametrize("change", ["master", "selector"])
+def test_a_change_that_is_taken_back_is_told_to_running_pods(
+    change: str, net: Namespace, robot: Robot
+) -> None:
+    """The proxy has unregistered the ROS nodes meanwhile, and they register only at their start."""
+    topic = f"/{unique('back').replace('-', '_')}"
+    site = Site(net, robot)
+    made = site.rosproxy
+    site.create_rosproxy(graceSeconds=2)
+    wait_for_service(net)
+    site.create_app(command=node_command("roscpp", "pub", "--topic", topic, "--word", "inside"))
+    listener = robot.node(f"listener_{change}", "roscpp", "sub", "--topic", topic)
+    listener.wait_for("inside", seconds=START)
+    made.wait_status(lambda s: s.get("rosNodes") == 1, "the ROS node is counted")
+    (pod,) = net.pods(INJECT)
+    node = pod["spec"]["nodeName"]
+    before = made.the_proxy(node)
+
+    changes: dict[str, tuple[api.Json, api.Json]] = {
+        "master": ({"master": NOWHERE}, {"master": {"uri": robot.master_uri}}),
+        "selector": ({"podSelector": {"matchLabels": {"app": "other"}}}, {"podSelector": None}),
+    }
+    other, same = changes[change]
+    made.change(**other)
+    wait_until(
+        lambda: before.uid_then not in {proxy.uid_then for proxy in made.proxies}, 60, made.tell
+    )
+    made.change(**same)
+    made.wait_status(lambda _: bool(made.on(node).get("unregisteredAt")), "the time is kept")
+    made.the_proxy(node)
+    wait_until(lambda: bool(site.texts("NotWired")), 60, made.tell)
+    assert any("unregistered its ROS nodes" in found["text"] for found in doctor(net.name)[1])
+
+    restart_as_told(site)
+    listener.wait_for("inside", since=time.time(), seconds=START)
+    wait_until(site.is_well, 120, made.tell)
 
 
 def test_deleted_service_comes_back_at_its_address(net: Namespace) -> None:

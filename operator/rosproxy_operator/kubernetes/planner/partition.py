@@ -121,7 +121,7 @@ def _within(helpers: tuple[HelperPod, ...], namespaces: frozenset[str]) -> tuple
 
 _BY_ROSPROXY = (
     *("absent", "served", "given", "refused", "moved", "tried", "former"),
-    *("attempts", "reported"),
+    *("unregistered", "attempts", "reported"),
 )
 _NAMESPACES: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(_BY_ROSPROXY, lambda key: key.of.namespace),

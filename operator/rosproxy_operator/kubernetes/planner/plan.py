@@ -63,6 +63,11 @@ from rosproxy_operator.kubernetes.planner.steps.reconcile import (
     seconds_to_deadlines,
 )
 from rosproxy_operator.kubernetes.planner.steps.remake import remake_unwired
+from rosproxy_operator.kubernetes.planner.unregistrations import (
+    Unregistration,
+    note_unregistrations,
+    with_unregistrations,
+)
 from rosproxy_operator.kubernetes.planner.zenoh_hubs import apart_findings, due_in
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Obstacle, RosProxyOnNode
 from rosproxy_operator.kubernetes.resources.model import (
@@ -134,18 +139,17 @@ def plan(
     pod_findings = _pod_findings(cluster_view, decided, now)
     problems = [*pod_findings]
     shared = (*pod_findings, *moves(cluster_view, decided, ranges.on_hosts))
+    unregistered = {**decided.unregistered}
     for _, rosproxy in sorted(cluster_view.rosproxies.items()):
-        own = [action for step in _STEPS for action in step(context, rosproxy)]
-        states = tuple(_states(context, rosproxy))
-        own_problems = _problems(context, rosproxy, states, shared)
-        status = _status(context, rosproxy, states, own_problems, stamp)
+        own, own_problems = _of_rosproxy(context, rosproxy, shared, unregistered, stamp)
         problems += own_problems
-        actions += [*own, *_patch(context, rosproxy, status), *events.results(rosproxy, own)]
+        actions += own
     for invalid in observed.unusable.values():
         problems.append(finding(invalid, invalid.reason, invalid.text, fatal=True))
         actions += _patch(context, invalid, status_of_invalid(invalid, stamp))
     unique = tuple(dict.fromkeys(problems))
     warnings = events.warnings(unique, decided.reported, now)
+    decided = replace(decided, unregistered=unregistered)
     departed = departures.find_departures(observed, decided, now)
     return ClusterPlan(
         actions=(*actions, *warnings.emits),
@@ -160,6 +164,28 @@ def plan(
         ),
         next_look_in=min(_waits(context, departed), default=None),
     )
+
+
+def _of_rosproxy(
+    context: ClusterContext,
+    rosproxy: RosProxy,
+    shared: Iterable[ClusterFinding],
+    unregistered: dict[ProxyPlace, Unregistration],
+    stamp: str,
+) -> tuple[list[Action], tuple[ClusterFinding, ...]]:
+    """Return the actions and the findings of a RosProxy.
+
+    Add the unregistrations that begin with these actions to ``unregistered``.
+    """
+    rosproxy = with_unregistrations(context.view, rosproxy, unregistered)
+    actions = [action for step in _STEPS for action in step(context, rosproxy)]
+    unregistered |= note_unregistrations(context.view, rosproxy, actions, unregistered, stamp)
+    rosproxy = with_unregistrations(context.view, rosproxy, unregistered)
+    states = tuple(_states(context, rosproxy))
+    problems = _problems(context, rosproxy, states, shared)
+    status = _status(context, rosproxy, states, problems, stamp)
+    results = events.results(rosproxy, actions)
+    return [*actions, *_patch(context, rosproxy, status), *results], problems
 
 
 def _pod_findings(
@@ -236,6 +262,7 @@ def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[RosProxyOnN
             obstacle=site if isinstance(site, Obstacle) else None,
             lan_relay=lan_relays.get(node),
             image_check=image_checks.get(node),
+            unregistered_at=rosproxy.unregistered_at.get(node, ""),
         )
 
 

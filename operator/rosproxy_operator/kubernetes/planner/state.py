@@ -25,6 +25,7 @@ from rosproxy_operator.common.problem import CONFLICT
 from rosproxy_operator.kubernetes.planner.cluster_view import View, has_ports, place_of, serves
 from rosproxy_operator.kubernetes.planner.former_ports import FormerPorts, remember
 from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
+from rosproxy_operator.kubernetes.planner.unregistrations import Unregistration, recall
 from rosproxy_operator.kubernetes.planner.zenoh_hubs import Apart, hubs_apart
 from rosproxy_operator.kubernetes.resources.cluster import PodFailure
 from rosproxy_operator.kubernetes.resources.model import (
@@ -58,6 +59,7 @@ class ClusterState(msgspec.Struct, frozen=True):
     - ``strange``: by node and address, the time since when a proxy reports this address, although
       no look has seen a pod with it.
     - ``former``: see `former_ports`.
+    - ``unregistered``: see `unregistrations`.
     - ``unselected``: the time since when no RosProxy selects a labelled pod.
     - ``apart``: see `zenoh_hubs.hubs_apart`.
     """
@@ -76,6 +78,7 @@ class ClusterState(msgspec.Struct, frozen=True):
     addresses: Mapping[str, Mapping[str, float]] = {}
     strange: Mapping[tuple[str, str], float] = {}
     former: Mapping[ProxyPlace, FormerPorts] = {}
+    unregistered: Mapping[ProxyPlace, Unregistration] = {}
     unselected: Mapping[Name, float] = {}
     apart: Apart = {}
 
@@ -97,6 +100,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
         state,
         begun=True,
         former=remember(view, state.former),
+        unregistered=recall(view, state.unregistered),
         absent={place: state.absent.get(place, now) for place in absent},
         lost={node: state.lost.get(node, now) for node in lost},
         served=served,

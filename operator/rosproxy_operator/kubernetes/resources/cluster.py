@@ -217,7 +217,8 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
     node without pods, so that the node gets the same ``range`` again. ``range`` is None if no range
     is free. ``proxy`` is the pod that serves the node, None if there is no such pod. ``lan_relay``
     is the proxy's LAN relay, ``image_check`` the check of the proxy's next image. ``answer`` is the
-    proxy's report, None before the first report.
+    proxy's report, None before the first report. ``unregistered_at`` is empty, or the time at which
+    a proxy last unregistered the ROS 1 nodes of running pods.
     """
 
     name: str
@@ -229,6 +230,7 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
     obstacle: Obstacle | None = None
     lan_relay: HelperPod | None = None
     image_check: HelperPod | None = None
+    unregistered_at: str = ""
 
 
 class WebhookState(msgspec.Struct, frozen=True):

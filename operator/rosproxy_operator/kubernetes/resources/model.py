@@ -199,7 +199,8 @@ class RosProxy(msgspec.Struct, frozen=True):
     ``former_ranges`` are the ranges in the status, by node name. ``cluster_ip`` is the address of
     the RosProxy's Service in the status, also of a deleted Service. ``remakes``: the operator
     evicts unwired pods. ``created`` is the creation time, as the API server writes the time.
-    ``misspelt`` has the texts of `misspelt_names`.
+    ``unregistered_at`` is, by node name, the time at which a proxy last unregistered the ROS 1
+    nodes of running pods, in the same form. ``misspelt`` has the texts of `misspelt_names`.
     """
 
     id: Name
@@ -212,6 +213,7 @@ class RosProxy(msgspec.Struct, frozen=True):
     deleting: bool = False
     remakes: bool = False
     created: str = ""
+    unregistered_at: Mapping[str, str] = {}
     misspelt: tuple[str, ...] = ()
 
 

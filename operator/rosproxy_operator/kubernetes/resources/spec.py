@@ -105,6 +105,7 @@ _ADVERTISE = {a.value: a for a in Advertise}
 _PULL_POLICY = {policy: policy for policy in ("", "Always", "IfNotPresent", "Never")}
 _OPERATORS = {operator: operator for operator in ("In", "NotIn", "Exists", "DoesNotExist")}
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
+_TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", re.ASCII)
 _EXAMPLE = "http://robot.example:11311"
 _LISTEN_PORTS = (1024, 65535)
 """Ports that a proxy may listen on."""
@@ -149,6 +150,7 @@ def rosproxy(obj: Json) -> RosProxy:
         deleting=is_deleted(meta),
         remakes=texts_at(meta, "annotations").get(REMAKE) == "true",
         created=text_at(meta, "creationTimestamp"),
+        unregistered_at=_unregistered_at(status),
         misspelt=misspelt_names(meta, "RosProxies"),
     )
 
@@ -595,3 +597,10 @@ def _former_ranges(status: Json) -> dict[str, PortRange]:
         text_at(line, "name"): port_range(line, "ports") for line in submaps(status, "perNode")
     }
     return {name: ports for name, ports in ranges.items() if ports is not None}
+
+
+def _unregistered_at(status: Json) -> dict[str, str]:
+    """Return the times ``unregisteredAt`` in a status, by node name, without malformed times."""
+    lines = submaps(status, "perNode")
+    times = {text_at(line, "name"): text_at(line, "unregisteredAt") for line in lines}
+    return {name: time for name, time in times.items() if _TIME.fullmatch(time)}

@@ -262,6 +262,7 @@ def _line(
         "pods": len(state.pods),
         **_ros(state, most_names, rosproxy.status),
         "hubs": hubs,
+        "unregisteredAt": state.unregistered_at,
         "message": bounded(_one_line(problem), _MOST_LINE_MESSAGE_CHARACTERS) if problem else "",
     }
     return {key: value for key, value in line.items() if value != ""}

@@ -170,15 +170,16 @@ def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
     """Whether a pod does not use its proxy, and the webhook would wire a recreated pod.
 
     True if ROS_MASTER_URI, ROS_STATIC_PEERS or the endpoint in ZENOH_CONFIG_OVERRIDE is missing or
-    outdated, or if the pod was wired for a former RosProxy. A variable that the template sets does
-    not count, except a ROS_MASTER_URI that names the real master of the RosProxy, and a
-    ZENOH_CONFIG_OVERRIDE that the webhook can extend. False for a pod without the label.
+    outdated, or if the ROS 1 nodes of the pod may be unregistered for good. A variable that the
+    template sets does not count, except a ROS_MASTER_URI that names the real master of the
+    RosProxy, and a ZENOH_CONFIG_OVERRIDE that the webhook can extend. False for a pod without the
+    label.
     """
     masters = _masters_of(rosproxy)
     lacks_master = (
         rosproxy.spec.ros1
         and all(_names_master(uri, masters) for uri in pod.own_masters)
-        and (pod.wired_master_uri != master_uri(cluster_ip) or _is_of_former(pod, rosproxy))
+        and (pod.wired_master_uri != master_uri(cluster_ip) or bool(_why_lost(pod, rosproxy)))
     )
     # A container without the endpoint in a wired pod comes from a later webhook.
     router = router_of(cluster_ip)
@@ -243,18 +244,33 @@ def edit_fix(change: str, pod: Pod) -> str:
     return f"{change}, then {recreate_fix(pod)}"
 
 
-def _is_of_former(pod: Pod, rosproxy: RosProxy) -> bool:
-    """Whether a pod was wired for a deleted RosProxy of the same name.
+def _why_lost(pod: Pod, rosproxy: RosProxy) -> str:
+    """Return why the ROS 1 nodes of a wired pod may be unregistered for good; empty if they aren't.
 
-    The proxy may have unregistered the ROS nodes of the pod when that RosProxy was deleted. ROS 1
-    nodes don't register again by themselves.
+    The proxy unregisters the nodes when the RosProxy is deleted, and when the operator moves the
+    proxy or no longer needs the proxy (`unregistrations`). ROS 1 nodes don't register again by
+    themselves.
     """
-    return bool(pod.wired_master_uri) and _is_older(pod, rosproxy)
+    if not pod.wired_master_uri:
+        return ""
+    if _is_older(pod, rosproxy.created):
+        return (
+            f"is older than RosProxy {rosproxy.id.name}: the former RosProxy of that name was "
+            "deleted, and the ROS nodes of the pod may have been unregistered at the master"
+        )
+    at = rosproxy.unregistered_at.get(pod.node, "")
+    if _is_older(pod, at):
+        return (
+            f"was created before {at}, when the proxy on node {pod.node} unregistered its ROS "
+            f"nodes after a change of RosProxy {rosproxy.id.name} or of the selected pods. ROS "
+            "nodes register only at their start"
+        )
+    return ""
 
 
-def _is_older(pod: Pod, rosproxy: RosProxy) -> bool:
+def _is_older(pod: Pod, time: str) -> bool:
     # The times are RFC 3339 in UTC with whole seconds, so texts sort like times.
-    return bool(pod.created) and pod.created < rosproxy.created
+    return bool(pod.created) and pod.created < time
 
 
 def should_be_wired(pod: Pod, rosproxy: RosProxy, ready_since: str) -> bool:
@@ -288,12 +304,8 @@ def _why_not_wired(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: Webho
             f"was wired to {clean(pod.wired_master_uri)[:200]}, but the proxy is at "
             f"{master_uri(cluster_ip)} now. Run {recreate_command(pod)}"
         )
-    if _is_of_former(pod, rosproxy):
-        return (
-            f"is older than RosProxy {rosproxy.id.name}: the former RosProxy of that name was "
-            "deleted, and the ROS nodes of the pod may have been unregistered at the master. Run "
-            f"{recreate_command(pod)}"
-        )
+    if lost := _why_lost(pod, rosproxy):
+        return f"{lost}. Run {recreate_command(pod)}"
     if not bypassing and (pod.wired_master_uri or pod.own_masters):
         return ""
     return missing_variable_text("ROS_MASTER_URI", pod, rosproxy, webhook)
@@ -314,7 +326,7 @@ def missing_variable_text(
     if pod.wired_master_uri or pod.static_peers or pod.router_endpoint:
         changed = f"spec.ros of RosProxy {rosproxy.id.name} has changed"
         return f"{text}, since {changed} after the pod was created. {restart}"
-    if _is_older(pod, rosproxy):
+    if _is_older(pod, rosproxy.created):
         return f"{text}, since the pod is older than RosProxy {rosproxy.id.name}. {restart}"
     reason = (
         "no operator answered the API server at the webhook port (chart value webhook.port) when "
