@@ -137,6 +137,26 @@ def test_a_webhook_that_the_api_server_does_not_reach_is_told(net: Namespace) ->
     assert f"{net.name}/{pod.name}" in found["text"]
 
 
+def test_a_webhook_that_the_api_server_does_not_reach_is_told_before_there_is_a_pod(
+    net: Namespace,
+) -> None:
+    made = rosproxy(net.name, master=NOWHERE)
+    made.wait_status(lambda s: bool(s.get("masterURI")), "the Service has an address")
+
+    def about_webhook() -> tuple[str, str]:
+        (found,) = [f for f in doctor(net.name)[1] if f["check"] == "webhook"]
+        return found["severity"], found["text"]
+
+    severity, text = about_webhook()
+    assert (severity, text.endswith(f"of a dry run in namespace {net.name}")) == ("ok", True)
+    with webhook_cut_off():
+        severity, text = about_webhook()
+    assert severity == "error"
+    assert text.startswith("no operator answered the API server at the webhook port")
+    assert text.endswith(f"in namespace {net.name} is not wired")
+    assert not net.pods()
+
+
 def test_labelled_pods_without_a_rosproxy_are_told(net: Namespace) -> None:
     pod = net.idle(on="node1")
     (found,) = [f for f in doctor(net.name)[1] if f["check"] == "pods"]

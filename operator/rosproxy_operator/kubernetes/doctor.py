@@ -60,10 +60,11 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
         pods = facts.labelled_pods()
         usable, _ = read_rosproxies(rosproxies)
         cut_off = unreached(pods, [*usable.values()], operators.ready_since)
+        webhook = facts.webhook(operators, cut_off, [*usable.values()])
         findings = [
             *operator_findings(operators),
             *([] if listed is None else _rosproxy_findings(listed, operators, pods)),
-            *webhook_findings(facts.webhook(operators, cut_off)),
+            *webhook_findings(webhook),
             *event_findings(facts.events(rosproxies, own_pods), ready_pods(own_pods)),
             *facts.refused,
         ]

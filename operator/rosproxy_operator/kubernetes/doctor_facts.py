@@ -19,9 +19,11 @@ from rosproxy_operator.kubernetes.api.api_client import (
     ApiNotFound,
 )
 from rosproxy_operator.kubernetes.api.rbac import missing_right
+from rosproxy_operator.kubernetes.planner.pods.trial import trial_pod
+from rosproxy_operator.kubernetes.planner.pods.wiring import UNWIRED
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at
-from rosproxy_operator.kubernetes.resources.model import Json, Name, Pod
+from rosproxy_operator.kubernetes.resources.model import Json, Name, Pod, RosProxy
 from rosproxy_operator.kubernetes.resources.names import INJECT
 from rosproxy_operator.kubernetes.status.condition_findings import is_unnoticed
 from rosproxy_operator.kubernetes.status.event_findings import (
@@ -35,6 +37,8 @@ from rosproxy_operator.kubernetes.status.operator_findings import (
     service_accounts,
 )
 from rosproxy_operator.kubernetes.status.webhook_findings import (
+    FAILED_CALL,
+    Trial,
     WebhookFacts,
     our_webhook,
     service_of,
@@ -43,6 +47,11 @@ from rosproxy_operator.kubernetes.status.webhook_findings import (
 T = TypeVar("T")
 MOST_CHECKED_EVENTS = 3 * MOST_EVENTS
 """Most Events for which the doctor checks whether the pod still exists."""
+RETRIAL_PAUSE_S = 2.0
+"""Seconds between two trials of the webhook.
+
+For a second after the start of an operator, kube-proxy may still lead to the former operator.
+"""
 
 
 class DoctorFacts:
@@ -104,10 +113,13 @@ class DoctorFacts:
         labelled = (pod for pod in pods if INJECT in pod.labels or pod.misspelt)
         return [pod for pod in labelled if not (pod.ended or pod.deleting)]
 
-    def webhook(self, operators: Operators, unreached: Sequence[str]) -> WebhookFacts:
+    def webhook(
+        self, operators: Operators, unreached: Sequence[str], rosproxies: Sequence[RosProxy]
+    ) -> WebhookFacts:
         """Return the webhook's configurations, and how many endpoints of each Service are ready.
 
-        ``unreached`` has the pods that no webhook wired (`labelled.unreached`).
+        ``unreached`` has the pods that no webhook wired (`labelled.unreached`). Without such pods,
+        a trial tells whether the API server reaches the operators.
         """
         api = self._api
         listed = self._ask("webhook", lambda: api.list_fresh(WEBHOOKS, ""))
@@ -119,7 +131,38 @@ class DoctorFacts:
         ready: dict[Name, int | None] = {}
         for service in {service_of(configuration) for configuration in ours}:
             self._ask("webhook", partial(self._count_ready, service, ready))
-        return WebhookFacts(ours, ready=ready, unreached=unreached)
+        trials: dict[str, Trial] = {}
+        for configuration in ours:
+            if ready.get(service_of(configuration)) and not unreached:
+                trial = self._ask("webhook", partial(self._trial, configuration, rosproxies))
+                trials |= {text_at(configuration["metadata"], "name"): trial} if trial else {}
+        return WebhookFacts(ours, ready=ready, unreached=unreached, trials=trials)
+
+    def _trial(self, configuration: Json, rosproxies: Sequence[RosProxy]) -> Trial | None:
+        """Let the API server call a webhook for a pod, in a dry run. None: this tells nothing."""
+        body = trial_pod(our_webhook(configuration), rosproxies)
+        if body is None:
+            return None
+        trial = self._try(body)
+        if trial is None or trial.is_wired:
+            return trial
+        time.sleep(RETRIAL_PAUSE_S)
+        return self._try(body)
+
+    def _try(self, body: Json) -> Trial | None:
+        """Try the webhook once. Raises ApiError for a refusal by another program."""
+        namespace = text_at(body["metadata"], "namespace")
+        try:
+            answer, warnings = self._api.try_creation("pods", body)
+        except ApiError as failure:
+            if FAILED_CALL in str(failure):
+                return Trial(namespace, error=str(failure))
+            raise
+        pod = objects.pod(answer)
+        is_wired = bool(pod.wired_master_uri or pod.static_peers or pod.router_endpoint)
+        if not is_wired and UNWIRED in warnings:
+            return None  # an operator answered, and the RosProxy has a fault
+        return Trial(namespace, is_wired)
 
     def events(self, rosproxies: Sequence[Json], own_pods: Sequence[Json]) -> list[RecentEvent]:
         """Return Warning Events of these objects and of users' existing pods, the newest first."""

@@ -314,6 +314,16 @@ class Api:
         """Create an object in the namespace of its metadata."""
         self._ask("POST", _path(kind, body["metadata"]["namespace"]), body=body, within=within)
 
+    def try_creation(self, kind: str, body: Json) -> tuple[JsonObject, str]:
+        """Return the object that the API server would create (dry run), and the warnings.
+
+        Only the doctor calls this, with the rights of its user.
+        """
+        path = _path(kind, body["metadata"]["namespace"])
+        answer = self._send_with_retries("POST", path, {"dryRun": "All"}, body, WITHIN)
+        data = self._checked(answer) or b""
+        return self._object(data, path), str(answer.getheader("Warning", ""))
+
     def may_patch_status(self, account: Name, namespace: str) -> bool:
         """Whether a service account may write the status of RosProxies in a namespace.
 
@@ -389,7 +399,9 @@ class Api:
         body: Json | list[Json] | None = None,
         within: Timeout = WITHIN,
     ) -> JsonObject:
-        data = self._data(method, path, query, body, within) or b""
+        return self._object(self._data(method, path, query, body, within) or b"", path)
+
+    def _object(self, data: bytes, path: str) -> JsonObject:
         try:
             return msgspec.json.decode(data, type=JsonObject)
         except (msgspec.DecodeError, UnicodeDecodeError):
@@ -410,7 +422,10 @@ class Api:
         longest: int | None = None,
     ) -> bytes | None:
         """Return the body of a successful answer; None if the body exceeds ``longest`` bytes."""
-        answer = self._send_with_retries(method, path, query, body, within)
+        return self._checked(self._send_with_retries(method, path, query, body, within), longest)
+
+    def _checked(self, answer: Any, longest: int | None = None) -> bytes | None:
+        """Return the body of an answer, as `_data` does. Raises ApiError for a refusal."""
         data = self._body(answer, longest)
         if data is not None and not 200 <= answer.status <= 299:
             raise refusal(int(answer.status), str(answer.reason or ""), data)

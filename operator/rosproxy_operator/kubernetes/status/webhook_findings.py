@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import msgspec
 
 from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
-from rosproxy.telemetry.text import listed, plural
+from rosproxy.telemetry.text import clean, listed, plural
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import INJECT
@@ -20,7 +20,22 @@ NAME = "wire.rosproxy.io"
 """The name of the webhook in the MutatingWebhookConfiguration."""
 _CHECK = "webhook"
 _REWIRE = "then create unwired pods again: kubectl rollout restart"
+_NO_ANSWER = "no operator answered the API server at the webhook port (chart value webhook.port)"
+FAILED_CALL = f'failed calling webhook "{NAME}"'
+"""What the API server writes when it reaches no operator: into its log, or into its refusal."""
 _REINSTALL = "create the object again: helm upgrade, or kubectl apply -f manifests/install.yaml"
+
+
+class Trial(msgspec.Struct, frozen=True):
+    """What the API server answered about a labelled pod in a dry run, in a namespace.
+
+    ``is_wired``: an operator wired the pod. Otherwise no operator answered the API server.
+    ``error`` is the refusal of the pod, with failurePolicy Fail.
+    """
+
+    namespace: str
+    is_wired: bool = False
+    error: str = ""
 
 
 class WebhookFacts(msgspec.Struct, frozen=True):
@@ -31,12 +46,14 @@ class WebhookFacts(msgspec.Struct, frozen=True):
     - ``ready``: the number of ready endpoints of each Service, None for a missing Service. A
       Service that the doctor could not read has no entry.
     - ``unreached``: the unwired pods that were created while an operator was ready.
+    - ``trials``: the trials, by the name of the configuration.
     """
 
     configurations: tuple[Json, ...] | None = None
     operators: tuple[Json, ...] | None = None
     ready: Mapping[Name, int | None] = {}
     unreached: Sequence[str] = ()
+    trials: Mapping[str, Trial] = {}
 
 
 def our_webhook(configuration: Json) -> Json:
@@ -102,23 +119,38 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
         text = f"the Service {service} of the webhook has no ready endpoint, so no pod is wired"
         yield error(_CHECK, subject, text, f"{describe_operators(service.namespace)}; {_REWIRE}")
     elif not lacks_ca and facts.unreached:
-        yield _cut_off(subject, service, facts.unreached)
+        yield _cut_off(subject, service, _text_of_pods(facts.unreached))
     elif not lacks_ca:
+        trial = facts.trials.get(text_at(metadata, "name"))
+        if trial is not None and not trial.is_wired:
+            yield _cut_off(subject, service, _text_of_trial(trial))
+            return
         text = f"{plural(ready, 'operator')} ready to wire pods"
-        yield ok(_CHECK, subject, text)
+        tried = f", and wired a pod of a dry run in namespace {trial.namespace}" if trial else ""
+        yield ok(_CHECK, subject, text + tried)
 
 
-def _cut_off(subject: str, service: Name, pods: Sequence[str]) -> DoctorFinding:
-    text = (
-        "no operator answered the API server at the webhook port (chart value webhook.port) when "
-        "these pods were created, although an operator was ready: "
-        f"{listed(pods)}"
+def _text_of_pods(pods: Sequence[str]) -> str:
+    return (
+        f"{_NO_ANSWER} when these pods were created, although an operator was ready: {listed(pods)}"
     )
+
+
+def _text_of_trial(trial: Trial) -> str:
+    result = f" ({clean(trial.error)})" if trial.error else ""
+    return (
+        f"{_NO_ANSWER} in a dry run, although an operator is ready: a new pod with the label "
+        f"{INJECT} in namespace {trial.namespace} is {'refused' if trial.error else 'not wired'}"
+        f"{result}"
+    )
+
+
+def _cut_off(subject: str, service: Name, text: str) -> DoctorFinding:
     fix = (
         "allow connections from the API server to the webhook port of the operator's pods in "
         "namespace "
         f"{service.namespace} (NetworkPolicy, firewall of the control plane); the API server's log "
-        f'has failed calling webhook "{NAME}"; {_REWIRE}'
+        f"has {FAILED_CALL}; {_REWIRE}"
     )
     return error(_CHECK, subject, text, fix)
 

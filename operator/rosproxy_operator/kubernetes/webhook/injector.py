@@ -27,7 +27,12 @@ from rosproxy_operator.kubernetes.api.api_client import (
 )
 from rosproxy_operator.kubernetes.planner.bounds import Consents, bounds_violation
 from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, why_not_selected
-from rosproxy_operator.kubernetes.planner.pods.wiring import Wiring, pod_variables, wire
+from rosproxy_operator.kubernetes.planner.pods.wiring import (
+    UNWIRED,
+    Wiring,
+    pod_variables,
+    wire,
+)
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import service_id
@@ -51,8 +56,6 @@ kube-proxy gathers changes for 1 s, and a creationTimestamp has whole seconds. I
 early, conntrack notes a connection without translation. The packets of the connection are then lost
 for two minutes, even if kube-proxy knows the Service a moment later. So the injector holds the pod.
 """
-NOT_WIRED = "rosproxy: this pod was not wired to a proxy: "
-"""The start of each warning at admission."""
 
 
 class NotWired(Exception):
@@ -93,7 +96,7 @@ class Injector:
             text = f"the operator failed: {error!r}"
         self._metrics.admissions.labels("failed").inc()
         log.warning("pod not wired: %s", text)
-        return Wiring(warnings=(NOT_WIRED + text,))
+        return Wiring(warnings=(UNWIRED + text,))
 
     async def _wiring_by(self, body: Json, dry_run: bool, deadline: float) -> tuple[Wiring, float]:
         """The wiring of a pod, and the seconds to hold the pod.
@@ -134,10 +137,10 @@ class Injector:
             address, hold = self._address(rosproxy, dry_run)
             return wire(body, pod_variables(rosproxy, address), rosproxy.spec.host_aliases), hold
         if rosproxy is not None:
-            return Wiring(warnings=(NOT_WIRED + rosproxy.text,)), 0.0
+            return Wiring(warnings=(UNWIRED + rosproxy.text,)), 0.0
         text = why_not_selected(pod, usable)
         reasons = [f"RosProxy {r.id.name}: {r.text}" for r in unusable.values()]
-        return Wiring(warnings=(". ".join([NOT_WIRED + text, *reasons]),) if text else ()), 0.0
+        return Wiring(warnings=(". ".join([UNWIRED + text, *reasons]),) if text else ()), 0.0
 
     def _address(self, rosproxy: RosProxy, dry_run: bool) -> tuple[str, float]:
         """The cluster IP of a RosProxy's Service, and the seconds until all nodes know the Service.

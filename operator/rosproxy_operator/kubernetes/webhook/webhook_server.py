@@ -18,10 +18,10 @@ from rosproxy.net.addresses import HostPort, plain_address
 from rosproxy.net.bounded_server import IDLE_TIMEOUT_S
 from rosproxy.net.budget import Budget, Charge, OverBudget
 from rosproxy.net.http_client import TooLong, read_bounded
+from rosproxy_operator.kubernetes.planner.pods.wiring import UNWIRED
 from rosproxy_operator.kubernetes.status.events import stamp
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.certificates import KeyPair
-from rosproxy_operator.kubernetes.webhook.injector import NOT_WIRED
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation
 from rosproxy_operator.kubernetes.webhook.tls_listener import TlsListener
 
@@ -172,7 +172,7 @@ async def _answer(fn: kopf.WebhookFn, body: bytes, webhook: str) -> web.Response
         return web.json_response(await fn(review, webhook=webhook))
     except Exception as error:  # admit the pod unwired
         log.warning("pod not wired: the operator failed: %r", error)
-        warning = f"{NOT_WIRED}the operator failed: {error!r}"[:200]
+        warning = f"{UNWIRED}the operator failed: {error!r}"[:200]
         response = {"uid": uid, "allowed": True, "warnings": [warning]}
         return web.json_response(
             {

@@ -52,6 +52,8 @@ class ApiServer:
         self.gone_for_watches = False
         self.granted = set[str]()  # the users that a SubjectAccessReview allows
         self.retry_after = ""
+        self.admit: Callable[[Object], Object] = lambda obj: obj  # the webhook, in a dry run
+        self.warning = ""  # of a dry run
         self.url = ""
         self._numbers = itertools.count(1)
         self._watches: list[tuple[str, str, asyncio.Queue[Object]]] = []
@@ -123,8 +125,11 @@ class ApiServer:
             return response
         if request.query.get("watch"):
             return await self._watch(request, kind, namespace)
-        body = await request.json() if request.can_read_body else None
+        body: Any = await request.json() if request.can_read_body else None
         self.bodies.append(body)
+        if request.query.get("dryRun"):
+            warnings = {"Warning": f'299 - "{self.warning}"'} if self.warning else {}
+            return web.json_response(self.admit(body), status=201, headers=warnings)
         return self._answer(request, (kind, namespace, name), sub, body)
 
     def _answer(

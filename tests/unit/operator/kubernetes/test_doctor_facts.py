@@ -96,7 +96,7 @@ async def about_webhook(api: Api, unreached: tuple[str, ...] = ()) -> list[Docto
         operators = facts.operators([])
         found = [
             *operator_findings(operators),
-            *webhook_findings(facts.webhook(operators, unreached)),
+            *webhook_findings(facts.webhook(operators, unreached, ())),
         ]
         return [*found, *facts.refused]
 

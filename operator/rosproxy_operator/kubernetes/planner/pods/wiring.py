@@ -54,6 +54,8 @@ WEBHOOK_READY_AFTER = timedelta(minutes=1)
 The time starts when the RosProxy exists and the webhook is ready.
 """
 UNKNOWN_WEBHOOK = WebhookState()
+UNWIRED = "rosproxy: this pod was not wired to a proxy: "
+"""The start of each warning at admission."""
 _CONTAINER_FIELDS = ("initContainers", "containers")
 
 
@@ -119,8 +121,8 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
     annotations = texts_at(pod, "metadata", "annotations")
     if MIRROR_ANNOTATION in annotations:
         warning = (
-            "rosproxy: this pod was not wired to a proxy: the pod is a static pod, made from a "
-            f"file on its node. Set {wanted.name} in that file, or run an ordinary pod"
+            f"{UNWIRED}the pod is a static pod, made from a file on its node. Set {wanted.name} "
+            "in that file, or run an ordinary pod"
         )
         return Wiring(warnings=(warning,))
     spec = submap(pod, "spec")
