@@ -31,6 +31,11 @@ _OPEN_HOSTPORTS = (
     "enable hostPorts in the nodes' network plug-in (CNI: the plug-in portmap); open the proxy's "
     "hostPorts in the node's firewall and in NetworkPolicies"
 )
+_KERNEL_BY_LABEL = (
+    "start the operator with --allow-data-plane kernel, and add the label "
+    "rosproxy.data-plane=kernel to a container of this proxy"
+)
+_KERNEL_BY_FIELD = "set spec.dataPlane: Kernel. The chart's allow.dataPlanes must list Kernel"
 _LABELLED = "start {nodes} in a container with the label rosproxy.enable=true"
 _INJECTED = "start {nodes} in a pod with the label rosproxy.io/inject=true"
 FIXES = {
@@ -170,9 +175,23 @@ FIXES = {
     ),
     "kernel plane": Fix(
         "set --data-plane kernel, and give the proxy the capability NET_ADMIN",
-        "start the operator with --allow-data-plane kernel, and add the label "
-        "rosproxy.data-plane=kernel to a container of this proxy",
-        "set spec.dataPlane: Kernel. The chart's allow.dataPlanes must list Kernel",
+        _KERNEL_BY_LABEL,
+        _KERNEL_BY_FIELD,
+    ),
+    "kernel rights": Fix(
+        "give the proxy's container the capability NET_ADMIN (cap_add: NET_ADMIN), and run the "
+        "container without no-new-privileges",
+        f"{_KERNEL_BY_LABEL}. If both are set, let the engine give containers NET_ADMIN",
+        f"{_KERNEL_BY_FIELD}. If both are set, check that no admission webhook removes NET_ADMIN "
+        "or allowPrivilegeEscalation from the proxy's pod",
+    ),
+    "kernel forwards": Fix(
+        "set net.ipv4.ip_forward there (sysctls: net.ipv4.ip_forward: 1; for nodes with IPv6 "
+        "addresses net.ipv6.conf.all.forwarding: 1)",
+        f"{_KERNEL_BY_LABEL}: the operator then sets net.ipv4.ip_forward. For nodes with IPv6 "
+        "addresses, set net.ipv6.conf.all.forwarding on this host",
+        "run sysctl -w net.ipv4.ip_forward=1 on the node, then delete the proxy's pod. For ROS "
+        "nodes with IPv6 addresses, set net.ipv6.conf.all.forwarding",
     ),
     "direction both": Fix(
         "set --direction both",

@@ -15,7 +15,7 @@ FIELDS = dict.fromkeys(("ports", "published", "uri", "host", "port", "nodes", "d
 OPTIONS = [setting.name for setting in declared(Settings)]
 SOURCES = (
     *("doctor/rules/*.py", "admin/setup_rules.py", "net/gate.py"),
-    *("ros2/domain_problems.py", "zenoh/findings.py"),
+    *("ros2/domain_problems.py", "zenoh/findings.py", "forwarding/kernel/*.py"),
 )
 
 

@@ -138,7 +138,7 @@ def _policy(policy: document.PolicyStatus) -> str:
 
 def _plane(plane: document.DataPlaneStatus) -> str:
     if plane.plane == "kernel":
-        return f"forwarded by the kernel (--data-plane {clean(plane.mode)})"
+        return f"forwarded by the kernel (data plane {clean(plane.mode)})"
     return f"relayed by the proxy ({clean(plane.plane)}): {clean(plane.reason)}"
 
 

@@ -1,12 +1,14 @@
 """Requirements of the kernel plane: conditions in files and firewalls, and programs."""
 
 import asyncio
+import re
 import shutil
 import stat
 from pathlib import Path
 
 import pytest
 
+from rosproxy import fixes
 from rosproxy.forwarding.kernel import preflight
 from rosproxy.forwarding.kernel import tools as kernel_tools
 from rosproxy.forwarding.kernel.decisions import HostForwarding
@@ -57,6 +59,20 @@ async def test_a_host_is_left_alone_unless_asked_for(place: Path) -> None:
     assert "eth0" in said
     assert "--data-plane kernel" in said
     assert await preflight.find_obstacle("kernel", ChainTools()) is None
+
+
+async def test_a_fix_in_a_cluster_names_the_field(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An option of the proxy is of no use there: the operator starts the proxy."""
+    monkeypatch.setattr(fixes, "_speaks_for", [fixes.Operator.KUBERNETES])
+    (place / "ipv4").write_text("0")
+    said = [await preflight.find_obstacle("auto", ChainTools()) or ""]
+    (place / "net" / "eth0" / "device").mkdir()
+    said.append(await preflight.find_obstacle("auto", ChainTools()) or "")
+    assert "run sysctl -w net.ipv4.ip_forward=1 on the node" in said[0]
+    assert "set spec.dataPlane: Kernel" in said[1]
+    assert not re.search(r"--data-plane|cap_add|sysctls:", " ".join(said))
 
 
 @pytest.mark.parametrize(

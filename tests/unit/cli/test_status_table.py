@@ -212,7 +212,7 @@ def planes(*nodes: dict[str, Any], **whole: str) -> str:
 
 def test_the_kernels_connections_count_as_the_proxys_own() -> None:
     text = planes(make_node(data_plane=a_plane(), connections=[make_connection()]))
-    assert "topics   forwarded by the kernel (--data-plane auto)" in text
+    assert "topics   forwarded by the kernel (data plane auto)" in text
     row = next(line for line in text.split("\n") if line.startswith("/talker"))
     assert row.split()[-5:] == ["3", "2.4", "kB/s", "10", "B/s"]
     assert "kernel     2 connections through port 45050: 3.4 MB out, 120 B in as IP packets" in text

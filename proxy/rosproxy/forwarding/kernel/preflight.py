@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from rosproxy.fixes import how_to
 from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.nft import NftError, dropping_chains
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
@@ -51,14 +52,14 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
     if mode == "auto" and (hardware := _hardware_interface()):
         yield (
             f"the proxy seems to run in the host's network (interface {hardware}), where "
-            "--data-plane auto does not use the kernel: set --data-plane kernel, or run the proxy "
-            "in a network namespace of its own"
+            "the data plane auto does not use the kernel: run the proxy in a network namespace of "
+            f"its own, or {how_to('kernel plane')}"
         )
     host = read_forwarding()
     if not (host.ipv4 or host.ipv6):
         yield (
-            "net.ipv4.ip_forward is not 1 in the proxy's network namespace: set it (sysctls: "
-            "net.ipv4.ip_forward: 1; for nodes with IPv6 addresses net.ipv6.conf.all.forwarding: 1)"
+            "net.ipv4.ip_forward is not 1 in the proxy's network namespace: "
+            f"{how_to('kernel forwards')}"
         )
     # nft does not list the chains of iptables-legacy, so `dropping_chains` can't see their policy.
     if "filter" in _read(_LEGACY_TABLES).split():

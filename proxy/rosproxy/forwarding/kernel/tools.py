@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
+from rosproxy.fixes import how_to
+
 IMAGE_FOLDER = Path("/usr/libexec/rosproxy")
 """The folder of the programs in the image; searched before the PATH."""
 SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
@@ -24,10 +26,6 @@ PIECE_BYTES = 16 * 1024
 """Bytes of a list that the proxy reads at once: some hundred lines."""
 ENVIRONMENT = {"LC_ALL": "C"}
 """English messages of the programs: the proxy looks for words in these messages."""
-REMEDY = (
-    "give the proxy's container the capability NET_ADMIN (cap_add: NET_ADMIN) and run it without "
-    "no-new-privileges"
-)
 _PACKAGES = {"nft": "nftables", "conntrack": "conntrack"}
 
 
@@ -163,11 +161,12 @@ def _timeout_error(program: str) -> ToolError:
 
 def _start_error(program: str, error: OSError) -> ToolError:
     if isinstance(error, PermissionError):
-        return ToolError(f"{program} may not run ({error.strerror}): {REMEDY}")
+        return ToolError(f"{program} may not run ({error.strerror}): {how_to('kernel rights')}")
     return ToolError(f"{program} can't run: {error.strerror}")
 
 
 def _failure(program: str, complaint: str) -> ToolError:
     message = " ".join(complaint.split())[:300]
     is_refused = "not permitted" in message or "you must be root" in message
-    return ToolError(f"{program}: {message}" + (f": {REMEDY}" if is_refused else ""))
+    fix = f": {how_to('kernel rights')}" if is_refused else ""
+    return ToolError(f"{program}: {message}{fix}")
