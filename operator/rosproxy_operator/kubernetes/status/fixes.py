@@ -41,7 +41,8 @@ _BY_REASON = {
     "PortsExhausted": f"lower spec.ports, or widen spec.portWindow: {_EDIT}",
     "PortsUnreachable": PORTS_FIX,
     "ProxiesStarting": f"wait a moment, then {_PODS}",
-    "ProxyStuck": _PODS,
+    "ProxyNotAdmitted": f"do as the message says; fields of the spec: {_EDIT}",
+    "ProxyStuck": f"do as the message says; fields of the spec: {_EDIT}; for more, {_PODS}",
     "ProxyUnreachable": "allow connections from the operator's pods to port "
     f"{ADMIN_PORT} of pods with the label {PROXY_OF}={{of.name}}; read kubectl -n {{of.namespace}} "
     "get networkpolicies",

@@ -45,7 +45,7 @@ _SCHEDULING = (
 # The errors of registries in the words of containerd; k8s.io/kubernetes, pkg/kubelet/images.
 _IMAGE = (
     (r"pull policy of never|errimageneverpull",
-     "Load the image on the node, or set spec.imagePullPolicy"),
+     "Load the image on the node, or correct spec.image or spec.imagePullPolicy"),
     (r"unauthorized|authorization failed|access denied|forbidden|no basic auth",
      "Correct the image's name, or set spec.imagePullSecrets"),
     (r"no such host|timeout|deadline exceeded|connection refused|no route|certificate",

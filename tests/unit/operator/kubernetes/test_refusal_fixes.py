@@ -84,7 +84,7 @@ def test_a_pod_that_no_node_takes(message: str, fix: str) -> None:
     ("message", "fix"),
     [
         ('Container image "x:1" is not present with pull policy of Never',
-         "Load the image on the node, or set spec.imagePullPolicy"),
+         "Load the image on the node, or correct spec.image or spec.imagePullPolicy"),
         ("failed to pull and unpack image: pull access denied, repository does not exist or may "
          "require authorization", "Correct the image's name, or set spec.imagePullSecrets"),
         ('failed to do request: Head "https://r.example/v2/x": dial tcp: lookup r.example: no such '

@@ -404,6 +404,8 @@ def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
     assert (finding.reason, finding.fatal) == (reason, False)
     assert finding.about is not None
     assert finding.about.kind == "Pod"
+    (of_deployment,) = ros2_findings(pod(container, workload="deployment/a"), of2(), ADDRESS)
+    assert ": kubectl -n ros edit deployment/a" in of_deployment.text
     assert list(ros2_findings(pod(container), some.rosproxy(), ADDRESS)) == []
 
 
@@ -428,6 +430,7 @@ def test_an_empty_domain_is_domain_0():
     (finding,) = ros2_findings(pod(container), of2(Ros2Spec(domain=5)), ADDRESS)
     assert finding.reason == "OtherDomain"
     assert "ROS_DOMAIN_ID=(empty, so 0) is not domain 5 of RosProxy" in finding.text
+    assert finding.text.endswith(". Or change spec.domain: kubectl -n ros edit rosproxy robot")
 
 
 def test_a_pod_that_no_webhook_has_seen_is_told():

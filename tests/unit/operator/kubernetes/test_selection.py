@@ -138,10 +138,11 @@ def test_a_clear_choice_has_no_warning():
 
 
 def test_a_pod_in_its_nodes_own_network_is_left_out():
-    finding = select_rosproxy(pod(host_network=True), [rosproxy()])
+    finding = select_rosproxy(pod(host_network=True, workload="deployment/a"), [rosproxy()])
 
     assert isinstance(finding, ClusterFinding)
     assert (finding.reason, finding.of) == ("HostNetwork", Name("robots", "arm"))
+    assert finding.text.endswith("from the template: kubectl -n robots edit deployment/a")
 
 
 def test_a_pod_that_is_not_labelled_needs_no_warning():
@@ -164,6 +165,23 @@ def test_why_no_rosproxy_takes_a_labelled_pod(label, rosproxies, said):
 
     assert said in text
     assert "create" in text
+
+
+def test_labels_that_do_not_match_are_named_with_the_commands():
+    """The text named neither the labels nor a command for the selector."""
+    labels = (expression("tier", "In", "b", "a"), expression("zone", "NotIn", "z"),
+              expression("old", "DoesNotExist"), expression("new", "Exists"))  # fmt: skip
+    every = tuple(e for selector in labels for e in selector.expressions)
+    rosproxies = [rosproxy("leg", Selector({"app": "x"}, every)), rosproxy("arm")]
+
+    text = why_not_selected(pod(labels={INJECT: "leg"}, workload="deployment/a"), rosproxies)
+
+    assert "RosProxy leg (app=x,tier in (a,b),zone notin (z),!old,new), so" in text
+    assert text.endswith(
+        "Add the missing labels to the template: kubectl -n robots edit deployment/a. Or correct "
+        "the selector: kubectl -n robots edit rosproxy leg; then run kubectl -n robots rollout "
+        "restart deployment/a"
+    )
 
 
 @pytest.mark.parametrize(

@@ -357,7 +357,12 @@ def test_a_pod_that_goes_around_its_proxy_is_told(master):
         (pod(controller="Job"), f". Run kubectl -n {NAMESPACE} delete pod {pod().id.name}"),
         (pod(workload="daemonset/arm"), f"kubectl -n {NAMESPACE} rollout restart daemonset/arm"),
         (pod(created="2026-01-01T00:00:00Z"), "is older than RosProxy arm. Run kubectl"),
-        (pod(labels={"app": "x"}), "rosproxy.io/inject=arm"),
+        (pod(created="2026-01-02T00:00:00Z"), "is older than RosProxy arm. Run kubectl"),
+        (
+            pod(labels={"app": "x"}, workload="deployment/a"),
+            "since the pod has no label rosproxy.io/inject. Add the label rosproxy.io/inject=arm "
+            f"to the template: kubectl -n {NAMESPACE} edit deployment/a",
+        ),
         (pod(wired_master_uri="http://10.96.0.1:11311"), f"the proxy is at {URI} now"),
     ],
 )

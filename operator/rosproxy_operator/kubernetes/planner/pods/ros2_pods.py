@@ -14,6 +14,7 @@ from rosproxy_operator.common.problem import NOT_WIRED
 from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
     UNKNOWN_WEBHOOK,
+    edit_fix,
     has_peers,
     is_of_service,
     missing_variable_text,
@@ -73,13 +74,14 @@ def _problems(
 ) -> Iterator[tuple[str, str]]:
     """Yield the reason and the text of each fault of a container."""
     get = container.variables.get
+    removal = edit_fix("Remove the variable from the template", pod)
     rmw = get("RMW_IMPLEMENTATION", "")
     if not is_dds(rmw):
         text = (
             f"variable RMW_IMPLEMENTATION={_shown(rmw)} is not DDS, and a proxy forwards DDS only"
         )
-        fix = "Use rmw_fastrtps_cpp or rmw_cyclonedds_cpp, or a RosProxy with spec.ros: zenoh"
-        yield "NoDds", f"{text}. {fix}"
+        fix = edit_fix("Set rmw_fastrtps_cpp or rmw_cyclonedds_cpp in the template", pod)
+        yield "NoDds", f"{text}. {fix}. Or use a RosProxy with spec.ros: zenoh"
     peers = get("ROS_STATIC_PEERS")
     if (
         peers is not None
@@ -88,7 +90,7 @@ def _problems(
     ):
         text = f"variable ROS_STATIC_PEERS={_shown(peers)} of the template does not name the proxy"
         fix = f"Remove the variable from the template, or add {address} to the variable"
-        yield NOT_WIRED, f"{text}. {fix}"
+        yield NOT_WIRED, f"{text}. {edit_fix(fix, pod)}"
     domain = get("ROS_DOMAIN_ID")
     number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
     # rcl treats an empty variable as unset (rcl, domain_id.c), and the webhook keeps the variable.
@@ -96,22 +98,20 @@ def _problems(
         value = _shown(str(domain)) or "(empty, so 0)"
         name = rosproxy.id.name
         text = f"variable ROS_DOMAIN_ID={value} is not domain {number} of RosProxy {name}"
-        fix = f"Change the variable or spec.domain, then run {recreate_command(pod)}"
-        yield "OtherDomain", f"{text}. {fix}"
+        edit = f"kubectl -n {rosproxy.id.namespace} edit rosproxy {name}"
+        yield "OtherDomain", f"{text}. {removal}. Or change spec.domain: {edit}"
     distro = _OLD.search(get("ROS_DISTRO", "").lower()) or _OLD.search(container.image.lower())
     if distro:
         text = f"has ROS 2 {distro[1].capitalize()}, which does not support ROS_STATIC_PEERS"
-        yield "TooOld", f"{text}. Use Iron or a later distribution"
+        fix = edit_fix("Use an image with Iron or a later distribution in the template", pod)
+        yield "TooOld", f"{text}. {fix}"
     reach = get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
     if reach.upper() in _RANGES_WITHOUT_PEERS:
         text = f"variable ROS_AUTOMATIC_DISCOVERY_RANGE={_shown(reach)} makes ROS 2 ignore static"
-        yield "Alone", f"{text} peers, such as the proxy. Remove the variable"
+        yield "Alone", f"{text} peers, such as the proxy. {removal}"
     if get("ROS_LOCALHOST_ONLY") == "1":
-        yield (
-            "Alone",
-            "variable ROS_LOCALHOST_ONLY=1 keeps the participants of the pod from being "
-            "discovered. Remove the variable",
-        )
+        text = "variable ROS_LOCALHOST_ONLY=1 keeps the participants of the pod from being"
+        yield "Alone", f"{text} discovered. {removal}"
 
 
 def _names_service(peers: str, rosproxy: RosProxy, address: str) -> bool:

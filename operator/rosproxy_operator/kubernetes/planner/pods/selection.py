@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
+from rosproxy.telemetry.text import shorten
 from rosproxy_operator.common.zenoh import tcp_endpoint
 from rosproxy_operator.kubernetes.planner.pods.wiring import edit_fix, recreate_fix
 from rosproxy_operator.kubernetes.resources.model import (
@@ -25,6 +26,7 @@ LABEL_OFF_VALUES = ("", "false")
 """Values of the label with which no RosProxy selects the pod, not even by a podSelector."""
 MOST_NAMES = 5
 """Most RosProxies that a text names."""
+_MOST_SELECTOR_CHARACTERS = 100
 _ANY = "true"
 _PART_OF_LABEL = "app.kubernetes.io/part-of"
 
@@ -64,10 +66,10 @@ def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | Clus
     rosproxy = (named or (wired if len(wired) == 1 else taking))[0]
     if pod.host_network:
         text = (
-            "is on the node's own network (hostNetwork), where ROS nodes need no proxy and get "
-            f"none. Remove the label {INJECT}, or remove hostNetwork"
+            "is on the node's own network (hostNetwork), where ROS nodes need no proxy and get none"
         )
-        return pod_finding(pod, rosproxy, "HostNetwork", text)
+        fix = edit_fix(f"Remove hostNetwork or the label {INJECT} from the template", pod)
+        return pod_finding(pod, rosproxy, "HostNetwork", f"{text}. {fix}")
     return rosproxy
 
 
@@ -94,7 +96,10 @@ def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
     checked that no RosProxy selects the pod.
     """
     label = pod.labels.get(INJECT, "")
-    names = sorted(r.id.name for r in rosproxies if r.id.namespace == pod.id.namespace)
+    local = sorted(
+        (r for r in rosproxies if r.id.namespace == pod.id.namespace), key=lambda r: r.id
+    )
+    names = [r.id.name for r in local]
     if label in LABEL_OFF_VALUES:
         return ""
     lost = "outside can't reach the ROS nodes of the pod"
@@ -111,11 +116,28 @@ def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
             f"label {INJECT}={label} names no RosProxy of namespace {pod.id.namespace}, so {lost}. "
             f"{edit_fix(f'Set the label to {value} in the template', pod)}"
         )
+    selectors = [
+        f"{r.id.name} ({shown(r.spec.pod_selector)})" for r in local if r.spec.pod_selector
+    ]
+    named = next((name for name in names if name == label), names[0])
     return (
         "the labels of the pod do not match spec.podSelector of RosProxy "
-        f"{' and '.join(names[:MOST_NAMES])}, "
-        f"so {lost}. Change the labels or the selector, then {recreate_fix(pod)}"
+        f"{' and '.join(selectors[:MOST_NAMES])}, so {lost}. "
+        f"{edit_fix('Add the missing labels to the template', pod)}. Or correct the selector: "
+        f"kubectl -n {pod.id.namespace} edit rosproxy {named}; then {recreate_fix(pod)}"
     )
+
+
+def shown(selector: Selector) -> str:
+    """A label selector as kubectl writes it, such as ``app=talker,tier in (a,b)``."""
+    parts = [f"{key}={value}" for key, value in selector.labels.items()]
+    for key, operator, values in selector.expressions:
+        words = {"In": "in", "NotIn": "notin"}.get(operator)
+        if words:
+            parts.append(f"{key} {words} ({','.join(sorted(values))})")
+        else:
+            parts.append(f"!{key}" if operator == "DoesNotExist" else key)
+    return shorten(",".join(parts), _MOST_SELECTOR_CHARACTERS)
 
 
 def wants_proxy(pod: Pod) -> bool:

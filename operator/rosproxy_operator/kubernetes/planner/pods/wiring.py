@@ -320,7 +320,8 @@ def missing_variable_text(
     text = f"has no variable {variable} with the address of the proxy"
     if INJECT not in pod.labels:
         label = f"{INJECT}={rosproxy.id.name}"
-        return f"{text}. {edit_fix(f'Add the label {label} to the template', pod)}"
+        fix = edit_fix(f"Add the label {label} to the template", pod)
+        return f"{text}, since the pod has no label {INJECT}. {fix}"
     restart = f"Run {recreate_command(pod)}"
     if not webhook.served:
         fix = edit_fix(f"Set {variable} in the template", pod)
@@ -328,7 +329,8 @@ def missing_variable_text(
     if pod.wired_master_uri or pod.static_peers or pod.router_endpoint:
         changed = f"spec.ros of RosProxy {rosproxy.id.name} has changed"
         return f"{text}, since {changed} after the pod was created. {restart}"
-    if _is_older(pod, rosproxy.created):
+    # An unwired pod of the same second is older, too: the webhook did not know the RosProxy.
+    if pod.created and pod.created <= rosproxy.created:
         return f"{text}, since the pod is older than RosProxy {rosproxy.id.name}. {restart}"
     reason = (
         "no operator answered the API server at the webhook port (chart value webhook.port) when "

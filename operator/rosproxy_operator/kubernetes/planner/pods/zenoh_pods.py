@@ -68,7 +68,8 @@ def _problems(
     if uses_dds(container.variables):
         rmw = clean(container.variables["RMW_IMPLEMENTATION"])[:200]
         text = f"variable RMW_IMPLEMENTATION={rmw} is DDS, and RosProxy {rosproxy.id.name} is for "
-        yield "NoZenoh", f"{text}rmw_zenoh. Use rmw_zenoh_cpp, or a RosProxy with spec.ros: 2"
+        fix = edit_fix("Set rmw_zenoh_cpp in the template", pod)
+        yield "NoZenoh", f"{text}rmw_zenoh. {fix}. Or use a RosProxy with spec.ros: 2"
         return
     override = container.variables.get(OVERRIDE, "")
     extended = wired_override(container.variables, router_of(address), pod.router_endpoint)
