@@ -9,6 +9,7 @@ the doctor checks the rest.
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 from kubernetes.client import ApiClient, CoreV1Api
 from kubernetes.client.exceptions import ApiException
@@ -58,9 +59,10 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
         own_pods = facts.own_pods()
         operators = facts.operators(rosproxies)
         pods = facts.labelled_pods()
-        usable, _ = read_rosproxies(rosproxies)
-        cut_off = unreached(pods, [*usable.values()], operators.ready_since)
-        webhook = facts.webhook(operators, cut_off, [*usable.values()])
+        by_name, _ = read_rosproxies(rosproxies)
+        usable = [*by_name.values()]
+        cut_off = unreached(pods, usable, operators.ready_since, cache(facts.service_since))
+        webhook = facts.webhook(operators, cut_off, usable)
         findings = [
             *operator_findings(operators),
             *([] if listed is None else _rosproxy_findings(listed, operators, pods)),

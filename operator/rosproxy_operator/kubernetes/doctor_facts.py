@@ -24,7 +24,7 @@ from rosproxy_operator.kubernetes.planner.pods.wiring import UNWIRED
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name, Pod, RosProxy
-from rosproxy_operator.kubernetes.resources.names import INJECT
+from rosproxy_operator.kubernetes.resources.names import INJECT, service_id
 from rosproxy_operator.kubernetes.status.condition_findings import is_unnoticed
 from rosproxy_operator.kubernetes.status.event_findings import (
     MOST_EVENTS,
@@ -185,6 +185,14 @@ class DoctorFacts:
         except ApiError:
             return True
         return text_at(submap(pod, "metadata"), "uid") == event.uid
+
+    def service_since(self, rosproxy: Name) -> str:
+        """Return since when a RosProxy has its Service, in RFC 3339; empty if unknown."""
+        try:
+            service = self._api.get("services", service_id(rosproxy))
+        except ApiError:
+            return ""
+        return text_at(submap(service, "metadata"), "creationTimestamp")
 
     def _count_ready(self, service: Name, ready: dict[Name, int | None]) -> None:
         """Store in ``ready`` how many endpoints of a Service are ready; None: no such Service."""

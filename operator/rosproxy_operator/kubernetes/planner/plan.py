@@ -275,7 +275,9 @@ def _problems(
     """Return all findings about a RosProxy."""
     address = context.cluster_ip(rosproxy)
     pods = context.view.selected_pods.get(rosproxy.id, ()) if address else ()
-    webhook = context.observed.webhook
+    service = context.observed.services.get(rosproxy.id)
+    since = service.created if service else ""
+    webhook = replace(context.observed.webhook, service_since=since)
     unlisted = context.observed.policies_error if context.settings.network_policy else ""
     text = f"the operator can't list NetworkPolicies, so this RosProxy gets none: {unlisted}"
     return (

@@ -97,7 +97,7 @@ SERVICE_IDS = {
 
 
 class ProxyService(msgspec.Struct, frozen=True):
-    """A Service of a RosProxy.
+    """A Service of a RosProxy. ``created`` is the time of the creation, in RFC 3339.
 
     A Service for outside has ``node_port``, the port of each node of the cluster, and of type
     LoadBalancer ``balancer``, the name or address of the load balancer; empty before there is one.
@@ -112,6 +112,7 @@ class ProxyService(msgspec.Struct, frozen=True):
     role: ServiceRole = ServiceRole.PODS
     node_port: int = 0
     balancer: str = ""
+    created: str = ""
 
     @property
     def id(self) -> Name:
@@ -234,13 +235,16 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
 
 
 class WebhookState(msgspec.Struct, frozen=True):
-    """Whether the operator has a webhook, and since when the operator serves the webhook.
+    """Whether the operator has a webhook, and since when the webhook can wire the pods.
 
-    ``since`` is in RFC 3339, and empty while the operator does not serve the webhook.
+    ``since``: since when the operator serves the webhook, empty while the operator does not.
+    ``service_since``: since when the RosProxy of the pods has its Service, empty if unknown. The
+    webhook wires no pod before. Both are in RFC 3339.
     """
 
     served: bool = True
     since: str = ""
+    service_since: str = ""
 
 
 class ClusterSnapshot(msgspec.Struct, frozen=True):

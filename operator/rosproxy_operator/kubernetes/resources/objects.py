@@ -201,6 +201,7 @@ def service(obj: Json) -> ProxyService | None:
         deleting=is_deleted(meta),
         role=role,
         node_port=next((int_at(port, "nodePort") for port in submaps(spec, "ports")), 0),
+        created=text_at(meta, "creationTimestamp"),
         balancer=next(filter(None, hosts), ""),
     )
 

@@ -49,7 +49,7 @@ _BY_REASON = {
     "SiteUnreachable": f"do as the message says, or correct spec.link: {_EDIT}",
     "LinkCertificate": "put a new certificate into the Secret of spec.link.secretName, as the "
     "message says",
-    "ProxyWarns": "read the findings of the proxies' doctors below",
+    "ProxyWarns": f"read the findings of the proxies' doctors below; fields of the spec: {_EDIT}",
     "UnknownName": "correct the name where the message says; for a pod, run the command in the "
     "message",
 }

@@ -3,6 +3,7 @@
 import copy
 import time
 from datetime import UTC, datetime
+from functools import cache
 from typing import Any
 
 import pytest
@@ -128,6 +129,11 @@ async def test_a_webhook_that_the_api_server_does_not_reach(server: ApiServer, a
     assert "the webhook port of the operator's pods in namespace system" in finding.fix
 
 
+def no_service(_: object) -> str:
+    """The doctor could not read the Service."""
+    return ""
+
+
 def test_which_pods_show_that_the_api_server_reached_no_operator() -> None:
     of = replace(rosproxy(cluster_ip=CLUSTER_IP), created="2026-01-02T00:00:00Z")
     late: Obj = {"created": "2026-02-01T00:00:00Z"}
@@ -139,9 +145,26 @@ def test_which_pods_show_that_the_api_server_reached_no_operator() -> None:
         pod("astray", {"rosproxy.io/inject": "leg"}, **late),
         pod("old", created="2026-01-01T00:00:00Z"),
     ]
-    assert unreached(pods, [of], "2026-01-31T00:00:00Z") == ["robots/unwired"]
-    assert unreached(pods, [of], "2026-01-31T23:59:30Z") == []
-    assert unreached(pods, [of], "") == []
+    assert unreached(pods, [of], "2026-01-31T00:00:00Z", no_service) == ["robots/unwired"]
+    assert unreached(pods, [of], "2026-01-31T23:59:30Z", no_service) == []
+    assert unreached(pods, [of], "", no_service) == []
+
+
+async def test_pods_older_than_the_service_show_nothing_about_the_webhook(
+    server: ApiServer, api: Api
+) -> None:
+    """A RosProxy that was refused for long gets its Service when its spec is corrected."""
+    of = replace(rosproxy(cluster_ip=CLUSTER_IP), created="2026-01-02T00:00:00Z")
+    unwired = pod("unwired", created="2026-02-01T00:00:00Z")
+
+    def look() -> list[str]:
+        since = cache(DoctorFacts(api, ()).service_since)
+        return unreached([unwired], [of], "2026-01-31T00:00:00Z", since)
+
+    assert await in_thread(look) == ["robots/unwired"]
+    made = {"name": "rosproxy-arm", "creationTimestamp": "2026-02-01T00:00:10Z"}
+    server.put("services", {"metadata": made}, NAMESPACE)
+    assert await in_thread(look) == []
 
 
 async def test_labelled_pods_in_a_namespace_without_a_rosproxy(server: ApiServer, api: Api) -> None:

@@ -273,6 +273,9 @@ def test_a_service():
         "f",
         False,
     )
+    of_today = service(service_obj(creationTimestamp="2026-11-28T14:00:00Z"))
+    assert of_today is not None
+    assert of_today.created == "2026-11-28T14:00:00Z"
 
 
 def test_a_service_without_an_address():

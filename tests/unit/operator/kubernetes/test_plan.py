@@ -359,6 +359,13 @@ def test_a_pod_that_is_not_wired_is_told() -> None:
     assert "kubectl -n ros delete pod talker" in told(plan, "NotWired")[0]
 
 
+def test_a_pod_that_is_older_than_the_service_is_told_so() -> None:
+    late = service(created="2026-01-01T00:00:10Z")
+    old = pod(wired_master_uri="", created="2026-01-01T00:00:09Z")
+    plan = look(complete(pods=(old,), services={ROBOT: late}))
+    assert "is older than Service rosproxy-robot of the RosProxy" in told(plan, "NotWired")[0]
+
+
 def test_a_pod_of_a_former_rosproxy_gets_a_finding() -> None:
     """Its nodes are no longer registered, although the new Service has the same address."""
     of = replace(rosproxy(), created="2026-01-01T00:00:10Z")

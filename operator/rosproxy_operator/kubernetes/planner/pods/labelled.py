@@ -3,7 +3,7 @@
 The doctor reads the pods itself: no operator has to run.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from rosproxy.admin.doctor_finding import DoctorFinding, error
 from rosproxy.telemetry.text import listed, plural
@@ -15,7 +15,7 @@ from rosproxy_operator.kubernetes.planner.pods.wiring import (
     recreate_command,
     should_be_wired,
 )
-from rosproxy_operator.kubernetes.resources.model import Pod, RosProxy
+from rosproxy_operator.kubernetes.resources.model import Name, Pod, RosProxy
 from rosproxy_operator.kubernetes.resources.names import INJECT
 
 MOST_COMMANDS = 5
@@ -58,11 +58,16 @@ def misspelt_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> lis
     return found[:MOST_MISSPELT_FINDINGS]
 
 
-def unreached(pods: Iterable[Pod], rosproxies: Sequence[RosProxy], ready_since: str) -> list[str]:
+def unreached(
+    pods: Iterable[Pod],
+    rosproxies: Sequence[RosProxy],
+    ready_since: str,
+    service_since: Callable[[Name], str],
+) -> list[str]:
     """Return the unwired pods that were created while an operator was ready, as NAMESPACE/NAME.
 
     ``ready_since`` is the RFC 3339 time at which an operator became ready; empty without an
-    operator.
+    operator. ``service_since`` returns since when a RosProxy has its Service; empty if unknown.
     """
     chosen = [(pod, select_rosproxy(pod, rosproxies)) for pod in pods]
     return sorted(
@@ -73,4 +78,5 @@ def unreached(pods: Iterable[Pod], rosproxies: Sequence[RosProxy], ready_since: 
         and not (pod.wired_master_uri or pod.static_peers or pod.router_endpoint)
         and needs_recreation(pod, rosproxy, rosproxy.cluster_ip)
         and should_be_wired(pod, rosproxy, ready_since)
+        and should_be_wired(pod, rosproxy, ready_since, service_since(rosproxy.id))
     )

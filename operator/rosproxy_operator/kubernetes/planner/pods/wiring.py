@@ -275,15 +275,31 @@ def _is_older(pod: Pod, time: str) -> bool:
     return bool(pod.created) and pod.created < time
 
 
-def should_be_wired(pod: Pod, rosproxy: RosProxy, ready_since: str) -> bool:
+def _younger_object(pod: Pod, rosproxy: RosProxy, service_since: str) -> str:
+    """The object that an unwired pod lacked at its creation; empty if both objects existed.
+
+    A pod of the same second as the object lacked the object, too: otherwise the webhook would have
+    wired the pod. The operator creates the Service, so the Service is younger than the RosProxy.
+    """
+    if _is_older(pod, rosproxy.created):
+        return f"RosProxy {rosproxy.id.name}"
+    if pod.created and pod.created <= service_since:
+        return f"Service {service_id(rosproxy.id).name} of the RosProxy"
+    return ""
+
+
+def should_be_wired(
+    pod: Pod, rosproxy: RosProxy, ready_since: str, service_since: str = ""
+) -> bool:
     """Whether the webhook should have wired a pod when the pod was created.
 
-    The pod must be at least `WEBHOOK_READY_AFTER` younger than the RosProxy, and than the time
-    ``ready_since`` at which the webhook became ready (RFC 3339). False if a time is not known.
+    The pod must be at least `WEBHOOK_READY_AFTER` younger than the RosProxy, than the time
+    ``ready_since`` at which the webhook became ready, and than the Service of the RosProxy
+    (``service_since``; empty if unknown). False if another time is not known.
     """
     if not (pod.created and rosproxy.created and ready_since):
         return False
-    others = (rosproxy.created, ready_since)
+    others = filter(None, (rosproxy.created, ready_since, service_since))
     latest = max(datetime.fromisoformat(time) for time in others)
     return datetime.fromisoformat(pod.created) - latest >= WEBHOOK_READY_AFTER
 
@@ -329,14 +345,13 @@ def missing_variable_text(
     if pod.wired_master_uri or pod.static_peers or pod.router_endpoint:
         changed = f"spec.ros of RosProxy {rosproxy.id.name} has changed"
         return f"{text}, since {changed} after the pod was created. {restart}"
-    # An unwired pod of the same second is older, too: the webhook did not know the RosProxy.
-    if pod.created and pod.created <= rosproxy.created:
-        return f"{text}, since the pod is older than RosProxy {rosproxy.id.name}. {restart}"
+    if younger := _younger_object(pod, rosproxy, webhook.service_since):
+        return f"{text}, since the pod is older than {younger}. {restart}"
     reason = (
         "no operator answered the API server at the webhook port (chart value webhook.port) when "
         "the pod was created"
     )
-    if should_be_wired(pod, rosproxy, webhook.since):
+    if should_be_wired(pod, rosproxy, webhook.since, webhook.service_since):
         return (
             f"{text}, since {reason}, although an operator was ready. Allow connections from the "
             "API server to the webhook port of the operator's pods (NetworkPolicy, firewall). "
