@@ -8,11 +8,11 @@ from tests.docker.engine import wait_until
 from tests.docker.nodes import node_command
 from tests.kubernetes import api
 from tests.kubernetes.measured import note
+from tests.kubernetes.mistakes import Site, restart_as_told
 from tests.kubernetes.pods import INJECT, Namespace, unique
 from tests.kubernetes.robot import Robot, robot_with_master
 from tests.kubernetes.rosproxies import NOWHERE, RosProxy, rosproxy
 from tests.kubernetes.test_doctor import doctor
-from tests.kubernetes.test_mistakes import Site, restart_as_told
 from tests.kubernetes.traffic import START, wait_for_service
 
 

@@ -1,6 +1,7 @@
 """etcd, the API server, the controller manager and the scheduler."""
 
 from pathlib import Path
+from typing import Any
 
 from tests.docker.engine import run, wait_until
 from tests.kubernetes.cluster.certificates import certificate_file, key_file
@@ -63,11 +64,10 @@ SCHEDULER = Program("kube-scheduler", (
 PROGRAMS = (ETCD, API_SERVER, CONTROLLER_MANAGER, SCHEDULER)
 
 
-def kubectl(*arguments: str | Path, check: bool = True, seconds: float = 60) -> str:
+def kubectl(*arguments: str | Path, check: bool = True, seconds: float = 60, **options: Any) -> str:
     """Run kubectl as the cluster's administrator."""
-    return run(
-        BIN / "kubectl", f"--kubeconfig={KUBECONFIG}", *arguments, check=check, seconds=seconds
-    )
+    command = (BIN / "kubectl", f"--kubeconfig={KUBECONFIG}", *arguments)
+    return run(*command, check=check, seconds=seconds, **options)
 
 
 def start_control_plane() -> None:
