@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 from urllib.parse import urlencode
@@ -113,6 +113,27 @@ def dry_run(body: Json) -> tuple[Json, str]:
     text, warnings = call("POST", url_path, body, query={"dryRun": "All"})
     created: Json = json.loads(text)
     return created, warnings
+
+
+def watch(
+    resource: str, namespace: str, selector: str, version: str, seconds: int
+) -> Iterator[Json]:
+    """The events of objects since a version, for some seconds. Without a version, first all
+    objects. Raises urllib3.exceptions.HTTPError.
+    """
+    query = {"watch": "1", "labelSelector": selector, "timeoutSeconds": str(seconds)}
+    query |= {"resourceVersion": version} if version else {}
+    url = API_SERVER + path(resource, namespace) + _query(query)
+    answer = _pool().request("GET", url, preload_content=False)
+    if answer.status != 200:  # the version is too old
+        yield {"type": "ERROR"}
+    rest = b""
+    try:
+        for piece in answer.stream() if answer.status == 200 else ():
+            *lines, rest = (rest + piece).split(b"\n")
+            yield from map(json.loads, lines)
+    finally:
+        answer.release_conn()
 
 
 def json_call(method: str, url_path: str, body: Json | None = None, **more: Any) -> Json:

@@ -1,5 +1,6 @@
 """helm test, and helm upgrade with traffic running."""
 
+import itertools
 import time
 
 import pytest
@@ -10,8 +11,9 @@ from tests.kubernetes import api, release
 from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace
 from tests.kubernetes.robot import Robot
+from tests.kubernetes.rollout import Absence, watched
 from tests.kubernetes.rosproxies import Proxy, rosproxy
-from tests.kubernetes.traffic import START, flow, wait_for_service
+from tests.kubernetes.traffic import START, Flow, flow, wait_for_service
 
 
 def test_helm_test() -> None:
@@ -31,6 +33,56 @@ def test_upgrade_of_the_operator_only(net: Namespace, robot: Robot) -> None:
         gaps = traffic.gaps(started)
         assert gaps.unnoticed, gaps
         assert made.the_proxy().uid_then == before.uid_then
+
+
+def test_the_image_changes_on_one_node_at_a_time(net: Namespace, robot: Robot) -> None:
+    """A proxy is ready again, and so reaches the master, before the next proxy is stopped.
+
+    Meanwhile the messages of the other node flow without a loss.
+    """
+    other = release.other_image()
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    with (
+        flow(net, robot, "roscpp", on="node1") as one,
+        flow(net, robot, "rospy", on="node2") as two,
+    ):
+        before = {node: made.the_proxy(node) for node in ("node1", "node2")}
+        with watched(made) as rollout:
+            started = time.time()
+            release.upgrade(proxy={"image": {"tag": other}})
+            wait_until(
+                lambda: {absence.node for absence in rollout.ended} == before.keys(),
+                120,
+                lambda: f"{rollout.absences()}: {made.tell()}",
+            )
+            for traffic in (one, two):
+                traffic.wait(since=time.time(), seconds=60)
+        flows = {"node1": one, "node2": two}
+        _assert_in_turn(rollout.absences(), flows)
+        for node, traffic in flows.items():
+            note(f"other image on two nodes, {node}: {traffic.gaps(started)}")
+            after = made.the_proxy(node)
+            assert (after.uid_then, after.restarts) == (before[node].uid_then, 1)
+            assert after.body["spec"]["containers"][0]["image"] == f"rosproxy:{other}"
+    release.upgrade()
+
+
+def _assert_in_turn(absences: list[Absence], flows: dict[str, Flow]) -> None:
+    """Each proxy is away once and never two at once, and the messages of other nodes flow."""
+    assert sorted(absence.node for absence in absences) == sorted(flows), absences
+    for one, following in itertools.pairwise(absences):
+        assert one.end <= following.begin, absences
+    for absence in absences:
+        for node, traffic in flows.items():
+            if node != absence.node:
+                _assert_no_loss(absence, traffic)
+
+
+def _assert_no_loss(absence: Absence, traffic: Flow) -> None:
+    for log, word in ((traffic.outward, "inside"), (traffic.inward, "outside")):
+        numbers = absence.numbers(log, word)
+        assert numbers, f"no message {word} during {absence}"
+        assert numbers == [*range(numbers[0], numbers[-1] + 1)], absence
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
