@@ -48,10 +48,24 @@ def helm(*arguments: str | Path, check: bool = True, seconds: float = 180) -> st
 
 def install() -> None:
     """Install the chart in a namespace that lets nothing run but what is *restricted*."""
+    _create_namespace()
+    _apply("install")
+
+
+def install_former(chart: Path, tag: str) -> None:
+    """Install a former chart in place of the release, with images of this tag."""
+    remove()
+    _create_namespace()
+    images = {"image": {"tag": tag}, "proxy": {"image": {"tag": tag}}}
+    # The former chart refuses values that came later.
+    former = {key: value for key, value in _IMAGES.items() if key in ("image", "proxy", "tests")}
+    _helm_with(_merged(former, images), "install", chart)
+
+
+def _create_namespace() -> None:
     restricted = {"pod-security.kubernetes.io/enforce": "restricted"}
     api.create({"apiVersion": "v1", "kind": "Namespace",
                 "metadata": {"name": NAMESPACE, "labels": restricted}})  # fmt: skip
-    _apply("install")
 
 
 def install_again(**values: Any) -> None:

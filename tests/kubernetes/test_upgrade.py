@@ -2,12 +2,14 @@
 
 import itertools
 import time
+from pathlib import Path
 
 import pytest
 
 from tests.docker.engine import wait_until
+from tests.docker.images import PROXY
 from tests.docker.nodes import LIBRARIES
-from tests.kubernetes import api, release
+from tests.kubernetes import api, former, release
 from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace
 from tests.kubernetes.robot import Robot
@@ -65,6 +67,41 @@ def test_the_image_changes_on_one_node_at_a_time(net: Namespace, robot: Robot) -
             assert (after.uid_then, after.restarts) == (before[node].uid_then, 1)
             assert after.body["spec"]["containers"][0]["image"] == f"rosproxy:{other}"
     release.upgrade()
+
+
+@pytest.mark.skipif(not former.is_known(), reason="the history of git is not here")
+def test_upgrade_from_a_former_chart(net: Namespace, robot: Robot, tmp_path: Path) -> None:
+    """The proxies are recreated in turn, on the same ports, and running pods go on."""
+    release.install_former(former.prepare(tmp_path), former.TAG)
+    try:
+        release.wait_operator()
+        made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+        with (
+            flow(net, robot, "roscpp", on="node1") as one,
+            flow(net, robot, "rospy", on="node2") as two,
+        ):
+            flows = {"node1": one, "node2": two}
+            before = {node: made.the_proxy(node) for node in flows}
+            with watched(made) as rollout:
+                started = time.time()
+                release.upgrade()
+                wait_until(
+                    lambda: {absence.node for absence in rollout.ended} == flows.keys(),
+                    180,
+                    lambda: f"{rollout.absences()}: {made.tell()}",
+                )
+                for traffic in flows.values():
+                    traffic.wait(since=time.time(), seconds=60)
+            _assert_in_turn(rollout.absences(), flows)
+            for node, traffic in flows.items():
+                note(f"helm upgrade from {former.COMMIT[:7]}, {node}: {traffic.gaps(started)}")
+                after = made.the_proxy(node)
+                assert after.ports == before[node].ports
+                assert after.body["spec"]["containers"][0]["image"] == PROXY
+    finally:
+        release.remove()
+        release.install()
+        release.wait_operator()
 
 
 def _assert_in_turn(absences: list[Absence], flows: dict[str, Flow]) -> None:
