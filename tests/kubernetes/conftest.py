@@ -20,7 +20,7 @@ from tests.kubernetes.robot import Robot, robot_with_master
 
 _LOCK = Path("/run/lock/rosproxy-cluster")
 LAST = ("test_chart", "test_operator_killed", "test_leader", "test_monitoring", "test_api_server",
-        "test_node_lost", "test_upgrade", "test_uninstall")  # fmt: skip
+        "test_node_lost", "test_administrators", "test_upgrade", "test_uninstall")  # fmt: skip
 """The modules whose tests disturb the whole cluster, in order."""
 
 

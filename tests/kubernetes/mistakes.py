@@ -181,15 +181,17 @@ def walk_through(mistake: Mistake, site: Site) -> None:
             wait_until(site.is_well, 90, lambda: f"the fix works: {_story(site)}")
         finally:
             mistake.undo(site)
-        wait_until(lambda: not errors(site), 90, lambda: f"content: {errors(site)}")
+        wait_until(
+            lambda: not errors(site.net.name), 90, lambda: f"content: {errors(site.net.name)}"
+        )
         fixed = time.time()
         for word in mistake.words:
             heard.wait_for(word, since=fixed, seconds=START)
 
 
-def errors(site: Site) -> list[str]:
+def errors(namespace: str) -> list[str]:
     """The errors of the doctor, each with its fix. No fix is one for users of Docker."""
-    code, found = doctor(site.net.name)
+    code, found = doctor(namespace)
     texts = [f"{f['text']}\n{f['fix']}" for f in found if f["severity"] == "error"]
     assert code == bool(texts), found
     assert not [text for text in texts if _OF_DOCKER.search(text)], texts
@@ -202,7 +204,7 @@ def _wait_said(site: Site, cure: Cure) -> str:
     told: list[str] = []
 
     def is_said() -> bool:
-        found = errors(site)
+        found = errors(site.net.name)
         told[:] = sorted(found, key=lambda text: not (said in text and advice in text))
         return bool(told) and said in told[0] and advice in told[0]
 

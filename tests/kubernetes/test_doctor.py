@@ -135,6 +135,12 @@ def test_a_webhook_that_the_api_server_does_not_reach_is_told(net: Namespace) ->
         "no operator answered the API server at the webhook port (chart value webhook.port)"
     )
     assert f"{net.name}/{pod.name}" in found["text"]
+    assert "allow connections from the API server to the webhook port" in found["fix"]
+    # The fix was followed at the end of `webhook_cut_off`. A new pod is wired.
+    pod.remove(grace=0)
+    assert net.idle(on="node1").environment
+    (found,) = [f for f in doctor(net.name)[1] if f["check"] == "webhook"]
+    assert found["severity"] == "ok"
 
 
 def test_a_webhook_that_the_api_server_does_not_reach_is_told_before_there_is_a_pod(

@@ -24,6 +24,7 @@ from tests.kubernetes.ros2 import (
     robot_with_ros2,
 )
 from tests.kubernetes.rosproxies import Proxy, RosProxy, rosproxy, wait_event
+from tests.kubernetes.test_doctor import doctor
 from tests.kubernetes.traffic import wait_for_service
 
 NODES = ("node1", "node2")
@@ -156,7 +157,10 @@ def test_what_users_are_told(world: World) -> None:
     port = of.service["spec"]["ports"][0]
     assert pod.environment["ROS_STATIC_PEERS"] == status["staticPeers"]
     assert (port["protocol"], port["port"]) == ("UDP", 7410)
-    assert len(lan_relays(of)) == len(NODES)
+    relays = {relay["metadata"]["name"] for relay in lan_relays(of)}
+    assert len(relays) == len(NODES)
+    findings = doctor(world.net.name)[1]
+    assert not [f for f in findings if any(relay in f["subject"] for relay in relays)]
 
 
 def test_seconds_to_the_first_message(world: World, robot2: Robot2) -> None:

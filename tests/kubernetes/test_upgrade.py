@@ -11,6 +11,7 @@ from tests.docker.images import PROXY
 from tests.docker.nodes import LIBRARIES
 from tests.kubernetes import api, former, release
 from tests.kubernetes.measured import note
+from tests.kubernetes.mistakes import errors
 from tests.kubernetes.pods import Namespace
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rollout import Absence, watched
@@ -149,6 +150,9 @@ def test_a_wrong_image_of_the_proxies(net: Namespace, robot: Robot) -> None:
         release.upgrade(proxy={"image": {"tag": "missing"}})
         made.wait_event("ImageUnusable", "rosproxy:missing")
         assert "rosproxy:missing" in made.wait_for("Degraded", "True")["message"]
+        (text,) = [text for text in errors(net.name) if "rosproxy:missing" in text]
+        assert "the node can't get the image rosproxy:missing (" in text
+        assert f"keeps the image {PROXY}. Load the image on the node, or correct spec.image" in text
         assert made.wait_for("Ready", "True")
         release.upgrade()
         made.wait_for("Degraded", "False")
