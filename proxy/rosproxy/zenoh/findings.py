@@ -81,6 +81,11 @@ _LINK_FAULTS = {
         "router, or two peers lead to the same router",
         "check the port, and give each router once",
     ),
+    LinkFault.MOVED: (
+        "the host name leads to another address than before, and the router there opens no session "
+        "yet. A router that has moved waits until its former session ends",
+        "wait some seconds. If the finding stays, check that the name leads to the router",
+    ),
     LinkFault.NO_QUIC_SESSION: (
         "no session over UDP. Either no proxy listens there for QUIC, a firewall drops UDP, or one "
         "side refuses the certificate of the other",

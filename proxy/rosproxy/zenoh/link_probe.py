@@ -41,6 +41,16 @@ async def try_link(link: Link, tls: ssl.SSLContext | None = None) -> LinkFault:
     return fault
 
 
+async def accepts(end: HostPort) -> bool:
+    """Whether a program accepts connections at an address."""
+    try:
+        sock = await sockets.dial(end)
+    except OSError:  # also TimeoutError
+        return False
+    sock.close()
+    return True
+
+
 async def _try_tls(sock: socket.socket, host: str, tls: ssl.SSLContext) -> LinkFault:
     """Try the handshake of TLS on a connection, and close the connection."""
     try:

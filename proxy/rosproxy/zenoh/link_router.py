@@ -15,13 +15,8 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import LINK_PROTOCOLS, Credentials, LinkPort, SiteLink, TopicLimit
 from rosproxy.zenoh.policy.access_control import AT_LINKS, access_control
 from rosproxy.zenoh.policy.key_expressions import check_glob, data_keys, matches_no_name
-from rosproxy.zenoh.router_configs import RouterConfig, router_config, tls_values
+from rosproxy.zenoh.router_configs import LEASE, RouterConfig, router_config, tls_values
 
-LEASE_MS = 10_000
-"""Time without a packet after which a link counts as lost, for example if a robot changes its
-address. zenoh then connects again."""
-_KEEP_ALIVES = 4
-"""Packets within the lease on a link without messages."""
 _HUB_RETRY = "#retry_period_init_ms=50"
 """The router opens before the hub. Without this value, the second try would follow after 1 s."""
 
@@ -52,8 +47,7 @@ class LinkPlan:
             "listen/timeout_ms": -1,
             **tls_values(credentials),
             "transport/link/tls/close_link_on_expiration": True,
-            "transport/link/tx/keep_alive": _KEEP_ALIVES,
-            "transport/link/tx/lease": LEASE_MS,
+            **LEASE,
         }
         if access := access_control(self.policy, AT_LINKS):
             own["access_control"] = access

@@ -23,6 +23,7 @@ class LinkFault(Enum):
     UNREACHABLE = "unreachable"
     ITSELF = "the proxy itself"
     NO_SESSION = "no session"
+    MOVED = "no session at the new address"
     NO_QUIC_SESSION = "no session over UDP"
     NO_TLS = "no TLS"
     PEER_EXPIRED = "the certificate of the peer has expired"
@@ -82,6 +83,7 @@ class Link:
     ``fault``: None if the link is up. ``since``: the time in seconds at which the link went up or
     down.
     ``is_hub``: the router is the hub of another proxy, and is no fault while away.
+    ``former``: the addresses of the last session, if the host name leads elsewhere now.
     """
 
     peer: HostPort
@@ -90,6 +92,7 @@ class Link:
     protocol: str = "tcp"
     addresses: tuple[str, ...] = ()
     fault: LinkFault | None = LinkFault.NOT_TRIED
+    former: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """The peer, for a link to another site with the protocol."""
@@ -105,8 +108,18 @@ class Link:
         """Whether the link leads to a router outside (``--zenoh-peer``)."""
         return not self.is_hub and not self.is_to_site
 
+    def note_addresses(self, addresses: tuple[str, ...]) -> None:
+        """Note the addresses of the host name. If the name has no address now, the former stay."""
+        if not addresses:
+            return
+        if self.fault is None and not {*addresses} & {*self.addresses}:
+            self.former = self.addresses
+        self.addresses = addresses
+
     def note(self, fault: LinkFault | None, now: float) -> bool:
         """Note the state of the link. Return whether the state or the fault has changed."""
+        if fault is None:
+            self.former = ()
         if fault == self.fault:
             return False
         if fault is None or self.fault is None:
@@ -135,6 +148,19 @@ def own_peers(links: Iterable[Link], routers: Sequence[RouterReport]) -> set[Hos
         if any(end.host == link.peer.host or end.host in link.addresses for end in reached)
     }
     return found or {link.peer for link in at_port if link.fault and not is_address(link.peer.host)}
+
+
+def left_behind(link: Link, links: Iterable[Link], routers: Iterable[Ends]) -> set[HostPort]:
+    """The ends of connections with former addresses of a peer, if no other link leads there."""
+    of_others = {
+        address
+        for other in links
+        if other is not link
+        for address in (*other.addresses, other.peer.host)
+    }
+    hosts = {*link.former}.difference(link.addresses, of_others)
+    remotes = {ends.remote for ends in routers}
+    return {end for end in remotes if end.port == link.peer.port and end.host in hosts}
 
 
 def is_linked(

@@ -28,6 +28,14 @@ from rosproxy.setting_kinds import Credentials
 from rosproxy.zenoh.policy.access_control import HUB_PROTOCOL, NODE_PROTOCOL
 from rosproxy.zenoh.protocol.report import MOST_SESSIONS
 
+LEASE_MS = 10_000
+"""Time without a packet after which the other end of a link counts the link as lost, for example if
+a robot changes its address. Until then, a router refuses the hub a second session."""
+KEEP_ALIVES = 4
+"""Packets within the lease on a link without messages."""
+LEASE = MappingProxyType(
+    {"transport/link/tx/keep_alive": KEEP_ALIVES, "transport/link/tx/lease": LEASE_MS}
+)
 RouterConfig = Mapping[str, str]
 """Values as JSON, by the keys of zenoh's configuration."""
 _TLS = "tls"
@@ -127,7 +135,7 @@ class RouterPlan:
         dialed += [_tcp(peer) for peer in self.peers if peer not in self.hubs]
         dialed += [f"{protocol}/{hub}" for hub in self.hubs]
         tls = tls_values(self.certificate) if self.certificate else {}
-        return router_config(listen, dialed, tls)
+        return router_config(listen, dialed, tls | LEASE)
 
     def _socket(self, port: int) -> list[str]:
         return [f"{HUB_PROTOCOL}/{self.directory}/{port}"] if self.directory else []

@@ -5,17 +5,21 @@ the proxy alone. The proxy then starts the process again (`rosproxy.zenoh.router
 
 Each line of standard input is JSON: a revision, and a list of `RouterConfig`. With each further
 line, the process restarts the routers with changed configurations, and leaves the other routers
-alone. Standard output gets a `Report` each second, and at once after a line. If a router cannot be
-opened or does not answer, the last report has the error, and the process ends.
+alone. A line ``{"end": [[ADDRESS, PORT]]}`` ends connections. Standard output gets a `Report` each
+second, and at once after a line. If a router cannot be opened or does not answer, the last report
+has the error, and the process ends.
 
 Nodes wait for the process, so the process loads little: msgspec would take as long as all the rest.
 """
 
+import contextlib
 import ctypes
 import json
 import os
 import queue
 import signal
+import socket
+import struct
 import sys
 import threading
 import time
@@ -151,6 +155,24 @@ def report(output: TextIO, **fields: Any) -> None:
     print(json.dumps(fields), file=output, flush=True)
 
 
+def end_connections(remotes: Sequence[Sequence[Any]]) -> None:
+    """End the connections of this process to addresses. zenoh has no call for that.
+
+    zenoh closes a connection while other connections wait. Without this value of SO_LINGER, that
+    takes ten seconds if the other end does not answer.
+    """
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            connection = socket.socket(fileno=os.dup(int(name)))
+        except OSError:  # no socket, or closed meanwhile
+            continue
+        with connection, contextlib.suppress(OSError):  # no connection
+            if [*connection.getpeername()[:2]] in remotes:
+                reset_at_once = struct.pack("ii", 1, 0)
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, reset_at_once)
+                connection.shutdown(socket.SHUT_RDWR)
+
+
 def read_lines(lines: "queue.SimpleQueue[str]") -> None:
     """Put each line of standard input into a queue; an empty text at the end."""
     while line := sys.stdin.readline():
@@ -171,8 +193,11 @@ def run(lines: "queue.SimpleQueue[str]", output: TextIO) -> None:
         if line != _NO_LINE:
             # The empty text at the end of the input is no JSON. So ValueError ends the process.
             message = json.loads(line)
-            routers.use(message["routers"])
-            revision = message["revision"]
+            if "end" in message:
+                end_connections(message["end"])
+            else:
+                routers.use(message["routers"])
+                revision = message["revision"]
         report(output, revision=revision, **routers.report())
         try:
             line = lines.get(timeout=REPORT_INTERVAL_S)

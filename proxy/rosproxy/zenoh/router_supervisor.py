@@ -13,9 +13,10 @@ import logging
 import signal
 import sys
 from asyncio.subprocess import PIPE, Process
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from typing import TypeVar
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy.telemetry.text import brief
 from rosproxy.zenoh.protocol.library_log import certificate_refusal, is_about_links
@@ -113,6 +114,13 @@ class RouterSupervisor:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             await process.wait()
+
+    def end_connections(self, remotes: Iterable[HostPort]) -> None:
+        """Let the process end the connections to these addresses. The hub then dials again."""
+        line = json.dumps({"end": [[end.host, end.port] for end in remotes]}).encode() + b"\n"
+        if self._process is not None:
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                _piped(self._process.stdin).write(line)
 
     async def _keep_running(self) -> None:
         loop = asyncio.get_running_loop()

@@ -28,7 +28,7 @@ from rosproxy.settings import Settings
 from rosproxy.telemetry.text import listed
 from rosproxy.zenoh import findings
 from rosproxy.zenoh.certificates import CLIENTS, SERVERS, Checked, Unusable, check_credentials
-from rosproxy.zenoh.link_probe import try_link
+from rosproxy.zenoh.link_probe import accepts, try_link
 from rosproxy.zenoh.links import Link, LinkFault, own_peers
 from rosproxy.zenoh.policy.access_control import access_control
 from rosproxy.zenoh.policy.name_sets import check_layers
@@ -334,8 +334,7 @@ class Zenoh:
 
     async def _look_at(self, link: Link) -> None:
         """Look up the addresses of a peer, and record why the link to the peer is down."""
-        # If the name does not resolve now, the former addresses stay.
-        link.addresses = tuple(await resolve(link.peer.host)) or link.addresses
+        link.note_addresses(tuple(await resolve(link.peer.host)))
         if link.is_to_site and self._sites.files is None:
             return  # the status has the fault of the file
         if self._note_own(link):
@@ -345,6 +344,9 @@ class Zenoh:
             fault = LinkFault.ITSELF
         elif not self.state.is_up(link):
             fault = await try_link(link, self._client_for(link))
+            if fault is LinkFault.NO_SESSION and link.former:
+                fault = LinkFault.MOVED
+                await self._end_former(link)
         if self.supervisor.failure:  # the routers do not run, so the fault of the link is unknown
             return
         # The link may have come up during the try, which takes some seconds.
@@ -352,6 +354,16 @@ class Zenoh:
         if link.note(fault, self._runtime.now()):
             state = f"down, {fault.value}" if fault else "up"
             log.info("zenoh link %s: %s", state, link)
+
+    async def _end_former(self, link: Link) -> None:
+        """End the sessions with former addresses of a peer, where no router answers any more.
+
+        The hub would wait for the lease of the peer, which is 60 s for rmw_zenohd.
+        """
+        former = [end for end in self.state.left_behind(link) if not await accepts(end)]
+        if former:
+            log.info("zenoh link %s: no router at %s any more", link, listed(map(str, former)))
+            self.supervisor.end_connections(former)
 
     def _client_for(self, link: Link) -> ssl.SSLContext | None:
         """What proves the proxy to the peer of a link; None for a link without TLS."""

@@ -23,8 +23,9 @@ from rosproxy.admin.status_document import (
     ZenohSessionStatus,
     ZenohStatus,
 )
+from rosproxy.net.addresses import HostPort
 from rosproxy.settings import Settings
-from rosproxy.zenoh.links import Link, is_linked
+from rosproxy.zenoh.links import Link, is_linked, left_behind
 from rosproxy.zenoh.matching import Comparison, compare
 from rosproxy.zenoh.protocol.liveliness import TokenGraph, TopicQos, ZenohNode
 from rosproxy.zenoh.protocol.report import (
@@ -168,6 +169,11 @@ class ZenohState(Collector):
             listen = frozenset([at_links.port] if at_links else [])
         routers = (ends for at_link, ends in self._reading.routers if at_link is link.is_to_site)
         return not self._process.failure and is_linked(link.peer, link.addresses, routers, listen)
+
+    def left_behind(self, link: Link) -> set[HostPort]:
+        """The ends of the hub's sessions with former addresses of a peer."""
+        routers = (ends for at_link, ends in self._reading.routers if not at_link)
+        return left_behind(link, self.links, routers)
 
     @property
     def container_sessions(self) -> list[tuple[int, str]]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy.zenoh import router_supervisor
 from rosproxy.zenoh.protocol.report import Report
@@ -34,6 +35,11 @@ for line in sys.stdin:
     told = json.loads(line)
     report = {"revision": told["revision"], "tokens": [json.dumps(told["routers"])]}
     print(json.dumps(report), flush=True)
+"""
+ECHOES = """
+import json, sys
+for line in sys.stdin:
+    print(json.dumps({"tokens": [line.strip()]}), flush=True)
 """
 HANGS = "import time; time.sleep(60)"
 TALKS = 'print("no report", flush=True)'
@@ -153,6 +159,15 @@ async def test_other_configurations_are_in_force_when_use_returns(tasks: Tasks) 
         await kept.supervisor.use([{"mode": mode}])
         assert kept.reports[-1].tokens == (f'[{{"mode": "{mode}"}}]',)
     assert kept.supervisor.restarts == 0
+
+
+async def test_the_process_is_asked_to_end_connections(tasks: Tasks) -> None:
+    kept = Kept(tasks, ECHOES)
+    kept.supervisor.end_connections([HostPort("192.0.2.7", 7447)])  # no process runs yet
+    await kept.supervisor.start(CONFIGS)
+    kept.supervisor.end_connections([HostPort("192.0.2.7", 7447)])
+    expected = '{"end": [["192.0.2.7", 7447]]}'
+    await until(lambda: kept.reports[-1].tokens == (expected,), "the process has the line")
 
 
 async def test_a_process_that_does_not_confirm_is_replaced(

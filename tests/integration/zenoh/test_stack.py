@@ -19,6 +19,7 @@ from rosproxy.admin.requests import BodyError
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.app.policy_sources import PolicySources
 from rosproxy.net import sockets
+from rosproxy.net.addresses import HostPort
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
 from rosproxy.zenoh import stack, status
@@ -36,6 +37,7 @@ from tests.run_options import parse_settings
 
 HOST = "127.0.2.1"
 PEER = "127.0.2.7"
+OTHER_PEER = "127.0.2.8"
 REPORTS = """
 import os, sys, time
 sys.stdin.readline()
@@ -211,6 +213,35 @@ async def test_a_peer_that_turns_out_to_be_the_proxy_is_left_out(
     await until(lambda: len(lines()) == 2, "the routers have other configurations")
     assert peers_of_hub(lines()[0]) == ["tcp/192.0.2.7:47448", f"tcp/{PEER}:7447"]
     assert peers_of_hub(lines()[1]) == [f"tcp/{PEER}:7447"]
+
+
+@pytest.mark.parametrize("is_silent", [True, False])
+async def test_a_session_with_a_former_address_ends_if_no_router_answers_there(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_silent: bool
+) -> None:
+    addresses = (PEER,)
+
+    async def resolved(host: str) -> tuple[str, ...]:
+        return addresses
+
+    monkeypatch.setattr(stack, "resolve", resolved)
+    ended: list[HostPort] = []
+    zenoh = make(zenoh_peer=("robot",))
+    monkeypatch.setattr(zenoh.supervisor, "end_connections", ended.extend)
+    (tmp_path / "linked").touch()
+    await zenoh.start()
+    (link,) = zenoh.state.links
+    await until(lambda: link.fault is None, "the link is up")
+    listeners = [sockets.listen(OTHER_PEER, 7447)]
+    if not is_silent:
+        listeners.append(sockets.listen(PEER, 7447))
+    addresses = (OTHER_PEER,)
+    await until(lambda: link.fault is LinkFault.MOVED, "the fault is known")
+    if is_silent:
+        await until(lambda: ended[:1] == [HostPort(PEER, 7447)], "the session ends")
+    assert is_silent or not ended
+    for listener in listeners:
+        listener.close()
 
 
 async def test_rules_of_a_changed_file_come_into_force(

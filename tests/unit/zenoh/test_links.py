@@ -3,7 +3,15 @@
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.zenoh.links import Link, LinkFault, alert_fault, is_linked, own_peers, verify_fault
+from rosproxy.zenoh.links import (
+    Link,
+    LinkFault,
+    alert_fault,
+    is_linked,
+    left_behind,
+    own_peers,
+    verify_fault,
+)
 from rosproxy.zenoh.protocol.report import Ends, RouterReport, RouterSession, SessionConnection
 
 PEER = HostPort("robot", 7447)
@@ -49,6 +57,28 @@ def test_a_link_knows_since_when_it_is_up_or_down() -> None:
     assert (link.fault, link.since) == (None, 5.0)
     assert link.note(LinkFault.REFUSED, 6.0)
     assert link.since == 6.0
+
+
+def test_a_link_leaves_addresses_that_its_host_name_has_no_more() -> None:
+    moved = Link(PEER, 1.0, addresses=ADDRESSES, fault=None)
+    other = Link(HostPort("other", 7447), 1.0, addresses=("192.0.2.9",), fault=None)
+    local = HostPort("172.18.0.2", 40000)
+    remotes = [HostPort(*ADDRESSES[:1], 7447), HostPort("192.0.2.7", 7448)]
+    routers = [Ends(local, remote) for remote in remotes]
+    moved.note_addresses(())
+    moved.note_addresses(ADDRESSES[1:])
+    moved.note_addresses(ADDRESSES)
+    assert left_behind(moved, [moved, other], routers) == set()
+    moved.note_addresses(("192.0.2.8",))
+    assert left_behind(moved, [moved, other], routers) == {remotes[0]}
+    assert left_behind(other, [moved, other], routers) == set()
+    other.addresses = ADDRESSES
+    assert left_behind(moved, [moved, other], routers) == set()
+    other.addresses = ("192.0.2.9",)
+    moved.note(LinkFault.MOVED, 2.0)
+    assert left_behind(moved, [moved, other], routers) == {remotes[0]}
+    moved.note(None, 3.0)
+    assert left_behind(moved, [moved, other], routers) == set()
 
 
 def test_zenoh_reports_the_dialed_name_of_a_link_over_quic() -> None:
