@@ -150,6 +150,15 @@ FIXES = {
         "put a new certificate into the Secret of spec.link.secretName. The proxies notice new "
         "files by themselves",
     ),
+    "zenoh peers": Fix(
+        'set mode="client" in ZENOH_CONFIG_OVERRIDE of these nodes. In containers beside the '
+        "proxy, you can also connect them to ports {ports} of the proxy, one for each container",
+        'set mode="client" in ZENOH_CONFIG_OVERRIDE of these nodes. In containers of this host, '
+        "remove connect/endpoints instead, and add the labels rosproxy.enable=true and "
+        "rosproxy.peers",
+        'set mode="client" in ZENOH_CONFIG_OVERRIDE of these nodes. In pods, remove the variable '
+        "instead, and add the label rosproxy.io/inject=true",
+    ),
     "zenoh nodes": Fix(
         "set for the nodes in containers: RMW_IMPLEMENTATION=rmw_zenoh_cpp and "
         """ZENOH_CONFIG_OVERRIDE='mode="client";connect/endpoints=["tcp/PROXY:{port}"];"""

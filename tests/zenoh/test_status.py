@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import time
 
-from rosproxy.zenoh.findings import routers_without_node
+import pytest
+
+from rosproxy.zenoh.findings import APART_GRACE_S, routers_without_node
 from tests.ros.processes import wait_until
-from tests.zenoh.lab import PORTS, ROUTER_PORT, Lab
+from tests.zenoh.lab import PORTS, ROUTER_PORT, VERSIONS, Lab
 
 VERSION = "1.6.2"
 LATER_VERSION = "1.10.2"
@@ -106,3 +109,44 @@ def test_a_router_that_loses_the_tokens_of_nodes_is_told(lab: Lab) -> None:
     assert f"/{publisher.title}" not in {node.name for node in lab.zenoh().nodes}
     wait_until("the link has been up for long", lambda: routers_without_node(lab.zenoh()), 60)
     assert [*routers_without_node(lab.zenoh())] == [f"zenoh peer {lab.topology.plan.robot}:7447"]
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_peer_of_the_router_of_the_robot_is_told(lab: Lab, version: str) -> None:
+    """The usual mistake: nodes connect to the robot's router, and get no message."""
+    lab.start_router(version)
+    lab.start_proxy()
+    lab.wait_for_link()
+    publisher = lab.node(version, "out", "pub")
+    robot = lab.topology.plan.robot
+    endpoint = f'connect/endpoints=["tcp/{robot}:{ROUTER_PORT}"]'
+    mistaken = lab.node(version, "c1", "sub", ZENOH_CONFIG_OVERRIDE=endpoint)
+    right = lab.node(version, "c2", "sub", ZENOH_CONFIG_OVERRIDE=f'mode="client";{endpoint}')
+    right.wait_for_count("^got hello ", 5, timeout=30)
+    assert lab.proxy is not None
+    told = lab.proxy.wait_for(f"zenoh peers of router {robot}:{ROUTER_PORT}: nodes at (.*)", 60)
+    assert told[1].startswith(f"{lab.topology.plan.host} (/{mistaken.title}) are connected")
+    assert "these nodes run on this host or in its containers" in told[1]
+    assert 'Fix: set mode="client" in ZENOH_CONFIG_OVERRIDE' in told[1]
+    assert publisher.title not in told[1]
+    assert "got" not in mistaken.output()
+    mistaken.kill()
+    wait_until("the fault is over", lambda: not lab.status().problems, 30)
+
+
+def test_peers_of_a_router_that_reach_each_other_are_no_fault(lab: Lab) -> None:
+    """As in a configuration in which all nodes listen on the LAN."""
+    lab.start_router(VERSION)
+    lab.start_proxy()
+    lab.wait_for_link()
+    robot = lab.topology.plan.robot
+    endpoint = f'connect/endpoints=["tcp/{robot}:{ROUTER_PORT}"]'
+    strategy = '{"peer":{"to_router":"always","to_peer":"always"}}'
+    dials = f"{endpoint};scouting/gossip/autoconnect_strategy={strategy}"
+    listens = f'listen/endpoints=["tcp/{robot}:0"]'
+    lab.node(VERSION, "out", "pub", ZENOH_CONFIG_OVERRIDE=listens)
+    subscriber = lab.node(VERSION, "c1", "sub", ZENOH_CONFIG_OVERRIDE=dials)
+    subscriber.wait_for_count("^got hello ", 5, timeout=30)
+    time.sleep(APART_GRACE_S)
+    assert not lab.zenoh().apart
+    subscriber.wait_for_count("^got hello ", 5, timeout=30, since=subscriber.mark())

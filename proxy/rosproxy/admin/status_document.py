@@ -477,6 +477,20 @@ class ZenohNodeStatus(msgspec.Struct, frozen=True):
     qos: tuple[ZenohQosStatus, ...] = ()
 
 
+class ZenohApartStatus(msgspec.Struct, frozen=True):
+    """Nodes at an address that reach no other peers of their router, a ``router`` outside.
+
+    ``nodes``: some of their names. ``since``: how long the proxy has known that. ``own_address``:
+    the router knows the proxy by the same address, so the nodes run on the same host.
+    """
+
+    router: str = ""
+    address: str = ""
+    nodes: Names = ()
+    own_address: bool = False
+    since: Seconds = 0.0
+
+
 class ZenohStatus(msgspec.Struct, frozen=True):
     """The routers for rmw_zenoh: ports for containers, and the port ``listen`` for outside.
 
@@ -486,7 +500,8 @@ class ZenohStatus(msgspec.Struct, frozen=True):
     publishes or serves, ``reader`` of the node that subscribes or calls. ``not_compared``: pairs of
     nodes that the proxy has not compared. ``link_listen``: the port for links of other sites, such
     as ``tls/7447``; ``link_listens``: whether this port accepts connections. ``limits``: the rates
-    of topics on links to other sites, as ``/camera/*=2Hz``.
+    of topics on links to other sites, as ``/camera/*=2Hz``. ``apart``: zenoh peers of routers
+    outside that do not reach each other.
     """
 
     ports: str = ""
@@ -505,6 +520,7 @@ class ZenohStatus(msgspec.Struct, frozen=True):
     mismatches_left_out: Count = 0
     not_compared: Count = 0
     hub_listen: Count | None = None
+    apart: tuple[ZenohApartStatus, ...] = ()
 
 
 class ProxyStatus(msgspec.Struct, frozen=True):

@@ -10,6 +10,7 @@ from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, 
 from rosproxy.admin.status_bounds import fair_choice
 from rosproxy.admin.status_document import (
     MismatchStatus,
+    ZenohApartStatus,
     ZenohCertificateStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
@@ -29,6 +30,8 @@ LINK_GRACE_S = 5.0
 """Seconds in which a link has to come up before it counts as a fault."""
 NODE_GRACE_S = 10.0
 """Seconds in which a session of a node has to announce the node."""
+APART_GRACE_S = 15.0
+"""Seconds in which peers of a router outside may find each other, and answer the hub."""
 GRAPH_GRACE_S = 30.0
 """Seconds in which a node behind a router should be known."""
 WARNING_DAYS = (1, 3, 7, 14)
@@ -37,6 +40,8 @@ MOST_LIMIT_COMPARISONS = 20_000
 """Pairs of a topic and a limit that are compared. A pair takes half a microsecond."""
 NO_TYPE_HASH = "TypeHashNotSupported"
 """The type hash of all types on Humble."""
+LONGEST_NODE = 60
+"""Characters of a node's name in a text that names several."""
 LONGEST_HASH = 24
 """Characters of a type hash in a text."""
 MOST_REPORTED_MISMATCHES = 20
@@ -165,6 +170,7 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
         if not link.up and is_fault and is_tried and link.since >= LINK_GRACE_S:
             yield _link_fault(link)
     yield from shared_ports(zenoh).values()
+    yield from _peers_apart(zenoh)
     yield from _sessions_without_node(zenoh)
 
 
@@ -230,6 +236,29 @@ def _shared_port(zenoh: ZenohStatus, port: int | None, hosts: set[str]) -> Docto
     if port is not None:
         fix = f"give each container a port of its own ({quoted(zenoh.ports)}); or {fix}"
     return warning("shared port", f"zenoh {at_port}", text, fix)
+
+
+def _peers_apart(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
+    """Yield a warning for each router outside with peers that do not reach each other."""
+    by_router: dict[str, list[ZenohApartStatus]] = {}
+    for peers in zenoh.apart:
+        if peers.since >= APART_GRACE_S:
+            by_router.setdefault(peers.router, []).append(peers)
+    for router, apart in by_router.items():
+        named = [
+            f"{p.address} ({listed([brief(name, LONGEST_NODE) for name in p.nodes])})"
+            if p.nodes
+            else p.address
+            for p in apart
+        ]
+        text = f"nodes at {listed(named)} are connected to this router as peers. They exchange no "
+        text += "messages with its peers at other addresses, such as the nodes on its own machine: "
+        text += "rmw_zenohd passes none between its own peers, and zenohd only up to 1.8"
+        if own := [peers.address for peers in apart if peers.own_address]:
+            text += f". {listed(own)} is also the address of this proxy as the router sees it, so "
+            text += "these nodes run on this host or in its containers"
+        fix = how_to("zenoh peers", ports=zenoh.ports)
+        yield warning("peers apart", f"zenoh peers of router {router}", text, fix)
 
 
 def _sessions_without_node(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:

@@ -28,6 +28,7 @@ from typing import Any, TextIO
 
 import zenoh
 
+from rosproxy.zenoh.outside_routers import OutsideRouters
 from rosproxy.zenoh.protocol.library_log import LEVELS
 from rosproxy.zenoh.protocol.liveliness import ALL_TOKENS, MOST_TOKENS, is_kept
 
@@ -97,6 +98,7 @@ class Routers:
     def __init__(self) -> None:
         self._routers: list[Router] = []
         self._left_out = 0
+        self._outside = OutsideRouters()
 
     def use(self, configs: Sequence[Mapping[str, str]]) -> None:
         """Open the routers with new or changed configurations. Raises zenoh.ZError."""
@@ -118,6 +120,7 @@ class Routers:
     def report(self) -> dict[str, Any]:
         """The fields of a report. Raises ValueError if a router does not answer."""
         described = [describe(router.session) for router in self._routers]
+        self._outside.look(self._routers[-1].session, described, time.monotonic())
         by_router = [router.tokens for router in self._routers]
         keys = None
         # A list, because `take_change` has to be called for every router.
@@ -127,7 +130,12 @@ class Routers:
             keys = union[:MOST_TOKENS]
             self._left_out = len(union) - len(keys)
         left_out = max(tokens.left_out for tokens in by_router) + self._left_out
-        return {"routers": described, "tokens": keys, "tokens_left_out": left_out}
+        return {
+            "routers": described,
+            "tokens": keys,
+            "tokens_left_out": left_out,
+            "outside": self._outside.report(),
+        }
 
 
 def open_router(config: Mapping[str, str]) -> Any:

@@ -16,6 +16,7 @@ from rosproxy.admin.status_bounds import fair_choice
 from rosproxy.admin.status_document import (
     MismatchStatus,
     NamedTypeStatus,
+    ZenohApartStatus,
     ZenohCertificateStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
@@ -27,6 +28,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.settings import Settings
 from rosproxy.zenoh.links import Link, is_linked, left_behind
 from rosproxy.zenoh.matching import Comparison, compare
+from rosproxy.zenoh.peers_apart import PeersApart, peers_apart
 from rosproxy.zenoh.protocol.liveliness import TokenGraph, TopicQos, ZenohNode
 from rosproxy.zenoh.protocol.report import (
     Ends,
@@ -44,6 +46,8 @@ MOST_LISTED_MISMATCHES = 100
 """Mismatches that the status lists, with fair shares by the address inside. As many pairs that
 differ in durability alone are listed, too; further ones are not counted."""
 MOST_LISTED_NODES = 1500
+MOST_NAMES_APART = 3
+"""Names of nodes at an address that do not reach other peers of their router."""
 MOST_LISTED_SESSIONS = 1500
 """Rows that the status lists, with fair shares by address. The live page shows as many nodes."""
 
@@ -67,7 +71,9 @@ class Reading(NamedTuple):
     ``routers`` are the ends of the sessions with other routers, and whether each is of the router
     of the links. ``names`` are the topics and services of nodes inside, and ``counts`` the numbers
     of nodes inside and outside. ``without_node`` has the times since which no node is known of a
-    session at a port for containers, by port and zenoh ID. The other fields have the listed rows.
+    session at a port for containers, by port and zenoh ID. ``apart`` has the peers of routers
+    outside that do not reach each other, with the times since which that is known. The other fields
+    have the listed rows.
     ``mismatches`` are also pairs that differ in durability alone.
     """
 
@@ -79,6 +85,7 @@ class Reading(NamedTuple):
     comparison: Comparison = Comparison()
     inside: frozenset[str] | None = None
     without_node: Mapping[tuple[int, str], float] = MappingProxyType({})
+    apart: Mapping[PeersApart, float] = MappingProxyType({})
     nodes: tuple[ZenohNodeStatus, ...] = ()
     rows: tuple[ZenohSessionStatus, ...] = ()
     rows_left_out: int = 0
@@ -158,7 +165,8 @@ class ZenohState(Collector):
             comparison = compare(reading.graph.entities, inside)
             reading = reading._replace(comparison=comparison, inside=inside)
         known = _without_node(former.without_node, sessions, reading.graph.nodes, self._now())
-        reading = reading._replace(without_node=known)
+        apart = _apart(former.apart, sessions, report, self._now())
+        reading = reading._replace(without_node=known, apart=apart)
         return reading if graph is None and sessions == former.sessions else _with_rows(reading)
 
     def is_up(self, link: Link) -> bool:
@@ -205,7 +213,22 @@ class ZenohState(Collector):
             mismatches=reading.mismatches,
             mismatches_left_out=reading.mismatches_left_out,
             not_compared=reading.comparison.not_compared,
+            apart=tuple(self._apart_status()),
         )
+
+    def _apart_status(self) -> Iterator[ZenohApartStatus]:
+        """Yield the peers of routers outside that do not reach each other, with their nodes."""
+        reading = self._reading
+        remotes = {placed.session.peer: placed.ends.remote for placed in reading.sessions}
+        for peers, since in reading.apart.items():
+            names = {n.name for n in reading.graph.nodes if n.session in peers.sessions}
+            yield ZenohApartStatus(
+                str(remotes.get(peers.router, "")),
+                peers.address,
+                tuple(sorted(names)[:MOST_NAMES_APART]),
+                own_address=peers.is_own_address,
+                since=round(max(self._now() - since, 0.0), 1),
+            )
 
     def _status_of_routers(self, failure: str) -> ZenohStatus:
         return ZenohStatus(
@@ -315,6 +338,24 @@ def _without_node(
         if port is not None and not is_known:
             silent[port, session.peer] = former.get((port, session.peer), now)
     return silent
+
+
+def _apart(
+    former: Mapping[PeersApart, float],
+    sessions: Sequence[_PlacedSession],
+    report: Report,
+    now: float,
+) -> dict[PeersApart, float]:
+    """The peers of routers outside that do not reach each other, as in `Reading`.
+
+    ``former``: these times before. They go on if other peers at the address come and go.
+    """
+    if not report.routers:
+        return {}
+    outside = [s.session.peer for s in sessions if s.port is None and s.session.whatami == ROUTER]
+    since = {(peers.router, peers.address): time for peers, time in former.items()}
+    found = peers_apart(outside, report.routers[-1].zid, report.outside)
+    return {peers: since.get((peers.router, peers.address), now) for peers in found}
 
 
 def _with_rows(reading: Reading) -> Reading:

@@ -6,6 +6,7 @@ from msgspec.structs import replace
 from rosproxy.admin.doctor_finding import Severity
 from rosproxy.admin.status_document import (
     MismatchStatus,
+    ZenohApartStatus,
     ZenohCertificateStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
@@ -13,6 +14,7 @@ from rosproxy.admin.status_document import (
     ZenohStatus,
 )
 from rosproxy.zenoh.findings import (
+    APART_GRACE_S,
     GRAPH_GRACE_S,
     LINK_GRACE_S,
     MOST_LIMIT_COMPARISONS,
@@ -254,3 +256,16 @@ def test_each_address_has_a_share_of_the_reported_mismatches() -> None:
     assert len(found) == MOST_REPORTED_MISMATCHES
     assert "/late" not in str(found)
     assert "the subscription 9 requests B" in found["topic /c"].text
+
+
+def test_peers_of_a_router_outside_that_are_apart_are_told_with_their_nodes() -> None:
+    here = ZenohApartStatus("robot:7447", "192.0.2.10", ("/talker",), True, APART_GRACE_S)
+    laptop = ZenohApartStatus("robot:7447", "192.0.2.20", (), False, APART_GRACE_S)
+    late = replace(laptop, address="192.0.2.30", since=APART_GRACE_S - 1)
+    (finding,) = faults(replace(GOOD, apart=(here, laptop, late)))
+    assert finding.severity is Severity.WARNING
+    assert finding.subject == "zenoh peers of router robot:7447"
+    assert finding.text.startswith("nodes at 192.0.2.10 (/talker), 192.0.2.20 are connected to")
+    assert "192.0.2.10 is also the address of this proxy as the router sees it" in finding.text
+    assert "192.0.2.30" not in finding.text
+    assert finding.fix.startswith('set mode="client" in ZENOH_CONFIG_OVERRIDE of these nodes')

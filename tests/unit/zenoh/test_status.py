@@ -4,11 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 from prometheus_client import CollectorRegistry, generate_latest
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.admin.status_document import (
     NamedTypeStatus,
+    ZenohApartStatus,
     ZenohCertificateStatus,
     ZenohQosStatus,
     ZenohSessionStatus,
@@ -348,3 +350,23 @@ def test_a_port_for_other_sites_may_fail_to_open() -> None:
     assert state.status().link_listens, "nothing is known before a report"
     state.take(site_report("tls", "192.0.2.9:7447", "unixsock-stream/x"), None)
     assert not state.status().link_listens
+
+
+def test_peers_of_a_router_outside_that_are_apart_have_a_time_and_nodes() -> None:
+    clock = Clock()
+    state = make_state(FakeProcess(), clock)
+    answer = RouterReport(
+        "04",
+        (
+            session("c1", "peer", "127.0.0.1:7447", "127.0.0.1:50004"),
+            session("bb", "peer", "192.0.2.7:7447", "192.0.2.10:50005"),
+            session("03", "router", "192.0.2.7:7447", "192.0.2.10:50003"),
+        ),
+    )
+    state.take(replace(REPORT, outside=(answer,)), None)
+    clock.time += 20.0
+    state.take(replace(REPORT, outside=(answer,)), None)
+    apart = ZenohApartStatus("192.0.2.7:7447", "192.0.2.10", ("/robot",), True, 20.0)
+    assert state.status().apart == (apart,)
+    state.take(REPORT, None)
+    assert state.status().apart == ()

@@ -11,6 +11,7 @@ from typing import Any
 import zenoh
 
 COMMON = {
+    "adminspace/enabled": "true",
     "connect/timeout_ms": '{"router":-1,"peer":-1,"client":0}',
     "connect/exit_on_failure": '{"router":false,"peer":false,"client":true}',
     "scouting/multicast/enabled": "false",
@@ -34,7 +35,6 @@ ROUTER = {
     "mode": '"router"',
     "listen/endpoints": '["tcp/0.0.0.0:7447"]',
     "routing/router/peers_failover_brokering": "false",
-    "adminspace/enabled": "true",
 }
 
 

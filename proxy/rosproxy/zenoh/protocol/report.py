@@ -45,7 +45,8 @@ class Report(msgspec.Struct, frozen=True):
 
     ``tokens`` is None if nothing has changed since the last report. ``tokens_left_out`` counts
     tokens above the bound. ``error``: why the routers do not run; empty if the routers run.
-    ``revision``: the revision of the configurations with which the routers run.
+    ``revision``: the revision of the configurations with which the routers run. ``outside``: what
+    routers outside, and their peers, say about their sessions with peers and with the hub.
     """
 
     routers: tuple[RouterReport, ...] = ()
@@ -53,6 +54,7 @@ class Report(msgspec.Struct, frozen=True):
     tokens_left_out: int = 0
     error: str = ""
     revision: int = 0
+    outside: tuple[RouterReport, ...] = ()
 
 
 class Ends(NamedTuple):
