@@ -46,7 +46,7 @@ PARTS = ("arm", "base", "camera", "lidar", "planner", "teleop", "battery", "grip
 ENDED = 3
 """Nodes in the first container of ROS 1 that have ended."""
 SINCE = time.time() - 300
-"""The Unix time in seconds of the last message on idle links."""
+"""The Unix time in seconds of the last message on idle links, and of all problems."""
 
 
 def documents(nodes: int) -> dict[str, Document | str]:
@@ -96,7 +96,8 @@ def _node(proxy: int, domain: str, index: int, is_inside: bool) -> PageNode:
     if index >= ENDED:
         return node
     text = f"registered as http://{host}:{port}/, but nothing answers there"
-    return replace(node, state=BROKEN, text=text, fix="run rosnode cleanup (answer y)")
+    fix = "run rosnode cleanup (answer y)"
+    return replace(node, state=BROKEN, text=text, fix=fix, wrong_since=SINCE)
 
 
 def _links(domain: str, inside: list[str], outside: list[str]) -> Iterator[PageLink]:
@@ -139,6 +140,7 @@ def _link(domain: str, i: int, source: str, target: str, is_direct: bool = False
         state=state,
         text=text,
         fix=fix,
+        wrong_since=None if state == OK else SINCE,
     )
 
 

@@ -34,6 +34,8 @@ from rosproxy_operator.common.merged_page import merged
 from tests.browser.fleet import serve
 
 HOST = "10.0.0.5"
+BROKEN_SINCE = time.time() - 2 * 3600
+"""The Unix time in seconds at which the proxies first saw the broken links."""
 
 
 class Template(NamedTuple):
@@ -230,7 +232,7 @@ def _broken(robot: Robot, topic: str, subscriber: str, link: PageLink) -> PageLi
         return link
     return PageLink(
         "topic", link.name, link.source, link.target, port=link.port, state=BROKEN, text=text,
-        fix=fix,
+        fix=fix, wrong_since=BROKEN_SINCE,
     )  # fmt: skip
 
 

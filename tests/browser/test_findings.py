@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.browser.page import THIS_MACHINE, made_up
-from tests.browser.test_picture import MARKED_BOXES, MARKED_ROWS, fleet, texts
+from tests.browser.test_picture import MARKED_BOXES, MARKED_ROWS, ROWS, fleet, texts
 from tests.browser.webdriver import Browser, Json
 from tests.ros.processes import wait_until
 from tests.ros.topology import Place
@@ -25,7 +25,8 @@ return import("/findings.js").then(({ follow, titleOf }) => {
   const seen = new Map();
   let events = [];
   arguments[0].forEach((titles, second) => {
-    const causes = titles.map((what) => ({ key: what, what, count: 1, kind: "broken" }));
+    const causes = titles.map((what) => ({ key: what, what, count: 1, kind: "broken",
+      since: what.length > 1 ? -1000 * Number(what.slice(1)) : Infinity }));
     events = follow(seen, causes, events, 1000 * second, second === 0);
   });
   return events.map(({ at, over, title, since }) => [at, over, title, since]);
@@ -119,7 +120,11 @@ def test_what_comes_and_goes_is_an_event(browser: Browser, tmp_path: Path) -> No
             [2000, True, "a", 0],
             [1000, False, "b", 1000],
         ]
-        assert len(browser.run(FOLLOW, [[], *([[str(n)] for n in range(90)])])) == 50
+        assert browser.run(FOLLOW, [[], ["a7200"], []]) == [
+            [2000, True, "a7200", -7_200_000],
+            [1000, False, "a7200", -7_200_000],
+        ]
+        assert len(browser.run(FOLLOW, [[], *([[f"a{n}"] for n in range(90)])])) == 50
 
 
 Look = tuple[float, Json | None, int]
@@ -215,7 +220,12 @@ def test_a_finding_is_shown_in_graph_and_table_and_leaves(browser: Browser, tmp_
     with fleet(browser, tmp_path, 30):
         first = texts(browser, "#findings li:first-child span")
         assert first[0] == "BROKEN: 3 at 172.18.0.2: /arm/driver_of_the_unit_0, behind ros1, …"
-        assert first[-1].startswith("for over ")
+        assert first[-1] == "first seen 5 min ago"
+        address = browser.run("return location.href")
+        browser.open("about:blank")
+        browser.open(address)
+        wait_until("the page shows rows again", lambda: browser.run(ROWS) > 0)
+        assert texts(browser, "#findings li:first-child span") == first, "not the same age again"
         browser.run("document.querySelector('#findings .cause').click()")
         assert len(texts(browser, MARKED_BOXES)) == 3
         assert len(texts(browser, "#node-rows tr[aria-current]")) == 3

@@ -13,7 +13,7 @@ another proxy or of a node inside another proxy. The operator drops a link if ne
 the proxy that reports the link.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
 from itertools import islice
 from operator import itemgetter
 from types import MappingProxyType
@@ -49,7 +49,7 @@ from rosproxy.page.page_document import (
 )
 from rosproxy.page.zenoh_graph import HUB, NODE, ROUTER
 from rosproxy.telemetry.text import plural
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import SILENT, Problem
 
 Json = dict[str, Any]
 PROXY = "proxy"
@@ -80,26 +80,27 @@ def merged(
     version: str,
     logs: Callable[[str], str],
     places: Mapping[str, str] = MappingProxyType({}),
-    problems: Sequence[Problem] = (),
+    problems: Mapping[Problem, float] = MappingProxyType({}),
 ) -> Json:
     """Return a single document from the documents of all proxies.
 
     ``documents`` has a document for each proxy name, or a text that says why the proxy does not
     answer. ``logs`` returns the command that shows the logs of a proxy. ``places`` has the names of
-    containers or pods inside, by address. ``problems`` are the problems of the operator.
+    containers or pods inside, by address. ``problems`` are the problems of the operator, with the
+    Unix times at which the operator first saw the problems.
     """
     nodes: dict[str, PageNode] = {}
     links: dict[str, PageLink] = {}
     silent = _silent(documents, problems)
-    findings = [*_own_findings(p for p in problems if p not in silent.values())]
+    findings = [*_own_findings(problems, silent.values())]
     shares = _shares(documents)
     left_out = sum(_size(whole) - _size(shares[name]) for name, whole in documents.items())
     documents = shares
     inside = _inside(documents)
     for name, document in documents.items():
         if isinstance(document, str):
-            reason = silent[name].text if name in silent else document
-            nodes[name] = _silent_proxy(name, reason, logs(name))
+            problem = silent.get(name, Problem(name, document, reason=SILENT))
+            nodes[name] = _silent_proxy(name, problem.text, logs(name), problems.get(problem))
             continue
         others = documents.keys() - {name}
         page_keys = {
@@ -129,7 +130,7 @@ def merged(
 
 
 def _silent(
-    documents: Mapping[str, Document | str], problems: Sequence[Problem]
+    documents: Mapping[str, Document | str], problems: Iterable[Problem]
 ) -> dict[str, Problem]:
     """Return the operator's problems about proxies that do not answer, by proxy name.
 
@@ -144,20 +145,27 @@ def _silent(
     }
 
 
-def _silent_proxy(name: str, reason: str, fix: str) -> PageNode:
+def _silent_proxy(name: str, reason: str, fix: str, since: float | None) -> PageNode:
     text = shown_text(f"no data from this proxy: {reason}")
-    return PageNode(HOST, PROXY, name, BROKEN, text, fix)
+    wrong_since = None if since is None else round(since)
+    return PageNode(HOST, PROXY, name, BROKEN, text, fix, wrong_since=wrong_since)
 
 
-def _own_findings(problems: Iterable[Problem]) -> Iterator[tuple[str, PageFinding]]:
+def _own_findings(
+    problems: Mapping[Problem, float], shown: Collection[Problem]
+) -> Iterator[tuple[str, PageFinding]]:
     """Yield the operator's problems as findings, fatal problems first, each with the owner.
 
-    A problem has the fix in the text, as in the operator's doctor.
+    Without the problems that the page has ``shown`` already. A problem has the fix in the text, as
+    in the operator's doctor.
     """
-    for problem in sorted(problems, key=lambda p: not p.fatal):
+    left = [problem for problem in problems if problem not in shown]
+    for problem in sorted(left, key=lambda p: not p.fatal):
         severity = "error" if problem.fatal else "warning"
         subject = shown_name(problem.subject)
-        yield _OPERATOR, PageFinding(severity, subject, shown_text(problem.text))
+        text = shown_text(problem.text)
+        wrong_since = round(problems[problem])
+        yield _OPERATOR, PageFinding(severity, subject, text, wrong_since=wrong_since)
 
 
 def _placed(name: str, key: str, node: PageNode, places: Mapping[str, str]) -> PageNode:

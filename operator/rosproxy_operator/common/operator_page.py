@@ -8,13 +8,14 @@ token of a single proxy must not see all proxies.
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from typing import Any
 
 from rosproxy import __version__
 from rosproxy.net.tasks import Tasks
 from rosproxy.page.feed import Feed
 from rosproxy.page.page_document import Document
+from rosproxy.page.problem_ages import ProblemAges
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
 from rosproxy_operator.common.merged_page import merged
@@ -30,19 +31,25 @@ def operator_page(
     documents: Documents,
     logs: Callable[[str], str],
     places: Callable[[], Mapping[str, str]] = dict,
-    problems: Callable[[], Sequence[Problem]] = tuple,
+    problems: Callable[[], Mapping[Problem, float]] = dict,
 ) -> Page:
     """Return the page. ``documents`` requests the documents of all proxies.
 
     ``logs`` returns the command that shows the logs of a proxy. ``places`` returns the names of
-    containers or pods inside, by address. ``problems`` returns the problems of the operator.
+    containers or pods inside, by address. ``problems`` returns the problems of the operator, with
+    the monotonic times at which the operator first saw the problems.
     """
+    ages = ProblemAges()
 
     async def make() -> AsyncGenerator[dict[str, Any]]:
+        # Read only once: otherwise rounding would change the times of the problems.
+        epoch = time.time() - time.monotonic()
         while True:
             proxy_documents = await documents()
-            own = places(), tuple(problems())
-            yield await asyncio.to_thread(merged, proxy_documents, __version__, logs, *own)
+            own = places(), {problem: epoch + since for problem, since in problems().items()}
+            document = await asyncio.to_thread(merged, proxy_documents, __version__, logs, *own)
+            ages.add_to(document, time.monotonic(), epoch, is_complete=True)
+            yield document
             await asyncio.sleep(ROUND_PAUSE_S)
 
     return Page(Feed(Tasks(), make), Visitors(None, time.monotonic, local=True))

@@ -65,22 +65,25 @@ def bounded(text: str, most: int) -> str:
 
 
 class ProblemLog:
-    """Logs each problem once, and logs when an object has no more problems."""
+    """Logs each problem once, and logs when an object has no more problems.
+
+    ``since``: the time of the update that first had the problem, of each current problem.
+    """
 
     def __init__(self) -> None:
-        self._logged: dict[Problem, None] = {}
+        self.since: dict[Problem, float] = {}
 
-    def update(self, problems: Iterable[Problem]) -> None:
+    def update(self, problems: Iterable[Problem], now: float) -> None:
         """Log new problems, and subjects whose problems are solved.
 
-        ``problems`` are all current problems.
+        ``problems`` are all current problems. ``now``: monotonic seconds.
         """
-        current = dict.fromkeys(problems)
+        current = {problem: self.since.get(problem, now) for problem in problems}
         for problem in current:
-            if problem not in self._logged:
+            if problem not in self.since:
                 level = logging.ERROR if problem.fatal else logging.WARNING
                 text = "%s: %s"
                 log.log(level, text, problem.subject, problem.text, extra=problem.log_fields)
-        for subject in sorted({p.subject for p in self._logged} - {p.subject for p in current}):
+        for subject in sorted({p.subject for p in self.since} - {p.subject for p in current}):
             log.info("%s: solved", subject)
-        self._logged = current
+        self.since = current

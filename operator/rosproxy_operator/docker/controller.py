@@ -204,9 +204,12 @@ class DockerController:
         """Return the names of the containers at each address, from the last look."""
         return container_names(self._last[0].state) if self._last else {}
 
-    def problems(self) -> list[Problem]:
-        """Return the problems of the last look."""
-        return self._shown
+    def problems(self) -> dict[Problem, float]:
+        """Return the problems of the last look.
+
+        The values are the monotonic times at which the operator first saw the problems.
+        """
+        return self._log.since
 
     async def status(self) -> Json:
         """Look anew, ask all proxies, and return the status document. Raises LookFailed."""
@@ -247,7 +250,7 @@ class DockerController:
             planned.groups, lambda action: self._docker_actions.carry_out(action, snapshot), started
         )
         problems = self._current(snapshot, planned)
-        self._log.update(problems)
+        self._log.update(problems, started)
         metrics = self._metrics
         metrics.look_time.observe(took)
         metrics.containers.set(sum(member.container.alive for member in planned.members))

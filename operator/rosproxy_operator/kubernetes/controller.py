@@ -165,12 +165,14 @@ class KubernetesController:
         """Return the names of pods by address, in namespaces with a RosProxy."""
         return self._store.pod_names()
 
-    def problems(self) -> list[Problem]:
+    def problems(self) -> dict[Problem, float]:
         """Return the problems of the last look for the live page; none on standby.
 
-        Warnings of the proxies are left out: the operator only repeats these warnings.
+        The values are the monotonic times at which the operator first saw the problems. Warnings
+        of the proxies are left out: the operator only repeats these warnings.
         """
-        return [*self._findings(WARNS), *self._own_problems()] if self._acting else []
+        shown = [*self._findings(WARNS), *self._own_problems()] if self._acting else []
+        return {problem: self._log.since.get(problem, time.monotonic()) for problem in shown}
 
     async def look(self) -> float | None:
         """Look and act. Return the seconds until the next look. Raises LookFailed.
@@ -299,7 +301,7 @@ class KubernetesController:
 
     def _report(self, observed: ClusterSnapshot) -> None:
         problems: list[Problem] = [*self._findings(), *self._own_problems()]
-        self._log.update(problems)
+        self._log.update(problems, time.monotonic())
         metrics = self._metrics
         metrics.rosproxies.set(len(observed.rosproxies))
         metrics.pods.set(len(observed.selected))

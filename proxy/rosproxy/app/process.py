@@ -23,6 +23,7 @@ from rosproxy.app.stacks import make_stacks
 from rosproxy.binding import setting_error_if_taken
 from rosproxy.net import proxy_signs, sockets
 from rosproxy.page.feed import Feed, PageWatch
+from rosproxy.page.problem_ages import ProblemAges
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
 from rosproxy.runtime import Runtime
@@ -66,9 +67,10 @@ class App:
         runtime = self.runtime
         settings = self.settings
         admin = default_url(str(settings.admin))
+        ages = ProblemAges()
 
         def look() -> AsyncGenerator[dict[str, Any]]:
-            return PageWatch(self.state, lambda: self._check.findings, admin).documents()
+            return PageWatch(self.state, lambda: self._check.findings, admin, ages).documents()
 
         visitors = Visitors(settings.token_hash, runtime.now, own_names=_own_names(settings))
         return Page(Feed(runtime.tasks, look), visitors)

@@ -28,6 +28,7 @@ from rosproxy.page.graph_document import graph_document, relayed
 from rosproxy.page.judgement import JudgedFacts, judge, topics_to_ask_about
 from rosproxy.page.measures import Measures
 from rosproxy.page.page_document import Json
+from rosproxy.page.problem_ages import ProblemAges
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +49,13 @@ MOST_WATCHERS_EACH = 6
 
 Chromium and Firefox open at most six connections to a server, so a browser needs no more.
 """
+SETTLED_AFTER_S = 30.0
+"""Seconds after which the documents of an opened page show all problems.
+
+A connection counts as stalled only when several messages are missing.
+"""
+SETTLED_AFTER_ROUNDS = 2
+"""Rounds after which the same holds: a pair is unconnected only if two rounds have shown that."""
 LINGER_S = 10.0
 """Seconds until the loops end after the last watcher. Users reload pages, and operators poll."""
 
@@ -156,10 +164,14 @@ class PageWatch:
         status: Callable[[], ProxyStatus],
         own_findings: Callable[[], Sequence[DoctorFinding]],
         admin: str,
+        ages: ProblemAges,
     ) -> None:
         self._status = status
         self._own_findings = own_findings
         self._admin = admin
+        self._ages = ages
+        self._began = time.monotonic()
+        self._rounds = 0
         self._measures = Measures()
         self._judged: JudgedFacts | None = None
         # Read only once: if the clock is set later, the times of the links stay as they are.
@@ -190,9 +202,16 @@ class PageWatch:
             if judged:
                 self._measures.read_relays(relayed(status, judged.facts.system), now)
             # In a thread, because the document of a large graph would hold up calls of nodes.
-            return await asyncio.to_thread(
+            document = await asyncio.to_thread(
                 graph_document, status, judged, self._measures, own_findings, now, self._epoch
             )
+        self._ages.add_to(document, now, self._epoch, self._is_settled(now))
+        return document
+
+    def _is_settled(self, now: float) -> bool:
+        """Whether the documents show all problems."""
+        is_old = now - self._began >= SETTLED_AFTER_S
+        return is_old and self._rounds >= SETTLED_AFTER_ROUNDS
 
     async def _ask(self) -> float:
         """Ask all nodes; return the seconds until the next round."""
@@ -204,6 +223,7 @@ class PageWatch:
             relayed_links = relayed(status, facts.system)
             self._measures.read_nodes(facts, judged.pairs.keys() | relayed_links.keys())
             self._judged = judged
+        self._rounds += 1
         questions = QUESTIONS_PER_NODE * len(facts.nodes)
         return max(ROUND_INTERVAL_S, questions / QUESTIONS_PER_SECOND - (time.monotonic() - began))
 

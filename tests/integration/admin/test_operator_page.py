@@ -1,6 +1,7 @@
 """The live page of an operator, over proxies that run."""
 
 import json
+import time
 from collections.abc import AsyncIterator
 
 import aiohttp
@@ -24,6 +25,8 @@ TOKEN = "0123456789abcdef"
 MISSPELT = Problem(
     "container talker-1", "label x is unknown. Did you mean y?", fatal=False, reason="X"
 )
+MISSPELT_SINCE = time.monotonic() - 7200
+"""The monotonic time at which the operator first saw the problem."""
 
 
 @pytest.fixture
@@ -46,7 +49,10 @@ async def opened(
         lambda: None,
         lambda: None,
         operator_page(
-            documents, "docker logs {}".format, lambda: {NODE: "talker-1"}, lambda: [MISSPELT]
+            documents,
+            "docker logs {}".format,
+            lambda: {NODE: "talker-1"},
+            lambda: {MISSPELT: MISSPELT_SINCE},
         ),
     )
 
@@ -76,8 +82,9 @@ async def test_all_proxies_stand_on_one_page(
             assert nodes["two rosproxy"]["label"] == "two"
             assert nodes["gone"]["state"] == "broken"
             assert f"{gone} refuses connections" in nodes["gone"]["text"]
-            own = {"subject": MISSPELT.subject, "text": MISSPELT.text}
-            assert {"severity": "warning", "fix": "", **own} in document["findings"]
+            (own,) = (f for f in document["findings"] if f["subject"] == MISSPELT.subject)
+            assert (own["severity"], own["text"], own["fix"]) == ("warning", MISSPELT.text, "")
+            assert nodes["gone"]["wrong_since"] - own["wrong_since"] >= 7200 - 1
             async with session.get(f"http://{address}/", headers={"Host": "evil.example"}) as reply:
                 assert reply.status == 403
             async with session.get(f"http://{address}/events") as reply:

@@ -3,8 +3,10 @@
 import asyncio
 import json
 import re
+import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import aiohttp
@@ -393,6 +395,29 @@ async def test_a_proxy_whose_master_is_away_is_shown(
         while not page.document["findings"]:
             await page.follow()
         assert page.document["findings"][0]["severity"] == "error"
+
+
+async def test_a_problem_has_the_same_age_on_a_page_that_is_opened_later(
+    make_proxy: MakeProxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await master.stop()
+    proxy = await make_proxy()
+    ages = [await age_of_the_master(proxy)]
+    await pass_time(LINGER_S + 1)
+    await until(lambda: proxy.app.page.feed.idle, "the feed ends after the last page")
+    later = SimpleNamespace(monotonic=lambda: time.monotonic() + 7200, time=time.time)
+    monkeypatch.setattr("rosproxy.page.feed.time", later)
+    ages.append(await age_of_the_master(proxy))
+    assert ages[1] - ages[0] >= 7200 - 2
+
+
+async def age_of_the_master(proxy: Proxy) -> float:
+    """The Unix time now, less the time since which the master is broken."""
+    async with opened(proxy) as page:
+        while page.document.get("nodes", {}).get("master", {}).get("state") != "broken":
+            await page.follow()
+        since: float = page.document["nodes"]["master"]["wrong_since"]
+        return time.time() - since
 
 
 async def test_updates_of_containers_go_on_while_a_page_is_open(

@@ -15,6 +15,7 @@ import pytest
 from rosproxy.admin.common_status import common_status
 from rosproxy.net import sockets
 from rosproxy.page.feed import PageWatch
+from rosproxy.page.problem_ages import ProblemAges
 from rosproxy.runtime import Runtime
 from rosproxy.zenoh import stack
 from rosproxy.zenoh.stack import Zenoh
@@ -88,7 +89,10 @@ class Page:
     async def document(self, table: str, key: str, **wanted: Any) -> dict[str, Any]:
         """The first document with these values in the row of a table; None: without the key."""
         status = PageWatch(
-            lambda: self.zenoh.extended_status(common_status(self._runtime)), tuple, ""
+            lambda: self.zenoh.extended_status(common_status(self._runtime)),
+            tuple,
+            "",
+            ProblemAges(),
         )
         seen: dict[str, Any] = {}
         async with aclosing(status.documents()) as documents:

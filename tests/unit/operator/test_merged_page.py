@@ -208,11 +208,11 @@ def test_the_operators_own_problems_are_findings() -> None:
         "container talker", "label x is unknown. Did you mean y?\x1b", fatal=False, reason="X"
     )
     fatal = Problem("master robot", "long" * LONGEST_TEXT, reason="X")
-    findings = merged({"one": shown("a")}, "1", LOGS, {}, [warning, fatal])["findings"]
-    assert [(f["severity"], f["subject"], f["fix"]) for f in findings] == [
-        ("error", "master robot", ""),
-        ("warning", "container talker", ""),
-        ("error", "one: ports", "x"),
+    findings = merged({"one": shown("a")}, "1", LOGS, {}, {warning: 5.0, fatal: 7.4})["findings"]
+    assert [(f["severity"], f["subject"], f["fix"], f["wrong_since"]) for f in findings] == [
+        ("error", "master robot", "", 7),
+        ("warning", "container talker", "", 5),
+        ("error", "one: ports", "x", None),
     ]
     assert len(findings[0]["text"]) == LONGEST_TEXT
     assert findings[1]["text"] == "label x is unknown. Did you mean y?\\x1b"
@@ -224,7 +224,7 @@ def test_proxies_and_the_operator_share_the_room_for_findings() -> None:
     ]
     problems.append(Problem("container last", "x", reason="X"))
     documents = {"evil": hostile(), "good": shown("a")}
-    findings = merged(documents, "1", LOGS, {}, problems)["findings"]
+    findings = merged(documents, "1", LOGS, {}, dict.fromkeys(problems, 5.0))["findings"]
     assert len(findings) == MOST_FINDINGS
     subjects = [finding["subject"] for finding in findings]
     assert subjects[0] == "container last"
@@ -236,12 +236,13 @@ def test_a_silent_proxy_is_reported_once() -> None:
     """The operator's problem has more to do about the proxy than the reason alone."""
     reason = "10.0.0.1:11312 refuses connections"
     advice = f"admin endpoint {reason}. Attach the operator to network uplink"
-    problems = [
-        Problem("proxy one", advice, reason="X"),
-        Problem("proxy one", "port 11412 is taken", reason="X"),
-    ]
+    problems = {
+        Problem("proxy one", advice, reason="X"): 5.0,
+        Problem("proxy one", "port 11412 is taken", reason="X"): 6.0,
+    }
     document = merged({"one": reason}, "1", LOGS, {}, problems)
     assert document["nodes"]["one"]["text"] == f"no data from this proxy: {advice}"
+    assert document["nodes"]["one"]["wrong_since"] == 5
     assert [finding["text"] for finding in document["findings"]] == ["port 11412 is taken"]
 
 

@@ -14,7 +14,7 @@ def test_each_problem_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     log = ProblemLog()
     for problems in ([FATAL], [FATAL, WARNING], [FATAL, WARNING], [WARNING], [], [], [FATAL]):
-        log.update(problems)
+        log.update(problems, 0.0)
     told = [(record.levelname, record.getMessage()) for record in caplog.records]
     assert told == [
         ("ERROR", "container talker: no master is known"),
@@ -24,9 +24,19 @@ def test_each_problem_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
     ]
 
 
+def test_a_problem_keeps_its_time_until_it_is_solved() -> None:
+    log = ProblemLog()
+    log.update([FATAL], 1.0)
+    log.update([FATAL, WARNING], 2.0)
+    assert log.since == {FATAL: 1.0, WARNING: 2.0}
+    log.update([], 3.0)
+    log.update([FATAL], 4.0)
+    assert log.since == {FATAL: 4.0}
+
+
 def test_what_a_problem_is_about_is_a_field_of_the_record(caplog: pytest.LogCaptureFixture) -> None:
     proxy = Problem("proxy rosproxy-a", "ends", reason="ProxyStuck")
-    ProblemLog().update([FATAL, proxy, Problem("uplink", "is gone", reason="Y")])
+    ProblemLog().update([FATAL, proxy, Problem("uplink", "is gone", reason="Y")], 0.0)
     names = ("container", "proxy", "reason")
     fields = [tuple(vars(record).get(name) for name in names) for record in caplog.records]
     assert fields == [("talker", None, "X"), (None, "rosproxy-a", "ProxyStuck"), (None, None, "Y")]

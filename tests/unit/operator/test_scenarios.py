@@ -239,11 +239,11 @@ def test_the_log_and_the_live_page_have_the_problem(
     scenario: Scenario, caplog: pytest.LogCaptureFixture
 ) -> None:
     problems = [on_docker(scenario), on_kubernetes(scenario)]
-    ProblemLog().update(problems)
+    ProblemLog().update(problems, 0.0)
     level = logging.ERROR if scenario.fatal else logging.WARNING
     logged = [(r.levelno, r.getMessage(), vars(r)["reason"]) for r in caplog.records]
     assert logged == [(level, f"{p.subject}: {p.text}", scenario.reason) for p in problems]
-    findings = merged({}, "1", str, {}, problems)["findings"]
+    findings = merged({}, "1", str, {}, dict.fromkeys(problems, 0.0))["findings"]
     severity = "error" if scenario.fatal else "warning"
     shown = [(f["severity"], f["subject"], f["text"]) for f in findings]
     assert shown == [(severity, p.subject, shown_text(p.text)) for p in problems]

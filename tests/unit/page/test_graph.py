@@ -291,6 +291,7 @@ def test_a_master_that_is_away_is_told() -> None:
         "subject": "range",
         "text": "x",
         "fix": "y",
+        "wrong_since": None,
     }
 
 

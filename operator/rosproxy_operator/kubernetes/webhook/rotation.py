@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import logging
+import time
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -287,7 +288,7 @@ class CertificateRotation:
             self._metrics.certificate_expiry.set(pair.expires.timestamp())
         self.not_made_yet = not_made_yet
         if problems or not not_made_yet:  # without a certificate, no earlier problem is solved
-            self._log.update(problems)
+            self._log.update(problems, time.monotonic())
 
 
 def certificate_source(

@@ -1,6 +1,6 @@
 // What is wrong, one entry for each cause, and what happened: pure functions, without a DOM.
 
-import { duration, labelOf, placeOf, RANK } from "./view.js";
+import { duration, isKnown, labelOf, placeOf, RANK } from "./view.js";
 
 const MOST_EVENTS = 50;
 const MOST_PLACES = 8; // with an entry of their own in a look
@@ -11,29 +11,32 @@ const PLAIN_KINDS = new Set(["node", "participant", "zenoh node"]);
 // The causes, the worst first. What has one fix and one place (a container or a machine) is one
 // cause: a container that ends, or a firewall, leaves many links with a problem. Names of nodes and
 // numbers, such as ports, make no other fix. Pods behind two proxies may have the same name.
-export function causesOf({ nodes, links, findings }) {
+// `since`: the time in milliseconds since which the oldest of these problems is there, by the clock
+// of the browser, which is `clock` seconds behind the proxy's; Infinity if it is not known.
+export function causesOf({ nodes, links, findings }, clock = 0) {
   const causes = new Map();
-  const add = (kind, { place, proxy = "", container = "" }, { what, text, fix }, ids, names = []) => {
+  const add = (kind, { place, proxy = "", container = "" }, { what, text, fix, since }, ids, names = []) => {
     const shape = names.reduce((rest, name) => rest.replaceAll(name, ""), fix || text).replace(/\d+/g, "");
     const key = `f:${JSON.stringify([kind, proxy, place, shape])}`;
-    if (!causes.has(key)) causes.set(key, { key, kind, place, container, what, text, fix, count: 0, nodes: new Set(), links: new Set() });
+    if (!causes.has(key)) causes.set(key, { key, kind, place, container, what, text, fix, count: 0, since: Infinity, nodes: new Set(), links: new Set() });
     const cause = causes.get(key);
     cause.count += 1;
+    if (isKnown(since)) cause.since = Math.min(cause.since, 1000 * (since - clock));
     if (ids.node) cause.nodes.add(ids.node);
     if (ids.link) cause.links.add(ids.link);
   };
   for (const one of findings) {
-    add(one.severity === "error" ? "broken" : "warning", { place: subjectPlace(one.subject) }, { what: one.subject, text: one.text, fix: one.fix }, {});
+    add(one.severity === "error" ? "broken" : "warning", { place: subjectPlace(one.subject) }, { what: one.subject, text: one.text, fix: one.fix, since: one.wrong_since }, {});
   }
   for (const [id, node] of nodes) {
-    if (isWrong(node)) add(node.state, whereOf(node), { what: labelOf(id, node) + behind([node]), text: node.text || "", fix: node.fix || "" }, { node: id }, [id, labelOf(id, node)]);
+    if (isWrong(node)) add(node.state, whereOf(node), { what: labelOf(id, node) + behind([node]), text: node.text || "", fix: node.fix || "", since: node.wrong_since }, { node: id }, [id, labelOf(id, node)]);
   }
   for (const [id, link] of links) {
     if (!isWrong(link)) continue;
     const ends = [link.source, link.target].filter(Boolean);
     const labels = ends.map((end) => labelOf(end, nodes.get(end)));
     const what = `${link.name} from ${labels.join(" to ")}${behind(ends.map((end) => nodes.get(end)))}`;
-    add(link.state, whereOf(nodeOf(link, ends, nodes)), { what, text: link.text || "", fix: link.fix || "" }, { link: id }, [...ends, ...labels]);
+    add(link.state, whereOf(nodeOf(link, ends, nodes)), { what, text: link.text || "", fix: link.fix || "", since: link.wrong_since }, { link: id }, [...ends, ...labels]);
   }
   return [...causes.values()].sort((a, b) => RANK[b.kind] - RANK[a.kind] || b.count - a.count);
 }
@@ -71,8 +74,7 @@ export function titleOf({ what, count, place, container }) {
 }
 
 // Note which causes are new and which are over. `seen`: the causes by their keys, with the time of
-// their beginning in milliseconds; those of the first document are `old`, and began earlier.
-// Returns the events, the newest first.
+// their beginning in milliseconds. Returns the events, the newest first.
 export function follow(seen, causes, events, now, isFirst) {
   const found = [];
   const present = new Set(causes.map(({ key }) => key));
@@ -82,9 +84,9 @@ export function follow(seen, causes, events, now, isFirst) {
     found.push({ at: now, over: true, kind: cause.kind, title: titleOf(cause), since });
   }
   for (const cause of causes) {
-    const { since, old } = seen.get(cause.key) || { since: now, old: isFirst };
+    const since = Number.isFinite(cause.since) ? cause.since : seen.get(cause.key)?.since ?? now;
     if (!seen.has(cause.key) && !isFirst) found.push({ at: now, over: false, kind: cause.kind, title: titleOf(cause), since });
-    seen.set(cause.key, { cause, since, old });
+    seen.set(cause.key, { cause, since });
   }
   return [...found, ...events].slice(0, MOST_EVENTS);
 }

@@ -25,7 +25,7 @@ const rows = new Map();
 const nodeRows = new Map();
 const findings = new Map();
 const eventRows = new Map();
-const seen = new Map(); // causes, with the time at which this page first saw them
+const seen = new Map(); // causes, with the time of their beginning
 const memory = emptyMemory(); // of nodes and proxies
 let events = [];
 let isFirst = true; // no document was shown yet
@@ -99,7 +99,7 @@ function draw() {
 
 function show() {
   const found = visibleLinks(state.links, state.nodes, chosen);
-  const causes = causesOf(state);
+  const causes = causesOf(state, clock);
   const now = Date.now();
   events = followNodes(memory, state, follow(seen, causes, events, now, isFirst), now);
   isFirst = isFirst && state.nodes.size === 0;
@@ -132,10 +132,10 @@ function showHead(found, causes) {
 function showFindings(causes, on) {
   const shown = new Map(causes.slice(0, MOST_FINDINGS).map((cause) => {
     const { kind, text, fix, nodes, links } = cause;
-    const { since, old } = seen.get(cause.key);
+    const { since } = seen.get(cause.key);
     const isOn = cause.key === selected || [...nodes].some((id) => on.nodes.has(id)) || [...links].some((id) => on.links.has(id));
     return [cause.key, { key: cause.key, kind, isOn, what: `${WORDS[kind]}: ${titleOf(cause)}`, text, fix,
-      since: `for ${old ? "over " : ""}${duration((Date.now() - since) / 1000)}` }];
+      since: `first seen ${duration((Date.now() - since) / 1000)} ago` }];
   }));
   const rest = causes.length - shown.size;
   if (rest > 0) shown.set("rest", { kind: "", what: `and ${rest} more` });

@@ -318,7 +318,7 @@ async def test_the_page_tells_of_problems_of_the_operator(engine: FakeEngine) ->
     """An unknown variable, and a container with an unknown label."""
     mistake = Problem("variable ROSPROXY_X", "unknown", fatal=False, reason="X")
     controller = DockerController(SETTINGS, 30.0, DockerMetrics(), mistakes=[mistake])
-    assert controller.problems() == []
+    assert controller.problems() == {}
     row = captured.running() | {"Id": "c" * 64, "Names": ["/odd"]}
     row["Labels"] = {"ros-proxy.enable": "true"}
     inspected = captured.inspected()
