@@ -44,32 +44,36 @@ LAPTOP_NODES: Nodes = {
     "/teleop/joystick": (PUB, "/joy", "--rate", "10"),
 }
 CONTAINERS: Mapping[str, Nodes] = {
-    "perception": {
+    "detector-gpu-1": {
         "/perception/detector": (SUB, "/camera/image"),
         "/perception/objects": (PUB, "/objects", "--rate", "5", "--size", "2000"),
         "/perception/tracker": (SUB, "/objects"),
         "/perception/battery": (SUB, "/battery"),
     },
-    "mapping": {
+    "slam-1": {
         "/mapping/scan_matcher": (SUB, "/scan"),
         "/mapping/imu_filter": (SUB, "/imu"),
         "/mapping/builder": (PUB, "/map", "--rate", "2", "--size", "40000"),
         "/mapping/localiser": (SUB, "/map"),
     },
-    "navigation": {
+    "nav-stack-2": {
         "/navigation/planner": (PUB, "/plan", "--rate", "5", "--size", "2000"),
         "/navigation/driver": (PUB, "/cmd_vel", "--rate", "10"),
         "/navigation/joystick": (SUB, "/joy"),
         "/navigation/safety": (PUB, "/safety/state", "--rate", "5"),
     },
-    "manipulation": {
+    "arm-driver-1": {
         "/manipulation/arm": (PUB, "/arm/goal", "--rate", "2"),
         "/manipulation/gripper": (PUB, "/gripper/command", "--rate", "2"),
         "/manipulation/joints": (SUB, "/joint_states"),
         "/manipulation/health": (PUB, "/diagnostics", "--rate", "2"),
     },
 }
-"""The nodes of ROS 1 in each container (tests/ros/nodes)."""
+"""The nodes of ROS 1 in each container (tests/ros/nodes).
+
+No container has the name of a namespace. Otherwise the picture would not show whether the page
+names the container.
+"""
 CART_NODES: Nodes = {
     "cart_pose": (PUB, "/cart/pose"),
     "cart_task": (SUB, "/cart/task"),
@@ -78,9 +82,12 @@ CART_NODES: Nodes = {
     "dock_sensor": (PUB, "/dock/state"),
 }
 CONTAINERS2: Mapping[str, Nodes] = {
-    "fleet": {"fleet_pose": (SUB, "/cart/pose"), "fleet_task": (PUB, "/cart/task")},
-    "lift": {"lift_command": (PUB, "/lift/command"), "lift_monitor": (SUB, "/lift/state")},
-    "dock": {"dock_monitor": (SUB, "/dock/state")},
+    "dispatcher-1": {"fleet_pose": (SUB, "/cart/pose"), "fleet_task": (PUB, "/cart/task")},
+    "elevator-bridge": {
+        "lift_command": (PUB, "/lift/command"),
+        "lift_monitor": (SUB, "/lift/state"),
+    },
+    "charger-1": {"dock_monitor": (SUB, "/dock/state")},
 }
 """The nodes of ROS 2 in each container (tests/ros2/nodes)."""
 ON_LAN = (ENABLE, f"rosproxy.advertise-host={HERE}")
