@@ -61,7 +61,9 @@ def _document(proxy: int, domain: str, numbers: list[int]) -> Document:
     inside = {_key(domain, n): _node(proxy, domain, i, True) for i, n in enumerate(numbers[::2])}
     outside = {_key(domain, n): _node(proxy, domain, i, False) for i, n in enumerate(numbers[1::2])}
     links = {link.key: link for link in _links(domain, [*inside], [*outside])}
-    nodes = {"rosproxy": PageNode(HOST, "proxy", "rosproxy", ports="11412-11443, 9 used, 23 free")}
+    ports = "11412-11443, 9 used, 23 free"
+    version = f"ROS 2, domain {domain}" if domain else "ROS 1"
+    nodes = {"rosproxy": PageNode(HOST, "proxy", "rosproxy", ports=ports, detail=version)}
     if not domain:
         nodes["master"] = PageNode(ROBOT, "master", "master", address="http://robot:11311/")
     return Document(

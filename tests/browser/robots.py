@@ -152,7 +152,10 @@ def documents(nodes: int, second: int) -> dict[str, Document | str]:
 
 
 def _document(proxy: str, fleet: list[Robot], second: int) -> Document:
-    nodes = {"rosproxy": PageNode("host", "proxy", "rosproxy", ports="11412-11475, 31 used")}
+    ports = "11412-11475, 31 used"
+    domain = PROXIES[proxy][1]
+    version = f"ROS 2, domain {domain}" if domain else "ROS 1"
+    nodes = {"rosproxy": PageNode("host", "proxy", "rosproxy", ports=ports, detail=version)}
     if not PROXIES[proxy][1]:
         nodes["master"] = PageNode(ROBOT, "master", "master", address="http://192.168.10.2:11311/")
     nodes |= {robot.key(name): _node(robot, name) for robot in fleet for name in robot.nodes}

@@ -27,6 +27,7 @@ ROWS = "return document.querySelectorAll('#rows tr').length"
 TEXTS = "return [...document.querySelectorAll(arguments[0])].map((item) => item.textContent)"
 MARKED_ROWS = "#rows tr[aria-current] td:nth-child(2)"
 MARKED_BOXES = ".box:not(.line)[aria-current]"
+PROXY_LABELS = "#boxes .proxy .fix"
 MARKED_FINDINGS = "#findings li[aria-current] .what"
 MARKED_LINES = ".box.line[aria-current]"
 SHOWN = """
@@ -97,6 +98,12 @@ def test_the_picture_reads(browser: Browser, tmp_path: Path, nodes: int) -> None
         wait_until("each node has a box", lambda: browser.run(NODES) >= nodes)
         if nodes <= MOST_UNFOLDED:
             assert geometry(browser) == []
+
+
+def test_each_proxy_has_its_version_of_ros(browser: Browser, tmp_path: Path) -> None:
+    with fleet(browser, tmp_path, 30):
+        labels = texts(browser, PROXY_LABELS)
+        assert sorted(labels) == ["ROS 1", "ROS 2, domain 0", "ROS 2, domain 7"]
 
 
 def geometry(browser: Browser) -> list[str]:

@@ -116,7 +116,20 @@ def _proxy_node(status: ProxyStatus) -> PageNode:
         "rosproxy",
         address=shown_name(status.settings.advertise_host),
         ports="; ".join(ports),
+        detail="; ".join(_versions(status)),
     )
+
+
+def _versions(status: ProxyStatus) -> Iterator[str]:
+    """The versions of ROS that a proxy serves, with the domains of ROS 2."""
+    if status.settings.for_ros1:
+        yield "ROS 1"
+    if "2" in status.settings.ros:
+        domains = ", ".join(str(domain.domain) for domain in status.domains)
+        word = "domains" if len(status.domains) > 1 else "domain"
+        yield f"ROS 2, {word} {domains}" if domains else "ROS 2"
+    if "zenoh" in status.settings.ros:
+        yield "rmw_zenoh"
 
 
 class _Ros1Graph:

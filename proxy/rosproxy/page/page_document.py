@@ -48,12 +48,12 @@ class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
     """A node, participant, master, router or proxy in its lane.
 
     ``label``: the text to show if the key is not a name. ``detail``: the text to show if a user
-    selects the node. ``place``: the name of the container or pod, if known. ``text`` and ``fix``:
-    the problem and what to do. ``ports``: the ports of the proxy for this node. ``rate``: forwarded
-    bytes a second, if the rates of the links are not known. ``proxy``: the proxy of the node, on an
-    operator's page. ``since``: the Unix time in seconds since which a router is linked or not.
-    ``wrong_since``: the Unix time in seconds at which the process first saw the problem
-    (`rosproxy.page.problem_ages`).
+    selects the node; for a proxy, the versions of ROS. ``place``: the name of the container or pod,
+    if known. ``text`` and ``fix``: the problem and what to do. ``ports``: the ports of the proxy
+    for this node. ``rate``: forwarded bytes a second, if the rates of the links are not known.
+    ``proxy``: the proxy of the node, on an operator's page. ``since``: the Unix time in seconds
+    since which a router is linked or not. ``wrong_since``: the Unix time in seconds at which the
+    process first saw the problem (`rosproxy.page.problem_ages`).
     """
 
     lane: str

@@ -7,7 +7,12 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import error
-from rosproxy.admin.status_document import ProxyStatus, read_status
+from rosproxy.admin.status_document import (
+    DomainStatus,
+    ProxyStatus,
+    StatusSettings,
+    read_status,
+)
 from rosproxy.doctor.facts import (
     Attempt,
     DoctorFacts,
@@ -272,6 +277,23 @@ def test_a_topic_with_too_many_links_keeps_no_other_topic_from_being_asked_about
     publishers = {"/a": names, "/chatter": ["/talker"]}
     graph = SystemState(publishers, {"/a": names, "/chatter": ["/listener"]}, {})
     assert topics_to_ask_about(make_facts().proxy, graph) == ("/chatter",)
+
+
+@pytest.mark.parametrize(
+    ("ros", "domains", "detail"),
+    [
+        (("1",), (), "ROS 1"),
+        (("2",), (7,), "ROS 2, domain 7"),
+        (("1", "2", "zenoh"), (0, 7), "ROS 1; ROS 2, domains 0, 7; rmw_zenoh"),
+    ],
+)
+def test_a_proxy_shows_its_versions_of_ros(
+    ros: tuple[str, ...], domains: tuple[int, ...], detail: str
+) -> None:
+    statuses = tuple(DomainStatus(domain=domain) for domain in domains)
+    status = ProxyStatus(settings=StatusSettings(ros=ros), domains=statuses)
+    document = graph_document(status, None, Measures(), (), 0.0, 0.0)
+    assert document["nodes"]["rosproxy"]["detail"] == detail
 
 
 def test_a_master_that_is_away_is_told() -> None:

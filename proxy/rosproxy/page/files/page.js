@@ -327,8 +327,8 @@ function boxOfProxy(id, proxy, rect, on) {
   if (id === DIRECT) return { id: "past", kind: "past", rect, texts: ["past the proxies", "", ""], state: "ok", title: "" };
   const state = proxy.state || "ok";
   const label = labelOf(id, proxy);
-  return { id: `n:${id}`, kind: "proxy", rect, state, on: on.nodes.has(id), texts: [marked(state, label), proxy.ports || "", ""],
-    title: `${label}\n${proxy.ports || ""}` };
+  return { id: `n:${id}`, kind: "proxy", rect, state, on: on.nodes.has(id), texts: [marked(state, label), proxy.ports || "", proxy.detail || ""],
+    title: [label, proxy.detail, proxy.ports].filter(Boolean).join("\n") };
 }
 
 function rowOfLine(line, rect, all, now) {

@@ -269,13 +269,14 @@ function heightOf(id, places) {
 function stackRows(lines, carriers, places) {
   const column = places.columns[1];
   let y = 0;
-  for (const { id: via, lines: carried } of carriers) {
+  for (const { id: via, proxy, lines: carried } of carriers) {
     const middle = new Map(carried.map((line) => [line, heightOf(line.a, places) + heightOf(line.b, places)]));
     const own = carried.sort((p, q) => middle.get(p) - middle.get(q) || compare(p.id, q.id));
     if (via === DIRECT && !own.length) continue;
     const start = y;
-    places.heads.set(via, { x: column.x + GAP, y: y + GAP, w: column.w - 2 * GAP, h: BOX });
-    y += BOX + 2 * GAP;
+    const head = { x: column.x + GAP, y: y + GAP, w: column.w - 2 * GAP, h: BOX + (proxy?.detail ? FIX : 0) };
+    places.heads.set(via, head);
+    y += head.h + 2 * GAP;
     for (const line of own) {
       const h = ROW + (hasFix(line) || places.isNarrow ? FIX : 0) + (isHairpin(line, places) ? GAP : 0);
       places.rows.set(line.id, { x: column.x + GAP, y, w: column.w - 2 * GAP, h });
