@@ -37,11 +37,12 @@ static std::string describe(const std::string& text) {
   return line.str();
 }
 
-// Publishes for ever, or `--count` messages; latched with `--latch 1`.
+// Publishes for ever, or `--count` messages; latched with `--latch 1`; `--queue 0`: no limit.
 static void publish(const Options& options) {
   ros::NodeHandle node;
   bool latch = options.number("latch", 0) > 0;
-  auto publisher = node.advertise<std_msgs::String>(options.text("topic"), 10, latch);
+  auto queue = static_cast<uint32_t>(options.number("queue", 10));
+  auto publisher = node.advertise<std_msgs::String>(options.text("topic"), queue, latch);
   ros::WallRate rate(options.number("rate", 20));
   size_t size = static_cast<size_t>(options.number("size", 0));
   double count = options.number("count", 1e9);
@@ -83,12 +84,13 @@ static void onMessage(const std_msgs::String::ConstPtr& message) {
   say("got " + describe(message->data));
 }
 
-// Prints every message; `--udp 1` asks for UDPROS alone.
+// Prints every message; `--udp 1` asks for UDPROS alone; `--queue 0`: a queue without limit.
 static void subscribe(const Options& options) {
   ros::NodeHandle node;
   ros::TransportHints hints;
   if (options.number("udp", 0) > 0) hints.unreliable();
-  auto subscriber = node.subscribe(options.text("topic"), 100, onMessage, hints);
+  auto queue = static_cast<uint32_t>(options.number("queue", 100));
+  auto subscriber = node.subscribe(options.text("topic"), queue, onMessage, hints);
   say("ready");
   ros::spin();
 }

@@ -65,10 +65,11 @@ def describe(text: str) -> str:
 
 
 def publish(options: Options) -> None:
-    """Publishes for ever, or `--count` messages; latched with `--latch 1`."""
+    """Publishes for ever, or `--count` messages. `--latch 1`: latched; `--queue 0`: no limit."""
     latch = options.number("latch", 0) > 0
     topic = options.text("topic")
-    publisher = rospy.Publisher(topic, String, queue_size=10, latch=latch)
+    queue = int(options.number("queue", 10))
+    publisher = rospy.Publisher(topic, String, queue_size=queue, latch=latch)
     prefix = options.text("word", "hello")
     size = int(options.number("size", 0))
     rate = rospy.Rate(options.number("rate", 20))
