@@ -170,7 +170,7 @@ def check_contents(wheel: Path, sdist: Path) -> None:
     """Check for required and unwanted files."""
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    scripts = ("page.js", "view.js", "picture.js", "findings.js", "history.js")
+    scripts = ("page.js", "view.js", "picture.js", "findings.js", "history.js", "zoom.js")
     needed = {"rosproxy/py.typed", "rosproxy_operator/py.typed", "rosproxy/cli/main.py"}
     page = (*scripts, "page.css", "index.html", "login.html")
     needed |= {f"rosproxy/page/files/{name}" for name in page}

@@ -8,8 +8,10 @@ const meet = (p, q) => p.left < q.right - 0.5 && q.left < p.right - 0.5
 const boxes = [...document.querySelectorAll("#boxes .box")].map((box) => ({ box, rect: rectOf(box) }));
 const texts = boxes.flatMap(({ box }) => [...box.children]).filter((one) => one.textContent);
 const labels = texts.map((one) => ({ text: one.textContent, rect: rectOf(one) }));
+const whole = rectOf(document.querySelector("#picture"));
+const zoom = whole.width / document.querySelector("#lines").viewBox.baseVal.width;
 for (const one of [...texts, ...document.querySelectorAll("#lanes span")]) {
-  const size = parseFloat(getComputedStyle(one).fontSize);
+  const size = zoom * parseFloat(getComputedStyle(one).fontSize);
   if (size < 11) found.push(`${one.textContent} has ${size} px`);
 }
 for (const all of [labels, boxes.map(({ box, rect }) => ({ text: name(box), rect }))]) {
@@ -18,7 +20,6 @@ for (const all of [labels, boxes.map(({ box, rect }) => ({ text: name(box), rect
   }
 }
 for (const { text, rect } of labels) if (rect.width < 20) found.push(`no room for ${text}`);
-const whole = rectOf(document.querySelector("#picture"));
 const heads = [...document.querySelectorAll("#lanes span")].map(rectOf);
 for (const { box, rect } of boxes) {
   if (rect.left < whole.left || rect.right > whole.right || rect.top < whole.top || rect.bottom > whole.bottom) {
@@ -40,10 +41,11 @@ for (const group of document.querySelectorAll("#lines g")) {
   if (row.top < frame.top || row.bottom > frame.bottom) found.push(`${id} does not pass its proxy`);
   const foreign = boxes.filter(({ box }) => ![a, b, id].includes(box.dataset.id));
   const way = group.firstChild;
-  for (let at = 0; at <= way.getTotalLength(); at += 4) {
+  const length = way.getTotalLength();
+  for (let at = 0; at <= length; at += 4) {
     const point = way.getPointAtLength(at);
-    const x = point.x + whole.left;
-    const y = point.y + whole.top;
+    const x = zoom * point.x + whole.left;
+    const y = zoom * point.y + whole.top;
     const hit = foreign.find(({ rect }) => x > rect.left + 1 && x < rect.right - 1 && y > rect.top + 1 && y < rect.bottom - 1);
     if (hit) { found.push(`a line crosses ${name(hit.box)}`); break; }
   }

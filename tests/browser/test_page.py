@@ -206,7 +206,8 @@ def test_the_keyboard_alone_gets_everywhere(lab: Lab, browser: Browser) -> None:
     visited = [name for name in visited if name not in ("cause", "copy")]
     boxes = visited.count("box")
     assert boxes > 3, "fewer boxes than two nodes, a line and the proxy"
-    before = ["skip", "wrong", "past", "filter", "quiet", "unfold", "graph"]
+    zoom = ["zoom-less", "zoom-more", "zoom-fit"]
+    before = ["skip", "wrong", "past", "filter", "quiet", "unfold", *zoom, "graph"]
     assert visited == [*before, *["box"] * boxes, "scroll", "scroll"], (
         "the order of the focus is wrong"
     )

@@ -27,6 +27,24 @@ ROWS = "return document.querySelectorAll('#rows tr').length"
 TEXTS = "return [...document.querySelectorAll(arguments[0])].map((item) => item.textContent)"
 MARKED_ROWS = "#rows tr[aria-current] td:nth-child(2)"
 MARKED_BOXES = ".box:not(.line)[aria-current]"
+LEVEL = "return document.querySelector('#zoom-level').textContent"
+SCROLLED = """
+const graph = document.querySelector("#graph");
+return [graph.scrollLeft, graph.scrollTop, graph.scrollWidth - graph.clientWidth];
+"""
+AT_POINT = """
+const box = document.elementFromPoint(arguments[0], arguments[1]).closest(".box");
+return box ? box.title : "";
+"""
+CENTRE = """
+const { left, top, width, height } = document.querySelector("#graph").getBoundingClientRect();
+const [x, middle] = [left + width / 2, top + height / 2];
+for (let y = middle; y < top + height; y += 1) {
+  if (document.elementFromPoint(x, y).closest(".box.line")) return [x, y + 5];
+}
+"""
+CTRL = 2
+"""The modifier of `Input.dispatchMouseEvent`."""
 PROXY_LABELS = "#boxes .proxy .fix"
 MARKED_FINDINGS = "#findings li[aria-current] .what"
 MARKED_LINES = ".box.line[aria-current]"
@@ -98,6 +116,81 @@ def test_the_picture_reads(browser: Browser, tmp_path: Path, nodes: int) -> None
         wait_until("each node has a box", lambda: browser.run(NODES) >= nodes)
         if nodes <= MOST_UNFOLDED:
             assert geometry(browser) == []
+
+
+@contextmanager
+def zoomable(browser: Browser, folder: Path, width: int, height: int) -> Iterator[None]:
+    """Show a page with a screen of this size, with the graph in view and the focus on the graph."""
+    with fleet(browser, folder, 15):
+        browser.resize(width, height)
+        wait_until("the picture has this width", lambda: not geometry(browser))
+        graph = "const graph = document.querySelector('#graph');"
+        browser.run(f"{graph} graph.focus(); graph.scrollIntoView();")
+        yield
+
+
+def mouse(browser: Browser, kind: str, x: float, y: float, **more: Any) -> None:
+    """Send an event of the mouse to the browser."""
+    browser.devtools("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+
+def level(browser: Browser) -> int:
+    """The zoom of the graph in percent."""
+    return int(browser.run(LEVEL).removesuffix(" %"))
+
+
+@pytest.mark.parametrize(("width", "height"), [(1500, 1000), (360, 740)])
+def test_keys_and_buttons_zoom_the_graph(
+    browser: Browser, tmp_path: Path, width: int, height: int
+) -> None:
+    """At each zoom, text has at least 11 px, no labels overlap, and the lanes fill the width."""
+    with zoomable(browser, tmp_path, width, height):
+        browser.press("++")
+        assert level(browser) == 156
+        assert geometry(browser) == []
+        browser.press("0")
+        assert 92 <= level(browser) <= 100
+        assert geometry(browser) == []
+        assert browser.run(SCROLLED)[:2] == [0, 0]
+        click(browser, "#zoom button", "+")
+        assert level(browser) > 100
+        for _ in range(9):
+            click(browser, "#zoom button", "\N{MINUS SIGN}")
+        assert level(browser) == 92
+        assert geometry(browser) == []
+
+
+def test_the_wheel_with_ctrl_zooms_at_the_pointer(browser: Browser, tmp_path: Path) -> None:
+    """The wheel without Ctrl scrolls."""
+    with zoomable(browser, tmp_path, 1500, 600):
+        x, y = browser.run(CENTRE)
+        box = browser.run(AT_POINT, x, y)
+        assert box
+        mouse(browser, "mouseWheel", x, y, deltaX=0, deltaY=-300, modifiers=CTRL)
+        wait_until("the graph is larger", lambda: level(browser) > 200)
+        assert browser.run(AT_POINT, x, y) == box
+        assert geometry(browser) == []
+        before = level(browser)
+        _, top, _ = browser.run(SCROLLED)
+        mouse(browser, "mouseWheel", x, y, deltaX=0, deltaY=120)
+        wait_until("the graph scrolls", lambda: browser.run(SCROLLED)[1] > top)
+        assert level(browser) == before
+
+
+def test_the_mouse_moves_the_graph_and_chooses_nothing(browser: Browser, tmp_path: Path) -> None:
+    with zoomable(browser, tmp_path, 1500, 1000):
+        browser.press("+++")
+        left, _, hidden = browser.run(SCROLLED)
+        assert 100 < left < hidden - 100, "there is no room to move the graph"
+        x, y = browser.run(CENTRE)
+        mouse(browser, "mousePressed", x, y, button="left", buttons=1, clickCount=1)
+        mouse(browser, "mouseMoved", x + 80, y, button="left", buttons=1)
+        mouse(browser, "mouseReleased", x + 80, y, button="left", clickCount=1)
+        wait_until("the graph moves", lambda: abs(browser.run(SCROLLED)[0] - left + 80) < 2)
+        assert not browser.run(DETAILS)
+        assert geometry(browser) == []
+        click(browser, "#boxes .proxy", "domain-7")
+        assert browser.run(DETAILS), "a box cannot be chosen any more"
 
 
 def test_each_proxy_has_its_version_of_ros(browser: Browser, tmp_path: Path) -> None:

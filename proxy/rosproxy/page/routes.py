@@ -58,6 +58,7 @@ _FILES = {
     "/picture.js": ("picture.js", "text/javascript"),
     "/findings.js": ("findings.js", "text/javascript"),
     "/history.js": ("history.js", "text/javascript"),
+    "/zoom.js": ("zoom.js", "text/javascript"),
     "/page.css": ("page.css", "text/css"),
 }
 _REFUSED_HTML = '<p role="alert">Wrong token. Enter the token of --admin-token.</p>'

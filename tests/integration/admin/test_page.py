@@ -34,7 +34,15 @@ from tests.integration.proxy import Proxy
 from tests.page_updates import apply_update
 
 TOKEN = "0123456789abcdef"
-FILES = ("/page.js", "/view.js", "/picture.js", "/findings.js", "/history.js", "/page.css")
+FILES = (
+    "/page.js",
+    "/view.js",
+    "/picture.js",
+    "/findings.js",
+    "/history.js",
+    "/zoom.js",
+    "/page.css",
+)
 LINK = "topic /chatter /talker /outside"
 
 

@@ -7,6 +7,7 @@ import { causesOf, connect, emptyMemory, follow, followNodes, titleOf } from "./
 import { curveOf, emptyHistory, lastMinute, minuteText, record } from "./history.js";
 import { boxesOf, DIRECT, hasFix, joined, layout, linesOf, selection } from "./picture.js";
 import { age, apply, duration, frequency, hertz, isKnown, labelOf, megabytes, placeOf, rateOf, visibleLinks, visibleNodes, WORDS } from "./view.js";
+import { zoomable } from "./zoom.js";
 
 const AT_MOST_EVERY = 500;
 const MOST_ROWS = 400;
@@ -31,6 +32,7 @@ let events = [];
 let isFirst = true; // no document was shown yet
 const boxes = new Map();
 const ways = new Map();
+const zoom = zoomable($("graph"), $("zoomed"), { less: $("zoom-less"), more: $("zoom-more"), fit: $("zoom-fit"), level: $("zoom-level") }, show);
 let source = null;
 let heard = 0;
 const rates = emptyHistory(Date.now()); // of the last minute
@@ -276,7 +278,7 @@ function showGraph(found, cause) {
   const on = selection(selected, links, all, cause);
   on.title = cause ? titleOf(cause) : all.has(selected) ? all.get(selected).label : "";
   const { lines, left } = linesOf(links, on);
-  const places = layout(lanes, lines, proxies, $("graph").clientWidth - 16);
+  const places = layout(lanes, lines, proxies, Math.floor($("graph").clientWidth / Math.min(1, zoom())) - 16);
   const [chosenBoxes, near] = [on.nodes, on.ends].map((ids) => new Set([...ids].map((id) => boxOf.get(id))));
   for (const box of all.values()) {
     box.on = box.id === selected || chosenBoxes.has(box.id);
