@@ -262,8 +262,9 @@ class Pod(msgspec.Struct, frozen=True):
 
     ``controller`` is the kind of the pod's controller, for example ReplicaSet. ``workload`` is the
     object for `kubectl rollout restart`, for example "deployment/talker". ``created`` is the
-    creation time, as the API server writes the time. ``misspelt`` has the texts of
-    `misspelt_names`.
+    creation time, as the API server writes the time. ``running_since`` is the earliest start of a
+    running container with ``wired_master_uri``, in the same form, empty if no such container runs.
+    ``misspelt`` has the texts of `misspelt_names`.
     """
 
     id: Name
@@ -285,6 +286,7 @@ class Pod(msgspec.Struct, frozen=True):
     controller: str = ""
     workload: str = ""
     created: str = ""
+    running_since: str = ""
     misspelt: tuple[str, ...] = ()
 
     @property

@@ -117,6 +117,7 @@ def pod(obj: Json) -> Pod:
         controller=text_at(_controller(meta), "kind"),
         workload=_workload(meta),
         created=text_at(meta, "creationTimestamp"),
+        running_since=_running_since(obj, wired) if wired else "",
         misspelt=misspelt_names(meta, "pods"),
     )
 
@@ -309,6 +310,30 @@ def _masters(spec: Json) -> Iterator[str]:
                 value = text_at(variable, "value")
                 is_indirect = variable.get("valueFrom") is not None or "$(" in value
                 yield VALUE_AT_RUNTIME if is_indirect else value
+
+
+def _running_since(obj: Json, wired: str) -> str:
+    """Return the earliest start of a running container with this ROS_MASTER_URI; empty for none.
+
+    A container that has restarted has new ROS nodes, also in an old pod. A container that does not
+    run has no ROS nodes.
+    """
+    spec = submap(obj, "spec")
+    status = submap(obj, "status")
+    ours = {
+        text_at(container, "name")
+        for kind in ("initContainers", "containers")
+        for container in submaps(spec, kind)
+        for variable in submaps(container, "env")
+        if variable.get("name") == MASTER_VARIABLE and _short(text_at(variable, "value")) == wired
+    }
+    starts = (
+        text_at(submap(container, "state", "running"), "startedAt")
+        for kind in ("initContainerStatuses", "containerStatuses")
+        for container in submaps(status, kind)
+        if text_at(container, "name") in ours
+    )
+    return min(filter(None, starts), default="")
 
 
 def _controller(meta: Json) -> Json:

@@ -166,6 +166,39 @@ def test_what_the_webhook_has_set_is_not_the_templates_own():
     assert (parsed_pod.own_masters, parsed_pod.wired_master_uri) == ((), "http://a:11311")
 
 
+def wired_pod(*init_containers: str, **started: str) -> dict[str, Any]:
+    """A wired pod with these containers. ``started`` has the start of each one that runs."""
+    env = [{"name": "ROS_MASTER_URI", "value": "http://a:11311"}]
+    containers = {"arm": env, "hand": env, "log": []}
+    specs = [{"name": name, "env": own} for name, own in containers.items()]
+    obj = pod_obj(
+        containers=specs, initContainers=[{"name": name, "env": env} for name in init_containers]
+    )
+    obj["metadata"]["annotations"] = {"rosproxy.io/master-uri": "http://a:11311"}
+    for name in (*containers, *init_containers):
+        running = {"running": {"startedAt": started[name]}} if name in started else {"waiting": {}}
+        kind = "initContainerStatuses" if name in init_containers else "containerStatuses"
+        obj["status"].setdefault(kind, []).append({"name": name, "state": running})
+    return obj
+
+
+@pytest.mark.parametrize(
+    ("obj", "since"),
+    [
+        (wired_pod(arm="2026-01-01T01:00:00Z", hand="2026-01-01T02:00:00Z"), 1),
+        (wired_pod(hand="2026-01-01T02:00:00Z"), 2),
+        (wired_pod("side", arm="2026-01-01T03:00:00Z", side="2026-01-01T02:00:00Z"), 2),
+        (wired_pod(arm="2026-01-01T03:00:00Z", log="2026-01-01T02:00:00Z"), 3),
+        (wired_pod(log="2026-01-01T02:00:00Z"), None),
+        (wired_pod(), None),
+        (pod_obj(), None),
+    ],
+    ids=["two", "one waits", "sidecar", "other container", "no ROS", "none runs", "not wired"],
+)
+def test_a_pod_runs_since_the_oldest_start_of_its_wired_containers(obj, since):
+    assert pod(obj).running_since == (f"2026-01-01T0{since}:00:00Z" if since else "")
+
+
 @pytest.mark.parametrize(
     ("phase", "ended"), [("Succeeded", True), ("Failed", True), ("Running", False), ("", False)]
 )

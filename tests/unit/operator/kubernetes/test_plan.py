@@ -367,14 +367,15 @@ def test_a_pod_that_is_older_than_the_service_is_told_so() -> None:
 
 
 def test_a_pod_of_a_former_rosproxy_gets_a_finding() -> None:
-    """Its nodes are no longer registered, although the new Service has the same address."""
+    """Its nodes may be no longer registered, although the new Service has the same address."""
     of = replace(rosproxy(), created="2026-01-01T00:00:10Z")
-    former = pod(created="2026-01-01T00:00:09Z", workload="deployment/talker")
+    deployment = "deployment/talker"
+    former = pod(running_since="2026-01-01T00:00:09Z", workload=deployment)
     plan = look(complete(pods=(former,), rosproxies=(of,)))
     (text,) = told(plan, "NotWired")
     assert "is older than RosProxy robot" in text
     assert text.endswith(". Run kubectl -n ros rollout restart deployment/talker")
-    of_now = pod(created="2026-01-01T00:00:10Z", workload="deployment/talker")
+    of_now = pod(created="2026-01-01T00:00:09Z", running_since=of.created, workload=deployment)
     assert not told(look(complete(pods=(of_now,), rosproxies=(of,))), "NotWired")
 
 

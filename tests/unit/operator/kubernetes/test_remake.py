@@ -58,7 +58,7 @@ def test_one_that_was_wired_to_a_former_address_is_evicted() -> None:
 
 
 def test_a_pod_of_a_former_rosproxy_is_evicted() -> None:
-    seen = cluster(of_set(wired_master_uri=WIRED, created="2026-01-01T00:00:00Z"))
+    seen = cluster(of_set(wired_master_uri=WIRED, running_since="2026-01-01T00:00:00Z"))
     (of,) = seen.rosproxies
     assert evicted(look(seen)) == []
     of = replace(of, created="2026-01-01T00:00:01Z")

@@ -33,7 +33,7 @@ WITHOUT_NODES = ProxyReport(answered=True)
 
 
 def running(**changes: Any) -> Pod:
-    more = {"created": BEFORE, "workload": "deployment/talker", "controller": "ReplicaSet"}
+    more = {"running_since": BEFORE, "workload": "deployment/talker", "controller": "ReplicaSet"}
     return pod(**{**more, **changes})
 
 
@@ -69,12 +69,14 @@ def test_another_master_and_back_leaves_older_pods_unregistered() -> None:
     first = look(seen(running(), proxy(), of=changed), stamp=THEN)
     assert retires(first)
     (text,) = told(first, "NotWired")
-    assert f"was created before {THEN}, when the proxy on node one unregistered" in text
+    assert f"was started before {THEN}, when the proxy on node one unregistered" in text
+    assert "The ROS nodes of this pod may have been unregistered" in text
     assert text.endswith(". Run kubectl -n ros rollout restart deployment/talker")
 
     back = stored(rosproxy(), first)
     assert told(look(seen(running(), proxy(), of=back)), "NotWired") == [text]
-    assert not told(look(seen(running(created=THEN), proxy(), of=back)), "NotWired")
+    started_later = running(created=BEFORE, running_since=THEN)
+    assert not told(look(seen(started_later, proxy(), of=back)), "NotWired")
 
 
 def test_a_look_with_a_former_status_still_tells() -> None:
@@ -139,8 +141,9 @@ def test_such_pods_are_evicted_if_the_rosproxy_asks_for_that() -> None:
     evicted = [a for a in look(seen(running(), proxy(), of=of)).actions if isinstance(a, EvictPod)]
     assert [action.id.name for action in evicted] == ["talker"]
     elsewhere = replace(of, unregistered_at={"two": THEN})
-    plan = look(seen(running(), proxy(), of=elsewhere))
-    assert not [action for action in plan.actions if isinstance(action, EvictPod)]
+    restarted = running(created=BEFORE, running_since=LATER)
+    for snapshot in (seen(running(), proxy(), of=elsewhere), seen(restarted, proxy(), of=of)):
+        assert not [action for action in look(snapshot).actions if isinstance(action, EvictPod)]
 
 
 @pytest.mark.parametrize("at", ["zzz", "", 7, None, "2026-01-01"])

@@ -251,28 +251,24 @@ def _why_lost(pod: Pod, rosproxy: RosProxy) -> str:
 
     The proxy unregisters the nodes when the RosProxy is deleted, and when the operator moves the
     proxy or no longer needs the proxy (`unregistrations`). ROS 1 nodes don't register again by
-    themselves.
+    themselves. A container that was started later has new nodes, which register at their start.
     """
-    if not pod.wired_master_uri:
+    if not pod.running_since:
         return ""
-    if _is_older(pod, rosproxy.created):
+    # The times are RFC 3339 in UTC with whole seconds, so texts sort like times.
+    if pod.running_since < rosproxy.created:
         return (
             f"is older than RosProxy {rosproxy.id.name}: the former RosProxy of that name was "
             "deleted, and the ROS nodes of the pod may have been unregistered at the master"
         )
     at = rosproxy.unregistered_at.get(pod.node, "")
-    if _is_older(pod, at):
+    if pod.running_since < at:
         return (
-            f"was created before {at}, when the proxy on node {pod.node} unregistered its ROS "
-            f"nodes after a change of RosProxy {rosproxy.id.name} or of the selected pods. ROS "
-            "nodes register only at their start"
+            f"was started before {at}, when the proxy on node {pod.node} unregistered ROS nodes "
+            f"after a change of RosProxy {rosproxy.id.name} or of the selected pods. The ROS nodes "
+            "of this pod may have been unregistered for good"
         )
     return ""
-
-
-def _is_older(pod: Pod, time: str) -> bool:
-    # The times are RFC 3339 in UTC with whole seconds, so texts sort like times.
-    return bool(pod.created) and pod.created < time
 
 
 def _younger_object(pod: Pod, rosproxy: RosProxy, service_since: str) -> str:
@@ -281,7 +277,7 @@ def _younger_object(pod: Pod, rosproxy: RosProxy, service_since: str) -> str:
     A pod of the same second as the object lacked the object, too: otherwise the webhook would have
     wired the pod. The operator creates the Service, so the Service is younger than the RosProxy.
     """
-    if _is_older(pod, rosproxy.created):
+    if pod.created and pod.created < rosproxy.created:
         return f"RosProxy {rosproxy.id.name}"
     if pod.created and pod.created <= service_since:
         return f"Service {service_id(rosproxy.id).name} of the RosProxy"
