@@ -190,6 +190,24 @@ def test_values_without_effect_are_refused(values: Json, told: str) -> None:
     assert told in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("values", "path"),
+    [
+        ({"image": {"repository": None}}, "image.repository"),
+        ({"proxy": {"image": {"repository": None}}}, "proxy.image.repository"),
+        ({"tests": {"image": None}}, "tests.image"),
+        ({"tests": {"ros": 2, "ros2Image": None}}, "tests.ros2Image"),
+        ({"tests": {"ros": None}}, "tests.ros"),
+        ({"tests": {"timeoutSeconds": None}}, "tests.timeoutSeconds"),
+    ],
+)
+def test_null_is_refused_where_the_chart_needs_a_value(values: Json, path: str) -> None:
+    """Helm removes the default before it asks the schema. The image of a pod was empty."""
+    done = helm("template", "x", CHART, "--kube-version", "1.30.0", values=values)
+    assert done.returncode != 0
+    assert f"{path}: is null, which removes the default" in done.stderr
+
+
 def off(*names: str) -> Json:
     """Values that switch these groups off."""
     return {name: {"enabled": False} for name in names}
@@ -200,6 +218,10 @@ def off(*names: str) -> Json:
     [
         {**off("webhook", "podDisruptionBudget"), "proxy": off("networkPolicy")},
         *({"tests": {"ros": ros}} for ros in (1, 2, "zenoh")),
+        *(
+            {"tests": {"ros": ros, image: None}}
+            for ros, image in ((1, "ros2Image"), (2, "image"), ("zenoh", "image"))
+        ),
     ],
 )
 def test_defaults_without_effect_are_accepted(values: Json) -> None:

@@ -8,6 +8,19 @@ each may be, is in values.schema.json.
 {{- fail (printf "global.%s: is unknown, and the release has no other chart. Use global.imageRegistry or global.imagePullSecrets, or remove global.%s" $key $key) }}
 {{- end }}
 {{- end }}
+{{- /* The schema takes null as a missing value. */}}
+{{- $needed := dict "image.repository" .Values.image.repository
+  "proxy.image.repository" .Values.proxy.image.repository
+  "tests.ros" .Values.tests.ros "tests.timeoutSeconds" .Values.tests.timeoutSeconds }}
+{{- $ofTest := get (dict "1" "image" "2" "ros2Image") (toString .Values.tests.ros) }}
+{{- with $ofTest }}
+{{- $_ := set $needed (printf "tests.%s" .) (get $.Values.tests .) }}
+{{- end }}
+{{- range $path, $value := $needed }}
+{{- if not $value }}
+{{- fail (printf "%s: is null, which removes the default. Set a value, or remove %s from your values" $path $path) }}
+{{- end }}
+{{- end }}
 {{- $ports := list (int .Values.webhook.port) (int .Values.metricsPort) (int .Values.livenessPort) }}
 {{- if ne (len (uniq $ports)) 3 }}
 {{- fail (printf "webhook.port, metricsPort, livenessPort: the ports %v are not different. Choose three different ports" $ports) }}
