@@ -7,16 +7,17 @@ output. Then the RosProxy is ready, the doctor has no error, and messages flow.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
 
-from tests.docker.engine import wait_until
+from tests.docker.engine import ROOT, wait_until
 from tests.kubernetes import api
 from tests.kubernetes.cluster.control_plane import kubectl
-from tests.kubernetes.cluster.layout import NODES, ROBOT_ADDRESS
+from tests.kubernetes.cluster.layout import NODES, ROBOT_ADDRESS, node_named
 from tests.kubernetes.cluster.network import inside
 from tests.kubernetes.mistakes import (
     APP,
@@ -29,6 +30,7 @@ from tests.kubernetes.mistakes import (
     by_hand,
     edit_rosproxy,
     edit_template,
+    errors,
     restart,
     run_told,
     walk_through,
@@ -37,6 +39,7 @@ from tests.kubernetes.pods import INJECT, Namespace
 from tests.kubernetes.robot import Robot, robot_with_master
 from tests.kubernetes.ros2 import ADDRESS, Robot2, robot_with_ros2
 from tests.kubernetes.rosproxies import rosproxy
+from tests.kubernetes.traffic import START
 
 OF_ROS2 = {"ros": 2, "peers": [ADDRESS], "ports": 16}
 
@@ -91,6 +94,31 @@ def _two(site: Site) -> None:
     site.create_rosproxy()
     rosproxy(site.net.name, "second", master={"uri": site.robot.master_uri}, ports=8)
     site.create_app()
+
+
+def _apply_example(site: Site, name: str) -> None:
+    """Apply the guide's RosProxy of this name, in the namespace and with the master of the test."""
+    guide = (ROOT / "docs/guide/kubernetes.md").read_text()
+    examples = re.findall(r"^kubectl apply -f - <<END\n(.*?)^END$", guide, re.DOTALL | re.MULTILINE)
+    (example,) = [text for text in examples if re.search(rf"^  name: {name}\b", text, re.MULTILINE)]
+    example = example.replace("namespace: robots", f"namespace: {site.net.name}")
+    example = re.sub(r"uri: http://\S+", f"uri: {site.robot.master_uri}", example)
+    kubectl("apply", "-f", "-", input=example)
+
+
+def _both_examples(site: Site) -> None:
+    """Apply the guide's example for ROS 2 while pods use the example for ROS 1."""
+    _apply_example(site, "robot")
+    site.create_app()
+    wait_until(site.is_well, 90, site.rosproxy.tell)
+    wait_until(lambda: site.robot.knows_proxied(site.node), START, "the ROS node is registered")
+    _apply_example(site, "robot2")
+
+
+def _relabel_registered(site: Site, said: str) -> None:
+    """The running pod stays with its proxy until the user changes the label."""
+    assert site.robot.knows_proxied(site.node)
+    _relabel("robot")(site, said)
 
 
 def _unknown_name(site: Site) -> None:
@@ -192,6 +220,38 @@ def _open_master(site: Site) -> None:
         inside(node, "sh", "-c", f"while iptables -w -D {' '.join(_rule(site))}; do :; done 2>&1")
 
 
+OCCUPIED = {"first": 12600, "last": 12607}
+KUBELET = "10250"
+"""The port of a program that listens on each node."""
+
+
+def _redirect() -> tuple[str, ...]:
+    ports = f"{OCCUPIED['first']}:{OCCUPIED['last']}"
+    return ("PREROUTING", "-d", node_named("node1").address, "-p", "tcp", "--dport", ports,
+            "-j", "REDIRECT", "--to-ports", KUBELET)  # fmt: skip
+
+
+def _program_at_the_ports(site: Site) -> None:
+    """Another program gets the connections to the hostPorts of the proxy.
+
+    A rule before those of portmap leads to this program, like the rules of Docker on a node.
+    """
+    inside(node_named("node1"), "iptables", "-w", "-t", "nat", "-I", *_redirect())
+    site.create_rosproxy(portWindow=OCCUPIED)
+    site.create_app(on="node1")
+    site.rosproxy.wait_status(lambda s: s.get("rosNodes") == 1, "the ROS node is counted", START)
+
+
+def _end_program(_: Site) -> None:
+    rule = " ".join(_redirect())
+    loop = f"while iptables -w -t nat -D {rule}; do :; done 2>&1"
+    inside(node_named("node1"), "sh", "-c", loop)
+
+
+def _other_window(site: Site) -> None:
+    site.rosproxy.change(portWindow={"first": 12620, "last": 12640})
+
+
 def _master_service(site: Site, name: str = "master", **spec: Any) -> None:
     """Create a Service at port 11400 for the master on the robot, like many sites."""
     port = {"port": 11400, "targetPort": site.robot.port}
@@ -274,6 +334,12 @@ MISTAKES: dict[str, Mistake] = {
         (Cure("is selected by RosProxy robot and second, so the pod gets no proxy",
               f"Set the label to the name of one RosProxy, such as {INJECT}=robot in the template",
               _relabel("robot")),),
+    ),
+    "guide's example for ROS 2 beside that for ROS 1": Mistake(
+        _both_examples, "Ambiguous",
+        (Cure("is selected by RosProxy robot and robot2. This pod stays with robot",
+              f"Set the label to the name of one RosProxy, such as {INJECT}=robot in the template",
+              _relabel_registered),),
     ),
     "another master in the template": Mistake(
         _template(env={"ROS_MASTER_URI": "http://192.0.2.7:11311"}), "NotWired",
@@ -372,6 +438,13 @@ MISTAKES: dict[str, Mistake] = {
         _spec(advertise="Hostname"), "ProxyWarns",
         (Cure("can't be resolved", "set spec.advertise", edit_rosproxy(advertise="InternalIP")),),
     ),
+    "program at the ports of the proxy": Mistake(
+        _program_at_the_ports, "PortsUnreachable",
+        (Cure("outside does not reach ports 12600-12607 of 10.88.0.11 (another program answers",
+              "set a spec.portWindow without these ports", by_hand(_other_window)),
+         Cure("The ROS nodes of this pod may have been unregistered", "Run kubectl", restart)),
+        _end_program,
+    ),
     "ports of NodePorts": Mistake(
         _spec(portWindow={"first": 30000, "last": 30100}), "PortsExhausted",
         (Cure("no 8 free ports in a row between 30000 and 30100", "Widen spec.portWindow",
@@ -450,3 +523,17 @@ def test_the_doctor_names_a_mistake_with_ros2_and_the_fix_works(
     name: str, net: Namespace, robot: Robot, robot2: Robot2
 ) -> None:
     walk_through(ROS2_MISTAKES[name], Site(net, robot, robot2))
+
+
+def test_a_new_proxy_beside_a_running_robot_is_well(
+    net: Namespace, robot: Robot, robot2: Robot2
+) -> None:
+    """The robot discovers the proxy while the proxy starts. This is no mistake."""
+    site = Site(net, robot, robot2)
+    with site.listener() as heard:
+        site.create_rosproxy(**OF_ROS2)
+        site.create_app()
+        heard.wait_for("inside", seconds=START)
+        # A problem of the start would be reported for `RECENT_S`, 300 s.
+        wait_until(site.is_well, 60, site.rosproxy.tell)
+        assert not errors(net.name)
