@@ -1,14 +1,17 @@
 """The chart, installed with Helm as a user would."""
 
 import json
+import re
+import shlex
 import tempfile
+import textwrap
 from pathlib import Path
 from typing import Any
 
 from scripts.release_check import running_registry
 
-from tests.docker.engine import ROOT, run, wait_until
-from tests.docker.images import PROXY
+from tests.docker.engine import ROOT, docker, run, wait_until
+from tests.docker.images import OPERATOR, PROXY
 from tests.kubernetes import api
 from tests.kubernetes.api import Json
 from tests.kubernetes.cluster.images import load_images
@@ -84,6 +87,42 @@ def install_from_a_registry(directory: Path) -> None:
         chart = f"oci://{address}/charts/{CHART.name}"
         _helm_with(_IMAGES, "install", chart, "--version", version, "--plain-http",
                    "--create-namespace")  # fmt: skip
+
+
+def install_as_the_readme_says(namespace: str, master: str) -> str:
+    """Run the command of the chart's README in place of the release. Return the notes' RosProxy.
+
+    The nodes have the images already. The operator manages ``namespace``, and allows ``master``.
+    """
+    remove()
+    version = _app_version()
+    for image in (OPERATOR, PROXY):
+        name = f"{image.partition(':')[0]}:{version}"
+        docker("tag", image, name)
+        load_images(name)
+    (command,) = re.findall(
+        r"^helm (install .*?)\n```", (CHART / "README.md").read_text(), re.M | re.S
+    )
+    own = {
+        "\\\n": "",
+        "$REGISTRY/": "",
+        "{robots}": f"{{{namespace}}}",
+        str(CHART.relative_to(ROOT)): str(CHART),
+    }
+    for theirs, ours in own.items():
+        assert theirs in command, command
+        command = command.replace(theirs, ours)
+    helm(*shlex.split(command), "--set", f"allow.masters={{{master}}}", seconds=360)
+    notes = helm("get", "notes", NAME, "--namespace", NAMESPACE)
+    (example,) = re.findall(
+        rf"^  kubectl -n {namespace} apply -f - <<END\n(.*?)^  END$", notes, re.M | re.S
+    )
+    return textwrap.dedent(example)
+
+
+def _app_version() -> str:
+    (version,) = re.findall(r"^appVersion: (\S+)$", (CHART / "Chart.yaml").read_text(), re.M)
+    return str(version)
 
 
 def upgrade(**values: Any) -> None:

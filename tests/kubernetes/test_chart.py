@@ -12,8 +12,11 @@ from tests.chart.chart import NAMESPACE, combinations, objects
 from tests.docker.engine import wait_until
 from tests.kubernetes import api, release
 from tests.kubernetes.api import Json
+from tests.kubernetes.cluster.control_plane import kubectl
 from tests.kubernetes.pods import Namespace, namespace
-from tests.kubernetes.rosproxies import NOWHERE, rosproxy
+from tests.kubernetes.robot import Robot
+from tests.kubernetes.rosproxies import NOWHERE, RosProxy, rosproxy
+from tests.kubernetes.traffic import START, wait_for_service
 
 FOREIGN = {"cert-manager.io/v1", "monitoring.coreos.com/v1"}
 """Groups without definitions in this cluster."""
@@ -183,6 +186,25 @@ def test_upgrade_keeps_the_certificate(restored: None) -> None:
     assert certificate() == before
     (webhook,) = api.get("mutatingwebhookconfigurations", "", release.FULL_NAME)["webhooks"]
     assert webhook["timeoutSeconds"] == 7
+
+
+def test_the_readmes_command_and_the_notes_example(net: Namespace, robot: Robot) -> None:
+    try:
+        example = release.install_as_the_readme_says(net.name, robot.master_uri)
+        release.wait_operator()
+        assert f"uri: {robot.master_uri}\n" in example
+        kubectl("-n", net.name, "apply", "-f", "-", input=example)
+        made = RosProxy(net.name, "robot")
+        wait_for_service(net)
+        net.node("rospy", "pub", "--topic", "/readme", "--word", "inside", on="node1")
+        listener = robot.node("listener_readme", "rospy", "sub", "--topic", "/readme")
+        listener.wait_for("inside", seconds=START)
+        made.wait_for("MasterReachable")
+        made.wait_for("Degraded", "False")
+    finally:
+        release.remove()
+        release.install()
+        release.wait_operator()
 
 
 def certificate() -> tuple[Any, Any]:
