@@ -2,7 +2,8 @@
 
 Each test makes a mistake, waits until an error of the doctor has the words about this mistake and
 the fix, and follows the fix. If the doctor names a command, the test runs the command from the
-output. Then the RosProxy is ready, the doctor has no error, and messages flow.
+output. Before, no message flows, with few exceptions. Then the RosProxy is ready, the doctor has no
+error, and messages flow.
 """
 
 from __future__ import annotations
@@ -180,10 +181,15 @@ def _privileged(site: Site, said: str) -> None:
 def _made_anew(site: Site) -> None:
     site.create_rosproxy()
     site.create_app()
-    wait_until(site.is_well, 90, site.rosproxy.tell)
+    wait_until(lambda: site.robot.knows_proxied(site.node), START, site.rosproxy.tell)
     site.rosproxy.remove()
     wait_until(lambda: not site.rosproxy.body, 60, "the RosProxy is gone")
     site.create_rosproxy()
+
+
+def _restart_unregistered(site: Site, said: str) -> None:
+    wait_until(lambda: not site.robot.uri(site.node), 30, lambda: str(site.robot.nodes()))
+    restart(site, said)
 
 
 def _two_nodes_for_a_port(site: Site) -> None:
@@ -327,7 +333,8 @@ MISTAKES: dict[str, Mistake] = {
     "RosProxy deleted and created again": Mistake(
         _made_anew, "NotWired",
         (Cure("is older than RosProxy robot: the former RosProxy of that name was deleted",
-              "Run kubectl", restart),),
+              "Run kubectl", _restart_unregistered),),
+        is_silent=False,  # before the RosProxy is deleted
     ),
     "two RosProxies": Mistake(
         _two, "Ambiguous",
@@ -340,6 +347,7 @@ MISTAKES: dict[str, Mistake] = {
         (Cure("is selected by RosProxy robot and robot2. This pod stays with robot",
               f"Set the label to the name of one RosProxy, such as {INJECT}=robot in the template",
               _relabel_registered),),
+        is_silent=False,  # the running pod keeps its proxy
     ),
     "another master in the template": Mistake(
         _template(env={"ROS_MASTER_URI": "http://192.0.2.7:11311"}), "NotWired",
@@ -401,6 +409,7 @@ MISTAKES: dict[str, Mistake] = {
         _two_nodes_for_a_port, "ProxyWarns",
         (Cure("no port is free, 1 used", "set a larger spec.ports", edit_rosproxy(ports=8)),),
         words=("one", "two"),
+        is_silent=False,  # one of both nodes has the port
     ),
     "image": Mistake(
         _spec(**IMAGE), "ProxyStuck",
