@@ -9,7 +9,7 @@ from tests.docker.nodes import node_command
 from tests.kubernetes import api
 from tests.kubernetes.measured import note
 from tests.kubernetes.mistakes import Site, restart_as_told
-from tests.kubernetes.pods import INJECT, Namespace, unique
+from tests.kubernetes.pods import INJECT, Namespace, Pod, unique
 from tests.kubernetes.robot import Robot, robot_with_master
 from tests.kubernetes.rosproxies import NOWHERE, RosProxy, rosproxy
 from tests.kubernetes.test_doctor import doctor
@@ -148,18 +148,23 @@ def test_rosproxy_deleted_and_created_at_once(who: str, net: Namespace, robot: R
     note(f"RosProxy deleted and created, pods restarted by the {who}: {gap:.1f} s without messages")
 
 
-@pytest.mark.parametrize("change", ["master", "selector"])
+@pytest.mark.parametrize(
+    ("change", "fix"), [("master", "restart"), ("selector", "restart"), ("master", "crash")]
+)
 def test_a_change_that_is_taken_back_is_told_to_running_pods(
-    change: str, net: Namespace, robot: Robot
+    change: str, fix: str, net: Namespace, robot: Robot
 ) -> None:
-    """The proxy has unregistered the ROS nodes, which register only at their start."""
+    """The proxy has unregistered the ROS nodes, which register only at their start.
+
+    A new container is enough: its ROS node registers.
+    """
     topic = f"/{unique('back').replace('-', '_')}"
     site = Site(net, robot)
     made = site.rosproxy
     site.create_rosproxy(graceSeconds=2)
     wait_for_service(net)
     site.create_app(command=node_command("roscpp", "pub", "--topic", topic, "--word", "inside"))
-    listener = robot.node(f"listener_{change}", "roscpp", "sub", "--topic", topic)
+    listener = robot.node(f"listener_{change}_{fix}", "roscpp", "sub", "--topic", topic)
     listener.wait_for("inside", seconds=START)
     made.wait_status(lambda s: s.get("rosNodes") == 1, "the ROS node is counted")
     (pod,) = net.pods(INJECT)
@@ -181,7 +186,10 @@ def test_a_change_that_is_taken_back_is_told_to_running_pods(
     wait_until(lambda: bool(site.texts("NotWired")), 60, made.tell)
     assert any("may have been unregistered" in found["text"] for found in doctor(net.name)[1])
 
-    restart_as_told(site)
+    if fix == "restart":
+        restart_as_told(site)
+    else:
+        Pod(net.name, pod["metadata"]["name"]).crash()
     listener.wait_for("inside", since=time.time(), seconds=START)
     wait_until(site.is_well, 120, made.tell)
 
