@@ -21,6 +21,7 @@ from rosproxy.ros1.protocol.master_methods import (
     method_spec,
     resolve_name,
 )
+from rosproxy.ros1.protocol.status_triples import ros_triple
 from rosproxy.ros1.protocol.uris import with_caller_address
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
@@ -29,7 +30,6 @@ from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL, inner_calls, inner_items
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting.addressing import Caller
-from rosproxy.ros1.rewriting.slave_api import ros_triple
 
 
 class LocalAnswer(msgspec.Struct, frozen=True):

@@ -15,6 +15,7 @@ import msgspec
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.status_triples import replace_in_message, replace_value, ros_triple
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call
@@ -170,11 +171,6 @@ def topic_port(call: Call, reply: bytes) -> int | None:
     return server.port if server and call.string(1) else None
 
 
-def ros_triple(value: Value | None) -> Value | None:
-    """The value of a reply if it is a ROS status triple, else None."""
-    return value if value and value.kind == "array" and len(value.items) == 3 else None
-
-
 def tcpros_address(triple: Value) -> HostPort | None:
     """The TCPROS address in a reply to ``requestTopic``; None if there is none."""
     if not _is_tcpros(triple):
@@ -189,20 +185,7 @@ def replace_topic_address(triple: Value, target: HostPort) -> list[Edit]:
     _, host, port = triple.items[2].items
     edits = [host.with_text(target.host), port.with_text(str(target.port))]
     # rospy's message is "ready on HOST:PORT" (tcpros_pubsub.py, init_publisher).
-    return edits + _in_message(triple, f"{host.text}:{port.text}", str(target))
-
-
-def replace_value(triple: Value, text: str) -> list[Edit]:
-    """Edits that replace the value of a reply, also inside the status message."""
-    # rosmaster's lookupService (master_api.py) and rospy's getMasterUri (masterslave.py) quote it.
-    value = triple.items[2]
-    return [value.with_text(text), *_in_message(triple, value.text, text)]
-
-
-def _in_message(triple: Value, before: str, after: str) -> list[Edit]:
-    """The edit that replaces a text in the status message; empty if the text is not there."""
-    text = triple.items[1].string() or ""
-    return [triple.items[1].with_text(text.replace(before, after))] if before in text else []
+    return edits + replace_in_message(triple, f"{host.text}:{port.text}", str(target))
 
 
 def _publishers(call: Call) -> list[Value]:
