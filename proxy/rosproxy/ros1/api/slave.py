@@ -18,6 +18,7 @@ from rosproxy.net.http_client import LongReply
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import MANY_VALUES, Context
 from rosproxy.ros1.leases import Leases
+from rosproxy.ros1.protocol.master_methods import MASTER_ONLY
 from rosproxy.ros1.protocol.name_lengths import too_long_to_ask
 from rosproxy.ros1.protocol.uris import parse_inside_path
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
@@ -317,6 +318,6 @@ class SlaveApi:
     async def _may_call(self, method: str, source: str) -> bool:
         """Whether ``--slave-control`` allows a source to call a method."""
         all_may_call = self._context.settings.slave_control == "any"
-        if all_may_call or method not in slave_api.MASTER_ONLY:
+        if all_may_call or method not in MASTER_ONLY:
             return True
         return source in await self._context.upstream.master_addresses()

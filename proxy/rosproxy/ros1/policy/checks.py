@@ -22,6 +22,7 @@ from rosproxy.ros1.policy.parameters import ParamUse, param_use, param_use_of, s
 from rosproxy.ros1.policy.service_finder import ServiceFinder
 from rosproxy.ros1.protocol.master_methods import (
     GRAPH_METHODS,
+    MASTER_ONLY,
     Kind,
     prefix,
     resolve_name,
@@ -41,7 +42,6 @@ from rosproxy.ros1.rewriting.master_calls import (
     Passing,
     Request,
 )
-from rosproxy.ros1.rewriting.slave_api import MASTER_ONLY
 
 MASTER = "/master"
 """The caller_id of the master's calls to nodes (rosmaster/registrations.py)."""

@@ -63,6 +63,8 @@ NO_SPEC = MethodSpec()
 
 GRAPH_METHODS = frozenset({"getPublishedTopics", "getSystemState", "getTopicTypes"})
 """The calls whose replies contain the graph: the names of topics, services and nodes."""
+MASTER_ONLY = frozenset({"shutdown", "publisherUpdate", "paramUpdate"})
+"""The calls of the master to nodes. A policy may refuse these calls from all other callers."""
 _PARAMETERS = {"deleteParam", "getParam", "getParamNames", "hasParam", "searchParam", "setParam"}
 _NODES = {"getBusInfo", "getBusStats", "getMasterUri", "getName", "getPid", "shutdown"}
 _TOPICS = {"getPublications", "getSubscriptions", "publisherUpdate", "requestTopic", "paramUpdate"}

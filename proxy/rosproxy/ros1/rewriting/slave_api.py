@@ -23,9 +23,6 @@ from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.protocol.xmlrpc.values import Edit, Value
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 
-MASTER_ONLY = frozenset({"shutdown", "publisherUpdate", "paramUpdate"})
-"""The calls of the master to nodes. A policy may refuse these calls from all other callers."""
-
 _URI_REPLIES = frozenset({"getUri", "getMasterUri"})
 _REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
 

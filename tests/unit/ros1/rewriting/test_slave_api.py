@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.master_methods import MASTER_ONLY, Kind
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
 from rosproxy.ros1.rewriting import slave_api
@@ -253,7 +253,7 @@ def test_methods_that_are_not_rewritten(method: str) -> None:
 
 
 def test_what_only_the_master_calls() -> None:
-    assert {"shutdown", "publisherUpdate", "paramUpdate"} == slave_api.MASTER_ONLY
+    assert {"shutdown", "publisherUpdate", "paramUpdate"} == MASTER_ONLY
 
 
 def test_an_update_from_before_a_publisher_was_registered_anew() -> None:
