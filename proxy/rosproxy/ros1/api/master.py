@@ -125,18 +125,15 @@ class MasterApi:
     async def _answer(self, request: Request, incoming: IncomingCall) -> bytes | LongReply:
         """The reply to a parsed request. A request without changes passes as the original bytes."""
         policy = self._context.policy
-        upstream = self._context.upstream
         if not request.is_address_free:
             # Without the recovery, a node of a former process of the proxy would get another port.
             # rosmaster would shut the node down for the new URI (registrations.py,
             # _register_node_api).
             await self._recovery.ensure()
-        elif policy.idle:
-            return await upstream.pass_to_master(request.body)
         version = policy.rules.version
         answers = await policy.check_request(request)
         if request.is_address_free and not any(answers) and not policy.reads_reply(request):
-            return await upstream.pass_to_master(request.body)
+            return await self._context.upstream.pass_to_master(request.body)
         pending = list[PendingRegistration]()
         try:
             outcomes = await self._outcomes(request, answers, incoming, pending)

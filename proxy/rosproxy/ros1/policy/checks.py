@@ -131,8 +131,10 @@ class Ros1Policy:
 
         A denied registration becomes hidden. At the URI of another node, the registration fails.
         """
-        affected = None if self.idle else call.registration
-        if affected is None or affected.kind is Kind.PARAM:  # already checked
+        affected = call.registration
+        if self.rules.empty or affected is None:
+            return None
+        if affected.kind is Kind.PARAM:  # already checked
             return None
         endpoint = admission if isinstance(admission, Endpoint) else None
         address = endpoint.address if endpoint else caller.address
@@ -150,10 +152,10 @@ class Ros1Policy:
         self, call: MasterCall, ended_at: Endpoint | Passing
     ) -> LocalAnswer | None:
         """The answer to a call that ends a hidden registration; None for any other call."""
-        if self.idle or not isinstance(ended_at, Endpoint):
-            return None
         ended = call.registration
-        current = ended_at.registrations.get(ended.key) if ended else None
+        if ended is None or not isinstance(ended_at, Endpoint):
+            return None
+        current = ended_at.registrations.get(ended.key)
         return self._hidden.answer_unregistration(current) if current and current.hidden else None
 
     def settle(self, endpoint: Endpoint, registration: Registration) -> Registration:
@@ -174,12 +176,14 @@ class Ros1Policy:
     def filter_result(self, result: CallResult, caller: Caller) -> Sequence[Edit]:
         """The edits that remove denied names from a result and add hidden names."""
         value = result.value
-        if self.idle or value is None or not result.accepted:
+        if value is None or not result.accepted:
             return ()
         call = result.call
         if call.method == "getParamNames":
             return self._without_denied_params(value, caller)
-        if call.method in GRAPH_METHODS and self._registry.has_hidden:
+        if not self._registry.has_hidden:
+            return ()
+        if call.method in GRAPH_METHODS:
             graph = self._hidden.complete_graph(call, xmlrpc.python_value(value))
             return [value.replaced_by(xmlrpc.dump_value(graph))]
         if call.spec.registers is Kind.SUBSCRIBER and result.endpoint:
