@@ -59,7 +59,9 @@ class Registration:
     The URI is None after a recovery, because only the node knows the URI. ``since`` is the time of
     the registration in seconds of the proxy's clock; 0 if only the master mentions it.
     ``hidden``: the policy denies the registration, and the master does not have it; see
-    `rosproxy.ros1.policy.hidden`.
+    `rosproxy.ros1.policy.hidden`. ``characters`` is the number of characters of all texts. Each
+    character counts as its bytes in XML, six at most. ROS allows only characters that have one byte
+    there, but rosmaster accepts all characters.
     """
 
     kind: Kind
@@ -69,22 +71,18 @@ class Registration:
     service_api: str | None = None
     since: float = 0.0
     hidden: bool = False
+    characters: int = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Count the characters, once for all checks of a bound."""
+        texts = (self.name + self.caller_id + self.type + (self.service_api or "")).encode()
+        escaped = len(texts) - len(texts.translate(None, b"&<>\"'"))
+        object.__setattr__(self, "characters", len(texts) + 5 * escaped)
 
     @property
     def key(self) -> tuple[Kind, str, str]:
         """The values that identify a registration at the master."""
         return self.kind, self.name, self.caller_id
-
-    @property
-    def characters(self) -> int:
-        """The number of characters of all texts of the registration.
-
-        Each character counts as its bytes in XML, six at most. ROS allows only characters that have
-        one byte there, but rosmaster accepts all characters.
-        """
-        texts = (self.name + self.caller_id + self.type + (self.service_api or "")).encode()
-        escaped = len(texts) - len(texts.translate(None, b"&<>\"'"))
-        return len(texts) + 5 * escaped
 
 
 @dataclass(slots=True, eq=False)
