@@ -248,11 +248,6 @@ class StandIns:
             f"ROS_IP={address}; the node then gives its address instead of its host name"
         )
 
-    def import_uri(self, uri: str, address: str) -> str:
-        """The URI that nodes inside get for a URI of outside, given the address of the proxy."""
-        stand_in = self.find(self.address(address), uri)
-        return stand_in.inside_uri if stand_in else uri
-
     def export_uri(self, uri: str) -> str | None:
         """The URI of outside for which nodes inside once got this URI; None if there is none."""
         if not self.is_bidirectional or len(uri) > LONGEST_URI:

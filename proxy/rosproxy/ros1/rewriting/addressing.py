@@ -144,7 +144,9 @@ class Addressing:
         return self._listening(parse_slave_uri(uri))
 
     def _import_foreign(self, uri: str, caller: Caller) -> str:
-        return self.stand_ins.import_uri(uri, caller.proxy) if self.stand_in_target(uri) else uri
+        """The URI of the stand-in for a URI of outside; the URI itself without a stand-in."""
+        stand_in = self.stand_ins.find(self.stand_ins.address(caller.proxy), uri)
+        return stand_in.inside_uri if stand_in and self.stand_in_target(uri) else uri
 
     def _import(self, endpoint: Endpoint, caller: Caller) -> str:
         # Several nodes may give the same URI. When the URI comes back, it has to mean this node.
@@ -169,10 +171,10 @@ class Addressing:
         the endpoint's, the URI means a node that had the port before.
         """
         endpoint = self._endpoint_at(parse_slave_uri(uri))
+        if endpoint is None:
+            return None
         inside = parse_inside_path(uri)
-        if endpoint is None or inside is None or inside.slave == endpoint.slave:
-            return endpoint
-        return None
+        return endpoint if inside is None or inside.slave == endpoint.slave else None
 
     def _endpoint_at(self, host_port: HostPort | None) -> Endpoint | None:
         port = self._listening(host_port)
