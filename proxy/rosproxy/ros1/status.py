@@ -209,7 +209,7 @@ class Ros1State(Collector):
     def _hidden(self) -> tuple[list[document.HiddenStatus], int]:
         """The registrations that the policy hides, and how many of them the list leaves out."""
         policy = self._context.policy
-        hidden = policy.hidden_registrations()
+        hidden = self._context.registry.hidden_registrations()
         rows = [
             document.HiddenStatus(
                 RULE_KINDS[registration.kind].value,

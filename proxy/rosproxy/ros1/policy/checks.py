@@ -32,7 +32,7 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Value
 from rosproxy.ros1.protocol.xmlrpc.values import Edit
-from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.rewriting.master_calls import (
@@ -219,14 +219,6 @@ class Ros1Policy:
         verdict = self.verdict(endpoint, registration)
         subject = f"{registration.name} of {registration.caller_id}"
         return self.rules.report(verdict, RULE_KINDS[registration.kind], subject, endpoint.address)
-
-    def hidden_registrations(self) -> list[EndpointRegistration]:
-        """All hidden registrations with their endpoints."""
-        return self._registry.hidden_registrations()
-
-    def hides_subscribers(self, topic: str) -> bool:
-        """Whether a topic has a hidden subscriber."""
-        return bool(self._registry.hidden_holders(Kind.SUBSCRIBER, topic))
 
     # What outside asks of a node inside
 

@@ -196,15 +196,11 @@ class StandInPorts:
         for stand_in in list(self._stand_ins.by_local.values()):
             self._close(stand_in)
 
-    @property
-    def _active(self) -> bool:
-        """Whether any URI may need a stand-in now."""
-        return self._stand_ins.is_bidirectional or self._context.upstream.master_address is not None
-
     async def _targets(self, uris: Iterable[str]) -> dict[str, HostPort]:
         """The URIs that need a stand-in, each with the host and port of the target."""
         targets = dict[str, HostPort]()
-        if not self._active or self._closed:
+        has_alias = self._context.upstream.master_address is not None
+        if self._closed or not (self._stand_ins.is_bidirectional or has_alias):
             return targets
         for number, uri in enumerate(uris, start=1):
             if number % URIS_PER_TURN == 0:

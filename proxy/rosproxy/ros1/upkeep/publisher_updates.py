@@ -77,8 +77,9 @@ class PublisherUpdates:
 
         Without ``all_inside``, only the hidden subscribers: the master tells all other subscribers.
         """
+        registry = self._context.registry
         for topic in topics:
-            if all_inside or self._context.policy.hides_subscribers(topic):
+            if all_inside or registry.hidden_holders(Kind.SUBSCRIBER, topic):
                 self._changed_topics[topic] = all_inside or self._changed_topics.get(topic, False)
                 if topic not in self._topics_underway:
                     self._topics_underway.add(topic)
