@@ -1,9 +1,10 @@
-"""Remembers when the proxy of a place last unregistered its ROS 1 nodes while their pods ran.
+"""Remembers when the proxy of a place last unregistered ROS 1 nodes while the pods still ran.
 
-A proxy that no other proxy takes over unregisters its nodes (`DeleteProxy.retire`): another master,
-other ports, or no selected pod any more. ROS 1 nodes register only at their start. So the nodes of
-older pods stay unregistered, also if the RosProxy gets its former master or selector back. The
-status keeps the time of each node (``unregisteredAt``), for the next operator.
+A proxy without a successor unregisters the ROS 1 nodes (`DeleteProxy.retire`). A proxy has no
+successor if the master or the ports change, or if no pod is selected any more. A ROS 1 node
+registers only at the start of the node. So the nodes of older pods stay unregistered, also if the
+RosProxy gets the former master or selector back. For the next operator, the status keeps a time for
+each Kubernetes node (``unregisteredAt``).
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,9 +19,9 @@ from rosproxy_operator.kubernetes.resources.model import ProxyPlace, RosProxy
 
 
 class Unregistration(msgspec.Struct, frozen=True):
-    """The proxy whose pod has this ``uid`` unregistered its nodes ``at`` this time (RFC 3339).
+    """The unregistration of all ROS 1 nodes of a proxy ``at`` a time (RFC 3339).
 
-    The ``uid`` is empty if the time comes from a status.
+    ``uid`` is the uid of the proxy's pod. The uid is empty if the time comes from a status.
     """
 
     uid: str
@@ -31,7 +32,7 @@ Unregistrations = Mapping[ProxyPlace, Unregistration]
 
 
 def recall(view: View, known: Unregistrations) -> dict[ProxyPlace, Unregistration]:
-    """Return the last unregistration of each place: the ``known`` one, or a later one of a status.
+    """Return the last unregistration of each place, either ``known`` or, if later, from a status.
 
     A watched status may be older than the operator's own state.
     """
@@ -49,8 +50,8 @@ def note_unregistrations(
 ) -> dict[ProxyPlace, Unregistration]:
     """Return the unregistrations that begin with these actions, at the time ``stamp``.
 
-    A plan may ask for the same deletion again. The time of the first plan counts, because a proxy
-    that has unregistered its nodes accepts no other nodes.
+    A plan may ask for the same deletion again. The time of the first plan counts, because a retired
+    proxy accepts no other nodes.
     """
     retiring = {a.uid for a in actions if isinstance(a, DeleteProxy) and a.retire}
     return {
@@ -64,7 +65,7 @@ def note_unregistrations(
 
 
 def with_unregistrations(view: View, rosproxy: RosProxy, known: Unregistrations) -> RosProxy:
-    """Return a RosProxy with the last unregistration on each of its nodes."""
+    """Return a RosProxy with the time of the last unregistration on each Kubernetes node."""
     nodes = (*rosproxy.former_ranges, *(p.node for p in view.places.get(rosproxy.id, ())))
     places = {node: ProxyPlace(rosproxy.id, node) for node in nodes}
     times = {node: known[place].at for node, place in places.items() if place in known}
