@@ -30,26 +30,26 @@ class Sight:
 
 @dataclass(frozen=True)
 class Absence:
-    """A proxy that is away: from the change of its pod until it is ready again."""
+    """The absence of a proxy: from the change of the pod until the proxy is ready again."""
 
     node: str
     begin: float
     end: float
 
     def numbers(self, log: Log, word: str) -> list[int]:
-        """The numbers of the messages that were received in the meantime."""
+        """The numbers of the messages that a node received during the absence."""
         return [got.number for got in log.got(word) if self.begin <= got.at <= self.end]
 
 
 @dataclass
 class Rollout:
-    """Collects what happens to the proxies of a RosProxy."""
+    """Collects the events of the proxies of a RosProxy."""
 
     made: RosProxy
     sights: list[Sight] = field(default_factory=list)
 
     def absences(self) -> list[Absence]:
-        """All absences of proxies, in the order of their begin. One that lasts has no end."""
+        """All absences of proxies, ordered by begin. An absence that lasts has an infinite end."""
         return [*absences(self.sights)]
 
     @property
@@ -57,7 +57,7 @@ class Rollout:
         return [absence for absence in self.absences() if absence.end < float("inf")]
 
     def collect(self, ended: threading.Event) -> None:
-        """Read events until ``ended``. A watch is short, so that this returns soon."""
+        """Read events until ``ended``. A watch is short, so the method returns soon."""
         selector = f"{PROXY_OF}={self.made.name},app.kubernetes.io/component=proxy"
         version = ""
         while not ended.is_set():
@@ -82,10 +82,10 @@ def sight(event: Json, at: float) -> Sight:
 
 
 def absences(sights: Iterable[Sight]) -> Iterator[Absence]:
-    """The absences of proxies, in the order of their begin.
+    """The absences of proxies, ordered by begin.
 
     After a change of the image, the pod stays ready until the kubelet ends the former container. So
-    a proxy is away until its container has restarted and is ready.
+    a proxy is away until the new container is ready.
     """
     pods: dict[str, Sight] = {}
     restarts_needed: dict[str, int] = {}

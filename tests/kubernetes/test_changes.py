@@ -56,7 +56,7 @@ def test_another_selector(net: Namespace) -> None:
 
 
 def test_a_second_rosproxy_takes_no_node_of_running_pods(net: Namespace, robot: Robot) -> None:
-    """Several RosProxies select the pod, and the pod stays with the first one."""
+    """Several RosProxies select the pod, and the pod stays with the first RosProxy."""
     topic = f"/{unique('second').replace('-', '_')}"
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8, graceSeconds=2)
     name = talker(net, topic)
@@ -154,7 +154,7 @@ def test_rosproxy_deleted_and_created_at_once(who: str, net: Namespace, robot: R
 def test_a_change_that_is_taken_back_is_told_to_running_pods(
     change: str, fix: str, net: Namespace, robot: Robot
 ) -> None:
-    """The proxy has unregistered the ROS nodes, which register only at their start.
+    """The proxy has unregistered the ROS nodes. A ROS node registers only at the start.
 
     A new container is enough: its ROS node registers.
     """

@@ -1,9 +1,10 @@
-"""What nodes offer each other: a topic, a latched topic, a service, parameters and an action.
+"""Nodes that offer each other two topics, a service, parameters and an action.
 
-Keys, tokens, attachments and options of queries are those of rmw_zenoh (rmw_publisher_data.cpp,
-rmw_client_data.cpp, rmw_service_data.cpp, liveliness_utils.cpp, attachment_helpers.cpp). Both
-topics and the service `add` have the payloads and type hashes of ROS, so that nodes of another
-library can use them (`sdk_node.py`). All other payloads are text, and have the hash of a string.
+A topic is latched. Keys, tokens, attachments and options of queries are the same as in rmw_zenoh.
+The sources are rmw_publisher_data.cpp, rmw_client_data.cpp, rmw_service_data.cpp,
+liveliness_utils.cpp and attachment_helpers.cpp. Both topics and the service `add` have the payloads
+and type hashes of ROS. So a node of another library can use these topics and the service
+(`sdk_node.py`). All other payloads are text, and have the hash of a string.
 """
 
 import itertools
@@ -73,7 +74,7 @@ class Kind(NamedTuple):
 
     @property
     def qos(self) -> str:
-        """The QoS in tokens: reliable, volatile and ten messages, or transient_local and one."""
+        """The QoS in tokens: reliable; volatile with ten messages, or transient_local with 1."""
         return ":1:,1:,:,:,," if self.latched else "::,10:,:,:,,"
 
 
@@ -105,7 +106,7 @@ def say(*words: object) -> None:
 
 
 class Node:
-    """A node with its entities and their tokens."""
+    """A node with entities and tokens."""
 
     def __init__(self, session: Any, name: str) -> None:
         self.session = session
@@ -128,7 +129,7 @@ class Node:
         return lambda text: publisher.put(kind.codec.encode(text))
 
     def subscribe(self, kind: Kind, owner: str, take: Callable[[str], None]) -> None:
-        """Have ``take`` called with each message of another node."""
+        """Call ``take`` with each message of another node."""
         key = self._declare("MS", kind, owner)
 
         def callback(sample: Any) -> None:
@@ -186,7 +187,7 @@ class Node:
                 yield reply.ok.payload.to_bytes()
 
     def _declare(self, entity: str, kind: Kind, owner: str) -> str:
-        """Declare the token of an entity. Return the key of its messages or calls."""
+        """Declare the token of an entity. Return the key of the messages or calls."""
         name = f"{owner}/{kind.name}"
         start = f"@ros2_lv/0/{self.session.info.zid()}/0/{next(self._entities)}/{entity}/%/%"
         mangled = f"/{name}".replace("/", "%")
@@ -208,7 +209,7 @@ def number_in(attachment: bytes) -> int:
 
 
 class Goal:
-    """A goal of an action with so many steps."""
+    """A goal of an action with ``steps`` steps."""
 
     def __init__(self, steps: int) -> None:
         self.steps = steps
@@ -218,7 +219,7 @@ class Goal:
 
 
 class ActionServer:
-    """The three services and two topics of an action, as rcl_action has them."""
+    """The three services and two topics of an action, as in rcl_action."""
 
     def __init__(self, node: Node) -> None:
         self._goals: dict[str, Goal] = {}
@@ -278,7 +279,7 @@ def offer(session: Any, name: str, _: str) -> None:
 
 
 def use(session: Any, name: str, owners: str) -> None:
-    """Use all kinds of each of ``owners``, which are nodes. Print what has arrived."""
+    """Use all kinds of each node in ``owners``. Print what has arrived."""
     node = Node(session, name)
     for owner in owners.split(","):
         subscribe(node, owner)
@@ -299,7 +300,7 @@ def subscribe(node: Node, owner: str) -> None:
 
 
 def call(node: Node, owner: str) -> None:
-    """Call the services of a node, ask for its parameters, and use its action."""
+    """Call the services of a node, ask for parameters, and use the action."""
     say("got", owner, "sum", node.client(ADD, owner)("1 2"))
     get_parameters = node.client(PARAMETERS["get_parameters"], owner)
     say("got", owner, get_parameters("use_sim_time"))
@@ -307,7 +308,7 @@ def call(node: Node, owner: str) -> None:
 
 
 def act(node: Node, owner: str) -> None:
-    """Send a goal and await its end, then send another goal and cancel that."""
+    """Send a short goal and await the end, then send a long goal and cancel the long goal."""
     goals = {f"{node.name}_short": SHORT_GOAL_STEPS, f"{node.name}_long": LONG_GOAL_STEPS}
     seen: set[str] = set()
 

@@ -367,7 +367,7 @@ def test_a_pod_that_is_older_than_the_service_is_told_so() -> None:
 
 
 def test_a_pod_of_a_former_rosproxy_gets_a_finding() -> None:
-    """Its nodes may be no longer registered, although the new Service has the same address."""
+    """The pod's nodes may be unregistered, though the new Service has the same address."""
     of = replace(rosproxy(), created="2026-01-01T00:00:10Z")
     deployment = "deployment/talker"
     former = pod(running_since="2026-01-01T00:00:09Z", workload=deployment)
@@ -437,7 +437,7 @@ KEY = b"k" * 32
 
 
 def two(*proxies: ProxyPod, key: bytes = KEY) -> ClusterSnapshot:
-    """Two nodes with a pod each, and these proxies, which were made without that key."""
+    """Two nodes with a pod each, and ``proxies``, which were made without ``key``."""
     pods = pod("a", ip="10.244.1.5"), pod("b", on="two", ip="10.244.2.5")
     nodes = node(), node("two")
     return observed(rosproxy(), service(), *nodes, *pods, *proxies, key=key)
