@@ -1,15 +1,21 @@
 """Build all parts of a release into dist/, and try each part like a user.
 
-    python scripts/release_check.py              this working tree: `make release-check`
-    python scripts/release_check.py --tag v1.2.3 the release with this tag
-    … --registry ghcr.io/me                      with the images' names in chart and manifest
-    … --repository https://github.com/me/rosproxy    with links there in chart and alerts
-    … --only packages                            some steps only
+    python scripts/release_check.py              Check the working tree, as `make release-check`.
+    python scripts/release_check.py --tag v1.2.3 Check the release with the tag.
+    … --registry ghcr.io/me                      Put this registry into chart and manifest.
+    … --repository https://github.com/me/rosproxy    Put links there into chart and alerts.
+    … --only packages                            Run some steps only.
 
-Steps: versions (the same everywhere), packages (wheel and sdist: reproducible, and installed
-without the sources), sbom (CycloneDX, of the installed packages), chart (linted, packed), images
-(built, and asked for the version), registry (images and chart pushed to a registry on this machine,
-and pulled). A step that cannot run fails. Nothing is published.
+The steps:
+
+  - versions: The version is the same everywhere.
+  - packages: The wheel and sdist are reproducible. The packages install without the sources.
+  - sbom: The list (CycloneDX) has the installed packages.
+  - chart: The script lints and packs the chart.
+  - images: The script builds the images, and asks each image for the version.
+  - registry: The script pushes images and chart to a registry on this machine, and pulls both.
+
+A step that cannot run fails. The script publishes nothing.
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """Run layers of tests, and report results and durations.
 
-    python -m scripts.test_layers --smoke          what `make test` runs
-    python -m scripts.test_layers                  what `make test-all` runs
-    python -m scripts.test_layers unit ros         these layers only
+    python -m scripts.test_layers --smoke          Run the tests of `make test`.
+    python -m scripts.test_layers                  Run the tests of `make test-all`.
+    python -m scripts.test_layers unit ros         Run these layers only.
 
 The steps (`layers` declares the layers):
 
