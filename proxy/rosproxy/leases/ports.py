@@ -1,4 +1,4 @@
-"""The listen range of the proxy, the advertised range, and the free ports."""
+"""Ranges of ports: listened on, advertised, free, and those of stand-ins."""
 
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -26,6 +26,11 @@ class PortRange:
     def ports(self) -> range:
         """All ports, in order."""
         return range(self.first, self.last + 1)
+
+
+STAND_IN_PORTS = PortRange(20_000, 32_767)
+"""The ports of stand-ins, of ROS 1 and of ROS 2, through which inside reaches outside. They are below
+the ports that Linux gives to outgoing connections."""
 
 
 @dataclass(frozen=True, slots=True)

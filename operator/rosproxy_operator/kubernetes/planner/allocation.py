@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import msgspec
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.leases.ports import STAND_IN_PORTS, PortRange
 from rosproxy_operator.common.port_ranges import (
     FormerRange,
     PortsExhausted,
@@ -261,6 +261,6 @@ def _avoided_stand_ins(spec: RosProxySpec) -> list[PortRange]:
     The list is empty for a proxy without stand-ins. If all ranges of the window have such ports, no
     range is better, and the list is empty, too.
     """
-    others = gaps(spec.window, (), [proxy_ports.STAND_INS])
+    others = gaps(spec.window, (), [STAND_IN_PORTS])
     has_choice = any(len(ports) >= spec.ports for ports in others)
-    return [proxy_ports.STAND_INS] if has_choice and proxy_ports.stand_in_protocols(spec) else []
+    return [STAND_IN_PORTS] if has_choice and proxy_ports.stand_in_protocols(spec) else []

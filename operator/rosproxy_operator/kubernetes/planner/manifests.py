@@ -7,13 +7,13 @@ from typing import Any
 import msgspec
 
 from rosproxy.access.layers import PolicyLayer
-from rosproxy.leases.ports import PortRange
+from rosproxy.leases.ports import STAND_IN_PORTS, PortRange
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.policy import POLICY_WAIT_S, as_variable
 from rosproxy_operator.common.port_ranges import LOCAL_PORTS, first_fitting, local_ports
 from rosproxy_operator.common.ros2 import discovery_port
 from rosproxy_operator.common.zenoh import LINK_DIRECTORY, LINK_FILES, link_settings
-from rosproxy_operator.kubernetes.planner.proxy_ports import STAND_INS, fixed_ports
+from rosproxy_operator.kubernetes.planner.proxy_ports import fixed_ports
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     Json,
@@ -170,7 +170,7 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     identity = hashlib.sha256(graph.encode()).hexdigest()[:8]
     # The digest is of the pod without the fingerprint annotation, which is added only now.
     meta["annotations"][FINGERPRINT] = f"{digest(body)}-{identity}"
-    own_spec = _spec(site, settings, local_ports(_listening(site), [STAND_INS]))
+    own_spec = _spec(site, settings, local_ports(_listening(site), [STAND_IN_PORTS]))
     return {**body, "spec": {**own_spec, "containers": [container]}}
 
 

@@ -1,13 +1,8 @@
 """The ports on which a proxy listens besides its range."""
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.ros1.registry.stand_ins import STAND_IN_PORTS
 from rosproxy_operator.common.ros2 import well_known_ports
 from rosproxy_operator.kubernetes.resources.model import RosProxySpec
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, MASTER_PORT
-
-STAND_INS = PortRange(STAND_IN_PORTS[0], STAND_IN_PORTS[-1])
-"""The ports of stand-ins, through which the selected pods reach outside. The same for ROS 2."""
 
 
 def fixed_ports(spec: RosProxySpec) -> frozenset[int]:

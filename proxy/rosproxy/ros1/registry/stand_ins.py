@@ -24,6 +24,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from hashlib import blake2b
 
+from rosproxy.leases.ports import STAND_IN_PORTS
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import (
     LONGEST_URI,
@@ -36,10 +37,9 @@ from rosproxy.settings import Settings
 
 MOST_STAND_INS = 1024
 """The highest number of stand-ins."""
-STAND_IN_PORTS = range(20_000, 32_768)
-"""The ports of stand-ins, below the ports that Linux gives to outgoing connections. The first half
-is for the stand-ins, the second for their fast ports."""
-_HALF = len(STAND_IN_PORTS) // 2
+_PORTS = STAND_IN_PORTS.ports()
+_HALF = len(_PORTS) // 2
+"""The first half of the ports is for the stand-ins, the second for their fast ports."""
 MOST_TRIES = 16
 """The highest number of ports that the proxy tries for a URI."""
 MOST_TOPICS = 512
@@ -110,7 +110,7 @@ class StandIn:
         if self.is_uri_kept or parse_service_uri(self.uri):
             return None
         number = _number(f"{self.local.host} {self.uri}") + self.fast_attempts**2
-        return HostPort(self.local.host, STAND_IN_PORTS[_HALF + number % _HALF])
+        return HostPort(self.local.host, _PORTS[_HALF + number % _HALF])
 
     def note_topic_port(self, topic: str, port: int) -> None:
         """Record the TCPROS port that the node has named for a topic. Only the latest topics stay.
@@ -168,7 +168,7 @@ class StandIns:
             return
         seed = _number(uri)
         for number in range(MOST_TRIES):
-            port = STAND_IN_PORTS[(seed + number * number) % _HALF]
+            port = _PORTS[(seed + number * number) % _HALF]
             yield StandIn(HostPort(address, port), uri, target, is_uri_kept=False)
 
     def address(self, proxy: str) -> str:

@@ -34,6 +34,7 @@ from hashlib import blake2b
 import msgspec
 
 from rosproxy.forwarding.datagrams import DatagramRelay, bind
+from rosproxy.leases.ports import STAND_IN_PORTS
 from rosproxy.net.addresses import HostPort, subnet
 from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.context import Context
@@ -43,7 +44,7 @@ from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.values import Edit
 from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.stand_ins import STAND_IN_PORTS, StandIn
+from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.rewriting.udpros_offers import read_offers, redirect_offer
 from rosproxy.ros1.stand_ins.outside_nodes import Outside
 
@@ -135,9 +136,8 @@ class UdprosRelays:
             port = endpoint.port
             sources = [endpoint.location.address]
             subscription = UdprosSubscription(port, topic, caller_id, source, target, False)
-            relay_port = self._open_relay(
-                subscription, condition, proxy, _candidates(subscription, STAND_IN_PORTS), sources
-            )
+            ports = _candidates(subscription, STAND_IN_PORTS.ports())
+            relay_port = self._open_relay(subscription, condition, proxy, ports, sources)
             return HostPort(proxy, relay_port) if relay_port else None
 
         return await _rewritten(call, body, condition, redirect)

@@ -10,15 +10,13 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.leases.ports import STAND_IN_PORTS
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import MOST_MAPPINGS, DomainSettings, Refused
 from rosproxy.ros2.ports.locator_ports import order_for
 from rosproxy.ros2.registry.participants import OutsideParticipant, PortMapping, TrafficKind
 from rosproxy.ros2.sources.claimed_addresses import is_proxy_port
 
-STAND_INS = PortRange(20_000, 32_767)
-"""The range of stand-ins, below the ephemeral ports of Linux."""
 MOST_PORTS_TRIED = 32
 """The highest number of ports that are tried for a locator outside."""
 MOST_SHARING = 3
@@ -116,7 +114,7 @@ def stand_in_port(key: str, users: Callable[[int], int], busy: Callable[[int], b
     data, as with multicast. ``busy`` returns whether a port is not available. Such ports do not
     count as tries, because there may be many.
     """
-    order = (port for port in order_for(key, STAND_INS) if not busy(port))
+    order = (port for port in order_for(key, STAND_IN_PORTS) if not busy(port))
     return next(
         (port for port in islice(order, MOST_PORTS_TRIED) if users(port) < MOST_SHARING), None
     )

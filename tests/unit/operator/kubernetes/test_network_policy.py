@@ -5,8 +5,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.ros1.registry.stand_ins import STAND_IN_PORTS
+from rosproxy.leases.ports import STAND_IN_PORTS, PortRange
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import CreatePolicy, DeletePolicy, SetPolicy
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
@@ -194,8 +193,8 @@ def test_a_role_that_lacks_the_right_is_told() -> None:
 def test_the_ports_that_stand_in_for_outside_are_for_selected_pods() -> None:
     """For UDP, too: there the proxy takes what UDPROS sends out."""
     everybody, pods, _ = rules(direction="both")
-    first = STAND_IN_PORTS[0]
-    last = STAND_IN_PORTS[-1]
+    first = STAND_IN_PORTS.first
+    last = STAND_IN_PORTS.last
     stand_ins = [
         {"protocol": protocol, "port": first, "endPort": last} for protocol in ("TCP", "UDP")
     ]

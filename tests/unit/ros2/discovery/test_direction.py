@@ -6,11 +6,12 @@ from math import inf
 
 import pytest
 
+from rosproxy.leases.ports import STAND_IN_PORTS
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.ports.locator_ports import order_for
-from rosproxy.ros2.ports.stand_ins import MOST_SHARING, STAND_INS
+from rosproxy.ros2.ports.stand_ins import MOST_SHARING
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import TrafficKind
@@ -201,7 +202,9 @@ def test_forged_participants_do_not_take_the_port_of_a_peer_before_it_comes() ->
     (before,) = told_port(make_domain())
     wanted = f"{STRANGER}:7410"
     prefixes = (b"\x01\x0f" + number.to_bytes(10, "big") for number in count())
-    chosen = (p for p in prefixes if next(order_for(f"{p.hex()} {wanted}", STAND_INS)) == before)
+    chosen = (
+        p for p in prefixes if next(order_for(f"{p.hex()} {wanted}", STAND_IN_PORTS)) == before
+    )
     domain = make_domain()
     meet(domain)
     for prefix in islice(chosen, MOST_SHARING):

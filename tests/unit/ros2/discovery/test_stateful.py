@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from rosproxy.access.rules import RuleKind
+from rosproxy.leases.ports import STAND_IN_PORTS
 from rosproxy.ros2.discovery import fragments
 from rosproxy.ros2.domain_settings import MOST_MAPPINGS, Outgoing
-from rosproxy.ros2.ports.stand_ins import MOST_SHARING, STAND_INS
+from rosproxy.ros2.ports.stand_ins import MOST_SHARING
 from rosproxy.ros2.protocol.rtps import LAST_SEQUENCE_NUMBER, source_prefix
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from rosproxy.ros2.sources.rates import BURST, MOST_SOURCES
@@ -151,7 +152,7 @@ class Neighbours(RuleBasedStateMachine):
 
     @rule(datagram=datagrams(), source=ADDRESS, index=st.integers(0, 9))
     def a_stand_in_gets_something(self, datagram: bytes, source: str, index: int) -> None:
-        ports = sorted(self.domain.stand_ins.by_port) or [STAND_INS.first]
+        ports = sorted(self.domain.stand_ins.by_port) or [STAND_IN_PORTS.first]
         sent = self.domain.at_stand_in(ports[index % len(ports)], datagram, source, self.now)
         assert not sent or source in self.domain.inside.count_by_address
         self.check(sent)
@@ -226,7 +227,7 @@ class Neighbours(RuleBasedStateMachine):
             ]
         )
 
-    @rule(port=st.integers(STAND_INS.first, STAND_INS.last), for_good=st.booleans())
+    @rule(port=st.integers(STAND_IN_PORTS.first, STAND_IN_PORTS.last), for_good=st.booleans())
     def another_program_has_a_port(self, port: int, for_good: bool) -> None:
         ports = sorted(self.domain.stand_ins.by_port)
         self.domain.stand_ins.block(ports[0] if ports and port % 8 == 0 else port, for_good)

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.ros2.ports.stand_ins import MOST_SHARING, STAND_INS, stand_in_port
+from rosproxy.leases.ports import STAND_IN_PORTS
+from rosproxy.ros2.ports.stand_ins import MOST_SHARING, stand_in_port
 
 
 @given(st.text(max_size=40))
@@ -17,7 +18,7 @@ def test_the_port_of_a_stand_in_follows_from_its_key(key: str) -> None:
 
     port = chosen(lambda _: 0)
     assert port is not None
-    assert port in STAND_INS
+    assert port in STAND_IN_PORTS
     assert chosen(lambda _: MOST_SHARING - 1) == port
     assert chosen(lambda candidate: MOST_SHARING if candidate == port else 0) not in (None, port)
     assert chosen(lambda _: MOST_SHARING) is None

@@ -28,7 +28,7 @@ outside goes through the proxy, which enforces the rules.
 from collections.abc import Collection, Iterator
 from typing import Any
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.leases.ports import STAND_IN_PORTS, PortRange
 from rosproxy_operator.common.port_ranges import gaps
 from rosproxy_operator.common.ros2 import discovery_port
 from rosproxy_operator.kubernetes.planner import proxy_ports
@@ -208,7 +208,7 @@ def _public_ports(rosproxy: RosProxy, ranges: Collection[PortRange]) -> Iterator
     own_ports = proxy_ports.fixed_ports(rosproxy.spec)
     for protocol in _protocols(rosproxy):
         has_stand_ins = protocol in proxy_ports.stand_in_protocols(rosproxy.spec)
-        stand_ins = [*gaps(proxy_ports.STAND_INS, (), ranges)] if has_stand_ins else []
+        stand_ins = [*gaps(STAND_IN_PORTS, (), ranges)] if has_stand_ins else []
         for ports in gaps(rosproxy.spec.window, own_ports, stand_ins):
             yield _port(ports.first, ports.last, protocol)
     if rosproxy.spec.zenoh and rosproxy.spec.zenoh.listen:
@@ -230,7 +230,7 @@ def _pod_ports(rosproxy: RosProxy) -> Iterator[Json]:
     if rosproxy.spec.zenoh:
         yield _port(ROUTERS.first)
     for protocol in proxy_ports.stand_in_protocols(rosproxy.spec):
-        yield _port(proxy_ports.STAND_INS.first, proxy_ports.STAND_INS.last, protocol)
+        yield _port(STAND_IN_PORTS.first, STAND_IN_PORTS.last, protocol)
 
 
 def _port(first: int, last: int = 0, protocol: str = "TCP") -> Json:
