@@ -24,12 +24,13 @@ from examples.demo.players import RATE
 from examples.demo.proxy_process import DemoError
 from examples.demo.reliable_topics import ReliableReader, ReliableWriter
 from examples.demo.rtps_messages import pack_string, unpack_string
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.domain_settings import (
+from rosproxy.leases.domain_ports import (
     PORTS_PER_DOMAIN,
     SPDP_MULTICAST,
-    SPDP_UNICAST,
+    first_unicast_port,
+    multicast_port,
 )
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 DOMAINS = range(1, 31)
@@ -125,7 +126,7 @@ class Ros2Acts:
 
     def announce_to_proxy(self, inside: str, outside: HostPort) -> None:
         """Have all nodes announce themselves to the proxy, from inside or from outside."""
-        well_known = HostPort(inside, SPDP_UNICAST + PORTS_PER_DOMAIN * self.domain)
+        well_known = HostPort(inside, first_unicast_port(self.domain))
         for node in self.inside:
             node.announce_to([well_known])
         for node in self.outside:
@@ -158,14 +159,13 @@ class Ros2Acts:
 def reserve_domain() -> tuple[int, socket.socket]:
     """A domain that no program on this machine uses, and the reservation. Raises DemoError."""
     for domain in random.sample(DOMAINS, len(DOMAINS)):
-        offset = PORTS_PER_DOMAIN * domain
         reservation = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            reservation.bind(("", RESERVING + offset))
+            reservation.bind(("", RESERVING + PORTS_PER_DOMAIN * domain))
         except OSError:
             reservation.close()
             continue
-        ports = SPDP_MULTICAST + offset, SPDP_UNICAST + offset
+        ports = multicast_port(domain), first_unicast_port(domain)
         if all(is_free(port, kind=socket.SOCK_DGRAM) for port in ports):
             return domain, reservation
         reservation.close()

@@ -23,6 +23,7 @@ from typing import (
 
 from rosproxy.access.layers import PolicyLayer, read_layers
 from rosproxy.access.rules import LONGEST_GLOB, parse_rules
+from rosproxy.leases.domain_ports import LAST_DOMAIN
 from rosproxy.leases.ports import PortRange
 from rosproxy.net import addresses
 from rosproxy.net.addresses import HostPort, Network, parse_host_port
@@ -413,8 +414,7 @@ def host_port(example: HostPort) -> Text:
 PORT = Number("PORT", 1, 65535)
 MEBIBYTES = Number("MiB", 1, 65536)
 CONNECTIONS = Number("N", 16, 1_000_000)
-# The RTPS ports of a domain begin at 7400 + 250 * ID. For 233 the ports would exceed 65535.
-DOMAIN = Number("ID", 0, 232)
+DOMAIN = Number("ID", 0, LAST_DOMAIN)
 PORT_RANGE = Text("A-B", read_range)
 HOST = Text("HOST", read_host)
 ADDRESS = Text("ADDRESS", read_address)

@@ -6,7 +6,7 @@ multicast. With the same domain, tests in two processes disturb each other.
 
 import socket
 
-from rosproxy.ros2.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST
+from rosproxy.leases.domain_ports import multicast_port
 
 _DOMAINS = range(29, 0, -1)
 """Domains with ports below the ports that tests draw (`PortDraws`)."""
@@ -20,7 +20,7 @@ def own_domain() -> int:
     for domain in _DOMAINS:
         sign = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            sign.bind(("127.0.0.1", SPDP_MULTICAST + PORTS_PER_DOMAIN * domain + _SIGN))
+            sign.bind(("127.0.0.1", multicast_port(domain) + _SIGN))
         except OSError:
             sign.close()
             continue

@@ -3,13 +3,11 @@
 import hashlib
 import hmac
 
+from rosproxy.leases.domain_ports import first_unicast_port, multicast_port
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST
 from rosproxy.setting_kinds import read_peer
 from rosproxy.settings import LEAST_PORTS_PER_DOMAIN
 
-LAST_DOMAIN = 232
-"""The last domain whose well-known ports are below 65536 (DDSI-RTPS 2.5, 9.6.2.3)."""
 MOST_PEERS = 32
 """The most hosts in a label or field. Each announcement goes to at least 32 ports of each host."""
 LEAST_PORTS = LEAST_PORTS_PER_DOMAIN + 1
@@ -22,14 +20,9 @@ LAN_RELAY_COMMAND = ("rosproxy", "lan-relay")
 """The command of a LAN relay, in the proxy's image."""
 
 
-def discovery_port(domain: int) -> int:
-    """Return the well-known port where the first participant of a machine gets announcements."""
-    return SPDP_UNICAST + PORTS_PER_DOMAIN * domain
-
-
 def well_known_ports(domain: int) -> frozenset[int]:
     """Return the ports on which the proxy of a domain listens in addition to its range."""
-    return frozenset({SPDP_MULTICAST + PORTS_PER_DOMAIN * domain, discovery_port(domain)})
+    return frozenset({multicast_port(domain), first_unicast_port(domain)})
 
 
 def read_peer_name(text: str) -> str:

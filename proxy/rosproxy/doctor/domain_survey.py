@@ -19,14 +19,16 @@ from ipaddress import ip_network
 
 from rosproxy.doctor.facts import HeardParticipant
 from rosproxy.forwarding import datagrams
-from rosproxy.net.addresses import HostPort, is_inside, plain_address
-from rosproxy.net.interfaces import address_into
-from rosproxy.ros2.domain_settings import (
-    PARTICIPANTS_TRIED,
+from rosproxy.leases.domain_ports import (
+    LAST_DOMAIN,
     PORTS_PER_DOMAIN,
     SPDP_MULTICAST,
-    SPDP_UNICAST,
+    first_unicast_port,
+    multicast_port,
 )
+from rosproxy.net.addresses import HostPort, is_inside, plain_address
+from rosproxy.net.interfaces import address_into
+from rosproxy.ros2.domain_settings import PARTICIPANTS_TRIED
 from rosproxy.ros2.protocol.announcement import SPDP_ENDPOINTS, announcement, dispose_message
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import PREFIX_BYTES, RtpsError, source_vendor
@@ -35,8 +37,6 @@ from rosproxy.ros2.rewriting.announced_participant import traits
 from rosproxy.ros2.rewriting.discovery import Announcement, read_discovery
 from rosproxy.ros2.servers.groups import family_of, groups_of, send_through
 
-DOMAIN_COUNT = 233
-"""The number of domains: 0 to 232. The ports of further domains would exceed 65535."""
 ALL_HOSTS = {socket.AF_INET: "224.0.0.1", socket.AF_INET6: "ff02::1"}
 ANSWER_TIMEOUT_S = 2.0
 """Seconds for which the doctor collects answers."""
@@ -122,11 +122,11 @@ def _answers(sock: socket.socket) -> Iterator[HeardParticipant]:
 
 
 def _targets(own_address: str, domains: Collection[int]) -> Iterator[tuple[str, int]]:
-    for domain in range(DOMAIN_COUNT):
+    for domain in range(LAST_DOMAIN + 1):
         for group in groups_of(own_address):
-            yield group, SPDP_MULTICAST + PORTS_PER_DOMAIN * domain
+            yield group, multicast_port(domain)
     for domain in domains:
-        first = SPDP_UNICAST + PORTS_PER_DOMAIN * domain
+        first = first_unicast_port(domain)
         # Every second port: the ports in between are for user data.
         for port in range(first, min(first + 2 * PARTICIPANTS_TRIED, 65536), 2):
             yield ALL_HOSTS[family_of(own_address)], port

@@ -29,8 +29,8 @@ class PortRange:
 
 
 STAND_IN_PORTS = PortRange(20_000, 32_767)
-"""The ports of stand-ins, of ROS 1 and of ROS 2, through which inside reaches outside. They are below
-the ports that Linux gives to outgoing connections."""
+"""The ports of stand-ins, through which inside reaches outside. They are below the ports that Linux
+gives to outgoing connections."""
 
 
 @dataclass(frozen=True, slots=True)

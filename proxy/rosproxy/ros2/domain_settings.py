@@ -6,16 +6,11 @@ from dataclasses import dataclass, field
 import msgspec
 
 from rosproxy.access.rules import RuleKind
+from rosproxy.leases.domain_ports import first_unicast_port, multicast_port
 from rosproxy.leases.ports import PortMap
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 
-PORTS_PER_DOMAIN = 250
-"""Domain d has the ports from 7400 + 250 d on (DDSI-RTPS 2.5, 9.6.2.3)."""
-SPDP_MULTICAST = 7400
-"""The multicast port of domain 0 for announcements of participants."""
-SPDP_UNICAST = 7410
-"""The first well-known port of domain 0."""
 PARTICIPANTS_TRIED = 32
 """The number of well-known ports of a peer to which announcements go. Each process binds one port.
 If more than 16 participants are known there, announcements go to two ports for each participant, up
@@ -144,12 +139,12 @@ class DomainSettings:
     @property
     def multicast_port(self) -> int:
         """The port for announcements to the multicast group."""
-        return SPDP_MULTICAST + PORTS_PER_DOMAIN * self.number
+        return multicast_port(self.number)
 
     @property
     def unicast_port(self) -> int:
         """The first well-known port, which the first participant of a machine binds."""
-        return SPDP_UNICAST + PORTS_PER_DOMAIN * self.number
+        return first_unicast_port(self.number)
 
     @property
     def discovery_port(self) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 
 from msgspec.structs import asdict, replace
 
+from rosproxy.leases.domain_ports import LAST_DOMAIN
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -18,7 +19,6 @@ from rosproxy_operator.common.policy import POLICY_WAIT_S, as_variable
 from rosproxy_operator.common.port_ranges import local_ports
 from rosproxy_operator.common.ros2 import (
     LAN_RELAY_COMMAND,
-    LAST_DOMAIN,
     lan_relay_variables,
     relay_secret,
     well_known_ports,

@@ -7,11 +7,11 @@ from typing import Any
 import msgspec
 
 from rosproxy.access.layers import PolicyLayer
+from rosproxy.leases.domain_ports import first_unicast_port
 from rosproxy.leases.ports import STAND_IN_PORTS, PortRange
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.policy import POLICY_WAIT_S, as_variable
 from rosproxy_operator.common.port_ranges import LOCAL_PORTS, first_fitting, local_ports
-from rosproxy_operator.common.ros2 import discovery_port
 from rosproxy_operator.common.zenoh import LINK_DIRECTORY, LINK_FILES, link_settings
 from rosproxy_operator.kubernetes.planner.proxy_ports import fixed_ports
 from rosproxy_operator.kubernetes.resources.model import (
@@ -257,7 +257,7 @@ def _service_ports(rosproxy: RosProxy) -> Iterator[Json]:
     if rosproxy.spec.ros1:
         yield _service_port("master", MASTER_PORT)
     if rosproxy.spec.ros2:
-        yield _service_port("discovery", discovery_port(rosproxy.spec.ros2.number), "UDP")
+        yield _service_port("discovery", first_unicast_port(rosproxy.spec.ros2.number), "UDP")
     if rosproxy.spec.zenoh:
         yield _service_port("router", ROUTERS.first)
 

@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 from rosproxy.access.layers import PolicyLayer, PolicyMode
 from rosproxy.access.rules import Rule, RuleAction, RuleKind, parse_rule
+from rosproxy.leases.domain_ports import LAST_DOMAIN
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
@@ -21,7 +22,7 @@ from rosproxy.settings import LEAST_PORTS_PER_DOMAIN, MOST_ZENOH_LIMITS, MOST_ZE
 from rosproxy.zenoh.link_router import check_limits
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.policy import excess_reason
-from rosproxy_operator.common.ros2 import LAST_DOMAIN, LEAST_PORTS, MOST_PEERS, read_peer_name
+from rosproxy_operator.common.ros2 import LEAST_PORTS, MOST_PEERS, read_peer_name
 from rosproxy_operator.common.zenoh import read_link_name, read_router_name
 from rosproxy_operator.kubernetes.resources.checks import (
     int_at,

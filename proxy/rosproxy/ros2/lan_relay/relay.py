@@ -22,12 +22,9 @@ from functools import partial
 
 from rosproxy.forwarding import datagrams
 from rosproxy.forwarding.datagrams import DATAGRAMS_PER_TURN, LARGEST_DATAGRAM
+from rosproxy.leases.domain_ports import multicast_port
 from rosproxy.net.addresses import HostPort, plain_address
-from rosproxy.ros2.domain_settings import (
-    PORTS_PER_DOMAIN,
-    SPDP_MULTICAST,
-    Outgoing,
-)
+from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.lan_relay.sources import SOURCE_BURST_UNITS, SOURCE_UNITS_PER_SECOND, LanSources
 from rosproxy.ros2.protocol.relay_envelope import LIST_MAGIC, listed_addresses, wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
@@ -71,7 +68,7 @@ class LanRelay:
         self._loop = asyncio.get_running_loop()
         self._proof = RelayProof(settings.secret, time.time)
         self._sockets: list[socket.socket] = []
-        self._port = SPDP_MULTICAST + PORTS_PER_DOMAIN * settings.domain
+        self._port = multicast_port(settings.domain)
         self._groups = GroupSockets(self._port, self._begin, self._end)
         self._sources = LanSources()
         # A machine on the LAN may forge the proxy's address, but not its proof.

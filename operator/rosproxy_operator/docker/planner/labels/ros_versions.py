@@ -16,9 +16,9 @@ that runs a router of zenoh states that.
 import re
 from collections.abc import Collection, Iterator
 
+from rosproxy.leases.domain_ports import LAST_DOMAIN
 from rosproxy.net.addresses import is_inside, is_loopback
 from rosproxy_operator.common.ros2 import (
-    LAST_DOMAIN,
     MOST_PEERS,
     ROS1_DISTROS,
     is_dds,

@@ -28,9 +28,9 @@ outside goes through the proxy, which enforces the rules.
 from collections.abc import Collection, Iterator
 from typing import Any
 
+from rosproxy.leases.domain_ports import first_unicast_port
 from rosproxy.leases.ports import STAND_IN_PORTS, PortRange
 from rosproxy_operator.common.port_ranges import gaps
-from rosproxy_operator.common.ros2 import discovery_port
 from rosproxy_operator.kubernetes.planner import proxy_ports
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
@@ -226,7 +226,7 @@ def _pod_ports(rosproxy: RosProxy) -> Iterator[Json]:
     if rosproxy.spec.ros1:
         yield _port(MASTER_PORT)
     if rosproxy.spec.ros2:
-        yield _port(discovery_port(rosproxy.spec.ros2.number), protocol="UDP")
+        yield _port(first_unicast_port(rosproxy.spec.ros2.number), protocol="UDP")
     if rosproxy.spec.zenoh:
         yield _port(ROUTERS.first)
     for protocol in proxy_ports.stand_in_protocols(rosproxy.spec):
