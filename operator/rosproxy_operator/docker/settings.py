@@ -23,7 +23,7 @@ from rosproxy.setting_kinds import (
     time,
 )
 from rosproxy.settings import MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
-from rosproxy.zenoh.link_router import check_limits
+from rosproxy.zenoh.policy.key_expressions import check_limits
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.images import IMAGE
 from rosproxy_operator.common.policy import administrators_policy

@@ -14,7 +14,7 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import LINK_PROTOCOLS, Credentials, LinkPort, SiteLink, TopicLimit
 from rosproxy.zenoh.policy.access_control import AT_LINKS, access_control
-from rosproxy.zenoh.policy.key_expressions import check_glob, data_keys, matches_no_name
+from rosproxy.zenoh.policy.key_expressions import data_keys
 from rosproxy.zenoh.router_configs import LEASE, RouterConfig, router_config, tls_values
 
 _HUB_RETRY = "#retry_period_init_ms=50"
@@ -54,20 +54,6 @@ class LinkPlan:
         if self.limits:
             own["downsampling"] = [_downsampling(self.limits)]
         return router_config(at, [to_hub, *map(str, self.dialed)], own)
-
-
-def check_limits(limits: Sequence[TopicLimit]) -> None:
-    """Raise ValueError, with the limit, if zenoh cannot count the messages of a limit."""
-    for limit in limits:
-        try:
-            check_glob(limit.glob)
-        except ValueError as error:
-            raise ValueError(f"{limit}: {error}") from None
-        if matches_no_name(limit.glob):
-            raise ValueError(f"{limit}: no topic of ROS 2 has such a name")
-        if len(data_keys(limit.glob)) > 1:  # zenoh would count each key expression by itself
-            text = "write * for whole parts of a name, or at the end: /camera/*, /*/image, /cam*"
-            raise ValueError(f"{limit}: {text}")
 
 
 def _downsampling(limits: Sequence[TopicLimit]) -> dict[str, object]:

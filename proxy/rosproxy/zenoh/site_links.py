@@ -21,7 +21,8 @@ from rosproxy.zenoh.link_files import (
     read_link_files,
     signatures,
 )
-from rosproxy.zenoh.link_router import LinkPlan, check_limits
+from rosproxy.zenoh.link_router import LinkPlan
+from rosproxy.zenoh.policy.key_expressions import check_limits
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy.zenoh.router_configs import RouterConfig
 

@@ -11,7 +11,8 @@ from rosproxy.access.rules import parse_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import Credentials, LinkPort, SiteLink, TopicLimit
-from rosproxy.zenoh.link_router import LinkPlan, check_limits
+from rosproxy.zenoh.link_router import LinkPlan
+from rosproxy.zenoh.policy.key_expressions import check_limits
 from rosproxy.zenoh.router_configs import RouterPlan
 
 CREDENTIALS = Credentials(b"certificate", b"secret key", b"authority")

@@ -19,7 +19,7 @@ from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_addr
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.setting_kinds import read_topic_limit
 from rosproxy.settings import LEAST_PORTS_PER_DOMAIN, MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
-from rosproxy.zenoh.link_router import check_limits
+from rosproxy.zenoh.policy.key_expressions import check_limits
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.policy import excess_reason
 from rosproxy_operator.common.ros2 import LEAST_PORTS, MOST_PEERS, read_peer_name

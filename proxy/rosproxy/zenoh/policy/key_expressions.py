@@ -18,6 +18,8 @@ from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import product
 
+from rosproxy.setting_kinds import TopicLimit
+
 MOST_STARS = 3
 """Most ``*`` with text on both sides in a glob. Each doubles the number of key expressions."""
 _FOREIGN = re.compile(r"[$#%@]|//|/$")
@@ -37,6 +39,20 @@ def check_glob(glob: str) -> None:
 def matches_no_name(glob: str) -> bool:
     """Whether a glob has characters that no name of ROS 2 has, and so matches no name."""
     return _FOREIGN.search(glob) is not None
+
+
+def check_limits(limits: Sequence[TopicLimit]) -> None:
+    """Raise ValueError, with the limit, if zenoh cannot count the messages of a limit."""
+    for limit in limits:
+        try:
+            check_glob(limit.glob)
+        except ValueError as error:
+            raise ValueError(f"{limit}: {error}") from None
+        if matches_no_name(limit.glob):
+            raise ValueError(f"{limit}: no topic of ROS 2 has such a name")
+        if len(data_keys(limit.glob)) > 1:  # zenoh would count each key expression by itself
+            text = "write * for whole parts of a name, or at the end: /camera/*, /*/image, /cam*"
+            raise ValueError(f"{limit}: {text}")
 
 
 def with_single_stars(glob: str) -> str:

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from rosproxy.access.rules import parse_rules
 from rosproxy.admin.status_document import ProxyStatus, StatusSettings, ZenohLinkStatus, ZenohStatus
-from rosproxy.zenoh.link_router import check_limits
+from rosproxy.zenoh.policy.key_expressions import check_limits
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import DeleteProxy, Emit
