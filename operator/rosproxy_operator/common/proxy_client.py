@@ -14,7 +14,7 @@ from rosproxy.access.layers import PolicyLayer, layers_as_json
 from rosproxy.admin.status_bounds import MOST_BYTES
 from rosproxy.admin.status_document import NotAStatus, ProxyStatus, parse_status, read_status
 from rosproxy.net.addresses import HostPort
-from rosproxy.net.http_client import TooLong, read_bounded
+from rosproxy.net.bodies import TooLong, read_bounded
 from rosproxy.page.page_document import Document
 from rosproxy_operator.common.merged_page import read_document
 

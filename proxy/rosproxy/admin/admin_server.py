@@ -36,9 +36,10 @@ from rosproxy.admin.shared_document import SharedDocument
 from rosproxy.admin.status_changes import StatusChanges, StatusSnapshot
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.net.addresses import HostPort, is_loopback, plain_address
+from rosproxy.net.bodies import TooLong, read_bounded
 from rosproxy.net.bounded_server import BoundedServer
 from rosproxy.net.fair_slots import FairSlots, NoSlot
-from rosproxy.net.http_client import CallFailed, TooLong, read_bounded
+from rosproxy.net.http_client import CallFailed
 from rosproxy.net.sockets import MOST_BACKLOG
 
 log = logging.getLogger(__name__)

@@ -26,6 +26,7 @@ from aiohttp.http_exceptions import HttpProcessingError
 
 from rosproxy.net import resolver
 from rosproxy.net.addresses import HostPort
+from rosproxy.net.bodies import BadResponse, TooLong, is_plain, read_bounded
 from rosproxy.net.http_protocol import HttpProtocol, wake
 from rosproxy.net.late_answers import LateAnswers
 from rosproxy.net.sockets import dial
@@ -435,40 +436,8 @@ def _request_start(path: str, host: str) -> str:
     return f"POST {path} HTTP/1.1\r\nHost: {host}\r\n"
 
 
-class BadResponse(ValueError):
-    """An HTTP response with a status other than 200, or with a compressed or too long body."""
-
-
 class CallFailed(Exception):
     """Another program could not be called, or refused the call; the message has the reason."""
-
-
-class TooLong(BadResponse):
-    """A body with more bytes than the bound."""
-
-    def __init__(self, most: int) -> None:
-        super().__init__(f"the body is longer than {most} bytes")
-
-
-async def read_bounded(
-    stream: aiohttp.StreamReader, longest: int, hold: Callable[[int], None] | None = None
-) -> bytes:
-    """The whole body, of at most ``longest`` bytes.
-
-    Calls ``hold`` with the size of each chunk before reading the next chunk. Raises TooLong, and
-    the errors of ``hold``.
-    """
-    chunks = list[bytes]()
-    size = 0
-    while not stream.at_eof():
-        chunk = stream.read_nowait() if stream.is_eof() else await stream.readany()
-        size += len(chunk)
-        if size > longest:
-            raise TooLong(longest)
-        if hold is not None:
-            hold(len(chunk))
-        chunks.append(chunk)
-    return chunks[0] if len(chunks) == 1 else b"".join(chunks)
 
 
 async def _upload(connection: ClientConnection, head: bytes, body: LongBody) -> None:
@@ -500,12 +469,6 @@ async def _drain_socket(sock: socket.socket, received: bytes) -> None:
         await _drain_answer(connection)
     finally:
         connection.close()
-
-
-def is_plain(headers: Mapping[str, str]) -> bool:
-    """Whether the headers announce a body without compression."""
-    encoding = headers.get("Content-Encoding")
-    return encoding is None or encoding.strip().lower() in ("identity", "")
 
 
 def _was_closed(error: BaseException) -> bool:

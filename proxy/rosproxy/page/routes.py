@@ -21,8 +21,8 @@ from aiohttp import web
 from rosproxy.admin.replies import send_shared, unavailable, write_pieces
 from rosproxy.admin.status_bounds import encode
 from rosproxy.net.addresses import plain_address
+from rosproxy.net.bodies import TooLong, read_bounded
 from rosproxy.net.fair_slots import NoSlot
-from rosproxy.net.http_client import TooLong, read_bounded
 from rosproxy.page.changes import changes
 from rosproxy.page.feed import Ended, Feed
 from rosproxy.page.page_document import Json

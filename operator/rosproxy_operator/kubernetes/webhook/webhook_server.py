@@ -15,9 +15,9 @@ import kopf
 from aiohttp import web
 
 from rosproxy.net.addresses import HostPort, plain_address
+from rosproxy.net.bodies import TooLong, read_bounded
 from rosproxy.net.bounded_server import IDLE_TIMEOUT_S
 from rosproxy.net.budget import Budget, Charge, OverBudget
-from rosproxy.net.http_client import TooLong, read_bounded
 from rosproxy_operator.kubernetes.planner.pods.wiring import UNWIRED
 from rosproxy_operator.kubernetes.status.events import stamp
 from rosproxy_operator.kubernetes.webhook import certificates

@@ -22,10 +22,10 @@ import aiohttp
 import msgspec
 
 from rosproxy.net.addresses import HostPort, is_address
+from rosproxy.net.bodies import BadResponse
 from rosproxy.net.http_client import (
     LONG_BODY_BYTES,
     MOST_BODY_BYTES,
-    BadResponse,
     CallFailed,
     HttpClient,
     LongBody,

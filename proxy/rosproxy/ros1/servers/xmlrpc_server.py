@@ -21,8 +21,9 @@ from typing import TypeVar
 from aiohttp import ClientError
 
 from rosproxy.net.addresses import parse_host_port
+from rosproxy.net.bodies import TooLong, is_plain, read_bounded
 from rosproxy.net.budget import Charge, OverBudget
-from rosproxy.net.http_client import LongReply, TooLong, is_plain, read_bounded
+from rosproxy.net.http_client import LongReply
 from rosproxy.net.http_server import (
     BadBody,
     HttpConnection,
