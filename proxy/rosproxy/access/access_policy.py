@@ -22,7 +22,8 @@ from rosproxy.access.layers import (
 from rosproxy.access.rule_index import RuleIndex
 from rosproxy.access.rules import RuleKind
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, Refusals
+from rosproxy.telemetry.problems import DENIED, WOULD_BE_DENIED
+from rosproxy.telemetry.refusals import Refusals
 
 OFFER_KINDS = frozenset({RuleKind.PUBLISH, RuleKind.SERVE})
 """The kinds of rules about what nodes inside offer: the proxy enforces these on TCPROS connections

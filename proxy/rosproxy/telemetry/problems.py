@@ -16,6 +16,9 @@ LONGEST_SUBJECT = 200
 """Characters of a subject; a longer subject loses its middle. Names of nodes have some tens."""
 LONGEST_TEXT = 500
 """Characters of a text; a longer text loses its middle. The proxy's own texts have up to 300."""
+DENIED = "policy"
+WOULD_BE_DENIED = "policy_audit"
+"""The reasons of denials by the policy, and of would-be denials in audit mode."""
 
 
 class NotedProblem(msgspec.Struct, frozen=True):
@@ -67,3 +70,8 @@ class Problems:
     def at(self, port: int) -> list[NotedProblem]:
         """The problems of the node that holds ``port``."""
         return [p for p in self._problems if p.port == port]
+
+
+def refusal_subject(reason: str) -> str:
+    """The subject of the problem for the last refusal of a reason."""
+    return f"refused: {reason.replace('_', ' ')}"

@@ -12,13 +12,10 @@ from dataclasses import dataclass, field
 from functools import cache
 
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import Problems
+from rosproxy.telemetry.problems import Problems, refusal_subject
 
 log = logging.getLogger(__name__)
 
-DENIED = "policy"
-WOULD_BE_DENIED = "policy_audit"
-"""The reasons of denials by the policy, and of would-be denials in audit mode."""
 QUIET = 60.0
 """Seconds after a line in the log without another line for the same source and reason."""
 OVER_AFTER = 300.0
@@ -82,11 +79,6 @@ class _Span:
         return self.last - self.first
 
 
-def problem_subject(reason: str) -> str:
-    """The subject of the problem for the last refusal of a reason."""
-    return f"refused: {reason.replace('_', ' ')}"
-
-
 class Refusals:
     """Reports refusals. ``now`` returns seconds of a monotonic clock."""
 
@@ -120,7 +112,7 @@ class Refusals:
         if len(self._logged_at) >= MOST_REMEMBERED_LINES:
             del self._logged_at[next(iter(self._logged_at))]
         self._logged_at[key] = now
-        subject = problem_subject(reason)
+        subject = refusal_subject(reason)
         log.warning("%s, from %s: %s", subject, source, text)
         self._problems.solved(subject)
         self._problems.add(subject, f"from {source}: {text}")
@@ -134,11 +126,11 @@ class Refusals:
         """
         for reason in START_REASONS & self._spans.keys():
             if self._spans[reason].settle(source):
-                self._problems.solved(problem_subject(reason))
+                self._problems.solved(refusal_subject(reason))
 
     def end_old(self) -> None:
         """Remove the problems of reasons without a refusal for OVER_AFTER seconds."""
         now = self._now()
         for reason in [r for r, span in self._spans.items() if now - span.last >= OVER_AFTER]:
             del self._spans[reason]
-            self._problems.solved(problem_subject(reason))
+            self._problems.solved(refusal_subject(reason))

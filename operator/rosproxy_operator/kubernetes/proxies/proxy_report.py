@@ -11,8 +11,12 @@ from rosproxy.admin.status_document import (
     ZenohStatus,
 )
 from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
-from rosproxy.telemetry.problems import MOST_PROBLEMS
-from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, problem_subject
+from rosproxy.telemetry.problems import (
+    DENIED,
+    MOST_PROBLEMS,
+    WOULD_BE_DENIED,
+    refusal_subject,
+)
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.proxy_status import (
@@ -26,7 +30,7 @@ from rosproxy_operator.kubernetes.resources.cluster import ProxyReport, ZenohRep
 
 RECENT_S = 300.0
 """Seconds for which a problem counts after the event. The proxy keeps listing its last problems."""
-_DENIAL_SUBJECTS = {problem_subject(reason) for reason in (DENIED, WOULD_BE_DENIED)}
+_DENIAL_SUBJECTS = {refusal_subject(reason) for reason in (DENIED, WOULD_BE_DENIED)}
 """Subjects of problems by which a proxy reports denials. A denial is no fault of the proxy."""
 _MOST_TEXT_CHARACTERS = 300
 """Characters that are kept of a problem or an error. The proxy may send texts of any size."""
