@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import rosproxy
 from rosproxy import fixes
 from rosproxy.fixes import FIXES, Fix, how_to, how_to_in_a_sentence
 from rosproxy.setting_kinds import declared
@@ -43,8 +44,9 @@ def test_a_fix_is_an_imperative_that_goes_on(fix: Fix) -> None:
 
 @pytest.mark.parametrize("pattern", SOURCES)
 def test_rules_take_all_such_words_from_the_table(pattern: str) -> None:
-    package = Path(fixes.__file__).parent
-    for path in package.glob(pattern):
+    paths = [*Path(rosproxy.__file__).parent.glob(pattern)]
+    assert paths
+    for path in paths:
         code = path.read_text(encoding="utf-8")
         code = re.sub(r'(?s:""".*?""")|#.*', "", code)
         assert not re.search(r"docker (run|exec|ps)|kubectl", code), path
