@@ -5,9 +5,11 @@ proxy has no part in the sessions of a router outside. But rmw_zenohd describes 
 admin space at ``@/ZID/router``, and a node at ``@/ZID/peer``. The hub asks both.
 """
 
+import contextlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import islice
 from typing import Any
 
 ASK_INTERVAL_S = 5.0
@@ -69,29 +71,36 @@ class OutsideRouters:
         """Note an answer. A thread of zenoh calls this."""
         payload = reply.ok.payload.to_bytes() if reply.ok is not None else b""
         if 0 < len(payload) <= LONGEST_ANSWER:
-            answers[zid] = {"zid": zid, "sessions": [*_sessions(payload, hub)]}
+            with contextlib.suppress(ValueError):
+                answers[zid] = {"zid": zid, "sessions": _sessions(payload, hub)}
 
 
 def _only(answers: Mapping[str, _Description], zids: Iterable[str]) -> dict[str, _Description]:
     return {zid: answers[zid] for zid in zids if zid in answers}
 
 
-def _sessions(payload: bytes, hub: str) -> Iterator[dict[str, Any]]:
-    """Yield the sessions of an answer with zenoh peers and with the hub; none if it is not valid.
+def _sessions(payload: bytes, hub: str) -> list[dict[str, Any]]:
+    """The first MOST_SESSIONS sessions of an answer with zenoh peers and with the hub.
 
-    An answer comes from outside, and the proxy reads the report strictly. So each value is checked.
+    Raises ValueError if the answer is not valid. Any program in the zenoh network may answer, and a
+    report that is not valid ends the routers. So each value is checked.
     """
     try:
         sessions = json.loads(payload)["sessions"]
-        for session in sessions:
-            if session["whatami"] == PEER or session["peer"] == hub:
-                links = [{"src": str(s["src"]), "dst": str(s["dst"])} for s in session["links"][:1]]
-                own = {"peer": str(session["peer"]), "whatami": str(session["whatami"])}
-                kept = {**own, "links": links}
-                if len(json.dumps(kept)) <= LONGEST_SESSION:
-                    yield kept
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return
+        kept = (_kept(s) for s in sessions if s["whatami"] == PEER or s["peer"] == hub)
+        short = (session for session in kept if len(json.dumps(session)) <= LONGEST_SESSION)
+        return [*islice(short, MOST_SESSIONS)]
+    except (KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"an answer that is not valid: {error!r}") from None
+
+
+def _kept(session: Mapping[str, Any]) -> dict[str, Any]:
+    """What a report has of a session. Raises ValueError, KeyError, TypeError."""
+    links = [{"src": str(link["src"]), "dst": str(link["dst"])} for link in session["links"][:1]]
+    kept = {"peer": str(session["peer"]), "whatami": str(session["whatami"]), "links": links}
+    # JSON may have halves of characters (``\ud800``), which the proxy can't read.
+    json.dumps(kept, ensure_ascii=False).encode()
+    return kept
 
 
 def _remote_peers(router: Mapping[str, Any]) -> Iterator[str]:

@@ -126,8 +126,11 @@ def test_a_router_that_is_gone_is_not_reported() -> None:
         "[" * 100_000,
         json.dumps({"sessions": [session("b1", "peer", "x" * 500)]}),
         json.dumps({"sessions": [session("b1", "peer", "192.0.2.10")] * 10_000}),
+        json.dumps({"sessions": [session("\ud800", "peer", "192.0.2.10")]}),
+        json.dumps({"sessions": [session("b1", "peer", "192.0.2.10\udfff")]}),
+        '{"sessions": [{"whatami": "peer", "peer": 1%s, "links": []}]}' % ("0" * 5000),
     ],
-    ids=range(11),
+    ids=range(14),
 )
 def test_an_answer_that_is_not_valid_or_too_long_tells_nothing(answer: str) -> None:
     assert not [
@@ -141,6 +144,15 @@ def test_values_of_other_types_do_not_end_the_report() -> None:
     assert router["sessions"] == [
         {"peer": "7", "whatami": "peer", "links": [{"src": "None", "dst": "[]"}]}
     ]
+
+
+def test_the_sessions_that_are_kept_of_an_answer_are_bounded() -> None:
+    """Otherwise the answers of a hundred peers would take a gigabyte."""
+    tiny = json.dumps({"sessions": [{"whatami": "peer", "peer": "", "links": []}] * 20_000})
+    outside = OutsideRouters()
+    outside.look(FakeHub({"@/04/router": tiny}), [OWN, HUB], 0.0)
+    (kept,) = vars(outside)["_routers"].values()
+    assert len(kept["sessions"]) == MOST_SESSIONS
 
 
 def test_the_sessions_of_a_report_are_bounded() -> None:
