@@ -58,13 +58,20 @@ class OutsideRouters:
                 hub.get(f"@/{zid}/{mode}", take, timeout=ANSWER_TIMEOUT_S)
 
     def report(self) -> list[_Description]:
-        """The latest descriptions, with MOST_SESSIONS in all."""
+        """The latest descriptions, with MOST_SESSIONS in all.
+
+        A peer is left out rather than cut: a session that is missing would count as a fault.
+        """
         room = MOST_SESSIONS
         reported = []
-        for description in [*self._routers.values(), *self._peers.values()]:
-            sessions = description["sessions"][:room]
+        for router in [*self._routers.values()]:
+            sessions = router["sessions"][:room]
             room -= len(sessions)
-            reported.append({**description, "sessions": sessions})
+            reported.append({**router, "sessions": sessions})
+        for peer in [*self._peers.values()]:
+            if len(peer["sessions"]) <= room:
+                room -= len(peer["sessions"])
+                reported.append(peer)
         return reported
 
     def _take(self, answers: dict[str, _Description], zid: str, hub: str, reply: Any) -> None:

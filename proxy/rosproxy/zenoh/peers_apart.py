@@ -5,9 +5,10 @@ they have a session with each other. That is the usual mistake with rmw_zenoh: i
 a laptop, ``ZENOH_CONFIG_OVERRIDE`` names the robot's router without ``mode="client"``.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from typing import NamedTuple
 
+from rosproxy.net.addresses import is_loopback
 from rosproxy.zenoh.protocol.report import Ends, RouterReport, ends_of
 
 PEER = "peer"
@@ -33,7 +34,8 @@ def peers_apart(
 ) -> tuple[PeersApart, ...]:
     """The peers that are apart, of the routers with these zenoh IDs.
 
-    ``hub`` is the zenoh ID of the hub. ``described`` are routers outside and peers.
+    ``hub`` is the zenoh ID of the hub. ``described`` are routers outside and peers. If neither of
+    two peers is described, the sessions between them are not known. So they do not count as apart.
     """
     by_zid = {description.zid: description for description in described}
     linked: dict[str, set[str]] = {}
@@ -42,12 +44,17 @@ def peers_apart(
             linked.setdefault(description.zid, set()).add(session.peer)
             linked.setdefault(session.peer, set()).add(description.zid)
     found = [
-        apart for zid in routers if zid in by_zid for apart in _apart_at(by_zid[zid], hub, linked)
+        apart
+        for zid in routers
+        if zid in by_zid
+        for apart in _apart_at(by_zid[zid], hub, linked, by_zid.keys())
     ]
     return tuple(found[:MOST_PEERS_APART])
 
 
-def _apart_at(router: RouterReport, hub: str, linked: dict[str, set[str]]) -> Iterator[PeersApart]:
+def _apart_at(
+    router: RouterReport, hub: str, linked: Mapping[str, Set[str]], described: Set[str]
+) -> Iterator[PeersApart]:
     """Yield the peers of a router that are apart; those on the machine of the router count too."""
     hosts: dict[str, set[str]] = {}
     own = ""
@@ -59,14 +66,18 @@ def _apart_at(router: RouterReport, hub: str, linked: dict[str, set[str]]) -> It
             own = _host(ends)
     peers = {peer for at_host in hosts.values() for peer in at_host}
     for host, at_host in hosts.items():
-        elsewhere = len(peers) - len(at_host)
-        apart = {
-            peer for peer in at_host if len(linked.get(peer, set()) & peers - at_host) < elsewhere
-        }
+        elsewhere = peers - at_host
+        known = elsewhere & described
+        apart = [
+            peer
+            for peer in sorted(at_host)
+            if (elsewhere if peer in described else known) - linked.get(peer, frozenset())
+        ]
         if host and apart:
-            yield PeersApart(router.zid, host, tuple(sorted(apart)), host == own)
+            yield PeersApart(router.zid, host, tuple(apart), host == own)
 
 
 def _host(ends: Ends) -> str:
     """The address of the other end; empty on the machine of the router."""
-    return "" if ends.remote.host == ends.local.host else ends.remote.host
+    remote = ends.remote.host
+    return "" if remote == ends.local.host or is_loopback(remote) else remote

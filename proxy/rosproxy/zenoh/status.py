@@ -219,9 +219,14 @@ class ZenohState(Collector):
     def _apart_status(self) -> Iterator[ZenohApartStatus]:
         """Yield the peers of routers outside that do not reach each other, with their nodes."""
         reading = self._reading
+        if not reading.apart:
+            return
         remotes = {placed.session.peer: placed.ends.remote for placed in reading.sessions}
+        by_session: dict[str, list[str]] = {}
+        for node in reading.graph.nodes:
+            by_session.setdefault(node.session, []).append(node.name)
         for peers, since in reading.apart.items():
-            names = {n.name for n in reading.graph.nodes if n.session in peers.sessions}
+            names = {name for zid in peers.sessions for name in by_session.get(zid, ())}
             yield ZenohApartStatus(
                 str(remotes.get(peers.router, "")),
                 peers.address,

@@ -159,3 +159,15 @@ def test_the_sessions_of_a_report_are_bounded() -> None:
     many = [session(f"{n:x}", "peer", "192.0.2.7") for n in range(MOST_SESSIONS + 10)]
     (router,) = reported({"@/04/router": json.dumps({"sessions": many})})
     assert len(router["sessions"]) == MOST_SESSIONS
+
+
+def test_a_peer_with_too_many_sessions_for_a_report_is_left_out() -> None:
+    """Otherwise the peer would seem to have no session with other peers."""
+    many = [session(f"{n:x}", "peer", "192.0.2.7") for n in range(MOST_SESSIONS)]
+    (router,) = reported(
+        {
+            "@/04/router": json.dumps({"sessions": [session("b1", "peer", "192.0.2.10")]}),
+            "@/b1/peer": json.dumps({"sessions": many}),
+        }
+    )
+    assert router["zid"] == "04"

@@ -21,7 +21,12 @@ IN_CONTAINER = session("b1", "peer", HOST)
 ON_LAPTOP = session("c1", "peer", LAPTOP)
 
 
-def apart(*sessions: RouterSession, peers: tuple[RouterReport, ...] = ()) -> tuple[PeersApart, ...]:
+def apart(
+    *sessions: RouterSession, peers: tuple[RouterReport, ...] | None = None
+) -> tuple[PeersApart, ...]:
+    """The peers apart. ``peers`` are the answers of peers; None: each answers without a session."""
+    if peers is None:
+        peers = tuple(RouterReport(s.peer) for s in sessions if s.whatami == "peer")
     return peers_apart(["04"], HUB, (RouterReport("04", sessions), *peers))
 
 
@@ -52,6 +57,22 @@ def test_peers_with_a_session_with_all_others_are_not_apart() -> None:
     assert not apart(ON_ROBOT, ON_LAPTOP, peers=(linked,))
     (found,) = apart(ON_ROBOT, ON_ROBOT_BY_LAN, ON_LAPTOP, peers=(linked,))
     assert found.address == LAPTOP
+
+
+def test_peers_without_an_answer_are_not_known_to_be_apart() -> None:
+    """A program without an admin space, or a peer beyond the bound of asked peers."""
+    assert not apart(ON_ROBOT, THE_HUB, IN_CONTAINER, ON_LAPTOP, peers=())
+    answer = RouterReport("c1", (session("b1", "peer", HOST, LAPTOP),))
+    (found,) = apart(ON_ROBOT, THE_HUB, IN_CONTAINER, ON_LAPTOP, peers=(answer,))
+    assert found.address == LAPTOP
+    silent = RouterReport("c1")
+    assert [p.address for p in apart(IN_CONTAINER, ON_LAPTOP, peers=(silent,))] == [HOST, LAPTOP]
+
+
+def test_a_node_that_finds_its_own_robot_by_name_is_on_the_machine_of_the_router() -> None:
+    """Debian gives the own host name the address 127.0.1.1."""
+    by_name = session("a3", "peer", "127.0.0.1", "127.0.1.1")
+    assert not apart(ON_ROBOT, by_name, ON_ROBOT_BY_LAN, THE_HUB)
 
 
 def test_a_router_without_an_answer_tells_nothing() -> None:

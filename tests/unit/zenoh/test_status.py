@@ -363,9 +363,10 @@ def test_peers_of_a_router_outside_that_are_apart_have_a_time_and_nodes() -> Non
             session("03", "router", "192.0.2.7:7447", "192.0.2.10:50003"),
         ),
     )
-    state.take(replace(REPORT, outside=(answer,)), None)
+    told = replace(REPORT, outside=(answer, RouterReport("bb")))
+    state.take(told, None)
     clock.time += 20.0
-    state.take(replace(REPORT, outside=(answer,)), None)
+    state.take(told, None)
     apart = ZenohApartStatus("192.0.2.7:7447", "192.0.2.10", ("/robot",), True, 20.0)
     assert state.status().apart == (apart,)
     state.take(REPORT, None)
