@@ -171,8 +171,13 @@ def end_connections(remotes: Sequence[Sequence[Any]]) -> None:
     """
     for name in os.listdir("/proc/self/fd"):
         try:
-            connection = socket.socket(fileno=os.dup(int(name)))
-        except OSError:  # no socket, or closed meanwhile
+            copy = os.dup(int(name))
+        except OSError:  # closed meanwhile
+            continue
+        try:
+            connection = socket.socket(fileno=copy)
+        except OSError:  # no socket
+            os.close(copy)
             continue
         with connection, contextlib.suppress(OSError):  # no connection
             if [*connection.getpeername()[:2]] in remotes:
