@@ -72,6 +72,7 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
         range_probe=replace(status.range_probe, age=0.0) if status.range_probe else None,
         unregistered_addresses=inside_addresses(status) - nodes.keys() - participants.keys(),
         zenoh=_zenoh_report(status) if status.zenoh else None,
+        retired=status.retired,
     )
 
 

@@ -180,6 +180,7 @@ class ProxyReport(msgspec.Struct, frozen=True):
     - ``unregistered_addresses``: addresses of nodes that the proxy has given up after a long
       silence. Such a node may come back.
     - ``zenoh``: the routers for rmw_zenoh; None without routers.
+    - ``retired``: the proxy has unregistered its ROS 1 nodes, and accepts no others.
     """
 
     answered: bool
@@ -194,6 +195,7 @@ class ProxyReport(msgspec.Struct, frozen=True):
     range_probe: RangeProbeStatus | None = None
     unregistered_addresses: frozenset[str] = frozenset()
     zenoh: ZenohReport | None = None
+    retired: bool = False
 
     @property
     def addresses(self) -> frozenset[str]:

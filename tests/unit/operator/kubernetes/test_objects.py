@@ -6,6 +6,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from rosproxy.admin.status_document import RangeProbeStatus, read_status
 from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
@@ -351,6 +352,8 @@ def test_what_a_proxy_answers():
     proxy_report = report(read_status(STATUS))
 
     assert (proxy_report.answered, proxy_report.master_up, proxy_report.error) == (True, True, "")
+    assert not proxy_report.retired
+    assert report(replace(read_status(STATUS), retired=True)).retired
     assert proxy_report.nodes == {"10.244.1.5": ("/a", "/b", "/talker"), "fd00::5": ("/v6",)}
     assert proxy_report.addresses == {"10.244.1.5", "10.244.1.6", "fd00::5"}
     assert proxy_report.topics == {"/chatter", "/rosout"}

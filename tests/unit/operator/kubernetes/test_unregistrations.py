@@ -30,6 +30,7 @@ LATER = "2026-01-01T02:00:00Z"
 OTHER_MASTER = MasterSpec("http://other:11311")
 WITH_NODES = ProxyReport(answered=True, nodes={"10.244.1.7": ("/talker",)})
 WITHOUT_NODES = ProxyReport(answered=True)
+RETIRED = ProxyReport(answered=True, retired=True)
 
 
 def running(**changes: Any) -> Pod:
@@ -134,6 +135,14 @@ def test_a_proxy_that_finds_its_nodes_again_is_no_reason(of: RosProxy) -> None:
     first = look(seen(running(), proxy(), of=of), stamp=THEN)
     assert not told(first, "NotWired")
     assert not first.state.unregistered
+
+
+def test_a_proxy_that_has_retired_in_vain_is_replaced() -> None:
+    """A pod is selected again, or the master is changed back, before the proxy is deleted."""
+    found = look(seen(running(), proxy(), of=rosproxy(), report=RETIRED))
+    (action,) = [a for a in found.actions if isinstance(a, DeleteProxy)]
+    assert action.retire, "another operator may have to wait until the proxy has unregistered all"
+    assert action.why == "the proxy has unregistered its nodes, and accepts no others"
 
 
 def test_such_pods_are_evicted_if_the_rosproxy_asks_for_that() -> None:

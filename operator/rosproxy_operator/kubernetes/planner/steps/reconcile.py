@@ -256,7 +256,12 @@ def _reconcile_existing(
             context, proxy, f"the pod has ended: {proxy.message or proxy.pod.phase}"
         )
     elif proxy.fingerprint == fingerprint and proxy.image == image:
-        return
+        report = context.observed.reports.get(proxy.pod.uid)
+        # The deletion was called off after the proxy had unregistered its nodes: the spec was
+        # changed back, a pod was selected again, or another operator has begun.
+        if report is not None and report.retired:
+            why = "the proxy has unregistered its nodes, and accepts no others"
+            yield from _delete_pod(context, proxy, why, retire=True)
     elif serves(proxy) and proxy.stuck is None and proxy.image != image:
         state = image_state(context, site)
         if state is ImageState.USABLE:
