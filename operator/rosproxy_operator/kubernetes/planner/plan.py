@@ -66,6 +66,7 @@ from rosproxy_operator.kubernetes.planner.steps.remake import remake_unwired
 from rosproxy_operator.kubernetes.planner.unregistrations import (
     Unregistration,
     note_unregistrations,
+    retiring_proxies,
     with_unregistrations,
 )
 from rosproxy_operator.kubernetes.planner.zenoh_hubs import apart_findings, due_in
@@ -180,7 +181,8 @@ def _of_rosproxy(
     rosproxy = with_unregistrations(context.view, rosproxy, unregistered)
     actions = [action for step in _STEPS for action in step(context, rosproxy)]
     unregistered |= note_unregistrations(context.view, rosproxy, actions, unregistered, stamp)
-    rosproxy = with_unregistrations(context.view, rosproxy, unregistered)
+    retiring = retiring_proxies(actions)
+    rosproxy = with_unregistrations(context.view, rosproxy, unregistered, retiring)
     states = tuple(_states(context, rosproxy))
     problems = _problems(context, rosproxy, states, shared)
     status = _status(context, rosproxy, states, problems, stamp)

@@ -5,9 +5,13 @@ successor if the master or the ports change, or if no pod is selected any more. 
 registers only at the start of the node. So the nodes of older pods stay unregistered, also if the
 RosProxy gets the former master or selector back. For the next operator, the status keeps a time for
 each Kubernetes node (``unregisteredAt``).
+
+A pod may be older than that time and registered all the same: the containers restarted later, the
+unregistration was called off, or the clocks of operator and API server differ. So a pod at whose
+address a proxy has ROS 1 nodes counts as registered.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 
 import msgspec
 from msgspec.structs import replace
@@ -53,7 +57,7 @@ def note_unregistrations(
     A plan may ask for the same deletion again. The time of the first plan counts, because a retired
     proxy accepts no other nodes.
     """
-    retiring = {a.uid for a in actions if isinstance(a, DeleteProxy) and a.retire}
+    retiring = retiring_proxies(actions)
     return {
         place: Unregistration(proxy.pod.uid, stamp)
         for place in view.places.get(rosproxy.id, ())
@@ -64,12 +68,28 @@ def note_unregistrations(
     }
 
 
-def with_unregistrations(view: View, rosproxy: RosProxy, known: Unregistrations) -> RosProxy:
-    """Return a RosProxy with the time of the last unregistration on each Kubernetes node."""
-    nodes = (*rosproxy.former_ranges, *(p.node for p in view.places.get(rosproxy.id, ())))
+def retiring_proxies(actions: Iterable[Action]) -> frozenset[str]:
+    """Return the uids of the proxies' pods that these actions let unregister the ROS 1 nodes."""
+    return frozenset(a.uid for a in actions if isinstance(a, DeleteProxy) and a.retire)
+
+
+def with_unregistrations(
+    view: View, rosproxy: RosProxy, known: Unregistrations, retiring: Set[str] = frozenset()
+) -> RosProxy:
+    """Return a RosProxy with the last unregistration on each node, and the registered addresses.
+
+    ``retiring``: the uids of the proxies that unregister ROS 1 nodes now.
+    """
+    own = view.places.get(rosproxy.id, ())
+    nodes = (*rosproxy.former_ranges, *(p.node for p in own))
     places = {node: ProxyPlace(rosproxy.id, node) for node in nodes}
     times = {node: known[place].at for node, place in places.items() if place in known}
-    return replace(rosproxy, unregistered_at=times)
+    pods = (proxy.pod for place in own for proxy in view.proxies.get(place, ()))
+    staying = (pod.uid for pod in pods if not pod.deleting and pod.uid not in retiring)
+    reports = (view.observed.reports.get(uid) for uid in staying)
+    answered = (report for report in reports if report and not report.retired)
+    registered = frozenset(address for report in answered for address in report.nodes)
+    return replace(rosproxy, unregistered_at=times, registered=registered)
 
 
 def _has_nodes(view: View, rosproxy: RosProxy, proxy: ProxyPod) -> bool:

@@ -200,7 +200,8 @@ class RosProxy(msgspec.Struct, frozen=True):
     the RosProxy's Service in the status, also of a deleted Service. ``remakes``: the operator
     evicts unwired pods. ``created`` is the creation time, as the API server writes the time.
     ``unregistered_at`` is, by node name, the time at which a proxy last unregistered the ROS 1
-    nodes of running pods, in the same form. ``misspelt`` has the texts of `misspelt_names`.
+    nodes of running pods, in the same form. ``registered`` are the addresses at which its proxies
+    have ROS 1 nodes. ``misspelt`` has the texts of `misspelt_names`.
     """
 
     id: Name
@@ -214,6 +215,7 @@ class RosProxy(msgspec.Struct, frozen=True):
     remakes: bool = False
     created: str = ""
     unregistered_at: Mapping[str, str] = {}
+    registered: frozenset[str] = frozenset()
     misspelt: tuple[str, ...] = ()
 
 

@@ -30,6 +30,7 @@ LATER = "2026-01-01T02:00:00Z"
 OTHER_MASTER = MasterSpec("http://other:11311")
 WITH_NODES = ProxyReport(answered=True, nodes={"10.244.1.7": ("/talker",)})
 WITHOUT_NODES = ProxyReport(answered=True)
+OF_THE_POD = ProxyReport(answered=True, nodes={pod().ip: ("/talker",)})
 RETIRED = ProxyReport(answered=True, retired=True)
 
 
@@ -135,6 +136,26 @@ def test_a_proxy_that_finds_its_nodes_again_is_no_reason(of: RosProxy) -> None:
     first = look(seen(running(), proxy(), of=of), stamp=THEN)
     assert not told(first, "NotWired")
     assert not first.state.unregistered
+
+
+def test_an_older_pod_with_nodes_at_its_proxy_is_neither_told_nor_evicted() -> None:
+    """Its containers started later, or the clock of the operator is ahead of the API server's."""
+    of = replace(rosproxy(), remakes=True, unregistered_at={"one": THEN}, created=LATER)
+    found = look(seen(running(), proxy(), of=of, report=OF_THE_POD))
+    assert not told(found, "NotWired")
+    assert not [action for action in found.actions if isinstance(action, EvictPod)]
+    two = seen(running(), running(name="listener"), proxy(), of=of, report=OF_THE_POD)
+    (text,) = told(look(two), "NotWired")
+    assert text.startswith("pod ros/listener: is older than RosProxy")
+
+
+def test_an_unregistration_that_is_called_off_leaves_no_pod_unregistered() -> None:
+    changed = rosproxy(master=OTHER_MASTER)
+    first = look(seen(running(), proxy(), of=changed, report=OF_THE_POD), stamp=THEN)
+    assert retires(first)
+    assert told(first, "NotWired"), "the report is older than the unregistration"
+    back = look(seen(running(), proxy(), of=rosproxy(), report=OF_THE_POD), first.state)
+    assert not told(back, "NotWired")
 
 
 def test_a_proxy_that_has_retired_in_vain_is_replaced() -> None:

@@ -251,9 +251,10 @@ def _why_lost(pod: Pod, rosproxy: RosProxy) -> str:
 
     The proxy unregisters the nodes when the RosProxy is deleted, and when the operator moves the
     proxy or no longer needs the proxy (`unregistrations`). ROS 1 nodes don't register again by
-    themselves. A container that was started later has new nodes, which register at their start.
+    themselves. A container that was started later has new nodes, which register at their start. If
+    a proxy has nodes at the address of the pod, the nodes of the pod are registered.
     """
-    if not pod.running_since:
+    if not pod.running_since or rosproxy.registered & {pod.ip, *pod.ips}:
         return ""
     # The times are RFC 3339 in UTC with whole seconds, so texts sort like times.
     if pod.running_since < rosproxy.created:
