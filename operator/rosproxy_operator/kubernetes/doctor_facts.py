@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import TypeVar
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, error, note, warning
 from rosproxy_operator.kubernetes.api.api_client import (
     ENDPOINTS,
     WEBHOOKS,
     Api,
     ApiError,
     ApiNotFound,
+    ApiUnavailable,
 )
 from rosproxy_operator.kubernetes.api.rbac import missing_right
 from rosproxy_operator.kubernetes.planner.pods.trial import trial_pod
@@ -150,14 +151,22 @@ class DoctorFacts:
         return self._try(body)
 
     def _try(self, body: Json) -> Trial | None:
-        """Try the webhook once. Raises ApiError for a refusal by another program."""
+        """Try the webhook once. Raises ApiError for a missing right, or without an answer.
+
+        Another program, such as a quota or a policy of the cluster, may refuse the pod. That is no
+        fault, because real pods differ from this pod. So a note reports it.
+        """
         namespace = text_at(body["metadata"], "namespace")
         try:
             answer, warnings = self._api.try_creation("pods", body)
         except ApiError as failure:
             if FAILED_CALL in str(failure):
                 return Trial(namespace, error=str(failure))
-            raise
+            if isinstance(failure, ApiUnavailable) or missing_right(str(failure)):
+                raise
+            text, fix = _not_checked(failure)
+            self.refused.append(note("webhook", "webhook", text, fix))
+            return None
         pod = objects.pod(answer)
         is_wired = bool(pod.wired_master_uri or pod.static_peers or pod.router_endpoint)
         if not is_wired and UNWIRED in warnings:
