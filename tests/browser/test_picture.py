@@ -187,6 +187,11 @@ def test_the_mouse_moves_the_graph_and_chooses_nothing(browser: Browser, tmp_pat
         mouse(browser, "mouseMoved", x + 80, y, button="left", buttons=1)
         mouse(browser, "mouseReleased", x + 80, y, button="left", clickCount=1)
         wait_until("the graph moves", lambda: abs(browser.run(SCROLLED)[0] - left + 80) < 2)
+        moved = browser.run(SCROLLED)
+        mouse(browser, "mouseMoved", x, y)
+        # The button was pressed outside the graph, for example to mark text.
+        mouse(browser, "mouseMoved", x + 40, y, button="left", buttons=1)
+        assert browser.run(SCROLLED) == moved
         assert not browser.run(DETAILS)
         assert geometry(browser) == []
         click(browser, "#boxes .proxy", "domain-7")

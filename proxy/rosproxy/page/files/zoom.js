@@ -61,7 +61,8 @@ function pan(graph) {
     last = event.pointerType === "mouse" && event.button === 0 ? event : null;
   });
   graph.addEventListener("pointermove", (event) => {
-    if (!last || event.buttons !== 1) return;
+    if (event.buttons !== 1) last = null; // released, also outside the graph
+    if (!last) return;
     const [x, y] = [last.clientX - event.clientX, last.clientY - event.clientY];
     if (!moves && Math.hypot(x, y) < STILL) return;
     moves = true;
