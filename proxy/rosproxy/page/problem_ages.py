@@ -24,6 +24,8 @@ class ProblemAges:
     def add_to(self, document: Json, now: float, epoch: float, is_complete: bool) -> None:
         """Set ``wrong_since`` in each row with a problem that has no such time.
 
+        An operator also replaces a time in the future: the clock of the proxy's host is ahead.
+
         ``epoch``: the Unix time in seconds at which the monotonic clock was 0. A problem keeps its
         time if the previous document has the problem. The first documents of an opened page may
         lack problems. So a problem of the last document with ``is_complete`` also keeps its time.
@@ -31,7 +33,8 @@ class ProblemAges:
         current: dict[_Key, float] = {}
         for key, row in _problems(document):
             current[key] = self._newest.get(key, self._complete.get(key, now))
-            if row.get("wrong_since") is None:
+            known = row.get("wrong_since")
+            if known is None or known > epoch + now + 1.0:
                 row["wrong_since"] = round(epoch + current[key])
         self._newest = current
         if is_complete:

@@ -66,3 +66,12 @@ def test_a_time_that_a_proxy_has_set_stays() -> None:
     shown = document(a="broken")
     shown["nodes"]["a"]["wrong_since"] = 7
     assert since(ProblemAges(), 1.0, shown) == {"a": 7}
+
+
+def test_a_time_of_a_proxy_in_the_future_is_replaced() -> None:
+    """Otherwise the page of an operator shows an age of 0 s until the operator's clock is there."""
+    ages = ProblemAges()
+    shown = document(a="broken", b="broken")
+    shown["nodes"]["a"]["wrong_since"] = EPOCH + 3600.0
+    shown["nodes"]["b"]["wrong_since"] = EPOCH - 3600.0
+    assert since(ages, 5.0, shown) == {"a": 1005, "b": EPOCH - 3600.0}
