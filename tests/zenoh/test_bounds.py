@@ -1,6 +1,10 @@
-"""A container with too many tokens disturbs no other container."""
+"""A container with too many tokens or messages disturbs no other container."""
 
 from __future__ import annotations
+
+import signal
+
+import pytest
 
 from tests.ros.processes import wait_until
 from tests.zenoh.lab import PORTS, Lab
@@ -20,4 +24,27 @@ def test_tokens_of_a_container_do_not_end_the_routers(lab: Lab) -> None:
     crowd.wait_for("declared", timeout=60)
     wait_until("the tokens are counted", lambda: lab.zenoh().left_out >= 1800, 60)
     subscriber.wait_for_count("^got hello ", 20, timeout=30, since=subscriber.mark())
+    assert lab.zenoh().restarts == 0
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+def test_messages_that_may_not_be_dropped_hold_up_no_other_container(
+    lab: Lab, *, hangs: bool
+) -> None:
+    """With the two threads of zenoh for all routers, no message arrived any more."""
+    lab.start_router(VERSION)
+    lab.start_proxy()
+    for role in PORTS:
+        lab.redirect(role)
+    lab.wait_for_link()
+    subscriber = lab.node(VERSION, "out", "sub")
+    lab.node(VERSION, "c2", "pub")
+    subscriber.wait_for_count("^got hello ", 5, timeout=30)
+    slow = lab.node(VERSION, "c2", "count", "images")
+    lab.node(VERSION, "c1", "blast", "images", NODE_BYTES="1000000")
+    slow.wait_for("^got 1000000", timeout=30)
+    if hangs:
+        slow.send(signal.SIGSTOP)
+    # Some messages pass before all queues are full.
+    subscriber.wait_for_count("^got hello ", 40, timeout=60, since=subscriber.mark())
     assert lab.zenoh().restarts == 0

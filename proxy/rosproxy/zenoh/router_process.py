@@ -37,6 +37,10 @@ REOPEN_PAUSE_S = 0.5
 """Seconds between the end of routers and the start of their successors. Other routers recompute
 their routes 0.1 s after a change. If a router ends and its successor connects within this time,
 they never send their subscriptions to the successor (zenoh 1.7.2, TREES_COMPUTATION_DELAY_MS)."""
+RECEIVING_THREADS = 128
+"""Threads that receive for all routers. zenoh has two. A message that may not be dropped holds its
+thread while a queue is full, in each router on its way. With two threads, one publisher at full
+rate, or one subscriber that hangs, stops the messages of all containers (zenoh 1.7.2)."""
 ANSWER_TIMEOUT_S = 5.0
 """Seconds in which a router has to describe itself. A router takes less than a millisecond."""
 _PR_SET_PDEATHSIG = 1
@@ -228,6 +232,8 @@ def main() -> int:
     output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     zenoh.init_log_from_env_or(LEVELS)
+    # zenoh reads this once, when it starts its threads (zenoh-runtime/src/lib.rs).
+    os.environ["ZENOH_RUNTIME"] = f"(rx: (worker_threads: {RECEIVING_THREADS}))"
     lines = queue.SimpleQueue[str]()
     threading.Thread(target=read_lines, args=[lines], daemon=True).start()
     try:

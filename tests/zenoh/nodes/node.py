@@ -1,10 +1,10 @@
 """A replacement for a node of rmw_zenoh: session, keys and liveliness tokens.
 
-`python node.py KIND NAME TOPIC`, where KIND is pub, shout, sub, clock, latch, late, serve, call,
-probe, graph, crowd, mute, offer or use. Prints a line for each event, and runs until killed.
-NODE_TYPE: another type, as in keys. NODE_PERIOD_S: the time between two messages. NODE_TOKENS,
-NODE_LETTER: see `crowd`. For `offer` and `use`, which gets names of nodes as TOPIC, see
-`matrix.py`.
+`python node.py KIND NAME TOPIC`, where KIND is pub, blast, shout, sub, count, clock, latch, late,
+serve, call, probe, graph, crowd, mute, offer or use. Prints a line for each event, and runs until
+killed. NODE_TYPE: another type, as in keys. NODE_PERIOD_S: the time between two messages.
+NODE_TOKENS, NODE_LETTER: see `crowd`. NODE_BYTES: see `blast`. For `offer` and `use`, which gets
+names of nodes as TOPIC, see `matrix.py`.
 """
 
 import os
@@ -50,8 +50,21 @@ def publish(session: Any, key: str) -> None:
         time.sleep(PERIOD_S)
 
 
+def blast(session: Any, key: str) -> None:
+    """Publish messages of NODE_BYTES at full rate, as rmw_zenoh does with reliable and keep_all."""
+    publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+    content = bytes(int(os.environ["NODE_BYTES"]))
+    while True:
+        publisher.put(content)
+
+
 def subscribe(session: Any, key: str, _: str) -> Any:
     return session.declare_subscriber(key, lambda s: say("got", s.payload.to_string()))
+
+
+def count(session: Any, key: str, _: str) -> Any:
+    """Subscribe, and print the number of bytes of each message."""
+    return session.declare_subscriber(key, lambda s: say("got", len(s.payload.to_bytes())))
 
 
 def clock(session: Any, key: str, _: str) -> Any:
@@ -124,17 +137,18 @@ def main(kind: str, name: str, topic: str) -> None:
 
 
 ENTITIES = {
-    **dict.fromkeys(("pub", "latch"), "MP"),
-    **dict.fromkeys(("sub", "clock", "late"), "MS"),
+    **dict.fromkeys(("pub", "blast", "latch"), "MP"),
+    **dict.fromkeys(("sub", "count", "clock", "late"), "MS"),
     "serve": "SS",
     "call": "SC",
 }
-RUNS = {"pub": publish, "shout": publish, "call": call, "probe": call}
+RUNS = {"pub": publish, "blast": blast, "shout": publish, "call": call, "probe": call}
 """`shout` and `probe` have no token, so their topic may have wildcards."""
 MATRIX = {"offer": offer, "use": use}
 """Both watch the graph, as each node of rmw_zenoh does."""
 DECLARES = {
     "sub": subscribe,
+    "count": count,
     "clock": clock,
     "serve": serve,
     "graph": watch_graph,
