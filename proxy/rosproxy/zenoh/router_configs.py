@@ -11,13 +11,13 @@ routers of other sites that connect to the proxy have one more router of this ki
 Links to other sites have a router of their own, which dials the hub (`rosproxy.zenoh.link_router`).
 
 The values come from rmw_zenohd (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_ROUTER_CONFIG.json5).
-Exceptions are the addresses, the bound of sessions, the queue for declarations, and the delay for
+Exceptions are the addresses, the bounds of sessions, the queue for declarations, and the delay for
 scouting, which is off.
 """
 
 import base64
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -28,9 +28,18 @@ from rosproxy.setting_kinds import Credentials
 from rosproxy.zenoh.policy.access_control import HUB_PROTOCOL, NODE_PROTOCOL
 from rosproxy.zenoh.protocol.report import MOST_SESSIONS
 
+NO_FILE_LIMIT = -1
+"""`resource.RLIM_INFINITY`, the number of open files of a process without a limit."""
 LEASE_MS = 10_000
 """Time without a packet after which the other end of a link counts the link as lost, for example if
 a robot changes its address. Until then, a router refuses the hub a second session."""
+SPARE_FILES = 64
+"""Open files that the router process needs besides those of its routers."""
+FILES_OF_ROUTER = 6
+"""Open files of a router without sessions: the ports, and the link with the hub."""
+LEAST_FILES_FOR_SESSIONS = 4
+"""Open files for the sessions of each router, with which a router is of use."""
+MAX_SESSIONS = "transport/unicast/max_sessions"
 KEEP_ALIVES = 4
 """Packets within the lease on a link without messages."""
 LEASE = MappingProxyType(
@@ -59,9 +68,7 @@ _COMMON: dict[str, Any] = {
     # zenoh, a burst of declarations can block all these threads for some seconds.
     "transport/link/tx/queue/size/control": 16,
     "transport/shared_memory/enabled": False,
-    "transport/unicast/accept_pending": MOST_SESSIONS,
     "transport/unicast/accept_timeout": 60_000,
-    "transport/unicast/max_sessions": MOST_SESSIONS,
     "transport/unicast/open_timeout": 60_000,
 }
 
@@ -74,7 +81,8 @@ class RouterPlan:
     ``hub_listen`` is the port of the hub for the hubs of other proxies, ``hubs`` are such hubs.
     With ``certificate``, the hubs use TLS, and each proves itself to the other.
     ``directory`` has the sockets by which the hub dials the other routers of the proxy. If empty,
-    the hub dials by TCP, and the routers can have no access control.
+    the hub dials by TCP, and the routers can have no access control. ``files``: the files that the
+    router process may open.
     """
 
     bind: str
@@ -85,6 +93,7 @@ class RouterPlan:
     hub_listen: int | None = None
     hubs: Sequence[HostPort] = ()
     certificate: Credentials | None = None
+    files: int = NO_FILE_LIMIT
 
     @property
     def all_ports(self) -> list[int]:
@@ -103,7 +112,8 @@ class RouterPlan:
 
         ``access`` has the access control of routers by port. ``links`` is the configuration of the
         router of the links to other sites, which gets the place before the hub. Raises ValueError
-        if there is access control or such a router, but no directory.
+        if there is access control or such a router, but no directory, or if the router process may
+        open too few files.
         """
         if (access or links) and not self.directory:
             raise ValueError("access control and links need a directory for sockets")
@@ -115,7 +125,8 @@ class RouterPlan:
             )
             for port in self.all_ports
         ]
-        return [*routers, *([links] if links else []), self._hub(bool(links))]
+        every = [*routers, *([links] if links else []), self._hub(bool(links))]
+        return [*_bounded(every, self.files)]
 
     def _hub(self, has_links: bool) -> RouterConfig:
         """The configuration of the hub.
@@ -139,6 +150,27 @@ class RouterPlan:
 
     def _socket(self, port: int) -> list[str]:
         return [f"{HUB_PROTOCOL}/{self.directory}/{port}"] if self.directory else []
+
+
+def _bounded(configs: Sequence[RouterConfig], files: int) -> Iterator[RouterConfig]:
+    """Yield the configurations with bounds of sessions. Raises ValueError for too few files.
+
+    All routers share the open files of a process. With these bounds, sessions of one container
+    leave the files that other containers need. A connection without a session also takes a file.
+    """
+    dialed = [len(json.loads(config["connect/endpoints"])) for config in configs]
+    needed = SPARE_FILES + sum(dialed) + FILES_OF_ROUTER * len(configs)
+    each = (files - needed) // len(configs)
+    if files == NO_FILE_LIMIT:
+        each = 2 * MOST_SESSIONS
+    if each < LEAST_FILES_FOR_SESSIONS:
+        needed += LEAST_FILES_FOR_SESSIONS * len(configs)
+        raise ValueError(f"needs {needed} open files, and this process may have {files}")
+    opening = min(max(each // 4, each - MOST_SESSIONS), MOST_SESSIONS)
+    most = min(each - opening, MOST_SESSIONS)
+    for config, own in zip(configs, dialed, strict=True):
+        bounds = {MAX_SESSIONS: most + own, "transport/unicast/accept_pending": opening}
+        yield {**config, **{key: json.dumps(value) for key, value in bounds.items()}}
 
 
 def _tcp(address: HostPort) -> str:

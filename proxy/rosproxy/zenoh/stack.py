@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import logging
+import resource
 import ssl
 import time
 from collections.abc import Mapping, Sequence
@@ -101,11 +102,13 @@ class Zenoh:
         _check_package()
         _check_ports(self._settings)
         self._of_hub = _hub_certificate(self._settings)
-        self._plan = replace_plan(self._plan, directory=make_socket_directory())
+        files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        self._plan = replace_plan(self._plan, directory=make_socket_directory(), files=files)
         self._check_policy()
         self._sites.check()
         if self._settings.has_site_links and not self._plan.directory:
             raise SettingError("--zenoh-link", LINKS_NEED_DIRECTORY)
+        self._check_files()
         tasks = self._runtime.tasks
         if self._awaiting:
             tasks.spawn(self._start_with_policy(), "waiting for an operator's policy")
@@ -316,6 +319,14 @@ class Zenoh:
             self._check_layers(self._runtime.policy.layers)
         except ValueError as error:
             raise SettingError("--policy", str(error)) from None
+
+    def _check_files(self) -> None:
+        """Raise SettingError if the routers need more open files than the process may have."""
+        try:
+            self._configs({})
+        except ValueError as error:
+            text = f"{self._settings.zenoh_ports} {error}. Raise the limit (ulimit -Hn)"
+            raise SettingError("--zenoh-ports", text) from None
 
     def _check_layers(self, layers: Sequence[PolicyLayer]) -> None:
         """Raise ValueError for rules that the routers cannot enforce."""

@@ -8,7 +8,14 @@ import pytest
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import Credentials
-from rosproxy.zenoh.router_configs import RouterConfig, RouterPlan
+from rosproxy.zenoh.router_configs import (
+    FILES_OF_ROUTER,
+    MAX_SESSIONS,
+    NO_FILE_LIMIT,
+    SPARE_FILES,
+    RouterConfig,
+    RouterPlan,
+)
 
 PORTS = PortRange(7448, 7449)
 
@@ -36,6 +43,35 @@ def test_each_router_has_a_long_queue_for_declarations() -> None:
     """With zenoh's default, a burst of 1,800 tokens stopped all routers, in five of eleven runs."""
     for config in RouterPlan("0.0.0.0", PORTS, None, ()).configs({}):
         assert json.loads(config["transport/link/tx/queue/size/control"]) == 16
+
+
+def session_bounds(files: int) -> list[tuple[int, int]]:
+    """The most sessions, and the most that are being opened, of each router."""
+    plan = RouterPlan("0.0.0.0", PORTS, None, (HostPort("robot", 7447),), "/run/r", files=files)
+    return [
+        (json.loads(config[MAX_SESSIONS]), json.loads(config["transport/unicast/accept_pending"]))
+        for config in plan.configs({})
+    ]
+
+
+@pytest.mark.parametrize("files", [NO_FILE_LIMIT, 1_048_576, 10_000])
+def test_routers_have_the_most_sessions_with_enough_open_files(files: int) -> None:
+    """The hub also has a session with each router that it dials."""
+    assert session_bounds(files) == [(1000, 1000), (1000, 1000), (1003, 1000)]
+
+
+@pytest.mark.parametrize("files", [100, 256, 1024, 4096])
+def test_all_sessions_together_leave_open_files(files: int) -> None:
+    """Otherwise one container takes all files, and no node of another container connects."""
+    bounds = session_bounds(files)
+    assert bounds[0] == bounds[1]
+    assert bounds[0][0] > bounds[0][1] > 0
+    assert sum(map(sum, bounds)) + SPARE_FILES + FILES_OF_ROUTER * len(bounds) <= files
+
+
+def test_too_few_open_files_are_refused() -> None:
+    with pytest.raises(ValueError, match="needs 97 open files, and this process may have 96"):
+        session_bounds(96)
 
 
 @pytest.mark.parametrize(
