@@ -54,14 +54,15 @@ class Lab:
         """A name that no other node has."""
         return f"{stem}_{next(self._numbers)}"
 
-    def start_proxy(self, *options: str, with_robot: bool = True) -> None:
-        """Start the proxy and wait until ready."""
+    def start_proxy(self, *options: str, with_robot: bool = True, files: int | None = None) -> None:
+        """Start the proxy and wait until ready. ``files``: the limit of open files."""
         robot = ["--zenoh-peer", self.topology.plan.robot] if with_robot else []
-        self.proxy = self.start_proxy_on("px", *robot, *options)
+        self.proxy = self.start_proxy_on("px", *robot, *options, files=files)
 
-    def start_proxy_on(self, role: str, *options: str) -> Process:
+    def start_proxy_on(self, role: str, *options: str, files: int | None = None) -> Process:
         """Start a proxy on a machine, and wait until ready."""
-        argv = [sys.executable, "-m", "rosproxy", "run", "--ros", "zenoh"]
+        argv = ["prlimit", f"--nofile={files}"] if files else []
+        argv += [sys.executable, "-m", "rosproxy", "run", "--ros", "zenoh"]
         argv += ["--zenoh-ports", f"{min(PORTS.values())}-{max(PORTS.values())}"]
         argv += options
         (packages,) = (ENVIRONMENTS / OWN_VERSION).glob("lib/python3*/site-packages")
@@ -143,6 +144,10 @@ class Lab:
             with closing(asking):
                 asking.request("GET", "/status")
                 return parse_status(asking.getresponse().read())
+
+    def problems(self) -> dict[str, str]:
+        """The texts of the proxy's problems, by subject."""
+        return {problem.subject: problem.text for problem in self.status().problems}
 
     def post_policy(self, *layers: Mapping[str, object]) -> None:
         """Give the proxy layers of rules, as an operator does."""

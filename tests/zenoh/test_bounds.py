@@ -1,4 +1,4 @@
-"""A container with too many tokens or messages disturbs no other container."""
+"""A container with too many tokens, messages or sessions disturbs no other container."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from tests.ros.processes import wait_until
 from tests.zenoh.lab import PORTS, Lab
 
 VERSION = "1.6.2"
+FILES = 256
+"""A limit of open files, with which a router has 43 sessions."""
 
 
 def test_tokens_of_a_container_do_not_end_the_routers(lab: Lab) -> None:
@@ -47,4 +49,28 @@ def test_messages_that_may_not_be_dropped_hold_up_no_other_container(
         slow.send(signal.SIGSTOP)
     # Some messages pass before all queues are full.
     subscriber.wait_for_count("^got hello ", 40, timeout=60, since=subscriber.mark())
+    assert lab.zenoh().restarts == 0
+
+
+def test_sessions_of_a_container_leave_files_for_other_containers(lab: Lab) -> None:
+    """The routers share the open files of a process."""
+    lab.start_router(VERSION)
+    lab.start_proxy(files=FILES)
+    for role in PORTS:
+        lab.redirect(role)
+    lab.wait_for_link()
+    lab.node(VERSION, "out", "pub")
+    flood = lab.node(VERSION, "c1", "hoard")
+    flood.wait_for_count("^refused", 20, timeout=60)
+    subject = f"zenoh router at port {PORTS['c1']}"
+    wait_until("the flood is told", lambda: subject in lab.problems(), 30)
+    assert "has 43 sessions" in lab.problems()[subject]
+    assert "raise the limit of open files" in lab.problems()[subject]
+    late = lab.node(VERSION, "c1", "sub")
+    other = lab.node(VERSION, "c2", "sub")
+    other.wait_for_count("^got hello ", 20, timeout=60)
+    assert "got" not in late.output()
+    flood.kill()
+    late.wait_for("^got hello ", timeout=60)
+    wait_until("nothing is told any more", lambda: subject not in lab.problems(), 30)
     assert lab.zenoh().restarts == 0

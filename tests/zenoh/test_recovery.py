@@ -106,12 +106,12 @@ def test_the_link_is_back_with_the_router_of_the_robot(lab: Lab) -> None:
     watched.wait()
     router.kill()
     subject = f"zenoh peer {lab.topology.plan.robot}:7447"
-    wait_until("the fault is told", lambda: subject in told(lab), 30)
-    assert told(lab)[subject].startswith("connection refused: no router listens there")
+    wait_until("the fault is told", lambda: subject in lab.problems(), 30)
+    assert lab.problems()[subject].startswith("connection refused: no router listens there")
     lab.start_router(VERSION)
     lab.wait_for_link()
     watched.wait(BACK_WITHIN_S)
-    wait_until("the fault is over", lambda: subject not in told(lab), 30)
+    wait_until("the fault is over", lambda: subject not in lab.problems(), 30)
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -140,8 +140,3 @@ def gap_after_kill(lab: Lab, clock: Process) -> float:
 def times(clock: Process) -> list[float]:
     """The times at which messages have arrived, in seconds."""
     return [float(line.split()[1]) for line in clock.output().splitlines() if line[:3] == "at "]
-
-
-def told(lab: Lab) -> dict[str, str]:
-    """The problems that the proxy tells of, by subject."""
-    return {problem.subject: problem.text for problem in lab.status().problems}

@@ -491,6 +491,19 @@ class ZenohApartStatus(msgspec.Struct, frozen=True):
     since: Seconds = 0.0
 
 
+class ZenohFullStatus(msgspec.Struct, frozen=True):
+    """A router of the proxy that refuses further sessions, at a ``port``.
+
+    ``addresses``: those with the most of its ``sessions``. ``few_files``: the limit of open files
+    allows no more sessions.
+    """
+
+    port: Count = 0
+    sessions: Count = 0
+    addresses: Names = ()
+    few_files: bool = False
+
+
 class ZenohStatus(msgspec.Struct, frozen=True):
     """The routers for rmw_zenoh: ports for containers, and the port ``listen`` for outside.
 
@@ -501,7 +514,7 @@ class ZenohStatus(msgspec.Struct, frozen=True):
     nodes that the proxy has not compared. ``link_listen``: the port for links of other sites, such
     as ``tls/7447``; ``link_listens``: whether this port accepts connections. ``limits``: the rates
     of topics on links to other sites, as ``/camera/*=2Hz``. ``apart``: zenoh peers of routers
-    outside that do not reach each other.
+    outside that do not reach each other. ``full``: the routers that refuse further sessions.
     """
 
     ports: str = ""
@@ -521,6 +534,7 @@ class ZenohStatus(msgspec.Struct, frozen=True):
     not_compared: Count = 0
     hub_listen: Count | None = None
     apart: tuple[ZenohApartStatus, ...] = ()
+    full: tuple[ZenohFullStatus, ...] = ()
 
 
 class ProxyStatus(msgspec.Struct, frozen=True):

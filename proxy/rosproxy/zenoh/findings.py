@@ -12,6 +12,7 @@ from rosproxy.admin.status_document import (
     MismatchStatus,
     ZenohApartStatus,
     ZenohCertificateStatus,
+    ZenohFullStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
     ZenohStatus,
@@ -169,6 +170,7 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
         is_fault = not link.hub or link.error in CERTIFICATE_FAULTS
         if not link.up and is_fault and is_tried and link.since >= LINK_GRACE_S:
             yield _link_fault(link)
+    yield from map(_full_router, zenoh.full)
     yield from shared_ports(zenoh).values()
     yield from _peers_apart(zenoh)
     yield from _sessions_without_node(zenoh)
@@ -193,6 +195,15 @@ def _certificate(certificate: ZenohCertificateStatus) -> DoctorFinding | None:
     if days is not None:
         return warning("certificate", subject, f"expires within {plural(days, 'day')}", renew)
     return None
+
+
+def _full_router(router: ZenohFullStatus) -> DoctorFinding:
+    text = f"has {plural(router.sessions, 'session')} with {listed(router.addresses)}, and accepts "
+    text += "no more. New nodes there reach no other container"
+    fix = "stop the program that opens these sessions, or its container: a node needs one session"
+    if router.few_files:
+        fix += f". If all these are nodes, {how_to('open files')}"
+    return error("sessions", f"zenoh router at port {router.port}", text, fix)
 
 
 def link_subject(link: ZenohLinkStatus) -> str:

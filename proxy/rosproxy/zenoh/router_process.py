@@ -82,11 +82,13 @@ class Tokens:
 class Router:
     """An open router. The hub, and each router with access control, has the tokens of the graph.
 
-    Access control keeps some tokens from the hub. Raises zenoh.ZError.
+    Access control keeps some tokens from the hub. ``most_sessions`` is 0 if not configured. Raises
+    zenoh.ZError.
     """
 
     def __init__(self, config: Mapping[str, str], *, is_hub: bool) -> None:
         self.config = config
+        self.most_sessions = int(config.get("transport/unicast/max_sessions", 0))
         self.session = open_router(config)
         self.tokens = Tokens()
         if is_hub or "access_control" in config:
@@ -123,7 +125,10 @@ class Routers:
 
     def report(self) -> dict[str, Any]:
         """The fields of a report. Raises ValueError if a router does not answer."""
-        described = [describe(router.session) for router in self._routers]
+        described = [
+            {**describe(router.session), "most_sessions": router.most_sessions}
+            for router in self._routers
+        ]
         self._outside.look(self._routers[-1].session, described, time.monotonic())
         by_router = [router.tokens for router in self._routers]
         keys = None

@@ -18,6 +18,7 @@ from rosproxy.admin.status_document import (
     NamedTypeStatus,
     ZenohApartStatus,
     ZenohCertificateStatus,
+    ZenohFullStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
     ZenohQosStatus,
@@ -31,6 +32,7 @@ from rosproxy.zenoh.matching import Comparison, compare
 from rosproxy.zenoh.peers_apart import PeersApart, peers_apart
 from rosproxy.zenoh.protocol.liveliness import TokenGraph, TopicQos, ZenohNode
 from rosproxy.zenoh.protocol.report import (
+    MOST_SESSIONS,
     Ends,
     Report,
     RouterReport,
@@ -48,6 +50,8 @@ differ in durability alone are listed, too; further ones are not counted."""
 MOST_LISTED_NODES = 1500
 MOST_NAMES_APART = 3
 """Names of nodes at an address that do not reach other peers of their router."""
+MOST_ADDRESSES_AT_FULL = 3
+"""Addresses that the status names for a router that refuses sessions."""
 MOST_LISTED_SESSIONS = 1500
 """Rows that the status lists, with fair shares by address. The live page shows as many nodes."""
 
@@ -72,8 +76,8 @@ class Reading(NamedTuple):
     of the links. ``names`` are the topics and services of nodes inside, and ``counts`` the numbers
     of nodes inside and outside. ``without_node`` has the times since which no node is known of a
     session at a port for containers, by port and zenoh ID. ``apart`` has the peers of routers
-    outside that do not reach each other, with the times since which that is known. The other fields
-    have the listed rows.
+    outside that do not reach each other, with the times since which that is known. ``full`` has the
+    routers that refuse sessions. The other fields have the listed rows.
     ``mismatches`` are also pairs that differ in durability alone.
     """
 
@@ -86,6 +90,7 @@ class Reading(NamedTuple):
     inside: frozenset[str] | None = None
     without_node: Mapping[tuple[int, str], float] = MappingProxyType({})
     apart: Mapping[PeersApart, float] = MappingProxyType({})
+    full: tuple[ZenohFullStatus, ...] = ()
     nodes: tuple[ZenohNodeStatus, ...] = ()
     rows: tuple[ZenohSessionStatus, ...] = ()
     rows_left_out: int = 0
@@ -166,7 +171,8 @@ class ZenohState(Collector):
             reading = reading._replace(comparison=comparison, inside=inside)
         known = _without_node(former.without_node, sessions, reading.graph.nodes, self._now())
         apart = _apart(former.apart, sessions, report, self._now())
-        reading = reading._replace(without_node=known, apart=apart)
+        full = tuple(self._full(report.routers))
+        reading = reading._replace(without_node=known, apart=apart, full=full)
         return reading if graph is None and sessions == former.sessions else _with_rows(reading)
 
     def is_up(self, link: Link) -> bool:
@@ -214,6 +220,7 @@ class ZenohState(Collector):
             mismatches_left_out=reading.mismatches_left_out,
             not_compared=reading.comparison.not_compared,
             apart=tuple(self._apart_status()),
+            full=reading.full,
         )
 
     def _apart_status(self) -> Iterator[ZenohApartStatus]:
@@ -276,6 +283,9 @@ class ZenohState(Collector):
         modes = Counter(placed.session.whatami for placed in reading.sessions)
         for mode in MODES:
             sessions.add_metric([mode], modes[mode])
+        full = GaugeMetricFamily(
+            "rosproxy_zenoh_routers_full", "Routers that refuse sessions.", len(reading.full)
+        )
         nodes = GaugeMetricFamily(
             "rosproxy_zenoh_nodes", "Nodes of rmw_zenoh by side.", labels=["side"]
         )
@@ -290,7 +300,7 @@ class ZenohState(Collector):
         for file in status.certificates:
             if file.ends_in is not None:
                 files.add_metric([file.file], time.time() + file.ends_in)
-        yield from (links, hubs, sessions, nodes, files)
+        yield from (links, hubs, sessions, full, nodes, files)
 
     def _sessions_of(self, routers: Sequence[RouterReport]) -> Iterator[_PlacedSession]:
         """The sessions with programs other than the routers themselves."""
@@ -304,6 +314,24 @@ class ZenohState(Collector):
                 ends = ends_of(session)
                 if ends and session.peer not in own:
                     yield _PlacedSession(port, session, ends, index == at_link)
+
+    def _full(self, routers: Sequence[RouterReport]) -> Iterator[ZenohFullStatus]:
+        """Yield the routers that refuse further sessions."""
+        settings = self._settings
+        at_links = settings.zenoh_link_listen
+        ports: list[int | None] = [*settings.zenoh_ports.ports()]
+        ports += [] if settings.zenoh_listen is None else [settings.zenoh_listen]
+        ports += [at_links.port if at_links else None] if settings.has_site_links else []
+        for port, router in zip([*ports, settings.zenoh_hub_listen], routers, strict=False):
+            if port is not None and router.is_full:
+                ends = filter(None, map(ends_of, router.sessions))
+                hosts = Counter(end.remote.host for end in ends)
+                yield ZenohFullStatus(
+                    port,
+                    len(router.sessions),
+                    tuple(host for host, _ in hosts.most_common(MOST_ADDRESSES_AT_FULL)),
+                    few_files=router.most_sessions < MOST_SESSIONS,
+                )
 
     def _with_age(
         self, row: ZenohSessionStatus, without_node: Mapping[tuple[int, str], float]

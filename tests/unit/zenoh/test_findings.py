@@ -8,6 +8,7 @@ from rosproxy.admin.status_document import (
     MismatchStatus,
     ZenohApartStatus,
     ZenohCertificateStatus,
+    ZenohFullStatus,
     ZenohLinkStatus,
     ZenohNodeStatus,
     ZenohSessionStatus,
@@ -102,6 +103,17 @@ def test_peers_of_two_containers_at_a_port_are_told() -> None:
     (finding,) = faults(replace(GOOD, listen=7447, sessions=tuple(outside)))
     assert finding.subject == "zenoh port 7447"
     assert "a port of its own" not in finding.fix
+
+
+@pytest.mark.parametrize("few_files", [False, True])
+def test_a_router_that_refuses_sessions_is_told(*, few_files: bool) -> None:
+    full = ZenohFullStatus(7448, 33, ("172.18.0.3", "172.18.0.4"), few_files)
+    (finding,) = faults(replace(GOOD, full=(full,)))
+    assert finding.severity is Severity.ERROR
+    assert finding.subject == "zenoh router at port 7448"
+    assert finding.text.startswith("has 33 sessions with 172.18.0.3, 172.18.0.4, and accepts no")
+    assert finding.fix.startswith("stop the program that opens these sessions")
+    assert ("raise the limit of open files" in finding.fix) is few_files
 
 
 def test_sessions_that_announce_no_node_are_told() -> None:

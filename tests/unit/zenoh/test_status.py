@@ -12,6 +12,7 @@ from rosproxy.admin.status_document import (
     NamedTypeStatus,
     ZenohApartStatus,
     ZenohCertificateStatus,
+    ZenohFullStatus,
     ZenohQosStatus,
     ZenohSessionStatus,
 )
@@ -290,6 +291,24 @@ def test_metrics() -> None:
         'rosproxy_zenoh_nodes{side="inside"} 1.0',
     ):
         assert line in lines
+
+
+@pytest.mark.parametrize(("most", "few_files"), [(2, True), (1000, False)])
+def test_a_router_with_the_most_sessions_is_full_until_a_session_ends(
+    most: int, *, few_files: bool
+) -> None:
+    state = make_state(FakeProcess())
+    peer = session(NODE_ZID, "peer", "172.18.0.2:7448", "172.18.0.3:50002")
+    for_hub = RouterSession("03", "router", (SessionConnection("unixsock-stream/a", ""),))
+    first = RouterReport("01", (for_hub, *[peer] * (most - 1)), most_sessions=most)
+    state.take(Report((first, RouterReport("02", most_sessions=most), HUB)), None)
+    full = ZenohFullStatus(7448, most, ("172.18.0.3",), few_files)
+    assert state.status().full == (full,)
+    assert "rosproxy_zenoh_routers_full 1.0" in metrics_of(state)
+    first = RouterReport("01", (for_hub, *[peer] * (most - 2)), most_sessions=most)
+    state.take(Report((first, HUB)), None)
+    assert not state.status().full
+    assert "rosproxy_zenoh_routers_full 0.0" in metrics_of(state)
 
 
 def sites_state(process: FakeProcess, protocol: str = "tls") -> ZenohState:

@@ -1,13 +1,14 @@
 """A replacement for a node of rmw_zenoh: session, keys and liveliness tokens.
 
 `python node.py KIND NAME TOPIC`, where KIND is pub, blast, shout, sub, count, clock, latch, late,
-serve, call, probe, graph, crowd, mute, offer or use. Prints a line for each event, and runs until
-killed. NODE_TYPE: another type, as in keys. NODE_PERIOD_S: the time between two messages.
+serve, call, probe, graph, crowd, hoard, mute, offer or use. Prints a line for each event, and runs
+until killed. NODE_TYPE: another type, as in keys. NODE_PERIOD_S: the time between two messages.
 NODE_TOKENS, NODE_LETTER: see `crowd`. NODE_BYTES: see `blast`. For `offer` and `use`, which gets
 names of nodes as TOPIC, see `matrix.py`.
 """
 
 import os
+import socket
 import sys
 import threading
 import time
@@ -60,6 +61,18 @@ def blast(session: Any, key: str) -> None:
 
 def subscribe(session: Any, key: str, _: str) -> Any:
     return session.declare_subscriber(key, lambda s: say("got", s.payload.to_string()))
+
+
+def hoard(_: Any, __: str) -> None:
+    """Take all sessions and connections that the router accepts, again and again."""
+    held: list[Any] = []
+    while True:
+        try:
+            held.append(open_session(NODE | {"mode": '"client"', "listen/endpoints": "[]"}))
+        except zenoh.ZError:
+            say("refused")
+            held += [socket.create_connection(("localhost", 7447)) for _ in range(20)]
+            time.sleep(PERIOD_S)
 
 
 def count(session: Any, key: str, _: str) -> Any:
@@ -142,7 +155,14 @@ ENTITIES = {
     "serve": "SS",
     "call": "SC",
 }
-RUNS = {"pub": publish, "blast": blast, "shout": publish, "call": call, "probe": call}
+RUNS = {
+    "pub": publish,
+    "blast": blast,
+    "hoard": hoard,
+    "shout": publish,
+    "call": call,
+    "probe": call,
+}
 """`shout` and `probe` have no token, so their topic may have wildcards."""
 MATRIX = {"offer": offer, "use": use}
 """Both watch the graph, as each node of rmw_zenoh does."""

@@ -14,7 +14,7 @@ from rosproxy.net.addresses import HostPort, parse_authority, plain_address
 LONGEST_REPORT = 16 * 1024 * 1024
 """Bytes of a line. A report with the most sessions and the most tokens has some 10 MB."""
 MOST_SESSIONS = 1000
-"""Most sessions of a router: the setting ``transport/unicast/max_sessions``."""
+"""Most sessions of a router, if the limit of open files allows as many."""
 
 
 class SessionConnection(msgspec.Struct, frozen=True):
@@ -33,11 +33,20 @@ class RouterSession(msgspec.Struct, frozen=True):
 
 
 class RouterReport(msgspec.Struct, frozen=True):
-    """A router: the zenoh ID, the sessions, and where the router listens, as ``tls/host:port``."""
+    """A router: the zenoh ID, the sessions, and where the router listens, as ``tls/host:port``.
+
+    ``most_sessions``: the number of sessions from which on the router refuses others; 0: unknown.
+    """
 
     zid: str
     sessions: tuple[RouterSession, ...] = ()
     locators: tuple[str, ...] = ()
+    most_sessions: int = 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the router refuses further sessions."""
+        return 0 < self.most_sessions <= len(self.sessions)
 
 
 class Report(msgspec.Struct, frozen=True):
