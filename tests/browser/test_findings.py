@@ -20,6 +20,19 @@ return import("/findings.js").then(({ causesOf, titleOf }) => {
   return causesOf({ ...state, findings }).map((cause) => `${titleOf(cause)}: ${cause.fix}`);
 });
 """
+AGES = """
+return import("/findings.js").then(({ ageOf }) =>
+  arguments[0].map(([seconds, older]) => ageOf({ older }, seconds)));
+"""
+OLDEST = """
+return import("/findings.js").then(({ causesOf }) => {
+  const row = { state: "broken", lane: "container", address: "10.0.0.1:1", text: "x", fix: "y" };
+  const nodes = new Map(arguments[0].map(([wrong_since, may_be_older], index) =>
+    [`/${index}`, { ...row, wrong_since, may_be_older }]));
+  const [{ since, older }] = causesOf({ nodes, links: new Map(), findings: [] });
+  return [since, older];
+});
+"""
 FOLLOW = """
 return import("/findings.js").then(({ follow, titleOf }) => {
   const seen = new Map();
@@ -110,6 +123,18 @@ def test_one_fix_in_one_place_is_one_cause(browser: Browser, tmp_path: Path) -> 
             "ports: more",
             "container listener: ",
         ]
+
+
+def test_the_age_of_a_cause(browser: Browser, tmp_path: Path) -> None:
+    """The age is that of the oldest problem of the cause."""
+    with made_up(browser, tmp_path, 10):
+        assert browser.run(AGES, [[300, False], [10, True], [3600, True]]) == [
+            "first seen 5 min ago",
+            "age not known",
+            "at least 60 min old",
+        ]
+        assert browser.run(OLDEST, [[60, False], [50, True]]) == [50_000, True]
+        assert browser.run(OLDEST, [[50, False], [60, True]]) == [50_000, False]
 
 
 def test_what_comes_and_goes_is_an_event(browser: Browser, tmp_path: Path) -> None:

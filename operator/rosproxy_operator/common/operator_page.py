@@ -44,11 +44,13 @@ def operator_page(
     async def make() -> AsyncGenerator[dict[str, Any]]:
         # Read only once: otherwise rounding would change the times of the problems.
         epoch = time.time() - time.monotonic()
+        is_first = True
         while True:
             proxy_documents = await documents()
             own = places(), {problem: epoch + since for problem, since in problems().items()}
             document = await asyncio.to_thread(merged, proxy_documents, __version__, logs, *own)
-            ages.add_to(document, time.monotonic(), epoch, is_complete=True)
+            ages.add_to(document, time.monotonic(), epoch, is_complete=not is_first)
+            is_first = False
             yield document
             await asyncio.sleep(ROUND_PAUSE_S)
 

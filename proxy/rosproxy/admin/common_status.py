@@ -76,8 +76,13 @@ def _policy(runtime: Runtime) -> PolicyStatus:
 
 def _problems(problems: Problems) -> tuple[ProblemStatus, ...]:
     """The noted problems, with their ages."""
-    # Readers refuse an age below 0 (`Seconds`), but the clock may have been set back meanwhile.
+    now = time.time()
     return tuple(
-        ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text, p.holds)
+        ProblemStatus(_age(p.when, now), p.subject, p.text, p.holds, _age(p.since, now))
         for p in problems.all()
     )
+
+
+def _age(when: float, now: float) -> float:
+    # Readers refuse an age below 0 (`Seconds`), but the clock may have been set back meanwhile.
+    return round(max(now - when, 0.0), 1)

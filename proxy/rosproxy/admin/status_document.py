@@ -194,7 +194,8 @@ class EndpointStatus(msgspec.Struct, frozen=True):
 
     ``nodes``: the names of the nodes; nodelets share a slave URI. ``uri``: the slave URI that the
     node has given. ``address``: the address at which the proxy reaches the node.
-    ``state`` is a member of `rosproxy.ros1.registry.endpoint.STATES`.
+    ``state`` is a member of `rosproxy.ros1.registry.endpoint.STATES`. ``unanswered``: the seconds
+    since the first of the last failed probes; 0 if the node answers.
     """
 
     nodes: Names = ()
@@ -211,6 +212,7 @@ class EndpointStatus(msgspec.Struct, frozen=True):
     problems: Names = ()
     data_plane: NodePlaneStatus | None = None
     left_out: Count = 0
+    unanswered: Seconds = 0.0
 
     @property
     def given_up(self) -> bool:
@@ -253,12 +255,16 @@ class PolicyStatus(msgspec.Struct, frozen=True):
 
 
 class ProblemStatus(msgspec.Struct, frozen=True):
-    """A problem that was noted ``age`` seconds ago. ``holds``: lasts until it is solved."""
+    """A problem that was last noted ``age`` seconds ago, and first ``known_for`` seconds ago.
+
+    ``holds``: lasts until it is solved.
+    """
 
     age: Seconds = 0.0
     subject: str = ""
     text: str = ""
     holds: bool = False
+    known_for: Seconds = 0.0
 
 
 class LocatorStatus(msgspec.Struct, frozen=True):

@@ -205,7 +205,7 @@ class PageWatch:
             document = await asyncio.to_thread(
                 graph_document, status, judged, self._measures, own_findings, now, self._epoch
             )
-        self._ages.add_to(document, now, self._epoch, self._is_settled(now))
+        self._ages.add_to(document, now, self._epoch, self._is_settled(now), status)
         return document
 
     def _is_settled(self, now: float) -> bool:

@@ -53,7 +53,8 @@ class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
     for this node. ``rate``: forwarded bytes a second, if the rates of the links are not known.
     ``proxy``: the proxy of the node, on an operator's page. ``since``: the Unix time in seconds
     since which a router is linked or not. ``wrong_since``: the Unix time in seconds at which the
-    process first saw the problem (`rosproxy.page.problem_ages`).
+    process first saw the problem (`rosproxy.page.problem_ages`). ``may_be_older``: the first
+    documents of an opened page had the problem, which may be older than the page.
     """
 
     lane: str
@@ -70,6 +71,7 @@ class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
     place: str = ""
     since: float | None = None
     wrong_since: float | None = None
+    may_be_older: bool = False
 
 
 class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -80,8 +82,8 @@ class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
     of the proxy. ``rate``: bytes a second. ``hz``: messages a second. ``since``: the Unix time in
     seconds of the last message, if nothing flows. None means unknown. ``flows``: messages pass now.
     ``quiet``: the page hides the link by default. ``proxy``: the key of the proxy with the
-    ``port``, on an operator's page. ``type``: the ROS type; empty if unknown. ``wrong_since`` as of
-    a node.
+    ``port``, on an operator's page. ``type``: the ROS type; empty if unknown. ``wrong_since`` and
+    ``may_be_older`` as of a node.
 
     ``datagrams``: user data of ROS 2 in datagrams per second. If ``shared`` is 2 or more, the
     measures are a sum over this number of links to the same participant, services of the
@@ -107,6 +109,7 @@ class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
     shared: int = 0
     type: str = ""
     wrong_since: float | None = None
+    may_be_older: bool = False
 
     @property
     def key(self) -> str:
@@ -181,13 +184,14 @@ def _shown_link(link: PageLink) -> PageLink:
 
 
 class PageFinding(msgspec.Struct, frozen=True):
-    """A finding, with the severity as a word. ``wrong_since`` as of a node."""
+    """A finding, with the severity as a word. The last two fields as of a node."""
 
     severity: str = ""
     subject: str = ""
     text: str = ""
     fix: str = ""
     wrong_since: float | None = None
+    may_be_older: bool = False
 
 
 class PageProxy(msgspec.Struct, frozen=True):

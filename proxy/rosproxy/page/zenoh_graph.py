@@ -94,8 +94,13 @@ def _router_nodes(status: ProxyStatus, zenoh: ZenohStatus, now: float) -> dict[s
     for link in zenoh.links:
         kind = HUB if link.hub else ROUTER
         finding = about.get(link_subject(link))
-        nodes[f"{kind} {link.title}"] = _router(link, kind, finding, now)
+        nodes[router_key(link)] = _router(link, kind, finding, now)
     return nodes
+
+
+def router_key(link: ZenohLinkStatus) -> str:
+    """The key of the router outside, or of the hub of another proxy, at the end of a link."""
+    return f"{HUB if link.hub else ROUTER} {link.title}"
 
 
 def _router(

@@ -244,4 +244,5 @@ class Ros1State(Collector):
             left_out=len(relays) - len(shown_relays),
             problems=tuple(problem.text for problem in problems),
             data_plane=msgspec.convert(self._plane.status_of(endpoint), document.NodePlaneStatus),
+            unanswered=round(endpoint.health.unanswered(self._context.now()), 1),
         )

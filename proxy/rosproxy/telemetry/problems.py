@@ -22,12 +22,13 @@ WOULD_BE_DENIED = "policy_audit"
 
 
 class NotedProblem(msgspec.Struct, frozen=True):
-    """A problem. ``when``: Unix time in seconds. ``subject``: a node, port or option.
+    """A problem, first noted at ``since`` and last noted at ``when``: Unix times in seconds.
 
-    ``port``: the lease of the node, if the problem concerns a node. ``holds``: the problem lasts
-    until `Problems.solved`; other problems are events.
+    ``subject``: a node, port or option. ``port``: the lease of the node, if the problem concerns a
+    node. ``holds``: the problem lasts until `Problems.solved`; other problems are events.
     """
 
+    since: float
     when: float
     subject: str
     text: str
@@ -36,9 +37,10 @@ class NotedProblem(msgspec.Struct, frozen=True):
 
 
 class Problems:
-    """The last MOST_PROBLEMS problems, newest last. A repeated problem replaces the older entry.
+    """The last MOST_PROBLEMS problems, newest last.
 
-    Beyond MOST_PROBLEMS, the oldest event goes. If all problems hold, the oldest of all goes.
+    A repeated problem replaces the older entry, and keeps its ``since``. Beyond MOST_PROBLEMS, the
+    oldest event goes. If all problems hold, the oldest of all goes.
     """
 
     def __init__(self) -> None:
@@ -48,8 +50,11 @@ class Problems:
         """Note a problem. For a problem that ``holds``, the caller has to call `solved` later."""
         subject = brief(subject, LONGEST_SUBJECT)
         text = brief(text, LONGEST_TEXT)
-        remaining = [p for p in self._problems if (p.subject, p.text) != (subject, text)]
-        noted = [*remaining, NotedProblem(time.time(), subject, text, port, holds)]
+        now = time.time()
+        same = [p for p in self._problems if (p.subject, p.text) == (subject, text)]
+        since = same[0].since if same else now
+        remaining = [p for p in self._problems if p not in same]
+        noted = [*remaining, NotedProblem(since, now, subject, text, port, holds)]
         if len(noted) > MOST_PROBLEMS:
             noted.remove(next((p for p in noted if not p.holds), noted[0]))
         self._problems = noted

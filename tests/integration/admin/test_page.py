@@ -406,26 +406,51 @@ async def test_a_proxy_whose_master_is_away_is_shown(
 
 
 async def test_a_problem_has_the_same_age_on_a_page_that_is_opened_later(
-    make_proxy: MakeProxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
+    proxy: Proxy, node: FakeNode, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    await master.stop()
-    proxy = await make_proxy()
-    ages = [await age_of_the_master(proxy)]
+    bus = [1, "", [[1, "/listener", "o", "TCPROS", "/chatter", False, ""]]]
+    node.answers["getBusInfo"] = value(bus)
+    other = await make_node("/listener", HOST)
+    await node.publish(proxy.master)
+    await other.subscribe(proxy.ros1.settings.master_uri)
+    with monkeypatch.context() as patched:
+        # As if this page had been open for long: its documents show all problems.
+        patched.setattr("rosproxy.page.feed.SETTLED_AFTER_S", 0.0)
+        patched.setattr("rosproxy.page.feed.SETTLED_AFTER_ROUNDS", 0)
+        ages = [await age_of_a_link(proxy)]
     await pass_time(LINGER_S + 1)
     await until(lambda: proxy.app.page.feed.idle, "the feed ends after the last page")
     later = SimpleNamespace(monotonic=lambda: time.monotonic() + 7200, time=time.time)
     monkeypatch.setattr("rosproxy.page.feed.time", later)
-    ages.append(await age_of_the_master(proxy))
+    ages.append(await age_of_a_link(proxy))
     assert ages[1] - ages[0] >= 7200 - 2
 
 
-async def age_of_the_master(proxy: Proxy) -> float:
-    """The Unix time now, less the time since which the master is broken."""
+async def age_of_a_link(proxy: Proxy) -> float:
+    """The Unix time now, less the time since which the link is broken."""
     async with opened(proxy) as page:
-        while page.document.get("nodes", {}).get("master", {}).get("state") != "broken":
-            await page.follow()
-        since: float = page.document["nodes"]["master"]["wrong_since"]
-        return time.time() - since
+        link = await page.link("topic /chatter /talker /listener", state="broken")
+        return time.time() - float(link["wrong_since"])
+
+
+async def test_the_age_of_a_node_that_does_not_answer_counts_without_a_page(
+    make_proxy: MakeProxy, master: FakeMaster, node: FakeNode
+) -> None:
+    proxy = await make_proxy(cleanup_after=0.0)
+    await node.publish(proxy.master)
+    await node.stop()
+    (endpoint,) = proxy.ros1.context.registry
+    await until(lambda: endpoint.is_down, "the node is down")
+    await master.stop()
+    await until(lambda: not proxy.app.state().master.up, "the master is down")
+    await pass_time(60)
+    async with opened(proxy) as page:
+        for name in ("master", "/talker"):
+            while page.document.get("nodes", {}).get(name, {}).get("state") != "broken":
+                await page.follow()
+            row = page.document["nodes"][name]
+            assert time.time() - row["wrong_since"] >= 60 - 1
+            assert "may_be_older" not in row
 
 
 async def test_updates_of_containers_go_on_while_a_page_is_open(

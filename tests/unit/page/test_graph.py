@@ -314,6 +314,7 @@ def test_a_master_that_is_away_is_told() -> None:
         "text": "x",
         "fix": "y",
         "wrong_since": None,
+        "may_be_older": False,
     }
 
 

@@ -2,7 +2,18 @@
 
 from typing import Any
 
+import pytest
+
+from rosproxy.admin.status_document import (
+    EndpointStatus,
+    MasterStatus,
+    ProblemStatus,
+    ProxyStatus,
+    ZenohLinkStatus,
+    ZenohStatus,
+)
 from rosproxy.page.problem_ages import ProblemAges
+from rosproxy.telemetry.text import brief
 
 EPOCH = 1000.0
 
@@ -75,3 +86,73 @@ def test_a_time_of_a_proxy_in_the_future_is_replaced() -> None:
     shown["nodes"]["a"]["wrong_since"] = EPOCH + 3600.0
     shown["nodes"]["b"]["wrong_since"] = EPOCH - 3600.0
     assert since(ages, 5.0, shown) == {"a": 1005, "b": EPOCH - 3600.0}
+
+
+def first_row(
+    ages: ProblemAges, now: float, status: ProxyStatus | None = None, **row: Any
+) -> tuple[float, bool]:
+    """The time of the problem of a node in the first document of an opened page."""
+    key = row.pop("key", "a")
+    node = {"state": "broken", **row}
+    shown = document() | {"nodes": {key: node}}
+    ages.add_to(shown, now, EPOCH, False, status)
+    return node["wrong_since"], node.get("may_be_older", False)
+
+
+def test_a_problem_of_the_first_documents_may_be_older_and_later_problems_may_not() -> None:
+    ages = ProblemAges()
+    assert first_row(ages, 1.0) == (1001, True)
+    shown = document(a="broken", b="broken")
+    assert since(ages, 40.0, shown) == {"a": 1001, "b": 1040}
+    assert [shown["nodes"][name].get("may_be_older") for name in "ab"] == [True, None]
+
+
+@pytest.mark.parametrize(
+    ("key", "status"),
+    [
+        ("master", ProxyStatus(master=MasterStatus(error="refused", since=7200.0))),
+        ("/talker", ProxyStatus(nodes=(EndpointStatus(nodes=("/talker",), unanswered=7200.0),))),
+        (
+            "router 10.0.0.2:7447",
+            ProxyStatus(zenoh=ZenohStatus(links=(ZenohLinkStatus("10.0.0.2:7447", since=7200.0),))),
+        ),
+    ],
+)
+def test_the_proxy_knows_the_time_of_a_node_without_a_page(key: str, status: ProxyStatus) -> None:
+    assert first_row(ProblemAges(), 9000.0, status, key=key) == (EPOCH + 1800, False)
+    assert first_row(ProblemAges(), 9000.0, status, key="other") == (EPOCH + 9000, True)
+
+
+@pytest.mark.parametrize("noted", ["deaf", "deaf. Fix: restart it", "deaf. restart it"])
+def test_a_noted_problem_has_its_time_at_its_node_alone(noted: str) -> None:
+    problem = ProblemStatus(age=5.0, subject="0102", text=noted, known_for=7200.0)
+    status = ProxyStatus(problems=(problem,))
+    row = {"text": "deaf", "fix": "restart it"}
+    assert first_row(ProblemAges(), 9000.0, status, key="0 0102", **row) == (EPOCH + 1800, False)
+    assert first_row(ProblemAges(), 9000.0, status, key="0 0103", **row)[1]
+    assert first_row(ProblemAges(), 9000.0, status, key="0 0102", text="mute", fix="")[1]
+
+
+def test_a_noted_text_is_bounded_and_still_found() -> None:
+    row = {"text": "x" * 900, "fix": "restart it"}
+    cut = brief(f"{row['text']}. Fix: {row['fix']}", 500)
+    status = ProxyStatus(problems=(ProblemStatus(subject="a", text=cut, known_for=60.0),))
+    assert first_row(ProblemAges(), 100.0, status, **row) == (EPOCH + 40, False)
+
+
+def test_a_problem_that_the_page_saw_some_seconds_earlier_keeps_its_time() -> None:
+    """An age in the status is rounded, and the proxy notes a problem after the page."""
+    ages = ProblemAges()
+    assert first_row(ages, 100.0, text="deaf") == (1100, True)
+    for now in (110.0, 111.0, 112.0):
+        noted = ProblemStatus(subject="a", text="deaf", known_for=round(now - 104.3) + 0.1)
+        status = ProxyStatus(problems=(noted,))
+        assert first_row(ages, now, status, text="deaf") == (1100, False)
+
+
+def test_a_problem_that_came_back_without_a_page_has_its_new_time() -> None:
+    ages = ProblemAges()
+    old = ProxyStatus(master=MasterStatus(error="refused", since=50.0))
+    new = ProxyStatus(master=MasterStatus(error="refused", since=20.0))
+    assert first_row(ages, 100.0, old, key="master") == (1050, False)
+    assert first_row(ages, 900.0, new, key="master") == (1880, False)

@@ -1,5 +1,7 @@
 """Problems: the newest stay, and texts are bounded."""
 
+import time
+
 from rosproxy.telemetry.problems import LONGEST_SUBJECT, LONGEST_TEXT, MOST_PROBLEMS, Problems
 
 
@@ -26,6 +28,17 @@ def test_the_same_again_replaces_the_older_one() -> None:
     for text in ("gone", "deaf", "gone"):
         problems.add("/a", text)
     assert [p.text for p in problems.all()] == ["deaf", "gone"]
+
+
+def test_the_same_again_keeps_the_time_when_it_was_first_noted() -> None:
+    problems = Problems()
+    problems.add("/a", "gone")
+    (first,) = problems.all()
+    while time.time() == first.when:
+        time.sleep(0)
+    problems.add("/a", "gone")
+    (again,) = problems.all()
+    assert again.since == first.since < again.when
 
 
 def test_texts_of_any_size_are_short_and_harmless() -> None:

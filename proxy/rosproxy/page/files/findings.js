@@ -12,31 +12,33 @@ const PLAIN_KINDS = new Set(["node", "participant", "zenoh node"]);
 // cause: a container that ends, or a firewall, leaves many links with a problem. Names of nodes and
 // numbers, such as ports, make no other fix. Pods behind two proxies may have the same name.
 // `since`: the time in milliseconds since which the oldest of these problems is there, by the clock
-// of the browser, which is `clock` seconds behind the proxy's; Infinity if it is not known.
+// of the browser, which is `clock` seconds behind the proxy's; Infinity if it is not known. `older`:
+// this problem may be older.
 export function causesOf({ nodes, links, findings }, clock = 0) {
   const causes = new Map();
-  const add = (kind, { place, proxy = "", container = "" }, { what, text, fix, since }, ids, names = []) => {
+  const add = (kind, { place, proxy = "", container = "" }, { what, text, fix, since, older = false }, ids, names = []) => {
     const shape = names.reduce((rest, name) => rest.replaceAll(name, ""), fix || text).replace(/\d+/g, "");
     const key = `f:${JSON.stringify([kind, proxy, place, shape])}`;
-    if (!causes.has(key)) causes.set(key, { key, kind, place, container, what, text, fix, count: 0, since: Infinity, nodes: new Set(), links: new Set() });
+    if (!causes.has(key)) causes.set(key, { key, kind, place, container, what, text, fix, count: 0, since: Infinity, older: false, nodes: new Set(), links: new Set() });
     const cause = causes.get(key);
     cause.count += 1;
-    if (isKnown(since)) cause.since = Math.min(cause.since, 1000 * (since - clock));
+    const begin = isKnown(since) ? 1000 * (since - clock) : Infinity;
+    if (begin < cause.since) Object.assign(cause, { since: begin, older });
     if (ids.node) cause.nodes.add(ids.node);
     if (ids.link) cause.links.add(ids.link);
   };
   for (const one of findings) {
-    add(one.severity === "error" ? "broken" : "warning", { place: subjectPlace(one.subject) }, { what: one.subject, text: one.text, fix: one.fix, since: one.wrong_since }, {});
+    add(one.severity === "error" ? "broken" : "warning", { place: subjectPlace(one.subject) }, { what: one.subject, text: one.text, fix: one.fix, since: one.wrong_since, older: one.may_be_older }, {});
   }
   for (const [id, node] of nodes) {
-    if (isWrong(node)) add(node.state, whereOf(node), { what: labelOf(id, node) + behind([node]), text: node.text || "", fix: node.fix || "", since: node.wrong_since }, { node: id }, [id, labelOf(id, node)]);
+    if (isWrong(node)) add(node.state, whereOf(node), { what: labelOf(id, node) + behind([node]), text: node.text || "", fix: node.fix || "", since: node.wrong_since, older: node.may_be_older }, { node: id }, [id, labelOf(id, node)]);
   }
   for (const [id, link] of links) {
     if (!isWrong(link)) continue;
     const ends = [link.source, link.target].filter(Boolean);
     const labels = ends.map((end) => labelOf(end, nodes.get(end)));
     const what = `${link.name} from ${labels.join(" to ")}${behind(ends.map((end) => nodes.get(end)))}`;
-    add(link.state, whereOf(nodeOf(link, ends, nodes)), { what, text: link.text || "", fix: link.fix || "", since: link.wrong_since }, { link: id }, [...ends, ...labels]);
+    add(link.state, whereOf(nodeOf(link, ends, nodes)), { what, text: link.text || "", fix: link.fix || "", since: link.wrong_since, older: link.may_be_older }, { link: id }, [...ends, ...labels]);
   }
   return [...causes.values()].sort((a, b) => RANK[b.kind] - RANK[a.kind] || b.count - a.count);
 }
@@ -68,6 +70,12 @@ function nodeOf(link, ends, nodes) {
     || known.find((one) => one.lane === "container") || known[0];
 }
 
+// In words. `seconds`: since which the problem of a cause is there.
+export function ageOf({ older }, seconds) {
+  if (!older) return `first seen ${duration(seconds)} ago`;
+  return seconds < 60 ? "age not known" : `at least ${duration(seconds)} old`;
+}
+
 export function titleOf({ what, count, place, container }) {
   if (count > 1) return `${count}${place ? ` at ${place}` : " times"}: ${what}, …`;
   return container ? `${what}, in ${container}` : what;
@@ -81,7 +89,7 @@ export function follow(seen, causes, events, now, isFirst) {
   for (const [key, { cause, since }] of seen) {
     if (present.has(key)) continue;
     seen.delete(key);
-    found.push({ at: now, over: true, kind: cause.kind, title: titleOf(cause), since });
+    found.push({ at: now, over: true, kind: cause.kind, title: titleOf(cause), since, older: cause.older });
   }
   for (const cause of causes) {
     const since = Number.isFinite(cause.since) ? cause.since : seen.get(cause.key)?.since ?? now;

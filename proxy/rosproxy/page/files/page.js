@@ -3,7 +3,7 @@
 // All that comes from nodes goes through textContent, or into attributes; nothing is parsed.
 // However many changes come, it is drawn twice a second at most, and only what differs is touched.
 
-import { causesOf, connect, emptyMemory, follow, followNodes, titleOf } from "./findings.js";
+import { ageOf, causesOf, connect, emptyMemory, follow, followNodes, titleOf } from "./findings.js";
 import { curveOf, emptyHistory, lastMinute, minuteText, record } from "./history.js";
 import { boxesOf, DIRECT, hasFix, joined, layout, linesOf, selection } from "./picture.js";
 import { age, apply, duration, frequency, hertz, isKnown, labelOf, megabytes, placeOf, rateOf, visibleLinks, visibleNodes, WORDS } from "./view.js";
@@ -137,7 +137,7 @@ function showFindings(causes, on) {
     const { since } = seen.get(cause.key);
     const isOn = cause.key === selected || [...nodes].some((id) => on.nodes.has(id)) || [...links].some((id) => on.links.has(id));
     return [cause.key, { key: cause.key, kind, isOn, what: `${WORDS[kind]}: ${titleOf(cause)}`, text, fix,
-      since: `first seen ${duration((Date.now() - since) / 1000)} ago` }];
+      since: ageOf(cause, (Date.now() - since) / 1000) }];
   }));
   const rest = causes.length - shown.size;
   if (rest > 0) shown.set("rest", { kind: "", what: `and ${rest} more` });
@@ -199,9 +199,9 @@ function copy(element, button) {
 function showEvents() {
   const shown = new Map(events.map((event) => [`${event.at} ${event.over} ${event.title}`, event]));
   put($("happened").firstElementChild, events.length ? `What happened (${events.length})` : "What happened: nothing since this page was opened");
-  arrange($("events"), eventRows, shown, () => make("li"), (li, { at, over, kind, title, since }) => {
+  arrange($("events"), eventRows, shown, () => make("li"), (li, { at, over, kind, title, since, older }) => {
     const time = new Date(at).toLocaleTimeString();
-    const begin = over ? `over after ${duration((at - since) / 1000)}: ` : kind ? `${WORDS[kind]}: ` : "";
+    const begin = over ? `over after ${older ? "at least " : ""}${duration((at - since) / 1000)}: ` : kind ? `${WORDS[kind]}: ` : "";
     put(li, `${time} ${begin}${title}`);
   });
 }

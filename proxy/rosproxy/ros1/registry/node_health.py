@@ -62,6 +62,12 @@ class Health:
             return "failing"
         return "new" if self.answered_at is None else "ok"
 
+    def unanswered(self, now: float) -> float:
+        """The seconds since the first of the last failed probes; 0 if the node answers."""
+        if self.failing_since is None or self.has_ended:
+            return 0.0
+        return now - self.failing_since
+
     def probe_soon(self) -> None:
         """Make the next look probe the node."""
         self.checked_at = None

@@ -117,6 +117,15 @@ def test_the_grace_period_counts_from_the_first_failure_and_starts_anew() -> Non
     assert health.cleanup_due(60.0, 30.0)
 
 
+def test_how_long_a_node_has_not_answered() -> None:
+    health = Health()
+    for moment, probe, unanswered in [(10.0, S, 0.0), (20.0, S, 10.0), (30.0, A, 0.0)]:
+        health.note(probe, moment)
+        assert health.unanswered(moment) == unanswered
+    health.end(40.0)
+    assert health.unanswered(50.0) == 0.0
+
+
 def test_a_node_that_is_known_to_have_ended_is_down_at_once() -> None:
     health = Health()
     health.note(A, 1.0)
