@@ -29,7 +29,7 @@ return [...document.querySelectorAll("#rows tr")].map((row) => ({
 """
 NODES = """
 const textOf = (cell) => [...cell.childNodes].map((child) =>
-  child.className === "copy" ? "" : child.textContent).join("");
+  child.className === "copies" ? "" : child.textContent).join("");
 return [...document.querySelectorAll("#node-rows tr")].map((row) => [...row.cells].map(textOf));
 """
 LINE = """

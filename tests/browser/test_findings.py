@@ -76,8 +76,43 @@ return [button.textContent, button.ariaLabel, button.hidden];
 NOTE_COPIES = """
 document.addEventListener("copy", () => { window.copied = String(getSelection()); });
 """
+PARTS = """
+return import("/findings.js").then(({ partsOf }) => arguments[0].map((fix) => {
+  const parts = partsOf(fix);
+  const whole = parts.map(([text]) => text).join("");
+  if (whole !== fix) throw new Error(`${whole} instead of ${fix}`);
+  return parts.filter(([, isCommand]) => isCommand).map(([text]) => text);
+}));
+"""
 FIXES = ("#findings li", "#rows tr", "#node-rows tr", "#details")
-"""The places of fixes, each with a button that copies the fix."""
+"""The places of fixes, each with a button that copies the command in the fix."""
+SET_FIX = """
+const { state } = window.rosproxyPage;
+for (const node of state.nodes.values()) if (node.text) node.fix = arguments[0];
+"""
+COMMANDS = {
+    "run rosnode cleanup (answer y)": ["rosnode cleanup"],
+    "Do not run rosnode cleanup: it unregisters nodes that are alive": [],
+    "restart the node; test from the proxy: nc -vz fd00::2 11412. If nc fails, open the port": [
+        "nc -vz fd00::2 11412"
+    ],
+    "check the robot's proxy: docker ps; docker logs ros-1. Then run docker exec ros-1 rosproxy "
+    "doctor": ["docker ps", "docker logs ros-1", "docker exec ros-1 rosproxy doctor"],
+    "publish the ports: docker run -p 1:1, and let the firewall accept it": ["docker run -p 1:1"],
+    "rosnode list -a shows the addresses of all nodes": ["rosnode list -a"],
+    "find the programs: ss -ltnp 'sport >= :1 and sport <= :2'; or set another --port-range": [
+        "ss -ltnp 'sport >= :1 and sport <= :2'"
+    ],
+    "run sysctl -w net.ipv4.ip_forward=1 on the node, then delete the proxy's pod": [
+        "sysctl -w net.ipv4.ip_forward=1"
+    ],
+    "the robot's node: nc -vz 'a; docker rm -f x' 1; restart 'b; docker rm -f y'": [
+        "nc -vz 'a; docker rm -f x' 1"
+    ],
+    "rootless Docker: set A=b; Docker Desktop: use an engine on Linux": [],
+    "set --udp": [],
+}
+"""The commands in fixes. Nodes may have chosen the quoted names."""
 CLEANUP = "run rosnode cleanup (answer y)"
 
 
@@ -263,7 +298,34 @@ def test_a_finding_is_shown_in_graph_and_table_and_leaves(browser: Browser, tmp_
         assert not texts(browser, MARKED_BOXES)
 
 
-def test_each_fix_has_a_button_that_copies_it(browser: Browser, tmp_path: Path) -> None:
+def test_the_commands_in_a_fix(browser: Browser, tmp_path: Path) -> None:
+    with made_up(browser, tmp_path, 10):
+        assert browser.run(PARTS, [*COMMANDS]) == [*COMMANDS.values()]
+
+
+def test_each_command_in_a_fix_has_a_button(browser: Browser, tmp_path: Path) -> None:
+    """The button at a fix without a command copies the whole fix."""
+    with fleet(browser, tmp_path, 30):
+        browser.run(NOTE_COPIES)
+        two = ["docker ps", "docker logs a"]
+        check_buttons(browser, "run docker ps; docker logs a", ["Copy 1", "Copy 2"], two)
+        check_buttons(browser, "restart the node", ["Copy"], ["restart the node"])
+
+
+def check_buttons(browser: Browser, fix: str, buttons: list[str], copied: list[str]) -> None:
+    """Give all nodes a fix, and press all buttons at the first cause."""
+    place = "#findings li:first-child"
+    browser.run(SET_FIX, fix)
+    wait_until("the fix is shown", lambda: texts(browser, f"{place} .fix") == [fix])
+    assert texts(browser, f"{place} .copy") == buttons
+    for number, text in enumerate(copied, 1):
+        button = f"{place} .copy:nth-child({number})"
+        browser.run("document.querySelector(arguments[0]).focus()", button)
+        browser.press(" ")
+        assert browser.run("return window.copied") == text
+
+
+def test_each_fix_has_a_button_that_copies_the_command(browser: Browser, tmp_path: Path) -> None:
     """Enter and the space bar press the button. This chooses no row."""
     with fleet(browser, tmp_path, 30):
         browser.run(NOTE_COPIES)
@@ -277,13 +339,14 @@ def test_each_fix_has_a_button_that_copies_it(browser: Browser, tmp_path: Path) 
 
 
 def check_copies(browser: Browser, place: str, key: str) -> None:
-    """Press a key at the first button of a place, which has to copy the first fix there."""
+    """Press a key at the first button of a place, which has to copy the first command there."""
     button = f"{place} .copy"
     text, label, hidden = browser.run(BUTTON, button)
     assert (text, hidden) == ("Copy", False)
-    assert label.startswith("Copy the fix for ")
+    (command, *_) = texts(browser, f"{place} .command")
+    assert label.startswith(f"Copy the command {command} for ")
     browser.run("document.querySelector(arguments[0]).focus()", button)
     browser.press(key)  # a script alone may not copy
     assert browser.run(BUTTON, button) == ["Copied", "Copied", False]
-    assert browser.run("return window.copied") == texts(browser, f"{place} .fix")[0]
+    assert browser.run("return window.copied") == command
     wait_until("the label is back", lambda: browser.run(BUTTON, button)[1] == label)

@@ -6,6 +6,12 @@ const MOST_EVENTS = 50;
 const MOST_PLACES = 8; // with an entry of their own in a look
 const MOST_GONE = 200;
 const SETTLED = 10000; // a proxy first asks all nodes, and until then the document lacks nodes outside
+const PROGRAMS = "conntrack|docker|helm|ip|kubectl|nc|ros2|roscore|rosnode|rosparam|rosproxy|rosproxy-operator|rostopic|ss|sudo|sysctl";
+// A quoted name, which a node may have chosen, or a program where a fix names a command.
+const START = new RegExp(`(?<!\\w)'[^']*'|"[^"]*"|(?<=^|[:;(] ?|(?<!not )\\b(?:[Rr]un|[Rr]ead|[Ss]ee|[Tt]hen|or|with) )(?:${PROGRAMS})(?= )`, "g");
+const WORD = /(?:(?<!\w)'[^']*'|"[^"]*"|[^\s'";()])+/y;
+// The first words of a sentence after a command.
+const STOPS = new Set("and as does fails for from has if in is lists of on or shows tells the then there to where with without".split(" "));
 const PLAIN_KINDS = new Set(["node", "participant", "zenoh node"]);
 
 // The causes, the worst first. What has one fix and one place (a container or a machine) is one
@@ -74,6 +80,37 @@ function nodeOf(link, ends, nodes) {
 export function ageOf({ older }, seconds) {
   if (!older) return `first seen ${duration(seconds)} ago`;
   return seconds < 60 ? "age not known" : `at least ${duration(seconds)} old`;
+}
+
+// The parts of a fix, each with whether the part is a command for a shell. Nothing marks a command in a
+// fix: it begins with a known program, and ends at the end of the clause.
+export function partsOf(fix) {
+  const parts = [];
+  let end = 0;
+  const add = (text, isCommand) => { if (text) parts.push([text, isCommand]); };
+  for (const { 0: found, index } of fix.matchAll(START)) {
+    const command = /^['"]/.test(found) || index < end ? "" : commandAt(fix, index);
+    if (!command.includes(" ")) continue;
+    add(fix.slice(end, index), false);
+    add(command, true);
+    end = index + command.length;
+  }
+  add(fix.slice(end), false);
+  return parts;
+}
+
+function commandAt(fix, start) {
+  let end = start;
+  for (let at = start, isLast = false; !isLast; at += 1) {
+    WORD.lastIndex = at;
+    const word = WORD.exec(fix)?.[0] || "";
+    const bare = word.replace(/[.,:]+$/, "");
+    if (!bare || STOPS.has(bare)) break;
+    end = at + bare.length;
+    at += word.length;
+    isLast = bare !== word || fix[at] !== " ";
+  }
+  return fix.slice(start, end);
 }
 
 export function titleOf({ what, count, place, container }) {

@@ -3,7 +3,7 @@
 // All that comes from nodes goes through textContent, or into attributes; nothing is parsed.
 // However many changes come, it is drawn twice a second at most, and only what differs is touched.
 
-import { ageOf, causesOf, connect, emptyMemory, follow, followNodes, titleOf } from "./findings.js";
+import { ageOf, causesOf, connect, emptyMemory, follow, followNodes, partsOf, titleOf } from "./findings.js";
 import { curveOf, emptyHistory, lastMinute, minuteText, record } from "./history.js";
 import { boxesOf, DIRECT, hasFix, joined, layout, linesOf, selection } from "./picture.js";
 import { age, apply, duration, frequency, hertz, isKnown, labelOf, megabytes, placeOf, rateOf, visibleLinks, visibleNodes, WORDS } from "./view.js";
@@ -161,21 +161,34 @@ function makeFinding({ key, kind }) {
   return li;
 }
 
-// A fix and the button that copies the fix.
+// A fix, with a button that copies the command in the fix. Several commands have a button each. A fix
+// without a command has a button that copies the whole fix.
 function makeFix() {
-  const [fix, button] = [make("code", "", "fix"), make("button", "Copy", "copy")];
-  button.type = "button";
-  button.addEventListener("click", () => copy(fix, button));
-  return [fix, button];
+  return [make("code", "", "fix"), make("span", "", "copies")];
 }
 
 // `what`: what the fix is for, which screen readers say at the button.
 function putFix(parent, text, what) {
-  const button = parent.querySelector(".copy");
-  put(parent.querySelector(".fix"), text);
-  button.hidden = !text;
-  const label = button.textContent === "Copy" ? `Copy the fix for ${what}` : button.textContent;
-  if (button.ariaLabel !== label) button.ariaLabel = label;
+  const [fix, copies] = [parent.querySelector(".fix"), parent.querySelector(".copies")];
+  if (fix.textContent !== text) {
+    fix.replaceChildren(...partsOf(text).map(([part, isCommand]) => isCommand ? make("span", part, "command") : part));
+    const commands = [...fix.querySelectorAll(".command")];
+    copies.replaceChildren(...(commands.length || !text ? commands : [fix]).map(makeCopy));
+  }
+  for (const button of copies.children) {
+    const label = button.textContent !== button.value ? button.textContent
+      : button.title ? `Copy the command ${button.title} for ${what}` : `Copy the fix for ${what}`;
+    if (button.ariaLabel !== label) button.ariaLabel = label;
+  }
+}
+
+function makeCopy(element, index, { length }) {
+  const button = make("button", length > 1 ? `Copy ${index + 1}` : "Copy", "copy");
+  button.type = "button";
+  button.value = button.textContent;
+  if (element.className === "command") button.title = element.textContent;
+  button.addEventListener("click", () => copy(element, button));
+  return button;
 }
 
 function updateFinding(li, { key, isOn, what, text, fix, since }) {
@@ -193,7 +206,7 @@ function copy(element, button) {
   put(button, document.execCommand("copy") ? "Copied" : "Not copied");
   button.ariaLabel = button.textContent;
   getSelection().removeAllRanges();
-  setTimeout(() => put(button, "Copy"), 2000);
+  setTimeout(() => put(button, button.value), 2000);
 }
 
 function showEvents() {
