@@ -134,7 +134,14 @@ def docker(
     )
     if runs:
         mistakes = [
-            Problem(f"variable {v.name}", v.text, False, reason=UNKNOWN_NAME) for v in unknown
+            Problem(
+                f"variable {v.name}",
+                v.text,
+                "Correct the name, or unset the variable",
+                fatal=False,
+                reason=UNKNOWN_NAME,
+            )
+            for v in unknown
         ]
         _run(settings, options["resync"], options["admin_bind"], once, mistakes)
     elif once:

@@ -154,7 +154,8 @@ class Controller:
 
     def problems(self) -> str:
         return "\n".join(
-            f"{problem['subject']}: {problem['text']}" for problem in self.status()["problems"]
+            f"{problem['subject']}: {problem['text']}. {problem['fix']}"
+            for problem in self.status()["problems"]
         )
 
     def kill(self) -> None:

@@ -188,8 +188,8 @@ def test_a_masters_name_that_leads_nowhere_and_its_fix(
     (told,) = [finding for finding in findings if finding["subject"] == f"container {node.name}"]
     for finding in (findings[0], told):
         assert f"the operator can't resolve the host name {named.name}" in finding["text"]
-        assert f"--add-host {named.name}:ADDRESS" in finding["text"]
-        assert "rosproxy.advertise-host" not in finding["text"]
+        assert f"--add-host {named.name}:ADDRESS" in finding["fix"]
+        assert "rosproxy.advertise-host" not in finding["fix"]
     try:
         blind.name(named.name, named.address)
         blind.once("--once")

@@ -31,6 +31,5 @@ def fail(reason: object) -> NoReturn:
 def exit_with(problems: Sequence[Problem]) -> NoReturn:
     """Print a line for each problem. Exit with 1 if there are problems, else with 0."""
     for problem in problems:
-        text = clean(f"{problem.subject}: {problem.text}")
-        click.echo(f"rosproxy-operator: {text}", err=True)
+        click.echo(f"rosproxy-operator: {clean(problem)}", err=True)
     sys.exit(1 if problems else 0)

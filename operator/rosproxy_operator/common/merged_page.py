@@ -99,8 +99,8 @@ def merged(
     inside = _inside(documents)
     for name, document in documents.items():
         if isinstance(document, str):
-            problem = silent.get(name, Problem(name, document, reason=SILENT))
-            nodes[name] = _silent_proxy(name, problem.text, logs(name), problems.get(problem))
+            problem = silent.get(name, Problem(name, document, logs(name), reason=SILENT))
+            nodes[name] = _silent_proxy(name, problem, problems.get(problem))
             continue
         others = documents.keys() - {name}
         page_keys = {
@@ -145,10 +145,10 @@ def _silent(
     }
 
 
-def _silent_proxy(name: str, reason: str, fix: str, since: float | None) -> PageNode:
-    text = shown_text(f"no data from this proxy: {reason}")
+def _silent_proxy(name: str, problem: Problem, since: float | None) -> PageNode:
+    text = shown_text(f"no data from this proxy: {problem.text}")
     wrong_since = None if since is None else round(since)
-    return PageNode(HOST, PROXY, name, BROKEN, text, fix, wrong_since=wrong_since)
+    return PageNode(HOST, PROXY, name, BROKEN, text, problem.fix, wrong_since=wrong_since)
 
 
 def _own_findings(
@@ -156,16 +156,15 @@ def _own_findings(
 ) -> Iterator[tuple[str, PageFinding]]:
     """Yield the operator's problems as findings, fatal problems first, each with the owner.
 
-    Without the problems that the page has ``shown`` already. A problem has the fix in the text, as
-    in the operator's doctor.
+    Without the problems that the page has ``shown`` already.
     """
     left = [problem for problem in problems if problem not in shown]
     for problem in sorted(left, key=lambda p: not p.fatal):
         severity = "error" if problem.fatal else "warning"
         subject = shown_name(problem.subject)
-        text = shown_text(problem.text)
+        texts = (shown_text(problem.text), shown_text(problem.fix))
         wrong_since = round(problems[problem])
-        yield _OPERATOR, PageFinding(severity, subject, text, wrong_since=wrong_since)
+        yield _OPERATOR, PageFinding(severity, subject, *texts, wrong_since=wrong_since)
 
 
 def _placed(name: str, key: str, node: PageNode, places: Mapping[str, str]) -> PageNode:

@@ -1,8 +1,9 @@
 """Problems that the operators of all engines report and log."""
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 log = logging.getLogger(__name__)
 
@@ -26,9 +27,38 @@ TOO_MANY = "TooMany"
 UNKNOWN_NAME = "UnknownName"
 
 
+def bounded(text: str, most: int) -> str:
+    """Return the text, cut to ``most`` characters at most. A cut text ends in an ellipsis."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+class Fault(NamedTuple):
+    """What is wrong, and the fix: an imperative, empty if there is nothing to do.
+
+    Both are without a full stop at the end.
+    """
+
+    text: str
+    fix: str = ""
+
+    def __str__(self) -> str:
+        """Return both as one text, for outputs that have room for a single text."""
+        return with_fix(*self)
+
+    def shortened(self, most: int, cut: Callable[[str, int], str] = bounded) -> "Fault":
+        """Return the fault with ``most`` characters at most, both together.
+
+        What is wrong is cut, and the fix stays whole up to three quarters of the room. ``cut``
+        shortens a text. It may count bytes, so the fix counts by its bytes.
+        """
+        fix = cut(self.fix, most * 3 // 4)
+        room = most - len(f". {fix}".encode()) if fix else most
+        return Fault(cut(self.text, room), fix)
+
+
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A problem of an object. The text says what is wrong and what to do.
+    """A problem of an object: ``text`` and ``fix`` are those of a `Fault`.
 
     ``subject`` names the object: ``container talker``, ``network app``, ``proxy rosproxy-…``.
     ``fatal``: the object does not get what its user wants. Otherwise the problem is a warning.
@@ -38,8 +68,18 @@ class Problem:
 
     subject: str
     text: str
+    fix: str = ""
     fatal: bool = True
     reason: str = field(kw_only=True)
+
+    @property
+    def message(self) -> str:
+        """What is wrong and the fix as one text."""
+        return with_fix(self.text, self.fix)
+
+    def __str__(self) -> str:
+        """Return the subject and the message as a line."""
+        return f"{self.subject}: {self.message}"
 
     @property
     def log_fields(self) -> dict[str, str]:
@@ -49,19 +89,20 @@ class Problem:
         return {**own, "reason": self.reason}
 
 
-def ends_again(error: str, command: str) -> str:
+def ends_again(error: str, command: str) -> Fault:
     """Say that the container of a proxy ends again and again. ``command`` prints the log."""
-    return f"the container ends again and again ({error}). Read {command}"
+    return Fault(f"the container ends again and again ({error})", f"Read {command}")
 
 
-def silent(error: str, fix: str) -> str:
+def silent(error: str, fix: str) -> Fault:
     """Say that a proxy does not answer the operator."""
-    return f"does not answer the operator ({error}). {fix}"
+    return Fault(f"does not answer the operator ({error})", fix)
 
 
-def bounded(text: str, most: int) -> str:
-    """Return the text, cut to ``most`` characters at most. A cut text ends in an ellipsis."""
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+def with_fix(text: str, fix: str) -> str:
+    """Return what is wrong and the fix as one text."""
+    end = " " if text.endswith(("?", "…")) else ". "
+    return f"{text}{end}{fix}" if fix else text
 
 
 class ProblemLog:
@@ -82,8 +123,7 @@ class ProblemLog:
         for problem in current:
             if problem not in self.since:
                 level = logging.ERROR if problem.fatal else logging.WARNING
-                text = "%s: %s"
-                log.log(level, text, problem.subject, problem.text, extra=problem.log_fields)
+                log.log(level, "%s", problem, extra=problem.log_fields)
         for subject in sorted({p.subject for p in self.since} - {p.subject for p in current}):
             log.info("%s: solved", subject)
         self.since = current

@@ -7,15 +7,16 @@ operator reports these variables only if the proxy discovers no participant of t
 from collections.abc import Callable, Mapping
 
 from rosproxy.telemetry.text import brief
+from rosproxy_operator.common.problem import Fault
 
 MOST_VALUE_CHARACTERS = 80
 """The most characters of a variable's value in a report."""
 
-_PROFILE = (
-    "The DDS profile may name other interfaces, other addresses or a discovery server. Unset the "
-    "variable, or change the profile: UDP on all interfaces, no announced address"
+_PROFILE = Fault(
+    "The DDS profile may name other interfaces, other addresses or a discovery server",
+    "Unset the variable, or change the profile: UDP on all interfaces, no announced address",
 )
-_LOCAL = "The nodes discover only nodes on their own machine. Unset the variable"
+_LOCAL = "The nodes discover only nodes on their own machine"
 
 
 def _always(_: str) -> bool:
@@ -30,19 +31,19 @@ def _has_unsupported_transports(value: str) -> bool:
     return value.upper().partition("?")[0] not in ("", "DEFAULT", "DEFAULTV6", "UDPV4", "UDPV6")
 
 
-_DISCOVERY_OBSTACLES: dict[str, tuple[Callable[[str], bool], str]] = {
+_DISCOVERY_OBSTACLES: dict[str, tuple[Callable[[str], bool], Fault]] = {
     "ROS_DISCOVERY_SERVER": (
         _always,
-        "The nodes announce themselves only to a discovery server. Unset the variable",
+        Fault("The nodes announce themselves only to a discovery server", "Unset the variable"),
     ),
-    "ROS_LOCALHOST_ONLY": (lambda value: value == "1", _LOCAL),
+    "ROS_LOCALHOST_ONLY": (lambda value: value == "1", Fault(_LOCAL, "Unset the variable")),
     "ROS_AUTOMATIC_DISCOVERY_RANGE": (
         lambda value: value.upper() in ("LOCALHOST", "OFF"),
-        f"{_LOCAL}, or set SUBNET",
+        Fault(_LOCAL, "Unset the variable, or set SUBNET"),
     ),
     "FASTDDS_BUILTIN_TRANSPORTS": (
         _has_unsupported_transports,
-        "A proxy forwards UDP only. Unset the variable, or set UDPv4",
+        Fault("A proxy forwards UDP only", "Unset the variable, or set UDPv4"),
     ),
     "CYCLONEDDS_URI": (_always, _PROFILE),
     "FASTDDS_DEFAULT_PROFILES_FILE": (_always, _PROFILE),
@@ -50,8 +51,8 @@ _DISCOVERY_OBSTACLES: dict[str, tuple[Callable[[str], bool], str]] = {
 }
 """Variables that may prevent discovery, the surest cause first.
 
-Each variable has a test, which is true for values that prevent discovery, and a text with the cause
-and the fix.
+Each variable has a test, which is true for values that prevent discovery, and the cause with the
+fix.
 """
 
 ROS2_VARIABLES = frozenset(
@@ -60,10 +61,11 @@ ROS2_VARIABLES = frozenset(
 """Variables that ROS 1 does not have."""
 
 
-def discovery_obstacle(variables: Mapping[str, str]) -> str:
-    """Return which variable may prevent discovery, and the fix; empty without such a variable."""
-    for name, (prevents_discovery, text) in _DISCOVERY_OBSTACLES.items():
+def discovery_obstacle(variables: Mapping[str, str]) -> Fault | None:
+    """Return which variable may prevent discovery, and the fix; None without such a variable."""
+    for name, (prevents_discovery, cause) in _DISCOVERY_OBSTACLES.items():
         value = variables.get(name, "")
         if value and prevents_discovery(value):
-            return f"variable {name}={brief(value, MOST_VALUE_CHARACTERS)}. {text}"
-    return ""
+            shown = f"variable {name}={brief(value, MOST_VALUE_CHARACTERS)}"
+            return Fault(f"{shown}. {cause.text}", cause.fix)
+    return None

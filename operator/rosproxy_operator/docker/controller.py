@@ -303,14 +303,15 @@ class DockerController:
         problems = [problem for problem in self._current(snapshot, planned) if problem.fatal]
         subjects = {problem.subject for problem in problems}
         problems += [
-            Problem(f"proxy {name}", f"does not answer. Read docker logs {name}", reason=SILENT)
+            Problem(f"proxy {name}", "does not answer", f"Read docker logs {name}", reason=SILENT)
             for name in self._silent(planned)
             if f"proxy {name}" not in subjects
         ]
         unfinished = _required(planned) or planned.deferred or snapshot.state.busy
         if unfinished and not problems:
-            text = "not all steps were done in time. Run this command again"
-            problems.append(Problem("operator", text, reason="StepsLeft"))
+            text = "not all steps were done in time"
+            fix = "Run this command again"
+            problems.append(Problem("operator", text, fix, reason="StepsLeft"))
         return problems
 
     def _port_taken(self, name: str, port: int | None) -> None:

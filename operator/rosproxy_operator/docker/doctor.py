@@ -86,7 +86,8 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
     problems = sorted(status["problems"], key=_order)
     for problem in problems:
         report = error if problem["fatal"] else warning
-        yield report(problem["subject"].partition(" ")[0], problem["subject"], problem["text"])
+        subject = problem["subject"]
+        yield report(subject.partition(" ")[0], subject, problem["text"], problem.get("fix", ""))
     # If an operator runs, its failed steps are among the problems.
     runs = bool(status["operator"])
     for proxy in status["proxies"]:

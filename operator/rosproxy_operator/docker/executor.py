@@ -236,11 +236,14 @@ class Executor:
                 self._port_taken(action.name, error.port)
                 break
             except EngineError as error:
-                fix = f". {group.fix}" if group.fix else ""
-                subject = _problem_subject((group.place, group.subject))
-                text = f"{action}: {error}{fix}"
                 # A later failure may be a consequence of the first. The log has both.
-                problem = problem or Problem(subject, text, group.fatal, reason=NOT_ADMITTED)
+                problem = problem or Problem(
+                    _problem_subject((group.place, group.subject)),
+                    f"{action}: {error}",
+                    group.fix,
+                    group.fatal,
+                    reason=NOT_ADMITTED,
+                )
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem

@@ -234,10 +234,15 @@ def _undiscovered(
             continue
         settled = _is_settled(container, status, now)
         addresses = _addresses(container, observed).values()
-        reason = discovery_obstacle(container.variables)
-        if reason and settled and not participants_by_address(status).keys() & {*addresses}:
+        obstacle = discovery_obstacle(container.variables)
+        if obstacle and settled and not participants_by_address(status).keys() & {*addresses}:
             text = "the proxy has discovered no participant of this container. Possible cause: "
-            yield Problem(f"container {container.name}", f"{text}{reason}", reason=NOT_WIRED)
+            yield Problem(
+                f"container {container.name}",
+                f"{text}{obstacle.text}",
+                obstacle.fix,
+                reason=NOT_WIRED,
+            )
 
 
 def _unconnected(
@@ -258,7 +263,8 @@ def _unconnected(
                 f"container {container.name}",
                 "no node of this container has connected to the proxy. Possible cause: variable "
                 f"{SESSION_FILE}={brief(file, MOST_VALUE_CHARACTERS)}. The file may name other "
-                "endpoints than tcp/localhost:7447. Unset the variable, or change the file",
+                "endpoints than tcp/localhost:7447",
+                "Unset the variable, or change the file",
                 reason=NOT_WIRED,
             )
 

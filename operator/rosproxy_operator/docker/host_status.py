@@ -24,7 +24,7 @@ from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.host_document import host_document
 from rosproxy_operator.docker.operator_sign import operators
 from rosproxy_operator.docker.planner.plan import plan
-from rosproxy_operator.docker.planner.report import render
+from rosproxy_operator.docker.planner.report import message_of, render
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import ask_proxies
 from rosproxy_operator.docker.settings import PlanSettings
@@ -102,7 +102,7 @@ def show_plan(host: HostStatus, as_json: bool, wait: float) -> int:
         # Problems quote names of labels. An image can put control characters into these names.
         write("\n".join(map(clean, status["actions"])) or "Nothing to do.")
         for problem in status["problems"]:
-            write(clean(f"{problem['subject']}: {problem['text']}"))
+            write(clean(f"{problem['subject']}: {message_of(problem)}"))
     return STEPS_LEFT if status["actions"] else int(_is_wrong(status))
 
 

@@ -282,4 +282,4 @@ def silent_proxy_problem(
         )
     else:
         advice = f"Read docker logs {name}"
-    return Problem(f"proxy {name}", silent(str(error), advice), reason=SILENT)
+    return Problem(f"proxy {name}", *silent(str(error), advice), reason=SILENT)

@@ -23,7 +23,7 @@ from tests.integration.proxy import Proxy
 
 TOKEN = "0123456789abcdef"
 MISSPELT = Problem(
-    "container talker-1", "label x is unknown. Did you mean y?", fatal=False, reason="X"
+    "container talker-1", "label x is unknown", "Remove the label", fatal=False, reason="X"
 )
 MISSPELT_SINCE = time.monotonic() - 7200
 """The monotonic time at which the operator first saw the problem."""
@@ -83,7 +83,8 @@ async def test_all_proxies_stand_on_one_page(
             assert nodes["gone"]["state"] == "broken"
             assert f"{gone} refuses connections" in nodes["gone"]["text"]
             (own,) = (f for f in document["findings"] if f["subject"] == MISSPELT.subject)
-            assert (own["severity"], own["text"], own["fix"]) == ("warning", MISSPELT.text, "")
+            shown = (own["severity"], own["text"], own["fix"])
+            assert shown == ("warning", MISSPELT.text, MISSPELT.fix)
             assert nodes["gone"]["wrong_since"] - own["wrong_since"] >= 7200 - 1
             async with session.get(f"http://{address}/", headers={"Host": "evil.example"}) as reply:
                 assert reply.status == 403

@@ -205,17 +205,17 @@ def test_a_proxy_that_cannot_be_asked_says_why() -> None:
 def test_the_operators_own_problems_are_findings() -> None:
     """Fatal problems come first, and the texts are as short as the texts of a proxy."""
     warning = Problem(
-        "container talker", "label x is unknown. Did you mean y?\x1b", fatal=False, reason="X"
+        "container talker", "label x is unknown\x1b", "Add y\x1b", fatal=False, reason="X"
     )
     fatal = Problem("master robot", "long" * LONGEST_TEXT, reason="X")
     findings = merged({"one": shown("a")}, "1", LOGS, {}, {warning: 5.0, fatal: 7.4})["findings"]
     assert [(f["severity"], f["subject"], f["fix"], f["wrong_since"]) for f in findings] == [
         ("error", "master robot", "", 7),
-        ("warning", "container talker", "", 5),
+        ("warning", "container talker", "Add y\\x1b", 5),
         ("error", "one: ports", "x", None),
     ]
     assert len(findings[0]["text"]) == LONGEST_TEXT
-    assert findings[1]["text"] == "label x is unknown. Did you mean y?\\x1b"
+    assert findings[1]["text"] == "label x is unknown\\x1b"
 
 
 def test_proxies_and_the_operator_share_the_room_for_findings() -> None:
@@ -235,13 +235,15 @@ def test_proxies_and_the_operator_share_the_room_for_findings() -> None:
 def test_a_silent_proxy_is_reported_once() -> None:
     """The operator's problem has more to do about the proxy than the reason alone."""
     reason = "10.0.0.1:11312 refuses connections"
-    advice = f"admin endpoint {reason}. Attach the operator to network uplink"
+    text = f"admin endpoint {reason}"
+    fix = "Attach the operator to network uplink"
     problems = {
-        Problem("proxy one", advice, reason="X"): 5.0,
+        Problem("proxy one", text, fix, reason="X"): 5.0,
         Problem("proxy one", "port 11412 is taken", reason="X"): 6.0,
     }
     document = merged({"one": reason}, "1", LOGS, {}, problems)
-    assert document["nodes"]["one"]["text"] == f"no data from this proxy: {advice}"
+    assert document["nodes"]["one"]["text"] == f"no data from this proxy: {text}"
+    assert document["nodes"]["one"]["fix"] == fix
     assert document["nodes"]["one"]["wrong_since"] == 5
     assert [finding["text"] for finding in document["findings"]] == ["port 11412 is taken"]
 

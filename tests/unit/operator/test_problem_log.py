@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from rosproxy_operator.common.problem import Problem, ProblemLog
+from rosproxy_operator.common.problem import Fault, Problem, ProblemLog
 
 FATAL = Problem("container talker", "no master is known", reason="X")
 WARNING = Problem("container talker", "label x is unknown", fatal=False, reason="X")
@@ -40,3 +40,18 @@ def test_what_a_problem_is_about_is_a_field_of_the_record(caplog: pytest.LogCapt
     names = ("container", "proxy", "reason")
     fields = [tuple(vars(record).get(name) for name in names) for record in caplog.records]
     assert fields == [("talker", None, "X"), (None, "rosproxy-a", "ProxyStuck"), (None, None, "Y")]
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        (Fault("is odd"), "is odd"),
+        (Fault("is odd", "Stop it"), "is odd. Stop it"),
+        (Fault("is it?", "Stop it"), "is it? Stop it"),
+        (Fault("is very odd indeed", "Stop it"), "is very od… Stop it"),
+        (Fault("is very odd indeed, and old"), "is very odd indeed,…"),
+        (Fault("is odd", "Stop it or leave it"), "… Stop it or lea…"),
+    ],
+)
+def test_a_long_text_is_cut_before_the_fix(fault: Fault, told: str) -> None:
+    assert str(fault.shortened(20)) == told

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from rosproxy.net.addresses import is_address
 from rosproxy.telemetry.text import listed
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import Fault, Problem
 from rosproxy_operator.docker.planner.labels.alias_bounds import (
     alias_refusal,
     is_allowed_by_administrator,
@@ -209,30 +209,30 @@ def _problems(claim: _Claim, common: _Claim | None) -> Iterator[Problem]:
             if MASTER_URI not in member.container.labels:
                 # A variable that names a proxy does not say which master the container means.
                 fix += f" and the label {MASTER_URI}={place.master.uri}"
-            text = (
-                f"the nodes look for the proxy by the name {claim.alias}, but "
-                f"{_obstacle(claim, place, fix)}"
-            )
-            yield Problem(f"container {member.container.name}", text, False, reason="NameTaken")
+            obstacle = _obstacle(claim, place, fix)
+            text = f"the nodes look for the proxy by the name {claim.alias}, but {obstacle.text}"
+            subject = f"container {member.container.name}"
+            yield Problem(subject, text, obstacle.fix, fatal=False, reason="NameTaken")
 
 
-def _obstacle(claim: _Claim, place: Place, fix: str) -> str:
+def _obstacle(claim: _Claim, place: Place, fix: str) -> Fault:
     """Return what keeps a proxy from having a name, and the fix.
 
     ``fix`` has the variable to set, and a label if the container lacks the label.
     """
     if claim.refusal and not claim.containers:
-        return (
+        return Fault(
             f"labels may not give a proxy that name on network {claim.network}: {claim.refusal}. "
-            "So the nodes bypass the proxy. Start the operator with --allow-alias "
-            f"{claim.alias}, or set {fix}"
+            "So the nodes bypass the proxy",
+            f"Start the operator with --allow-alias {claim.alias}, or set {fix}",
         )
     holders = [f"container {name}" for name in claim.containers]
     rivals = {*claim.holders, claim.owner or place} - {place}
     holders += [_holder(claim, rival) for rival in sorted(rivals)]
-    return (
+    return Fault(
         f"on network {claim.network} that name belongs to {listed(holders)}. So the nodes bypass "
-        f"the proxy. Set {fix}"
+        "the proxy",
+        f"Set {fix}",
     )
 
 

@@ -20,6 +20,7 @@ from rosproxy_operator.common.port_ranges import (
 from rosproxy_operator.common.problem import (
     CONFLICT,
     EXHAUSTED,
+    Fault,
     Problem,
 )
 from rosproxy_operator.docker.planner.model import SERVING, STARTED, Container, Desired, HostState
@@ -151,21 +152,21 @@ def allocate(
     for place, ports in sorted(ranges.items()):
         if place in moved and is_moved(moved[place].ports, ports):
             ros = place.graph.ros
-            advice = advice_after_move(ros == "1", ros == "2")
             text = (
                 f"has left ports {moved[place].ports} for {ports}, since another program or "
-                f"container has taken the old ports. {advice}"
+                "container has taken the old ports"
             )
-            problems.append(_problem(place, text, CONFLICT))
+            fault = Fault(text, advice_after_move(ros == "1", ros == "2"))
+            problems.append(_problem(place, fault, CONFLICT))
     return replace(memory, served=served, planned=ranges, moved=moved), problems
 
 
 def _no_range(place: Place, error: PortsExhausted) -> Problem:
-    text = (
-        f"{error}. Lower --ports or the label rosproxy.ports ({error.count}), widen "
-        f"--port-window ({error.window}), or stop programs that hold ports there"
+    fix = (
+        f"Lower --ports or the label rosproxy.ports ({error.count}), widen --port-window "
+        f"({error.window}), or stop programs that hold ports there"
     )
-    return _problem(place, text, EXHAUSTED, fatal=True)
+    return _problem(place, Fault(str(error), fix), EXHAUSTED, fatal=True)
 
 
 def _too_short(
@@ -181,27 +182,28 @@ def _too_short(
         others = (other for other in sorted(ranges) if other != place)
         neighbour = next((other for other in others if overlap(ranges[other], missing)), None)
         if missing.last > window.last:
-            why = f"ports {missing} are beyond --port-window ({window}). Widen --port-window"
+            why = f"ports {missing} are beyond --port-window ({window})"
+            fix = "Widen --port-window"
         elif neighbour:
-            why = (
-                f"proxy {proxy_name(neighbour)} has {ranges[neighbour]}. Stop the containers of "
-                "that proxy until the operator has removed that proxy (--grace), then start them "
-                "again"
+            why = f"proxy {proxy_name(neighbour)} has {ranges[neighbour]}"
+            fix = (
+                "Stop the containers of that proxy until the operator has removed that proxy "
+                "(--grace), then start them again"
             )
         elif overlap(ephemeral, missing):
-            why = (
-                f"ports {missing} lie in the kernel's range of ephemeral ports ({ephemeral}). Give "
-                "--port-window more room below that range, or begin that range later: sysctl "
+            why = f"ports {missing} lie in the kernel's range of ephemeral ports ({ephemeral})"
+            fix = (
+                "Give --port-window more room below that range, or begin that range later: sysctl "
                 "net.ipv4.ip_local_port_range"
             )
         else:
+            why = f"ports {missing} are not all free"
             fix = "Stop the programs that hold these ports (see ss -ltnup)"
-            why = f"ports {missing} are not all free. {fix}"
         text = (
             f"has only the {len(ports)} ports {ports}, although --ports or the label "
             f"rosproxy.ports asks for {count}: {why}"
         )
-        yield _problem(place, text, EXHAUSTED)
+        yield _problem(place, Fault(text, fix), EXHAUSTED)
 
 
 def _router_ports(count: int, memory: DockerMemory) -> PortRange:
@@ -213,5 +215,5 @@ def _router_ports(count: int, memory: DockerMemory) -> PortRange:
     return PortRange(FIRST_PORT, FIRST_PORT + max(count, len(former) if former else 0) - 1)
 
 
-def _problem(place: Place, text: str, reason: str, fatal: bool = False) -> Problem:
-    return Problem(f"proxy {proxy_name(place)}", text, fatal, reason=reason)
+def _problem(place: Place, fault: Fault, reason: str, fatal: bool = False) -> Problem:
+    return Problem(f"proxy {proxy_name(place)}", *fault, fatal=fatal, reason=reason)

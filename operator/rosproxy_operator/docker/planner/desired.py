@@ -132,8 +132,9 @@ def _refused_network(name: str, uplink: str) -> Problem:
     return Problem(
         f"network {name}",
         f"proxies can't join this network: its name sorts before the name of the uplink network "
-        f"{uplink}, so the engine would move the published ports of the proxies there. Create the "
-        "network under another name, or start the operator with an --uplink that sorts first",
+        f"{uplink}, so the engine would move the published ports of the proxies there",
+        "Create the network under another name, or start the operator with an --uplink that sorts "
+        "first",
         reason="NetworkUnusable",
     )
 
@@ -144,8 +145,9 @@ def _preferred_network(name: str, uplink: str) -> Problem:
         f"network {name}",
         f"the network has IPv6, and the uplink network {uplink} does not. So the engine moves the "
         "published ports of a proxy when the proxy joins or leaves this network, which cuts all "
-        "connections. Create the network without IPv6, or start the operator with --uplink and the "
-        "name of a bridge that has IPv6 and sorts first",
+        "connections",
+        "Create the network without IPv6, or start the operator with --uplink and the name of a "
+        "bridge that has IPv6 and sorts first",
         fatal=False,
         reason="NetworkUnusable",
     )
@@ -163,8 +165,8 @@ def _option_warnings(desired: Iterable[Desired]) -> Iterator[Problem]:
                 yield Problem(
                     subject,
                     "label rosproxy.udp=true is ignored: datagrams from outside need both "
-                    "directions. Add the label rosproxy.direction=both, or remove the label "
-                    "rosproxy.udp",
+                    "directions",
+                    "Add the label rosproxy.direction=both, or remove the label rosproxy.udp",
                     fatal=False,
                     reason=OPTION_IGNORED,
                 )
@@ -172,7 +174,8 @@ def _option_warnings(desired: Iterable[Desired]) -> Iterator[Problem]:
                 yield Problem(
                     subject,
                     f"label rosproxy.data-plane={asked} is ignored: the proxy also serves {rival}, "
-                    f"whose label asks for {plane}. Give both containers the same value",
+                    f"whose label asks for {plane}",
+                    "Give both containers the same value",
                     fatal=False,
                     reason=OPTION_IGNORED,
                 )

@@ -13,6 +13,7 @@ from dataclasses import replace
 from rosproxy.settings import MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
 from rosproxy_operator.common.problem import (
     TOO_MANY,
+    Fault,
     Problem,
 )
 from rosproxy_operator.docker.planner.labels.readers import LINK, PEERS
@@ -80,11 +81,11 @@ def _ignored(
     return ignored
 
 
-def _problems(ignored: Collection[Member], text: Callable[[Place], str]) -> tuple[Problem, ...]:
+def _problems(ignored: Collection[Member], fault: Callable[[Place], Fault]) -> tuple[Problem, ...]:
     return tuple(
-        Problem(f"container {member.container.name}", text(member.place), False, reason=TOO_MANY)
-        for member in ignored
-        if member.container.alive
+        Problem(f"container {m.container.name}", *fault(m.place), fatal=False, reason=TOO_MANY)
+        for m in ignored
+        if m.container.alive
     )
 
 
@@ -92,18 +93,20 @@ def _most(place: Place) -> int:
     return MOST_ZENOH_PEERS if place == ZENOH else MOST_PEERS_OF_PROXY
 
 
-def _ignored_peers(place: Place) -> str:
+def _ignored_peers(place: Place) -> Fault:
     """Return why the peers of a container are ignored, and the fix."""
     common = "" if place == ZENOH else ", or start the operator with --ros2-peer for common peers"
-    return (
+    return Fault(
         f"label {PEERS} is ignored: a proxy takes at most {_most(place)} peers from all labels of "
-        f"its containers, and ignores the labels with the most peers. Name fewer peers{common}"
+        "its containers, and ignores the labels with the most peers",
+        f"Name fewer peers{common}",
     )
 
 
-def _ignored_links(_: Place) -> str:
+def _ignored_links(_: Place) -> Fault:
     """Return why the links of a container are ignored, and the fix."""
-    return (
+    return Fault(
         f"label {LINK} is ignored: a proxy has at most {MOST_ZENOH_LINKS} links, and ignores the "
-        "labels with the most links. Name fewer links"
+        "labels with the most links",
+        "Name fewer links",
     )

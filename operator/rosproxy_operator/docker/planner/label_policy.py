@@ -51,13 +51,13 @@ def with_bounded_rules(
         layers[place] += 1
     text = (
         f"label {POLICY}: the container gets no proxy, since the containers of one proxy have too "
-        f"many rules together (at most {MOST_RULES} rules in {MOST_LAYERS} policies). Join rules "
-        "by globs, in this label or in the labels of the other containers"
+        f"many rules together (at most {MOST_RULES} rules in {MOST_LAYERS} policies)"
     )
+    fix = "Join rules by globs, in this label or in the labels of the other containers"
     return (
         tuple(member for member in members if member not in refused),
         tuple(
-            Problem(f"container {member.container.name}", text, reason=TOO_MANY)
+            Problem(f"container {member.container.name}", text, fix, reason=TOO_MANY)
             for member in refused
         ),
     )

@@ -61,11 +61,14 @@ def missing_lan_relay(place: Place, observed: HostState, settings: PlanSettings)
         or observed.lan_relays_of(place)
     ):
         return None
-    text = (
-        "has no LAN relay, since the operator does not know this host's address on the LAN. Start "
-        f"the operator with --ros2-lan ADDRESS, or with --ros2-lan {NOWHERE} if peers are enough"
+    return Problem(
+        f"proxy {proxy_name(place)}",
+        "has no LAN relay, since the operator does not know this host's address on the LAN",
+        "Start the operator with --ros2-lan ADDRESS, or with --ros2-lan "
+        f"{NOWHERE} if peers are enough",
+        fatal=False,
+        reason=NO_LAN_ADDRESS,
     )
-    return Problem(f"proxy {proxy_name(place)}", text, False, reason=NO_LAN_ADDRESS)
 
 
 def _starts(step: Action, sandboxes: Collection[str]) -> bool:

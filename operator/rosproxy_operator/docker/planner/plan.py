@@ -173,17 +173,18 @@ def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
     if not observed.image_id:
         return Problem(
             f"proxy image {settings.proxy_image}",
-            f"not on this host. Run docker pull {settings.proxy_image}, or in rosproxy's sources "
-            f"docker build --target proxy -t {settings.proxy_image} .",
+            "not on this host",
+            f"Run docker pull {settings.proxy_image}, or in rosproxy's sources docker build "
+            f"--target proxy -t {settings.proxy_image} .",
             reason=STUCK,
         )
     for network in observed.networks:
         if network.name == settings.uplink and (network.internal or network.driver != "bridge"):
             return Problem(
                 f"network {network.name}",
-                "can't be the uplink of the proxies: the uplink must be a bridge, and not "
-                "internal. Remove the network (the operator creates a new one), or name another "
-                "network with --uplink",
+                "can't be the uplink of the proxies: the uplink must be a bridge, and not internal",
+                "Remove the network (the operator creates a new one), or name another network with "
+                "--uplink",
                 reason="NetworkUnusable",
             )
     return None
@@ -276,10 +277,10 @@ def _container_problems(observed: HostState, live: Collection[Place]) -> Iterato
         if own.place in live and own.container.state == "restarting":
             kind = "proxy" if isinstance(own, Proxy) else "container"  # a sandbox, or a LAN relay
             reason = LAN_RELAY_STUCK if isinstance(own, LanRelayContainer) else STUCK
-            text = ends_again("the engine restarts it", f"docker logs {name}")
-            yield Problem(f"{kind} {name}", text, reason is STUCK, reason=reason)
+            fault = ends_again("the engine restarts it", f"docker logs {name}")
+            yield Problem(f"{kind} {name}", *fault, fatal=reason is STUCK, reason=reason)
     for host in sorted(host for host, address in observed.masters.items() if not address):
-        yield Problem(f"master {host}", unresolved_master(host), reason=MASTER_UNKNOWN)
+        yield Problem(f"master {host}", *unresolved_master(host), reason=MASTER_UNKNOWN)
 
 
 def _seconds_to_changes(

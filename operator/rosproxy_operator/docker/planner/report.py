@@ -9,6 +9,7 @@ from typing import Any
 
 from rosproxy.telemetry.tables import besides_first, table
 from rosproxy.telemetry.text import clean, listed, plural, shorten, wrap
+from rosproxy_operator.common.problem import with_fix
 
 Status = Mapping[str, Any]
 """What ``rosproxy-operator docker status --json`` prints."""
@@ -44,7 +45,7 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
         head += wrap(f"Live page of all proxies: {clean(status['operator'])}/", columns, "")
     subjects = {f"container {container['name']}" for container in status["containers"]}
     problems = [
-        f"{clean(problem['subject'])}: {clean(problem['text'])}"
+        f"{clean(problem['subject'])}: {clean(message_of(problem))}"
         for problem in status["problems"]
         if problem["subject"] not in subjects
     ]
@@ -137,9 +138,8 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
         # A container with both versions of ROS has two rows, and the report shows problems once.
         subject = f"container {container['name']}"
         if subject not in reported:
-            yield from _problem_lines(
-                (p["text"] for p in status["problems"] if p["subject"] == subject), columns
-            )
+            own = (p for p in status["problems"] if p["subject"] == subject)
+            yield from _problem_lines(map(message_of, own), columns)
         reported.add(subject)
 
 
@@ -164,6 +164,11 @@ def _container_row(container: Status, ranges: Mapping[str, str]) -> tuple[str, .
     participants = plural(len(container["participants"]), "participant")
     nodes = str(len(container["nodes"]) + len(container["zenoh_nodes"]))
     return (*cells, participants if container["ros"] == "2" else nodes)
+
+
+def message_of(problem: Status) -> str:
+    """What is wrong and the fix. An operator of an earlier build has the fix in the text."""
+    return with_fix(problem["text"], problem.get("fix", ""))
 
 
 def _problem_lines(texts: Iterable[str], columns: int) -> Iterator[str]:

@@ -17,6 +17,7 @@ from rosproxy.setting_kinds import SettingError, hash_token, parse_range
 from rosproxy.settings import MOST_ZENOH_PORTS
 from rosproxy_operator.common.policy import POLICY_WAIT_S, as_variable
 from rosproxy_operator.common.port_ranges import local_ports
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.common.ros2 import (
     LAN_RELAY_COMMAND,
     lan_relay_variables,
@@ -179,17 +180,17 @@ def _identity(place: Place) -> str:
     return f"{name} {place.advertise_host}"
 
 
-def unresolved_master(host: str) -> str:
-    """Say what users can do if the operator can't resolve the host name of a master.
+def unresolved_master(host: str) -> Fault:
+    """Say that the operator can't resolve the host name of a master.
 
     An address in place of the name is no fix: nodes with an address in ROS_MASTER_URI bypass the
     proxy.
     """
-    return (
-        f"the operator can't resolve the host name {host}. Add the line 'ADDRESS {host}' to "
-        "/etc/hosts of this host; if the operator runs in a container, start that container with "
-        f"docker run --add-host {host}:ADDRESS (Compose: extra_hosts). Do not replace the name by "
-        "an address"
+    return Fault(
+        f"the operator can't resolve the host name {host}",
+        f"Add the line 'ADDRESS {host}' to /etc/hosts of this host; if the operator runs in a "
+        f"container, start that container with docker run --add-host {host}:ADDRESS (Compose: "
+        "extra_hosts). Do not replace the name by an address",
     )
 
 

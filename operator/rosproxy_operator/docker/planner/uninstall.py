@@ -64,9 +64,9 @@ def _other_operator(observed: HostState, first: frozenset[str]) -> Problem | Non
         return None
     return Problem(
         "operator",
-        f"another operator is running on this host, and has created {listed(new)} meanwhile. Stop "
-        "that operator (docker rm -f rosproxy-operator, or docker compose stop operator), then run "
-        "uninstall again",
+        f"another operator is running on this host, and has created {listed(new)} meanwhile",
+        "Stop that operator (docker rm -f rosproxy-operator, or docker compose stop operator), "
+        "then run uninstall again",
         reason="OtherOperator",
     )
 
@@ -94,8 +94,9 @@ def _remaining(observed: HostState, settings: PlanSettings) -> Iterator[Problem]
         if guests := _guests(observed, network.name) if network.made_by_operator else []:
             yield Problem(
                 f"network {network.name}",
-                f"not removed, since containers are on this network: {listed(guests)}. Run docker "
-                f"network disconnect {network.name} {guests[0]}, then run uninstall again",
+                f"not removed, since containers are on this network: {listed(guests)}",
+                f"Run docker network disconnect {network.name} {guests[0]}, then run uninstall "
+                "again",
                 reason="NetworkInUse",
             )
     if observed.redirects and not observed.image_id:
@@ -104,8 +105,8 @@ def _remaining(observed: HostState, settings: PlanSettings) -> Iterator[Problem]
         yield Problem(
             f"proxy image {settings.proxy_image}",
             "not on this host. The operator needs the image to remove the redirects in the networks"
-            f" of {listed(sorted({names.get(owner, owner[:12]) for owner in owners}))}. Run docker "
-            f"pull {settings.proxy_image}, then run uninstall again",
+            f" of {listed(sorted({names.get(owner, owner[:12]) for owner in owners}))}",
+            f"Run docker pull {settings.proxy_image}, then run uninstall again",
             reason=STUCK,
         )
 

@@ -24,6 +24,7 @@ from rosproxy_operator.common.port_ranges import (
     overlap,
     within,
 )
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.planner import proxy_ports
 from rosproxy_operator.kubernetes.planner.cluster_view import (
     View,
@@ -57,7 +58,7 @@ class ClusterRanges(msgspec.Struct, frozen=True):
 
     given: dict[ProxyPlace, PortRange] = {}
     published: dict[ProxyPlace, PortRange] = {}
-    exhausted: dict[ProxyPlace, str] = {}
+    exhausted: dict[ProxyPlace, Fault] = {}
     findings: list[ClusterFinding] = []
     of_zenoh: set[ProxyPlace] = set()
 
@@ -212,9 +213,10 @@ class _Node(msgspec.Struct):
             holder = f"pod {abbreviated(pods)} has"
         text = (
             f"the master is not published on port {port} of node {self.node}, since {holder} this "
-            "port. Choose another spec.master.publish, or free the port"
+            "port"
         )
-        return finding(rosproxy, "PortConflict", text)
+        fix = "Choose another spec.master.publish, or free the port"
+        return finding(rosproxy, "PortConflict", Fault(text, fix))
 
     def _too_short(self, place: ProxyPlace, ports: PortRange) -> ClusterFinding:
         """Return the finding that a range is shorter than ``spec.ports``."""
@@ -223,13 +225,15 @@ class _Node(msgspec.Struct):
         missing = PortRange(ports.last + 1, ports.first + count - 1)
         text = (
             f"the proxy on node {self.node} has only the {len(ports)} ports {ports}, although "
-            f"spec.ports is {count}: ports {missing} are not all free, or not in spec.portWindow. "
+            f"spec.ports is {count}: ports {missing} are not all free, or not in spec.portWindow"
+        )
+        fix = (
             "Delete the pods that hold these ports, or move spec.portWindow elsewhere, so that the "
             "proxy gets another range"
         )
-        return finding(rosproxy, "PortsExhausted", text)
+        return finding(rosproxy, "PortsExhausted", Fault(text, fix))
 
-    def _exhaustion(self, place: ProxyPlace, error: PortsExhausted) -> str:
+    def _exhaustion(self, place: ProxyPlace, error: PortsExhausted) -> Fault:
         """Return why a proxy gets no range, and the fix."""
         window = error.window
         reasons = [f"{subject} {r}" for subject, r in self.kernel.items() if overlap(r, window)]
@@ -240,7 +244,7 @@ class _Node(msgspec.Struct):
         reason = ", ".join(reasons) or "ports that the node refused a short time ago"
         fix = f"Widen spec.portWindow ({window}), or lower spec.ports ({error.count})"
         fix += ", or delete one of these pods" if holders else ""
-        return f"{error}. Not available: {reason}. {fix}"
+        return Fault(f"{error}. Not available: {reason}", fix)
 
     def _other_pods(self, place: ProxyPlace) -> list[Pod]:
         """Return all other pods that hold ports on the node."""

@@ -22,7 +22,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.setting_kinds import read_peer, read_site_link
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.port_ranges import within
-from rosproxy_operator.common.problem import NOT_ALLOWED
+from rosproxy_operator.common.problem import NOT_ALLOWED, Fault
 from rosproxy_operator.kubernetes.resources.checks import quoted
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.model import (
@@ -52,11 +52,11 @@ def within_bounds(observed: ClusterSnapshot, settings: ClusterSettings) -> Clust
     """
     refused: dict[str, InvalidRosProxy] = {}
     for rosproxy in observed.rosproxies:
-        text = "" if rosproxy.deleting else bounds_violation(rosproxy, observed.consents, settings)
-        if text:
-            refused[rosproxy.uid] = InvalidRosProxy(
-                rosproxy.id, rosproxy.uid, rosproxy.generation, text, rosproxy.status, NOT_ALLOWED
-            )
+        fault = bounds_violation(rosproxy, observed.consents, settings)
+        if fault and not rosproxy.deleting:
+            of = (rosproxy.id, rosproxy.uid, rosproxy.generation)
+            status = rosproxy.status
+            refused[rosproxy.uid] = InvalidRosProxy(*of, *fault, status, NOT_ALLOWED)
     if not refused:
         return observed
     return replace(
@@ -66,13 +66,15 @@ def within_bounds(observed: ClusterSnapshot, settings: ClusterSettings) -> Clust
     )
 
 
-def bounds_violation(rosproxy: RosProxy, consents: Consents, settings: ClusterSettings) -> str:
-    """Return the first violation of a RosProxy: field, value and fix; empty if there is none."""
+def bounds_violation(
+    rosproxy: RosProxy, consents: Consents, settings: ClusterSettings
+) -> Fault | None:
+    """Return the first violation of a RosProxy: field, value and fix; None if there is none."""
     objections = (
         *_violations(rosproxy.spec, settings),
         _missing_consent(rosproxy, consents),
     )
-    return next(filter(None, objections), "")
+    return next(filter(None, objections), None)
 
 
 def is_allowed_master(master: str, allowed: tuple[str, ...]) -> bool:
@@ -89,7 +91,7 @@ def is_allowed_master(master: str, allowed: tuple[str, ...]) -> bool:
     return any(is_address(host_port.host) or not _ADDRESS_PATTERN.fullmatch(p) for p in matching)
 
 
-def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
+def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[Fault]:
     """Yield the violations of the administrator's bounds."""
     bounds = settings.bounds
     if bounds.masters and spec.ros1:
@@ -107,7 +109,7 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
         yield _refusal("spec.image", spec.image, f"Remove the field{choice}", "allow.images")
 
 
-def _violations_of_versions(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
+def _violations_of_versions(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[Fault]:
     """Yield the violations in the fields for DDS, for rmw_zenoh, and for all but rmw_zenoh."""
     if spec.ros2:
         yield from _peer_violations("spec.peers", spec.ros2.peers, spec, settings.bounds)
@@ -123,14 +125,14 @@ def _violations_of_versions(spec: RosProxySpec, settings: ClusterSettings) -> It
     yield from _data_plane_violations(spec, settings.bounds)
 
 
-def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
+def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[Fault]:
     """Yield the violation in the multicast of ROS 2."""
     if spec.multicast and not bounds.multicast:
         fix = "Remove the field, and name the hosts outside in spec.peers"
         yield _refusal("spec.multicast", True, fix, "allow.multicast")
 
 
-def _zenoh_violations(spec: ZenohSpec, settings: ClusterSettings) -> Iterator[str]:
+def _zenoh_violations(spec: ZenohSpec, settings: ClusterSettings) -> Iterator[Fault]:
     """Yield the violation in listen, and rules of the administrator that zenoh can't hold."""
     if spec.listen and spec.listen.type not in settings.bounds.listen:
         others = " or ".join(settings.bounds.listen)
@@ -139,15 +141,15 @@ def _zenoh_violations(spec: ZenohSpec, settings: ClusterSettings) -> Iterator[st
     try:
         check_layers(settings.policy)
     except ValueError as error:
-        yield (
-            f"spec.ros: rmw_zenoh can't hold the operator's policy: {error}. Ask the operator's "
-            "administrator to change the rules (chart value policy.rules)"
+        yield Fault(
+            f"spec.ros: rmw_zenoh can't hold the operator's policy: {error}",
+            "Ask the operator's administrator to change the rules (chart value policy.rules)",
         )
 
 
 def _peer_violations(
     field: str, peers: Iterable[str], spec: RosProxySpec, bounds: Bounds
-) -> Iterator[str]:
+) -> Iterator[Fault]:
     """Yield the violations in ``spec.peers``, or in the hosts of ``spec.link.to``.
 
     If the RosProxy itself gives addresses for a host name, these count instead of the host name.
@@ -168,14 +170,14 @@ def _bracketed(pattern: str) -> str:
     return f"[{pattern}]" if ":" in pattern and not pattern.startswith("[") else pattern
 
 
-def _data_plane_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
+def _data_plane_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[Fault]:
     if spec.proxy.data_plane not in bounds.data_planes:
         choices = " or ".join(p.capitalize() for p in bounds.data_planes)
         value = spec.proxy.data_plane.capitalize()
         yield _refusal("spec.dataPlane", value, f"Choose {choices}", "allow.dataPlanes")
 
 
-def _port_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
+def _port_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[Fault]:
     """Yield the violations in the hostPorts."""
     if spec.ports > bounds.max_ports:
         fix = f"Ask for {bounds.max_ports} at most"
@@ -192,10 +194,10 @@ def _any_of(patterns: Iterable[str]) -> str:
     return " or ".join(map(quoted, islice(patterns, MOST_PATTERNS)))
 
 
-def _refusal(field: str, value: object, fix: str, allowing: str) -> str:
-    return (
-        f"{field}: the operator does not allow {quoted(value)}. {fix}, or ask the operator's "
-        f"administrator to allow the value (chart value {allowing})"
+def _refusal(field: str, value: object, fix: str, allowing: str) -> Fault:
+    return Fault(
+        f"{field}: the operator does not allow {quoted(value)}",
+        f"{fix}, or ask the operator's administrator to allow the value (chart value {allowing})",
     )
 
 
@@ -229,22 +231,22 @@ def _fits(text: str, pattern: str) -> bool:
     return fnmatchcase(text, pattern.replace("[", "[[]"))
 
 
-def _missing_consent(rosproxy: RosProxy, consents: Consents) -> str:
-    """Return the missing consent for a master in another namespace, with the fix; else empty.
+def _missing_consent(rosproxy: RosProxy, consents: Consents) -> Fault | None:
+    """Return the missing consent for a master in another namespace, with the fix; else None.
 
     The text does not tell whether the Service exists: only the other namespace may know that.
     """
     service = rosproxy.spec.master.service
     namespace = rosproxy.id.namespace
     if service is None or service.namespace == namespace:
-        return ""
+        return None
     allowed = consents.get(service, frozenset())
     if allowed & {namespace, _ANY_NAMESPACE}:
-        return ""
+        return None
     value = ",".join(sorted({*allowed, namespace}))
-    return (
+    return Fault(
         f"spec.master.service.namespace: namespace {quoted(service.namespace)} does not allow "
-        f"RosProxies of namespace {quoted(namespace)} to use this master. Ask a user that may "
-        "change the Service to run kubectl "
-        f"-n {service.namespace} annotate --overwrite service {service.name} {ALLOW_FROM}={value}"
+        f"RosProxies of namespace {quoted(namespace)} to use this master",
+        f"Ask a user that may change the Service to run kubectl -n {service.namespace} annotate "
+        f"--overwrite service {service.name} {ALLOW_FROM}={value}",
     )

@@ -11,6 +11,7 @@ from typing import TypeVar
 import msgspec
 
 from rosproxy.telemetry.text import listed
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.planner.pods.selection import (
     ambiguity_warning,
     on_node,
@@ -154,9 +155,9 @@ def _selected_pods(
         if selects(r, pod)
     ]
     findings += [
-        pod_finding(pod, r, "Ambiguous", text, fatal=False)
+        pod_finding(pod, r, "Ambiguous", fault, fatal=False)
         for choice, pod in choices
-        if isinstance(choice, RosProxy) and (text := ambiguity_warning(pod, rosproxies.values()))
+        if isinstance(choice, RosProxy) and (fault := ambiguity_warning(pod, rosproxies.values()))
         for r in rosproxies.values()
         if selects(r, pod)
     ]
@@ -187,10 +188,10 @@ def _wanted(
             continue
         text = (
             f"node {place.node} does not match spec.nodeSelector, so selected pods there have no "
-            f"proxy: {abbreviated(str(pod.id) for pod in pods)}. Widen spec.nodeSelector, or set "
-            "the same nodeSelector in the pods"
+            f"proxy: {abbreviated(str(pod.id) for pod in pods)}"
         )
-        findings.append(finding(rosproxy, "NodeLeftOut", text))
+        fix = "Widen spec.nodeSelector, or set the same nodeSelector in the pods"
+        findings.append(finding(rosproxy, "NodeLeftOut", Fault(text, fix)))
     return wanted, findings
 
 

@@ -8,7 +8,7 @@ single Event.
 from collections.abc import Iterable, Iterator
 from heapq import nsmallest
 
-from rosproxy_operator.common.problem import UNKNOWN_NAME
+from rosproxy_operator.common.problem import UNKNOWN_NAME, Fault
 from rosproxy_operator.kubernetes.planner.cluster_view import View, group_by_key
 from rosproxy_operator.kubernetes.planner.pods.wiring import edit_fix
 from rosproxy_operator.kubernetes.resources.model import (
@@ -26,7 +26,7 @@ MOST_PODS = 10
 def misspellings(view: View, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
     """Yield the findings about names at a RosProxy, at its nodes and at the master's Service."""
     observed = view.observed
-    yield from (finding(rosproxy, UNKNOWN_NAME, text) for text in rosproxy.misspelt)
+    yield from (finding(rosproxy, UNKNOWN_NAME, Fault(text)) for text in rosproxy.misspelt)
     for place in view.places.get(rosproxy.id, ()):
         node = observed.nodes.get(place.node)
         yield from _others(rosproxy, f"node {place.node}", node.misspelt if node else ())
@@ -37,7 +37,7 @@ def misspellings(view: View, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
 
 
 def _others(rosproxy: RosProxy, subject: str, texts: Iterable[str]) -> Iterator[ClusterFinding]:
-    return (finding(rosproxy, UNKNOWN_NAME, text, subject=subject) for text in texts)
+    return (finding(rosproxy, UNKNOWN_NAME, Fault(text), subject=subject) for text in texts)
 
 
 def misspelt_pod_findings(view: View) -> Iterator[ClusterFinding]:
@@ -50,10 +50,10 @@ def misspelt_pod_findings(view: View) -> Iterator[ClusterFinding]:
             about = Reference("Pod", pod.id, pod.uid)
             fix = edit_fix("Correct the name in the template", pod)
             for text in pod.misspelt:
-                joint = " " if text.endswith("?") else ". "
                 yield ClusterFinding(
                     f"pod {pod.id}",
-                    f"{text}{joint}{fix}",
+                    text,
+                    fix,
                     fatal=False,
                     reason=UNKNOWN_NAME,
                     of=of,

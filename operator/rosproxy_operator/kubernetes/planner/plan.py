@@ -17,6 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping
 import msgspec
 from msgspec.structs import replace
 
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.planner import departures
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
@@ -146,7 +147,8 @@ def plan(
         problems += own_problems
         actions += own
     for invalid in observed.unusable.values():
-        problems.append(finding(invalid, invalid.reason, invalid.text, fatal=True))
+        fault = Fault(invalid.text, invalid.fix)
+        problems.append(finding(invalid, invalid.reason, fault, fatal=True))
         actions += _patch(context, invalid, status_of_invalid(invalid, stamp))
     unique = tuple(dict.fromkeys(problems))
     warnings = events.warnings(unique, decided.reported, now)
@@ -283,7 +285,7 @@ def _problems(
     unlisted = context.observed.policies_error if context.settings.network_policy else ""
     text = f"the operator can't list NetworkPolicies, so this RosProxy gets none: {unlisted}"
     return (
-        *((finding(rosproxy, "NoNetworkPolicy", text),) if unlisted else ()),
+        *((finding(rosproxy, "NoNetworkPolicy", Fault(text)),) if unlisted else ()),
         *findings(rosproxy, states, context.retries.failures(rosproxy.id)),
         *(f for f in (*shared, *context.ranges.findings) if f.of == rosproxy.id),
         *filter(

@@ -21,7 +21,7 @@ from rosproxy_operator.common.port_ranges import (
     new_moves,
     overlap,
 )
-from rosproxy_operator.common.problem import CONFLICT
+from rosproxy_operator.common.problem import CONFLICT, Fault
 from rosproxy_operator.kubernetes.planner.cluster_view import View, has_ports, place_of, serves
 from rosproxy_operator.kubernetes.planner.former_ports import FormerPorts, remember
 from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
@@ -136,12 +136,13 @@ def moves(
             rosproxy = view.rosproxies[place.of]
             if place in ranges and is_moved(move.ports, ranges[place]):
                 why = "the old ports are not free. Nothing needs to be done"
+                fix = ""
                 if has_served:
-                    lost = advice_after_move(rosproxy.spec.ros1, rosproxy.spec.ros2 is not None)
-                    why = f"the old ports are taken, or the RosProxy no longer allows them. {lost}"
+                    why = "the old ports are taken, or the RosProxy no longer allows them"
+                    fix = advice_after_move(rosproxy.spec.ros1, rosproxy.spec.ros2 is not None)
                 change = f"has left ports {move.ports} for {ranges[place]}"
                 text = f"the proxy on node {place.node} {change}, since {why}"
-                yield finding(rosproxy, CONFLICT, text)
+                yield finding(rosproxy, CONFLICT, Fault(text, fix))
 
 
 def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:

@@ -8,6 +8,7 @@ of the two says so.
 from collections.abc import Iterator, Mapping
 
 from rosproxy.telemetry.text import listed
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.planner.cluster_view import View, group_by_key
 from rosproxy_operator.kubernetes.resources.cluster import ZenohReport
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, ProxyPlace, RosProxy
@@ -43,11 +44,15 @@ def apart_findings(apart: Apart, rosproxy: RosProxy, now: float) -> Iterator[Clu
     for place, nodes in sorted(group_by_key(due).items()):
         text = (
             f"the hub is not linked with the hubs on node {listed(sorted(nodes))}, so messages "
-            f"between pods of these nodes may not pass. Let the proxies connect to each other at "
-            f"port {HUB_PORT} (NetworkPolicy, firewall), and check that pods resolve "
-            f"{hub_address(place.of, nodes[0]).host}"
+            "between pods of these nodes may not pass"
         )
-        yield finding(rosproxy, "HubsApart", text, subject=f"proxy on node {place.node}")
+        fix = (
+            f"Let the proxies connect to each other at port {HUB_PORT} (NetworkPolicy, firewall), "
+            f"and check that pods resolve {hub_address(place.of, nodes[0]).host}"
+        )
+        yield finding(
+            rosproxy, "HubsApart", Fault(text, fix), subject=f"proxy on node {place.node}"
+        )
 
 
 def due_in(since: float, now: float) -> float:

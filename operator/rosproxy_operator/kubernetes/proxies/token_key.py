@@ -89,9 +89,9 @@ class TokenKey:
             f"Secret {self._secret}: {error}. The key of the proxies' tokens is in memory only, and"
             " the operator replaces the proxies at its next start"
         )
-        if isinstance(error, ApiNotFound):
-            text += ". Create an empty Secret of this name (the chart does so)"
-        self.problems = (Problem("proxies' tokens", text, reason="KeyNotStored"),)
+        is_missing = isinstance(error, ApiNotFound)
+        fix = "Create an empty Secret of this name (the chart does so)" if is_missing else ""
+        self.problems = (Problem("proxies' tokens", text, fix, reason="KeyNotStored"),)
 
 
 def _read(secret: Json) -> bytes:

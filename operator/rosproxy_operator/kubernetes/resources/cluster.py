@@ -7,6 +7,7 @@ import msgspec
 
 from rosproxy.admin.status_document import RangeProbeStatus
 from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     InvalidRosProxy,
@@ -211,6 +212,7 @@ class Obstacle(msgspec.Struct, frozen=True):
 
     reason: str
     text: str
+    fix: str = ""
 
 
 class RosProxyOnNode(msgspec.Struct, frozen=True):
@@ -293,7 +295,7 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     services: Mapping[Name, ProxyService] = {}
     hub_services: Mapping[Name, ProxyService] = {}
     outside_services: Mapping[Name, ProxyService] = {}
-    masters: Mapping[Name, tuple[str, str]] = {}
+    masters: Mapping[Name, tuple[str, Fault | None]] = {}
     consents: Mapping[Name, frozenset[str]] = {}
     selected: frozenset[str] = frozenset()
     unselected_pods: tuple[Pod, ...] = ()

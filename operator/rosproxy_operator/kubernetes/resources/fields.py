@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.resources.checks import quoted
 
 N = TypeVar("N", int, float)
@@ -17,7 +18,11 @@ _EMPTY_MAP: Mapping[str, Any] = {}
 
 
 class InvalidField(Exception):
-    """An object is unusable. The message has the field, the problem and the fix."""
+    """An object is unusable. The fault has the field, the problem and the fix."""
+
+    def __init__(self, text: str, fix: str = "") -> None:
+        self.fault = Fault(text, fix)
+        super().__init__(str(self.fault))
 
 
 class Field(msgspec.Struct, frozen=True):
@@ -33,7 +38,7 @@ class Field(msgspec.Struct, frozen=True):
 
     def error(self, problem: str, fix: str) -> InvalidField:
         """Return the error to raise for this field."""
-        return InvalidField(f"{self.path}: {quoted(self.value)} {problem}. {fix}")
+        return InvalidField(f"{self.path}: {quoted(self.value)} {problem}", fix)
 
     def __getitem__(self, key: str) -> "Field":
         return Field(f"{self.path}.{key}", self.map().get(key))

@@ -329,12 +329,13 @@ class ClusterFinding(Problem):
 class InvalidRosProxy(msgspec.Struct, frozen=True):
     """A RosProxy that the operator can't read, or that asks for more than allowed.
 
-    ``text`` is the reason for users, ``reason`` a CamelCase word.
+    ``text`` says what is wrong. ``reason`` is a CamelCase word.
     """
 
     id: Name
     uid: str
     generation: int
     text: str
+    fix: str = ""
     status: Json = {}
     reason: str = INVALID

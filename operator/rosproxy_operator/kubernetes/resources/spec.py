@@ -162,7 +162,8 @@ def invalid(obj: Json, error: InvalidField) -> InvalidRosProxy:
     status = submap(obj, "status")
     uid = text_at(meta, "uid")
     generation = int_at(meta, "generation")
-    return InvalidRosProxy(name_of(meta), uid, generation, str(error), status)
+    text, fix = error.fault
+    return InvalidRosProxy(name_of(meta), uid, generation, text, fix, status)
 
 
 def _spec(field: Field, of: Name) -> RosProxySpec:
@@ -417,7 +418,7 @@ def _policy(field: Field, of: Name) -> tuple[PolicyLayer, ...]:
     rules = tuple(rule for r in field["rules"].items() for rule in _rules(r))
     layers = (PolicyLayer(f"RosProxy {of}", rules, mode),) if rules else ()
     if problem := excess_reason(layers):
-        raise InvalidField(f"{field['rules'].path}: {problem}. Join names or nodes by globs")
+        raise InvalidField(f"{field['rules'].path}: {problem}", "Join names or nodes by globs")
     return layers
 
 
@@ -450,8 +451,8 @@ def _window(field: Field, ports: int) -> PortRange:
     )
     if window.last - window.first + 1 < ports:
         raise InvalidField(
-            f"{field.path}: {window} has fewer than the {ports} ports of spec.ports. Widen "
-            "spec.portWindow, or lower spec.ports"
+            f"{field.path}: {window} has fewer than the {ports} ports of spec.ports",
+            "Widen spec.portWindow, or lower spec.ports",
         )
     return window
 
@@ -528,7 +529,7 @@ def _master(field: Field, of: Name) -> MasterSpec:
     if service.value is None:
         return MasterSpec(uri=_uri(uri, of), address=_address(address), publish=publish)
     if address.value is not None:
-        raise InvalidField(f"{address.path}: goes with uri only. Remove the field")
+        raise InvalidField(f"{address.path}: goes with uri only", "Remove the field")
     port = service["port"].number(MASTER_PORT, 1, 65535)
     return MasterSpec(service=_service(service, of), service_port=port, publish=publish)
 

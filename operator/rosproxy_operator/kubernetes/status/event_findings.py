@@ -95,8 +95,9 @@ def _messages(rosproxies: Iterable[Json]) -> Iterator[str]:
 
 
 def _is_in_condition(event: RecentEvent, messages: Iterable[str]) -> bool:
-    text = event.message.removesuffix("…")
-    return any(text in message for message in messages)
+    # An ellipsis stands for the end of what is wrong, before the fix.
+    parts = event.message.split("…")
+    return any(all(part in message for part in parts) for message in messages)
 
 
 def _read(event: Json, now: float) -> RecentEvent:

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 
 import msgspec
 
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateHelper,
@@ -215,11 +216,13 @@ def _warning(finding: ClusterFinding) -> Emit:
     assert reference is not None  # noqa: S101 - `warnings` skips findings without `about`
     itself = finding.subject == f"{reference.kind.lower()} {reference.id}"
     text = finding.text if itself else f"{finding.subject}: {finding.text}"
-    return Emit(finding.of, reference, "Warning", finding.reason, _bounded(text))
+    message = str(Fault(text, finding.fix).shortened(MOST_MESSAGE_BYTES, _bounded))
+    return Emit(finding.of, reference, "Warning", finding.reason, message)
 
 
-def _bounded(text: str) -> str:
-    if len(text.encode()) <= MOST_MESSAGE_BYTES:
+def _bounded(text: str, most: int = MOST_MESSAGE_BYTES) -> str:
+    """Return the text, cut to ``most`` bytes at most. A cut text ends in an ellipsis."""
+    if len(text.encode()) <= most:
         return text
     # The ellipsis has three bytes. `ignore` drops a character that the bound cuts.
-    return text.encode()[: MOST_MESSAGE_BYTES - 3].decode(errors="ignore") + "…"
+    return text.encode()[: most - 3].decode(errors="ignore") + "…"

@@ -14,7 +14,7 @@ from rosproxy_operator.common.problem import (
     REFUSES,
     SILENT,
     STUCK,
-    bounded,
+    Fault,
     ends_again,
     silent,
 )
@@ -83,7 +83,8 @@ def node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> list[ClusterFind
 
 def _node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> Iterator[ClusterFinding]:
     if state.obstacle is not None:
-        yield _finding(rosproxy, f"node {state.name}", state.obstacle.text, state.obstacle.reason)
+        fault = Fault(state.obstacle.text, state.obstacle.fix)
+        yield _finding(rosproxy, f"node {state.name}", fault, state.obstacle.reason)
     relay = state.lan_relay
     if relay is not None and relay.stuck is not None and not relay.pod.deleting:
         yield _lan_relay_stuck(rosproxy, relay)
@@ -101,27 +102,33 @@ def _node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> Iterator[Cluste
 
 
 def finding(
-    of: RosProxy | InvalidRosProxy, reason: str, text: str, fatal: bool = False, subject: str = ""
+    of: RosProxy | InvalidRosProxy,
+    reason: str,
+    fault: Fault,
+    fatal: bool = False,
+    subject: str = "",
 ) -> ClusterFinding:
     """A finding about a RosProxy or a ``subject`` of the RosProxy, with an Event."""
     subject = subject or f"rosproxy {of.id}"
     about = Reference(KIND, of.id, of.uid)
-    return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=of.id, about=about)
+    return ClusterFinding(subject, *fault, fatal=fatal, reason=reason, of=of.id, about=about)
 
 
 def pod_finding(
-    pod: Pod, rosproxy: RosProxy, reason: str, text: str, fatal: bool = True
+    pod: Pod, rosproxy: RosProxy, reason: str, fault: Fault, fatal: bool = True
 ) -> ClusterFinding:
     """A finding about a pod that a RosProxy selects, with an Event on the pod."""
     subject = f"pod {pod.id}"
     about = Reference("Pod", pod.id, pod.uid)
-    return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=rosproxy.id, about=about)
+    return ClusterFinding(subject, *fault, fatal=fatal, reason=reason, of=rosproxy.id, about=about)
 
 
-def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> ClusterFinding:
-    return finding(
-        rosproxy, reason, bounded(text, _MOST_TEXT_CHARACTERS), fatal=True, subject=subject
-    )
+def _finding(
+    rosproxy: RosProxy, subject: str, fault: Fault, reason: str, fatal: bool = True
+) -> ClusterFinding:
+    """A finding of bounded length."""
+    short = fault.shortened(_MOST_TEXT_CHARACTERS)
+    return finding(rosproxy, reason, short, fatal=fatal, subject=subject)
 
 
 def proxy_subject(proxy: ProxyPod) -> str:
@@ -133,21 +140,26 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: PodFailure) -> ClusterFin
     id = proxy.pod.id
     error = proxy.message
     command = f"kubectl -n {id.namespace} describe pod {id.name}"
-    texts = {
-        PodFailure.PORTS: f"ports {proxy.range} are not all free on the node ({error}). The "
-        "operator tries other ports. Set a spec.portWindow without the ports that other programs "
-        "use",
-        PodFailure.SCHEDULING: f"the scheduler or the kubelet does not admit the pod ({error}). "
-        f"{scheduling_fix(error)}. Read {command}",
-        PodFailure.IMAGE: f"the node can't get the image {proxy.image} ({error}). "
-        + image_fix(error),
+    faults = {
+        PodFailure.PORTS: Fault(
+            f"ports {proxy.range} are not all free on the node ({error}). The operator tries other "
+            "ports",
+            "Set a spec.portWindow without the ports that other programs use",
+        ),
+        PodFailure.SCHEDULING: Fault(
+            f"the scheduler or the kubelet does not admit the pod ({error})",
+            f"{scheduling_fix(error)}. Read {command}",
+        ),
+        PodFailure.IMAGE: Fault(
+            f"the node can't get the image {proxy.image} ({error})", image_fix(error)
+        ),
         PodFailure.CRASHING: ends_again(
             error, f"kubectl -n {id.namespace} logs --previous {id.name}"
         ),
-        PodFailure.SANDBOX: f"the node can't start the pod ({error}). Read {command}",
+        PodFailure.SANDBOX: Fault(f"the node can't start the pod ({error})", f"Read {command}"),
     }
     reason = CONFLICT if cause is PodFailure.PORTS else STUCK
-    return _finding(rosproxy, proxy_subject(proxy), texts[cause], reason)
+    return _finding(rosproxy, proxy_subject(proxy), faults[cause], reason)
 
 
 def _unusable(rosproxy: RosProxy, check: HelperPod, proxy: ProxyPod) -> ClusterFinding:
@@ -165,19 +177,19 @@ def _unusable(rosproxy: RosProxy, check: HelperPod, proxy: ProxyPod) -> ClusterF
     else:
         text = f"the pod that tests the image {check.image} does not run ({check.message})"
         fix = f"Read kubectl -n {id.namespace} describe pod {id.name}"
-    kept = f"{text}. So proxy {proxy.pod.id.name} keeps the image {proxy.image}. {fix}"
-    subject = f"node {check.node}"
-    return finding(rosproxy, "ImageUnusable", bounded(kept, _MOST_TEXT_CHARACTERS), subject=subject)
+    fault = Fault(f"{text}. So proxy {proxy.pod.id.name} keeps the image {proxy.image}", fix)
+    return _finding(rosproxy, f"node {check.node}", fault, "ImageUnusable", fatal=False)
 
 
 def _lan_relay_stuck(rosproxy: RosProxy, lan_relay: HelperPod) -> ClusterFinding:
     id = lan_relay.pod.id
     text = (
         f"the pod does not run ({lan_relay.message}), so no discovery passes between the LAN and "
-        f"the proxy. Read kubectl -n {id.namespace} describe pod {id.name}"
+        "the proxy"
     )
+    fault = Fault(text, f"Read kubectl -n {id.namespace} describe pod {id.name}")
     subject = f"LAN relay {id.name} on node {lan_relay.node}"
-    return finding(rosproxy, LAN_RELAY_STUCK, bounded(text, _MOST_TEXT_CHARACTERS), subject=subject)
+    return _finding(rosproxy, subject, fault, LAN_RELAY_STUCK, fatal=False)
 
 
 def _answered(
@@ -195,14 +207,14 @@ def _answered(
                 f"{ADMIN_PORT} of this pod (NetworkPolicy)"
             )
             # No Event: an operator that reaches no proxy would create an Event for each proxy.
-            yield ClusterFinding(subject, silent(answer.error, fix), reason=SILENT, of=rosproxy.id)
+            yield ClusterFinding(subject, *silent(answer.error, fix), reason=SILENT, of=rosproxy.id)
         return
     if answer.refusal:
-        yield _finding(rosproxy, subject, answer.refusal, REFUSES)
+        yield _finding(rosproxy, subject, Fault(answer.refusal), REFUSES)
     if not answer.master_up:
         fix = _master_remedy(rosproxy, answer.error)
-        text = f"does not reach the master ({answer.error}). {fix}"
-        yield _finding(rosproxy, subject, text, NO_MASTER)
+        fault = Fault(f"does not reach the master ({answer.error})", fix)
+        yield _finding(rosproxy, subject, fault, NO_MASTER)
     probe = answer.range_probe
     if probe is not None and probe.reached is False:
         yield _finding(rosproxy, subject, no_way_in(state, probe), NO_WAY_IN)
@@ -213,7 +225,7 @@ def _told(rosproxy: RosProxy, subject: str, problem: str) -> ClusterFinding:
     """The finding for a problem that a proxy reports."""
     reason = next((r for begin, r in _OF_ZENOH.items() if problem.startswith(begin)), "")
     if reason:
-        return finding(rosproxy, reason, bounded(problem, _MOST_TEXT_CHARACTERS), subject=subject)
+        return _finding(rosproxy, subject, Fault(problem), reason, fatal=False)
     return ClusterFinding(subject, problem, fatal=False, reason=WARNS, of=rosproxy.id)
 
 
@@ -245,8 +257,7 @@ def _master_remedy(rosproxy: RosProxy, error: str) -> str:
 
 def _refused(rosproxy: RosProxy, id: Name, text: str) -> ClusterFinding:
     message = clean(" ".join(text.split()))
-    remedy = admission_fix(message, rosproxy)
+    fix = admission_fix(message, rosproxy)
     problem = "the operator could not create, change or delete this object"
-    message = message[: _MOST_TEXT_CHARACTERS - len(f"{problem} (). {remedy}")]
-    text = f"{problem} ({message}). {remedy}"
-    return _finding(rosproxy, str(id), text, NOT_ADMITTED)
+    message = message[: _MOST_TEXT_CHARACTERS - len(f"{problem} (). {fix}")]
+    return _finding(rosproxy, str(id), Fault(f"{problem} ({message})", fix), NOT_ADMITTED)

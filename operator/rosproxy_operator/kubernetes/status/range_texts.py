@@ -7,6 +7,7 @@ from outside (`range_probe`).
 
 from rosproxy.admin.status_document import RangeProbeStatus
 from rosproxy.fixes import FIXES
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.resources.cluster import RosProxyOnNode
 
 ADDRESS_FIX = FIXES["advertised host"].kubernetes
@@ -39,13 +40,14 @@ _BY_OUTCOME = {
 """The cause and the fix, by the outcome of the proxy's own test."""
 
 
-def no_way_in(state: RosProxyOnNode, probe: RangeProbeStatus) -> str:
-    """The text that outside does not reach the proxy of a node, with the fix.
+def no_way_in(state: RosProxyOnNode, probe: RangeProbeStatus) -> Fault:
+    """The fault that outside does not reach the proxy of a node.
 
     The text leaves out the tested ports: each test takes other ports, and each text is an Event.
     """
     cause, fix = _BY_OUTCOME.get(probe.from_proxy, ("the test failed", PORTS_FIX))
-    return f"outside does not reach {_target(state)} ({cause}). {fix[:1].upper()}{fix[1:]}"
+    text = f"outside does not reach {_target(state)} ({cause})"
+    return Fault(text, f"{fix[:1].upper()}{fix[1:]}")
 
 
 def not_proven(state: RosProxyOnNode, probe: RangeProbeStatus | None) -> str:

@@ -8,7 +8,7 @@ import msgspec
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.telemetry.text import brief, plural, shorten
-from rosproxy_operator.common.problem import CONFLICT, EXHAUSTED, bounded
+from rosproxy_operator.common.problem import CONFLICT, EXHAUSTED, Fault, bounded
 from rosproxy_operator.common.zenoh import OVERRIDE, client_override, tcp_endpoint
 from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
 from rosproxy_operator.kubernetes.resources.cluster import (
@@ -211,7 +211,7 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
     All other conditions stay, because the operator leaves the existing proxies as they are.
     """
     former = rosproxy.status
-    text = rosproxy.text
+    text = str(Fault(rosproxy.text, rosproxy.fix).shortened(MOST_MESSAGE_CHARACTERS))
     conditions = [_read(condition) for condition in submaps(former, "conditions")]
     judged = [
         Condition(READY, "False", rosproxy.reason, text),
@@ -221,7 +221,7 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
     return {
         **former,
         "observedGeneration": rosproxy.generation,
-        "message": bounded(text, MOST_MESSAGE_CHARACTERS),
+        "message": text,
         "conditions": _conditions(judged, former, rosproxy.generation, stamp),
     }
 
@@ -410,7 +410,8 @@ def _read(condition: Json) -> Condition:
 
 
 def _one_line(problem: ClusterFinding) -> str:
-    return f"{problem.subject}: {problem.text}"
+    fault = Fault(f"{problem.subject}: {problem.text}", problem.fix)
+    return str(fault.shortened(MOST_MESSAGE_CHARACTERS))
 
 
 def _ready(

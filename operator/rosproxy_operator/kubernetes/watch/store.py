@@ -17,6 +17,7 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from rosproxy.net.addresses import is_address, plain_address
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.api.api_client import (
     ApiError,
     ApiNotFound,
@@ -378,7 +379,7 @@ def _requested(record: Record | None) -> object:
         asked = record.uid, record.generation, record.deleting, record.spec, record.remakes
         return *asked, record.misspelt
     if isinstance(record, InvalidRosProxy):
-        return record.uid, record.generation, record.text
+        return record.uid, record.generation, record.text, record.fix
     return None
 
 
@@ -391,21 +392,27 @@ def _set(index: dict[str, dict[str, R]], name: str, key: str, record: R | None) 
         del index[name]
 
 
-def read_master(service: MasterService | None, id: Name, ports: Iterable[int]) -> tuple[str, str]:
-    """Return the address of a master's Service, and the problem of the Service.
+def read_master(
+    service: MasterService | None, id: Name, ports: Iterable[int]
+) -> tuple[str, Fault | None]:
+    """Return the address of a master's Service, and the fault of the Service.
 
-    Exactly one of the two is empty. ``ports`` are the ports that RosProxies name. The Service needs
+    Exactly one of the two is there. ``ports`` are the ports that RosProxies name. The Service needs
     at least one of these ports.
     """
+    fault = None
     if service is None:
-        return "", "does not exist. Create the Service, or correct spec.master.service"
+        fix = "Create the Service, or correct spec.master.service"
+        return "", Fault("does not exist", fix)
     if service.address == "None":
-        return "", "is headless. Delete the Service, and create it without clusterIP: None"
-    if not is_address(service.address):
-        return "", f"has no cluster IP (type {service.type}). Use a Service of type ClusterIP"
-    if service.ports.isdisjoint(ports):
+        fault = Fault("is headless", "Delete the Service, and create it without clusterIP: None")
+    elif not is_address(service.address):
+        text = f"has no cluster IP (type {service.type})"
+        fault = Fault(text, "Use a Service of type ClusterIP")
+    elif service.ports.isdisjoint(ports):
         has, wanted = (
             ", ".join(sorted(map(str, numbers))) or "none" for numbers in (service.ports, ports)
         )
-        return "", f"has no port {wanted} (its ports: {has}). Set spec.master.service.port"
-    return service.address, ""
+        text = f"has no port {wanted} (its ports: {has})"
+        fault = Fault(text, "Set spec.master.service.port")
+    return ("", fault) if fault else (service.address, None)

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from datetime import datetime
 
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
+from rosproxy_operator.common.problem import with_fix
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import (
     SOON,
@@ -137,10 +138,10 @@ class Injector:
             address, hold = self._address(rosproxy, dry_run)
             return wire(body, pod_variables(rosproxy, address), rosproxy.spec.host_aliases), hold
         if rosproxy is not None:
-            return Wiring(warnings=(UNWIRED + rosproxy.text,)), 0.0
-        text = why_not_selected(pod, usable)
-        reasons = [f"RosProxy {r.id.name}: {r.text}" for r in unusable.values()]
-        return Wiring(warnings=(". ".join([UNWIRED + text, *reasons]),) if text else ()), 0.0
+            return Wiring(warnings=(UNWIRED + rosproxy.message,)), 0.0
+        fault = why_not_selected(pod, usable)
+        reasons = [f"RosProxy {r.id.name}: {with_fix(r.text, r.fix)}" for r in unusable.values()]
+        return Wiring(warnings=(". ".join([f"{UNWIRED}{fault}", *reasons]),) if fault else ()), 0.0
 
     def _address(self, rosproxy: RosProxy, dry_run: bool) -> tuple[str, float]:
         """The cluster IP of a RosProxy's Service, and the seconds until all nodes know the Service.

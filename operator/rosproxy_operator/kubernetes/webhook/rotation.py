@@ -185,9 +185,9 @@ class SelfSigned:
     def _complain(self, error: ApiError) -> None:
         """Report that the Secret is unusable, so only this process has the certificate."""
         text = f"Secret {self._secret}: {error}. The certificate is in memory only"
-        if isinstance(error, ApiNotFound):
-            text += ". Create an empty Secret of this name (the chart does so)"
-        self.problems.append(Problem(_SUBJECT, text, reason=_REASON))
+        is_missing = isinstance(error, ApiNotFound)
+        fix = "Create an empty Secret of this name (the chart does so)" if is_missing else ""
+        self.problems.append(Problem(_SUBJECT, text, fix, reason=_REASON))
 
     def _read(self, secret: Json) -> KeyPair | None:
         data = texts_at(secret, "data")
@@ -221,10 +221,12 @@ class SelfSigned:
                 log.info(text, self._configuration)
         except ApiError as error:
             text = f"MutatingWebhookConfiguration {self._configuration}: {error}"
+            fix = ""
             if isinstance(error, ApiNotFound):
-                text += ". Without this object no pod is wired. Install the chart again"
+                text += ". Without this object no pod is wired"
+                fix = "Install the chart again"
             if not isinstance(error, ApiUnavailable):
-                self.problems.append(Problem(_SUBJECT, text, reason=_REASON))
+                self.problems.append(Problem(_SUBJECT, text, fix, reason=_REASON))
             return False
         return True
 

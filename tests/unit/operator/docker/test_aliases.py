@@ -61,7 +61,7 @@ def aliases(plan: DockerPlan, network: str = "app") -> set[str]:
 
 
 def told(plan: DockerPlan) -> list[str]:
-    return [problem.text for problem in plan.problems]
+    return [problem.message for problem in plan.problems]
 
 
 # the form of a name

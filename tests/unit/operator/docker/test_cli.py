@@ -146,9 +146,9 @@ def test_a_misspelt_variable_is_told_with_the_one_that_was_meant(
         "rosproxy_operator.docker.controller.run", lambda *given: told.extend(given[-1])
     )
     run("docker", ROSPROXY_PORT_WINDO="12000-12999", ROSPROXY_PORT_RANGE="11000-11009")
-    assert told == [
-        Problem("variable ROSPROXY_PORT_WINDO", misspelt, fatal=False, reason="UnknownName")
-    ]
+    (problem,) = told
+    assert (problem.subject, problem.text) == ("variable ROSPROXY_PORT_WINDO", misspelt)
+    assert (problem.fatal, problem.reason) == (False, "UnknownName")
 
 
 def test_uninstall_says_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -129,7 +129,7 @@ async def test_a_forged_container_is_told_and_left_alone(engine: FakeEngine, nam
     assert CreateSandbox in map(type, planned.actions)
     assert name not in {action.name for action in planned.actions}
     (told,) = [
-        problem.text for problem in planned.problems if problem.subject == f"container {name}"
+        problem.message for problem in planned.problems if problem.subject == f"container {name}"
     ]
     assert "ignores them" in told
     assert f"docker rm -f {name}" in told

@@ -103,7 +103,7 @@ def test_a_container_whose_label_is_outvoted_gets_a_problem() -> None:
         ("container a", False),
         ("container d", False),
     ]
-    assert plan.problems[0].text == (
+    assert plan.problems[0].message == (
         "label rosproxy.data-plane=copy is ignored: the proxy also serves container b, whose "
         "label asks for kernel. Give both containers the same value"
     )

@@ -125,7 +125,7 @@ def test_a_network_that_would_take_the_published_ports_is_not_joined(network: Ne
         return
     assert desired[PLACE].networks == {"app"}
     assert [problem.subject for problem in problems] == [f"network {network.name}"]
-    assert "its name sorts before the name of the uplink network 0-rosproxy" in problems[0].text
+    assert "its name sorts before the name of the uplink network 0-rosproxy" in problems[0].message
 
 
 def test_a_network_with_ipv6_takes_the_ports_of_an_uplink_without() -> None:
@@ -134,7 +134,7 @@ def test_a_network_with_ipv6_takes_the_ports_of_an_uplink_without() -> None:
     desired, problems = want(observed(container(), networks=(UPLINK, app)))
     assert desired[PLACE].networks == {"app"}
     assert [(problem.subject, problem.fatal) for problem in problems] == [("network app", False)]
-    assert "the network has IPv6, and the uplink network 0-rosproxy does not" in problems[0].text
+    assert "the network has IPv6, and the uplink network 0-rosproxy does not" in problems[0].message
     internal = replace(app, internal=True)
     uplink = replace(UPLINK, dual_stack=True)
     for networks in ((UPLINK, internal), (uplink, app)):
@@ -200,8 +200,8 @@ def test_who_looks_for_the_masters_name_then_is_told() -> None:
         Problem(
             "container talker",
             "the nodes look for the proxy by the name robot, but on network app that name belongs "
-            "to container robot. So the nodes bypass the proxy. Set "
-            "ROS_MASTER_URI=http://rosproxy:11311",
+            "to container robot. So the nodes bypass the proxy",
+            "Set ROS_MASTER_URI=http://rosproxy:11311",
             fatal=False,
             reason="NameTaken",
         ),
@@ -309,7 +309,7 @@ def test_an_earlier_container_with_a_wrong_port_is_named_in_the_problem() -> Non
     seen = observed(bad, container("good", bare, env=PLACE.master.uri), sandboxes=[sandbox(WRONG)])
     problems = named(seen).problems
     assert [problem.subject for problem in problems] == ["container good"]
-    assert problems[0].text == (
+    assert problems[0].message == (
         "the nodes look for the proxy by the name robot, but on network app that name belongs to "
         f"proxy {proxy_name(WRONG)} (for the master {WRONG.master.uri} of bad). So the nodes "
         f"bypass the proxy. Set ROS_MASTER_URI=http://{NAME}:11311 and the label "
@@ -340,7 +340,7 @@ def test_who_follows_the_advice_is_told_nothing_more(
         members, problems = read_members(seen, settings)
         problems += named(seen, settings).problems
         assert PLACE in {m.place for m in members if m.container.name == "talker"}
-        return [p.text for p in problems if p.subject == "container talker"]
+        return [p.message for p in problems if p.subject == "container talker"]
 
     texts = told(container(labels=labels, env=env))
     assert texts or env != PLACE.master.uri

@@ -78,7 +78,7 @@ def test_the_network_that_the_label_names_is_what_counts() -> None:
 def test_a_direction_that_can_not_be() -> None:
     members, (problem,) = read_members(observed(labelled("a", "inwards")))
     assert members == ()
-    assert problem.text.startswith("label rosproxy.direction='inwards' is none of out, both.")
+    assert problem.message.startswith("label rosproxy.direction='inwards' is none of out, both.")
 
 
 def test_an_exited_container_keeps_the_direction_for_the_grace() -> None:

@@ -106,7 +106,7 @@ async def test_what_fails_ends_its_group_and_is_tried_again_later(host: Host) ->
     assert host.done == [Start("c")]
     (problem,) = host.work.problems
     assert problem.subject.startswith("proxy rosproxy-one-")
-    assert problem.text.endswith(": no. do this")
+    assert problem.message.endswith(": no. do this")
     assert 0.5 < (host.work.again_in or 0) <= 1.0
     host.begin(group)
     assert not host.work.busy
@@ -151,7 +151,7 @@ async def test_the_first_cause_stays_visible(host: Host) -> None:
     host.does[Start("a")] = EngineError("no")
     await host.start(Group(ONE, (connect, Start("a"))))
     (problem,) = host.work.problems
-    assert problem.text.endswith(": network not found")
+    assert problem.message.endswith(": network not found")
 
 
 async def test_a_port_that_is_taken_is_no_failure_but_told(host: Host) -> None:
@@ -186,6 +186,6 @@ async def test_a_mistake_of_ours_is_a_problem_and_not_a_loop(
 ) -> None:
     host.does[Start("a")] = TypeError("oops")
     await host.start(Group(ONE, (Start("a"),)))
-    assert host.work.problems[0].text == "the operator failed: TypeError('oops')"
+    assert host.work.problems[0].message == "the operator failed: TypeError('oops')"
     assert (host.work.again_in or 0) > 0.5
     assert "Traceback" in caplog.text

@@ -1,6 +1,6 @@
 """Conntrack entries for a sandbox's UDP ports are deleted after each start of the sandbox."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
@@ -8,6 +8,7 @@ from msgspec import structs
 
 from rosproxy.admin.doctor_finding import Severity
 from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.doctor import host_findings
 from rosproxy_operator.docker.engine_json import check_inspection, read_making
 from rosproxy_operator.docker.planner.actions import Action, CreateFlush, Remove, Run
@@ -202,13 +203,12 @@ def test_where_it_fails_users_are_told_the_command_and_nothing_else_waits() -> N
 
 def test_the_doctor_prints_the_command_as_a_warning() -> None:
     (group,) = groups(published())
-    text = f"{group.actions[-1]}: ended with 1. {group.fix}"
-    problem = {"subject": group.subject, "text": text, "fatal": group.fatal}
-    status: dict[str, Any] = {"problems": [problem], "proxies": [], "actions": []}
+    problem = Problem(group.subject, "ended with 1", group.fix, group.fatal, reason="X")
+    status: dict[str, Any] = {"problems": [asdict(problem)], "proxies": [], "actions": []}
     status |= {"containers": [], "operator": None}
     (finding,) = host_findings(status)
     assert finding.severity is Severity.WARNING
-    assert "conntrack -D -p udp --orig-port-dst $port" in finding.text
+    assert "conntrack -D -p udp --orig-port-dst $port" in finding.fix
 
 
 def test_it_has_one_capability_in_the_hosts_network_and_bounds() -> None:

@@ -15,7 +15,7 @@ from rosproxy.admin.status_document import (
     ZenohStatus,
 )
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import Problem, with_fix
 from rosproxy_operator.docker.host_document import (
     NODES_STARTING_S,
     PROXY_STARTING_S,
@@ -102,7 +102,7 @@ def told_of_talker(
     document = host_document(
         state, made, (), {proxy_name(DOMAIN): status}, SETTINGS, STARTED + age + 1
     )
-    return [problem["text"] for problem in document["problems"]]
+    return [with_fix(p["text"], p["fix"]) for p in document["problems"]]
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) 
     made = planned(state, SETTINGS, DockerMemory(), 0.0)
     silence = Problem("proxy p", "admin endpoint refuses connections", reason="X")
     document = host_document(state, made, (), {"p": silence}, SETTINGS, STARTED + age)
-    told = [problem["text"] for problem in document["problems"]]
+    told = [with_fix(p["text"], p["fix"]) for p in document["problems"]]
     assert (silence.text in told) is is_told
 
 
@@ -202,7 +202,7 @@ def test_a_file_of_sessions_is_named_where_no_node_has_connected(
     status = ProxyStatus(uptime=NODES_STARTING_S, zenoh=ZenohStatus(sessions=sessions))
     answers = {proxy_name(ZENOH): status}
     document = host_document(state, made, (), answers, SETTINGS, STARTED + age + 1)
-    told = [problem["text"] for problem in document["problems"]]
+    told = [with_fix(p["text"], p["fix"]) for p in document["problems"]]
     assert any("variable ZENOH_SESSION_CONFIG_URI=/my.json5. " in text for text in told) is is_told
 
 

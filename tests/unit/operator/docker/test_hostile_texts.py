@@ -86,7 +86,9 @@ def log_lines(plan: DockerPlan) -> Iterator[str]:
         for action in plan.actions:
             yield form.format(record(action.log_fields, "%s", action))
         for problem in plan.problems:
-            yield form.format(record(problem.log_fields, "%s: %s", problem.subject, problem.text))
+            yield form.format(
+                record(problem.log_fields, "%s: %s", problem.subject, problem.message)
+            )
 
 
 def record(fields: dict[str, str], message: str, *arguments: object) -> logging.LogRecord:
@@ -110,7 +112,7 @@ def test_no_text_of_a_container_gets_further_than_its_place(
         assert line.isprintable()
         assert line.encode()
     for problem in plan.problems:
-        assert len(problem.text) < LONGEST_PROBLEM
+        assert len(problem.message) < LONGEST_PROBLEM
     document = {**host_document(seen, plan, plan.problems, {}, SETTINGS, 0.0), "operator": None}
     assert json.dumps(document).isascii()
     assert all(line.isprintable() for line in render(document, 80).split("\n"))

@@ -27,6 +27,6 @@ def test_many_containers_with_peers_keep_no_proxy_from_starting() -> None:
     assert len([peer for peer in made.peers if "few-" in peer]) == 2
     body = container_config(made, SETTINGS, SECRET, "")
     assert max(len(variable) for variable in body["Env"]) < 128 * 1024
-    ignored = {p.subject for p in plan.problems if "label rosproxy.peers is ignored" in p.text}
+    ignored = {p.subject for p in plan.problems if "label rosproxy.peers is ignored" in p.message}
     assert ignored == {f"container c{n:02}" for n in range(7, 20)}
     assert not any(problem.fatal for problem in plan.problems)

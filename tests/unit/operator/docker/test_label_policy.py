@@ -51,7 +51,7 @@ def read(text: str) -> tuple[tuple[Member, ...], str]:
     assert all(
         (problem.subject, problem.fatal) == ("container talker", True) for problem in problems
     )
-    return members, "".join(problem.text for problem in problems)
+    return members, "".join(problem.message for problem in problems)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_who_has_many_rules_takes_no_room_from_who_has_few() -> None:
     left, (problem,) = with_bounded_rules(members, settings)
     assert {member.container.name for member in left} == set("abcdefh")
     assert (problem.subject, problem.fatal) == ("container g", True)
-    assert "have too many rules together (at most 1000 rules" in problem.text
+    assert "have too many rules together (at most 1000 rules" in problem.message
     assert with_bounded_rules(members, SETTINGS) == (tuple(members), ())
 
 
@@ -189,6 +189,6 @@ def test_the_plan_leaves_out_whom_a_proxy_can_not_hold() -> None:
     seen = observed(*(container(f"c{n:02}", labels={**ENABLED, **label}) for n in range(11)))
     plan = planned(seen, SETTINGS, DockerMemory(), 0.0)
     assert [member.container.name for member in plan.members] == [f"c{n:02}" for n in range(10)]
-    assert [problem.subject for problem in plan.problems if "rosproxy.policy" in problem.text] == [
-        "container c10"
-    ]
+    assert [
+        problem.subject for problem in plan.problems if "rosproxy.policy" in problem.message
+    ] == ["container c10"]

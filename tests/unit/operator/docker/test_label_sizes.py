@@ -15,14 +15,14 @@ LONGEST_PROBLEM = 1000
 def told(**labels: str) -> list[Problem]:
     """The problems of a container with more labels, each of a bounded length."""
     _, problems = read_members(observed(container(labels={**ENABLED, **labels})))
-    assert all(len(problem.text) < LONGEST_PROBLEM for problem in problems)
+    assert all(len(problem.message) < LONGEST_PROBLEM for problem in problems)
     return problems
 
 
 def test_unknown_labels_are_told_up_to_a_number() -> None:
     problems = told(**{f"rosproxy.x{n:05}": "y" for n in range(10_000)})
     assert len(problems) == MOST_UNKNOWN_LABELS + 1
-    assert problems[-1].text == (
+    assert problems[-1].message == (
         f"{10_000 - MOST_UNKNOWN_LABELS} more labels rosproxy.… are unknown and ignored. "
         "Remove these labels"
     )
@@ -32,15 +32,15 @@ def test_unknown_labels_are_told_up_to_a_number() -> None:
 def test_labels_without_the_one_that_counts_are_told_in_short() -> None:
     labels = {f"rosproxy.x{n:05}" + "y" * 1000: "" for n in range(100)}
     _, problems = read_members(observed(container(labels=labels)))
-    assert problems[-1].text.endswith(
+    assert problems[-1].message.endswith(
         "and 95 more ignored, since the label rosproxy.enable=true is missing. Add that label"
     )
-    assert all(len(problem.text) < LONGEST_PROBLEM for problem in problems)
+    assert all(len(problem.message) < LONGEST_PROBLEM for problem in problems)
 
 
 def test_the_name_of_a_label_may_be_long() -> None:
     (problem,) = told(**{"rosproxy." + "x" * 1_000_000: "y"})
-    assert problem.text.startswith("label rosproxy.xxx")
+    assert problem.message.startswith("label rosproxy.xxx")
 
 
 def test_the_spelling_of_many_labels_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,8 +65,8 @@ def test_a_long_value_leaves_its_container_out(label: str, ros: str) -> None:
     assert [member.container.name for member in served] == ["good"]
     (problem,) = problems
     assert (problem.subject, problem.fatal) == ("container bad", True)
-    assert f"label {label}" in problem.text
-    assert len(problem.text) < LONGEST_PROBLEM
+    assert f"label {label}" in problem.message
+    assert len(problem.message) < LONGEST_PROBLEM
 
 
 def test_a_host_name_is_not_longer_than_host_names_are() -> None:

@@ -45,7 +45,7 @@ def refusal(container: Container, settings: PlanSettings = SETTINGS, **more) -> 
     member, problems = read(container, settings, **more)
     assert member is None
     assert problems[-1].fatal
-    return problems[-1].text
+    return problems[-1].message
 
 
 def warning(container: Container) -> str:
@@ -53,7 +53,7 @@ def warning(container: Container) -> str:
     member, problems = read(container)
     assert member is not None
     assert [problem.fatal for problem in problems] == [False]
-    return problems[0].text
+    return problems[0].message
 
 
 def good(
@@ -141,7 +141,7 @@ def test_a_label_without_enable_is_ignored_and_told() -> None:
     member, problems = read(container(labels={"rosproxy.ports": "8"}, env=ROBOT))
     assert member is None
     assert [problem.fatal for problem in problems] == [False]
-    assert problems[0].text == (
+    assert problems[0].message == (
         "label rosproxy.ports ignored, since the label rosproxy.enable=true is missing. Add that "
         "label"
     )
@@ -163,7 +163,10 @@ def test_a_label_without_enable_is_ignored_and_told() -> None:
 )
 def test_an_unknown_label_and_the_nearest_right_one(name: str, near: str) -> None:
     text = warning(container(labels={**ENABLED, name: "1"}))
-    assert text == f"label {name} is unknown and ignored. Did you mean {near}?"
+    assert text == (
+        f"label {name} is unknown and ignored. Did you mean {near}? Create the container again, "
+        "with the right label"
+    )
 
 
 def test_an_unknown_label_that_is_near_to_none() -> None:
@@ -231,7 +234,7 @@ def test_the_operators_master_is_for_those_who_name_the_proxy_or_nobody() -> Non
     member, told = read(container(labels=ON, env=""), settings)
     assert member is not None
     assert member.place == arm
-    assert "so the operator assumes ROS 1" in told[0].text
+    assert "so the operator assumes ROS 1" in told[0].message
     member, _ = read(container(labels=ON, env="http://rosproxy-zoo-0a1b2c:11311"), settings)
     assert member is not None
     assert good(container(labels=ON, env=ROBOT), settings).place == PLACE
@@ -278,7 +281,7 @@ def test_an_address_is_told_the_variable_and_the_label_at_once() -> None:
     settings = replace(SETTINGS, redirect=False)
     _, (problem,) = read(container(labels=ON, env=uri), settings)
     advice = f"Set ROS_MASTER_URI=http://rosproxy:11311 and the label rosproxy.master-uri={uri}, or"
-    assert advice in problem.text
+    assert advice in problem.message
     cured = container(labels={**ON, "rosproxy.master-uri": uri}, env="http://rosproxy:11311")
     assert good(cured, settings).place.master.uri == uri
 
@@ -339,7 +342,7 @@ def test_a_masters_name_that_leads_nowhere_is_the_cause_and_its_fix_the_whole() 
 def test_a_misspelt_label_is_told_with_the_one_that_was_meant(label: str, meant: str) -> None:
     member, (told, *_) = read(container(labels={label: "true"}))
     assert member is None
-    assert f"label {label} is unknown and ignored. Did you mean {meant}?" in told.text
+    assert f"label {label} is unknown and ignored. Did you mean {meant}?" in told.message
 
 
 @pytest.mark.parametrize(
@@ -425,7 +428,7 @@ def test_containers_that_share_the_network_of_each_other() -> None:
         (replace(talker, network_mode="container:id-talker"), ()),
     ):
         _, (problem,) = read(guest, SETTINGS, *others)
-        text = problem.text
+        text = problem.message
         assert "which shares the network of this container. Create one of the two" in text
         assert "does not exist" not in text
 
@@ -484,7 +487,7 @@ def test_one_bad_container_does_not_touch_the_others() -> None:
 
 def test_a_container_with_the_operators_own_label() -> None:
     _, problems = read(container(labels={"io.rosproxy.managed": "true"}))
-    assert problems[0].text.startswith(
+    assert problems[0].message.startswith(
         "has the label io.rosproxy.managed, but not the other labels"
     )
 

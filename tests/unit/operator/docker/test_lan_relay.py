@@ -196,7 +196,7 @@ def test_the_lan_is_where_the_option_says_or_the_advertised_host_or_far_hosts_ar
             sandboxes=[Sandbox(place, own(box, attachments, "app"), RANGE, box.fingerprint)],
         )  # fmt: skip
         plan = look(state, settings)
-        told = [p.text for p in plan.problems if "has no LAN relay" in p.text]
+        told = [p.message for p in plan.problems if "has no LAN relay" in p.message]
         return [action.lan for action in plan.actions if isinstance(action, CreateLanRelay)] or told
 
     assert lan(HERE, "192.0.2.77") == ["192.0.2.77"]
@@ -380,7 +380,7 @@ def test_a_restarting_container_is_reported_by_what_it_is(role: str, subject: st
     made = running_proxy()
     (one,) = made[role]
     made[role] = (replace(one, container=replace(one.container, state="restarting")),)
-    problems = [p for p in look(observed(TALKER, **made)).problems if "restarts" in p.text]
-    assert [(p.subject, p.text.split(". ")[1]) for p in problems] == [
+    problems = [p for p in look(observed(TALKER, **made)).problems if "restarts" in p.message]
+    assert [(p.subject, p.message.split(". ")[1]) for p in problems] == [
         (subject, f"Read docker logs {subject.split()[1]}")
     ]

@@ -21,7 +21,7 @@ FAR = "203.0.113.9"
 
 def wrong(place: Place = PLACE, **variables: str) -> str:
     seen = observed(advertise={"robot": TOWARDS}, default_route_address=FAR)
-    return wrong_own_address(replace(container(), variables=variables), place, seen)
+    return str(wrong_own_address(replace(container(), variables=variables), place, seen) or "")
 
 
 @pytest.mark.parametrize("name", ["ROS_IP", "ROS_HOSTNAME"])

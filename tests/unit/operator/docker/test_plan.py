@@ -92,7 +92,7 @@ def actions(seen: HostState, **more: Any) -> list[Action]:
 
 
 def texts(plan: DockerPlan) -> list[str]:
-    return [problem.text for problem in plan.problems]
+    return [problem.message for problem in plan.problems]
 
 
 FIRST = [
@@ -232,7 +232,7 @@ def test_a_sandbox_on_a_network_that_was_made_anew_is_made_anew(network_id: str)
             [sandbox(state="restarting", networks=())],
             [],
             None,
-            [ends_again("the engine restarts it", f"docker logs {PORTS}")],
+            [str(ends_again("the engine restarts it", f"docker logs {PORTS}"))],
         ),
         ([sandbox(state="removing"), proxy()], [], 1.0, []),
         ([sandbox(state="dead")], [Remove(PORTS, "left over"), *FIRST], None, []),
@@ -443,7 +443,7 @@ def test_a_container_that_has_exited_keeps_its_network_for_the_grace() -> None:
 
 
 def port_problem(plan: DockerPlan) -> str:
-    return next(problem.text for problem in plan.problems if problem.subject == f"proxy {NAME}")
+    return next(problem.message for problem in plan.problems if problem.subject == f"proxy {NAME}")
 
 
 def created(plan: DockerPlan) -> PortRange:
@@ -690,7 +690,7 @@ def test_a_proxy_is_not_made_before_the_address_of_its_master_is_known() -> None
     assert not any(isinstance(action, Create) for action in plan.actions)
     assert any(isinstance(action, Create) for group in plan.deferred for action in group.actions)
     (problem,) = [p for p in plan.problems if p.subject == "master robot"]
-    assert "--add-host robot:ADDRESS" in problem.text
+    assert "--add-host robot:ADDRESS" in problem.message
     assert problem.fatal
     other = look(observed(container(), masters={"robot": "192.0.2.7", "arm": ""}))
     assert any(isinstance(action, Create) for action in other.actions)

@@ -261,7 +261,11 @@ async def test_without_its_policy_nobody_new_is_let_in(
     proxies.refuses = None
     assert await proxies.next() == ["172.18.0.5"]
     problem = silent_proxy_problem("p", PolicyRefused("knows no policies"), seen, "0-rosproxy")
-    assert (problem.subject, problem.text, problem.fatal) == ("proxy p", "knows no policies", True)
+    assert (problem.subject, problem.text, problem.fatal) == (
+        "proxy p",
+        "knows no policies",
+        True,
+    )
 
 
 async def test_what_ends_the_task_of_a_proxy_ends_it_until_the_next_look(

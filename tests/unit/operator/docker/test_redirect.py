@@ -235,26 +235,26 @@ def test_who_is_not_redirected_is_told(
     talker: Container, settings: PlanSettings, text: str
 ) -> None:
     members, problems = read_members(observed(talker), settings)
-    assert text in " ".join(problem.text for problem in problems)
+    assert text in " ".join(problem.message for problem in problems)
     assert not any(member.redirected for member in members)
 
 
 def test_a_label_can_not_widen() -> None:
     _, problems = read_members(observed(node(redirect="true")), OFF)
-    assert any("rosproxy.redirect=true is ignored" in problem.text for problem in problems)
+    assert any("rosproxy.redirect=true is ignored" in problem.message for problem in problems)
 
 
 def test_without_a_way_outwards_nothing_is_redirected() -> None:
     cell = replace(APP, internal=True)
     (member,), (problem,) = read_members(observed(node(), networks=[UPLINK, cell]))
     assert not member.redirected
-    assert "all networks of the container are internal" in problem.text
+    assert "all networks of the container are internal" in problem.message
 
 
 def test_a_master_that_is_not_allowed_is_not_redirected() -> None:
     members, (problem,) = read_members(observed(node()), replace(SETTINGS, allow_master=("a:1",)))
     assert not members
-    assert "--allow-master" in problem.text
+    assert "--allow-master" in problem.message
 
 
 def test_its_nodes_arrive_once_more_when_it_is_there() -> None:

@@ -44,7 +44,7 @@ def read(
 ) -> tuple[list[Member], list[str]]:
     """The members of a container, and the texts of its problems."""
     members, problems = read_members(observed(container, **more), settings)
-    return list(members), [problem.text for problem in problems]
+    return list(members), [problem.message for problem in problems]
 
 
 def places(container: Container, settings: PlanSettings = SETTINGS) -> list[Place]:
@@ -56,7 +56,7 @@ def refusal(container: Container, settings: PlanSettings = SETTINGS) -> str:
     assert not members
     assert [type(problem) for problem in problems] == [Problem]
     assert problems[0].fatal
-    return problems[0].text
+    return problems[0].message
 
 
 @pytest.mark.parametrize(

@@ -231,4 +231,4 @@ def test_what_is_kept_of_a_container_is_bounded() -> None:
     found = container(kept, Labels=labels)
     served, problems = read_members(observed(found))
     assert served == ()
-    assert "ROS_MASTER_URI" in problems[0].text
+    assert "ROS_MASTER_URI" in problems[0].message

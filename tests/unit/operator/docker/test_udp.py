@@ -61,14 +61,14 @@ def test_who_asks_for_it_alone_is_told() -> None:
     plan = planned(observed(labelled("a", ASKED)), SETTINGS, DockerMemory(), 0.0)
     (problem,) = plan.problems
     assert problem.subject == "container a"
-    assert "rosproxy.direction=both" in problem.text
+    assert "rosproxy.direction=both" in problem.message
     assert not problem.fatal
 
 
 def test_a_word_that_is_none() -> None:
     members, (problem,) = read_members(observed(labelled("a", {"rosproxy.udp": "yes"})))
     assert members == ()
-    assert problem.text.startswith("label rosproxy.udp='yes' is neither true nor false")
+    assert problem.message.startswith("label rosproxy.udp='yes' is neither true nor false")
 
 
 @pytest.mark.parametrize("udp", [False, True])

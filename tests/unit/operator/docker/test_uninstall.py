@@ -98,7 +98,7 @@ def test_who_is_still_on_the_uplink_is_named(state: str) -> None:
     assert planned.actions == ()
     (problem,) = planned.problems
     assert str(problem.subject) == "network 0-rosproxy"
-    assert "docker network disconnect 0-rosproxy prometheus" in problem.text
+    assert "docker network disconnect 0-rosproxy prometheus" in problem.message
 
 
 def test_where_another_operator_makes_all_anew_it_stops() -> None:
@@ -108,8 +108,8 @@ def test_where_another_operator_makes_all_anew_it_stops() -> None:
     assert planned.actions == ()
     (problem,) = planned.problems
     assert problem.fatal
-    assert "another operator is running" in problem.text
-    assert sandbox_name(PLACE) in problem.text
+    assert "another operator is running" in problem.message
+    assert sandbox_name(PLACE) in problem.message
 
 
 def test_the_label_says_which_networks_are_the_operators() -> None:

@@ -93,7 +93,7 @@ def read(
     *containers: Container, settings: PlanSettings = SETTINGS, **more: Any
 ) -> tuple[tuple[Member, ...], list[str]]:
     members, problems = read_members(observed(*containers, **more), settings)
-    return members, [problem.text for problem in problems]
+    return members, [problem.message for problem in problems]
 
 
 def look(
@@ -378,7 +378,7 @@ def test_peers_of_the_same_router_in_a_container_are_told() -> None:
     _, problems = read_members(observed(node(override=AT_ROUTER), other, ROUTER), SETTINGS)
     assert [problem.subject for problem in problems] == ["container listener", "container talker"]
     assert not any(problem.fatal for problem in problems)
-    assert problems[1].text == (
+    assert problems[1].message == (
         "the nodes are peers of the same router ('router:7447') as the nodes of container "
         "listener. Messages between these containers do not pass: rmw_zenohd passes none between "
         'its peers, and neither does zenohd from 1.9 on. Add mode="client" to the variable '
@@ -548,8 +548,8 @@ def test_a_proxy_takes_so_many_routers() -> None:
     plan = look(observed(*many))
     assert len(plan.desired[0].peers) == 60
     (problem,) = plan.problems
-    assert "a proxy takes at most 64 peers" in problem.text
-    assert "ros2-peer" not in problem.text
+    assert "a proxy takes at most 64 peers" in problem.message
+    assert "ros2-peer" not in problem.message
 
 
 # the proxy

@@ -123,7 +123,7 @@ def test_a_label_that_can_not_be(value: str, text: str) -> None:
 def test_the_label_is_for_rmw_zenoh_alone(ros: str) -> None:
     labels = {**ENABLED, "rosproxy.ros": ros, "rosproxy.master-uri": "http://robot:11311"}
     plan = look(observed(container(labels={**labels, LABEL: CLOUD})), ALLOWED)
-    texts = [problem.text for problem in plan.problems]
+    texts = [problem.message for problem in plan.problems]
     assert any(text.startswith(f"label {LABEL} is ignored: the label is for") for text in texts)
 
 
@@ -184,7 +184,7 @@ def test_many_labels_leave_the_few_their_links() -> None:
     assert {"tls/few:7447", "tls/home:7447"} <= {*desired.links}
     (problem,) = plan.problems
     assert problem.subject == "container n1"
-    assert problem.text.startswith(f"label {LABEL} is ignored: a proxy has at most 16 links")
+    assert problem.message.startswith(f"label {LABEL} is ignored: a proxy has at most 16 links")
 
 
 @pytest.mark.parametrize(

@@ -190,7 +190,7 @@ def status(plan: ClusterPlan, of: Name = ROBOT) -> Mapping[str, Any]:
 def told(plan: ClusterPlan, reason: str) -> list[str]:
     """The texts of findings with a reason."""
     return [
-        f"{finding.subject}: {finding.text}"
+        f"{finding.subject}: {finding.message}"
         for finding in plan.problems
         if finding.reason == reason
     ]

@@ -11,6 +11,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateHelper,
@@ -308,7 +309,7 @@ class Cluster:
         policies = seen.policies.values()
         of = tuple(parse_rosproxy.rosproxy(rosproxy) for rosproxy in self.state.rosproxies.values())
         masters = {rosproxy.spec.master.service for rosproxy in of if rosproxy.spec.master.service}
-        resolved = (self.master_ip, "") if self.master_ip else ("", "does not exist")
+        resolved = (self.master_ip, None) if self.master_ip else ("", Fault("does not exist"))
         return ClusterSnapshot(
             rosproxies=of,
             nodes={name: parse.node(node) for name, node in seen.nodes.items()},

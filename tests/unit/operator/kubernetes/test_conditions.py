@@ -288,8 +288,8 @@ def test_who_refuses_the_kernel_plane_is_told_of_it(text, fix):
 
     (finding,) = findings(of, (), {REFUSED: text})
 
-    assert finding.text.endswith(fix)
-    assert len(finding.text) <= 600
+    assert finding.message.endswith(fix)
+    assert len(finding.message) <= 600
 
 
 def test_findings_are_told_at_the_rosproxy():

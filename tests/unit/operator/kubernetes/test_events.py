@@ -1,5 +1,7 @@
 """The Kubernetes Events of the operator."""
 
+from dataclasses import replace
+
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
@@ -124,6 +126,10 @@ def test_a_message_is_not_longer_than_the_api_server_takes():
 
     assert MOST_MESSAGE_BYTES - 3 <= len(emit.message.encode()) <= MOST_MESSAGE_BYTES
     assert emit.message.endswith("ü…")
+    fixed = replace(finding("ü" * MOST_MESSAGE_BYTES), fix="Start the node")
+    (emit,) = warnings([fixed], {}, 0.0).emits
+    assert MOST_MESSAGE_BYTES - 4 <= len(emit.message.encode()) <= MOST_MESSAGE_BYTES
+    assert emit.message.endswith("ü… Start the node")
 
 
 def test_what_is_done_is_told():

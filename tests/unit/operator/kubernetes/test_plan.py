@@ -6,6 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.planner.actions import (
     CreateProxy,
     CreateService,
@@ -319,13 +320,13 @@ def test_a_node_that_outside_does_not_reach_gets_no_proxy_and_it_is_told_why(
 
 
 def test_a_master_in_the_cluster_is_given_by_name_and_address() -> None:
-    seen = replace(scene(of=rosproxy(master=INSIDE)), masters={MASTER: ("10.96.0.9", "")})
+    seen = replace(scene(of=rosproxy(master=INSIDE)), masters={MASTER: ("10.96.0.9", None)})
     created = env(creation(look(seen)))
     assert created["ROS_MASTER_URI"] == "http://roscore.ros.svc:11311"
     assert created["ROSPROXY_MASTER_ADDRESS"] == "10.96.0.9"
 
 
-@pytest.mark.parametrize("masters", [{}, {MASTER: ("", "does not exist. Create the Service")}])
+@pytest.mark.parametrize("masters", [{}, {MASTER: ("", Fault("does not exist"))}])
 def test_while_the_masters_service_is_missing_everything_stays(masters: dict) -> None:
     of = rosproxy(master=INSIDE)
     plan = look(replace(scene(proxy(), of=of), masters=masters))

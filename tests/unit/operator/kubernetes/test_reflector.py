@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.api import api_client as api_module
 from rosproxy_operator.kubernetes.api.api_client import Api, ApiError, ApiNotFound, ApiUnavailable
 from rosproxy_operator.kubernetes.proxies import sandbox
@@ -399,7 +400,7 @@ async def test_the_service_of_a_master(server: ApiServer, seen: Seen) -> None:
     server.put("rosproxies", obj, NAMESPACE)
     id = Name("ros", "roscore")
     assert (await begun(server, seen)).masters == {
-        id: ("", "does not exist. Create the Service, or correct spec.master.service")
+        id: ("", Fault("does not exist", "Create the Service, or correct spec.master.service"))
     }
     ports = [{"port": 11311}]
     server.put(
@@ -407,7 +408,7 @@ async def test_the_service_of_a_master(server: ApiServer, seen: Seen) -> None:
         {"metadata": {"name": "roscore"}, "spec": {"clusterIP": "10.96.1.1", "ports": ports}},
         "ros",
     )
-    await until(lambda: seen.store.snapshot().masters == {id: ("10.96.1.1", "")})
+    await until(lambda: seen.store.snapshot().masters == {id: ("10.96.1.1", None)})
     assert seen.store.snapshot().consents == {id: frozenset()}
 
 
@@ -448,4 +449,4 @@ def test_a_service_that_is_no_master(spec: dict[str, Any], told: str) -> None:
     service = master_service({"metadata": {"name": "roscore", "namespace": "ros"}, "spec": spec})
     address, problem = read_master(service, Name("ros", "roscore"), {11311})
     assert address == ""
-    assert told in problem
+    assert told in str(problem)

@@ -165,8 +165,8 @@ def test_an_image_that_a_node_can_not_run_stops_the_rollout(
     assert done(plan) == []
     (problem,) = plan.problems
     assert (problem.reason, problem.subject, problem.fatal) == ("ImageUnusable", "node one", False)
-    assert text in problem.text
-    assert "keeps the image rosproxy:1" in problem.text
+    assert text in problem.message
+    assert "keeps the image rosproxy:1" in problem.message
     (event,) = (action for action in plan.actions if isinstance(action, Emit))
     assert (event.type, event.reason) == ("Warning", "ImageUnusable")
 

@@ -405,7 +405,7 @@ def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
     assert finding.about is not None
     assert finding.about.kind == "Pod"
     (of_deployment,) = ros2_findings(pod(container, workload="deployment/a"), of2(), ADDRESS)
-    assert ": kubectl -n ros edit deployment/a" in of_deployment.text
+    assert ": kubectl -n ros edit deployment/a" in of_deployment.message
     assert list(ros2_findings(pod(container), some.rosproxy(), ADDRESS)) == []
 
 
@@ -429,16 +429,18 @@ def test_an_empty_domain_is_domain_0():
     container = PodContainer(variables={"ROS_DOMAIN_ID": ""})
     (finding,) = ros2_findings(pod(container), of2(Ros2Spec(domain=5)), ADDRESS)
     assert finding.reason == "OtherDomain"
-    assert "ROS_DOMAIN_ID=(empty, so 0) is not domain 5 of RosProxy" in finding.text
-    assert finding.text.endswith(". Or change spec.domain: kubectl -n ros edit rosproxy robot")
+    assert "ROS_DOMAIN_ID=(empty, so 0) is not domain 5 of RosProxy" in finding.message
+    assert finding.message.endswith(". Or change spec.domain: kubectl -n ros edit rosproxy robot")
 
 
 def test_a_pod_that_no_webhook_has_seen_is_told():
     (finding,) = ros2_findings(pod(static_peers=""), of2(), ADDRESS)
     assert finding.reason == "NotWired"
-    assert finding.text.endswith(". Run kubectl -n ros delete pod talker, and create the pod again")
+    assert finding.message.endswith(
+        ". Run kubectl -n ros delete pod talker, and create the pod again"
+    )
     (finding,) = ros2_findings(pod(static_peers="10.96.9.9"), of2(), ADDRESS)
-    assert "the proxy is at 10.96.1.1 now" in finding.text
+    assert "the proxy is at 10.96.1.1 now" in finding.message
 
 
 @pytest.mark.parametrize(
@@ -452,7 +454,7 @@ def test_a_pod_that_no_webhook_has_seen_is_told():
 )
 def test_what_the_administrator_allows(bounds: Bounds, field: str):
     of = of2(Ros2Spec(peers=("robot",), multicast=True), ports=5)
-    violation = bounds_violation(of, {}, ClusterSettings(bounds=bounds))
+    violation = str(bounds_violation(of, {}, ClusterSettings(bounds=bounds)) or "")
     assert violation.startswith(field)
     assert bool(violation) == bool(field)
 

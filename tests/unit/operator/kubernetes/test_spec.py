@@ -296,7 +296,8 @@ def _refusal(obj: Any) -> str:
     try:
         rosproxy(obj)
     except InvalidField as error:
-        return invalid(obj, error).text
+        invalid(obj, error)
+        return str(error)
     return ""
 
 

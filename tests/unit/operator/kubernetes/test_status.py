@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from rosproxy.admin.status_document import RangeProbeStatus
 from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.resources.cluster import (
     HelperPod,
     Obstacle,
@@ -151,7 +152,9 @@ def test_a_node_tells_first_why_its_proxy_is_stuck():
 
 
 def test_the_wide_output_tells_the_first_problem_of_a_rosproxy_that_is_ready():
-    astray = pod_finding(pod("astray"), rosproxy(), "NotWired", "has no variable", fatal=False)
+    astray = pod_finding(
+        pod("astray"), rosproxy(), "NotWired", Fault("has no variable"), fatal=False
+    )
     rosproxy_status = status(state(), more=(astray,))
 
     assert judged(rosproxy_status, "Ready") == ("True", "Serving")
@@ -227,8 +230,9 @@ def test_the_address_of_a_service_that_is_gone_is_kept():
 
 def test_one_that_can_not_be_read_keeps_what_it_has():
     first = status(state())
-    text = "spec.ports: 0 is not valid: write an integer from 1 to 500"
-    bad = InvalidRosProxy(rosproxy().id, "uid-arm", 4, text, first)
+    text = "spec.ports: 0 is not valid"
+    fix = "Write an integer from 1 to 500"
+    bad = InvalidRosProxy(rosproxy().id, "uid-arm", 4, text, fix, first)
 
     rosproxy_status = status_of_invalid(bad, LATER)
 
@@ -237,9 +241,8 @@ def test_one_that_can_not_be_read_keeps_what_it_has():
         key: first[key] for key in first if key not in changed
     }
     assert rosproxy_status["observedGeneration"] == 4
-    assert rosproxy_status["message"] == text
+    assert rosproxy_status["message"] == message(rosproxy_status) == f"{text}. {fix}"
     assert judged(rosproxy_status, "Ready") == ("False", "Invalid")
-    assert message(rosproxy_status) == text
     assert judged(rosproxy_status, "Degraded") == ("True", "Invalid")
     assert condition(rosproxy_status, "MasterReachable")["lastTransitionTime"] == STAMP
     again = status_of_invalid(replace(bad, status=rosproxy_status), "2026-11-21T16:00:00Z")

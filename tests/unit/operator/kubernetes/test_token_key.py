@@ -65,7 +65,7 @@ async def test_without_its_secret_it_lasts_as_long_as_the_operator(
     assert not token_key.problems
     server.refuse("GET", "secrets", status, "no")
     assert await read(token_key) == key
-    text = "".join(problem.text for problem in token_key.problems)
+    text = "".join(problem.message for problem in token_key.problems)
     assert text.count("Secret ns/key") == 1
     assert ("Create an empty Secret" in text) == (status == 404)
     server.refusals.clear()

@@ -163,7 +163,7 @@ def test_the_own_masters_uri_is_replaced_and_any_other_stays(master, uri, names_
     unwired = objects.pod({**obj, "metadata": {"labels": {INJECT: "true"}}})
     assert needs_recreation(unwired, of, CLUSTER_IP) == names_it
     finding = wiring_finding(unwired, of, CLUSTER_IP)
-    assert finding is None or ("Remove the variable" in finding.text) == (not names_it)
+    assert finding is None or ("Remove the variable" in finding.message) == (not names_it)
 
 
 def test_what_was_replaced_stays_visible_when_it_is_wired_again():
@@ -342,7 +342,7 @@ def test_a_pod_that_goes_around_its_proxy_is_told(master):
 
     assert finding is not None
     assert (finding.reason, finding.fatal) == ("NotWired", False)
-    assert f"ROS_MASTER_URI={master}" in finding.text
+    assert f"ROS_MASTER_URI={master}" in finding.message
     assert finding.about is not None
     assert finding.about.id == pod().id
 
@@ -370,7 +370,7 @@ def test_a_pod_that_is_not_wired_is_told_what_to_do(unwired, said):
     finding = wiring_finding(unwired, of, CLUSTER_IP)
 
     assert finding is not None
-    assert said in finding.text
+    assert said in finding.message
 
 
 @pytest.mark.parametrize(
@@ -387,7 +387,7 @@ def test_a_pod_that_no_operator_wired_though_one_was_ready_needs_another_fix(cre
     finding = wiring_finding(pod(created=created), of, CLUSTER_IP, webhook)
 
     assert finding is not None
-    assert said in finding.text
+    assert said in finding.message
 
 
 def test_a_pod_that_is_older_than_the_service_is_told_so():
@@ -401,9 +401,9 @@ def test_a_pod_that_is_older_than_the_service_is_told_so():
     assert old is not None
     assert new is not None
     assert newer is not None
-    assert "since the pod is older than Service rosproxy-arm of the RosProxy. Run" in old.text
-    assert "although an operator was ready" not in new.text
-    assert "although an operator was ready" in newer.text
+    assert "since the pod is older than Service rosproxy-arm of the RosProxy. Run" in old.message
+    assert "although an operator was ready" not in new.message
+    assert "although an operator was ready" in newer.message
 
 
 def test_without_the_webhook_the_template_sets_the_variable():
@@ -411,4 +411,4 @@ def test_without_the_webhook_the_template_sets_the_variable():
     finding = wiring_finding(unwired, rosproxy(), CLUSTER_IP, WebhookState(served=False))
 
     assert finding is not None
-    assert "(webhook.enabled=false). Set ROS_MASTER_URI in the template: kubectl" in finding.text
+    assert "(webhook.enabled=false). Set ROS_MASTER_URI in the template: kubectl" in finding.message

@@ -131,7 +131,7 @@ def test_the_administrator_allows_types(
     allowed: tuple[ListenType, ...], type: ListenType, fix: str
 ) -> None:
     settings = replace(SETTINGS, bounds=Bounds(listen=allowed))
-    refusal = bounds_violation(listening(ListenSpec(type)), {}, settings)
+    refusal = str(bounds_violation(listening(ListenSpec(type)), {}, settings) or "")
     if fix:
         assert refusal.startswith(f"spec.listen.type: the operator does not allow '{type}'. {fix}")
         assert "allow.listen" in refusal

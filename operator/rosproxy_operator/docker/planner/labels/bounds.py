@@ -15,6 +15,7 @@ from fnmatch import fnmatchcase
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.setting_kinds import DataPlane, read_peer, read_site_link
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.spec import WISHES
@@ -27,19 +28,20 @@ mail servers have such ports, and a proxy must not take the place of these serve
 """
 
 
-def refused_master(uri: str, settings: PlanSettings) -> str:
-    """Return why a container may not have the master at ``uri``; empty for an allowed master.
+def refused_master(uri: str, settings: PlanSettings) -> Fault | None:
+    """Return why a container may not have the master at ``uri``; None for an allowed master.
 
-    Also empty for a text that is no URI of a master.
+    Also None for a text that is no URI of a master.
     """
     master = parse_slave_uri(uri)
     option = parse_slave_uri((settings.master_uri or "").lower())
     if master is None or master == option or _is_allowed_master(master, settings.allow_master):
-        return ""
+        return None
     names = ", ".join(settings.allow_master)
     usual = f"has a port below {LEAST_MASTER_PORT}, which is not allowed for a master by default"
     reason = f"matches no --allow-master of the operator ({names})" if names else usual
-    return f"{reason}. To allow this master, start the operator with --allow-master {master}"
+    fix = f"To allow this master, start the operator with --allow-master {master}"
+    return Fault(reason, fix)
 
 
 def allowed_planes(settings: PlanSettings) -> frozenset[DataPlane]:
@@ -48,42 +50,43 @@ def allowed_planes(settings: PlanSettings) -> frozenset[DataPlane]:
     return frozenset({*(settings.allow_data_plane or free), settings.data_plane})
 
 
-def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[str, ...]]:
+def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[Fault, ...]]:
     """Return the allowed part of a container's request, and warnings about the refused part."""
-    warnings: list[str] = []
+    warnings: list[Fault] = []
     limit = max(settings.max_ports, settings.ports)
     if request.ports > limit:
-        warnings.append(
-            f"label rosproxy.ports={request.ports} exceeds the bound of labels: the proxy gets "
-            f"{limit} ports. To allow more, start the operator with --max-ports {request.ports}"
-        )
+        text = f"label rosproxy.ports={request.ports} exceeds the bound of labels: the proxy gets "
+        fix = f"To allow more, start the operator with --max-ports {request.ports}"
+        warnings.append(Fault(f"{text}{limit} ports", fix))
         request = replace(request, ports=limit)
     wishes = dict(request.wishes)
     plane = wishes.get("data_plane", settings.data_plane)
     if plane not in allowed_planes(settings):
-        warnings.append(
-            f"label rosproxy.data-plane={plane} is ignored: the operator does not allow this value "
-            f"in labels. To allow this value, start the operator with --allow-data-plane {plane}"
-        )
+        text = f"label rosproxy.data-plane={plane} is ignored: the operator does not allow this "
+        fix = f"To allow this value, start the operator with --allow-data-plane {plane}"
+        warnings.append(Fault(f"{text}value in labels", fix))
         del wishes["data_plane"]
     if wishes.get("slave_control") == "any" and settings.slave_control == "master":
-        warnings.append(
+        text = (
             "label rosproxy.slave-control=any is ignored: the operator has --slave-control master, "
-            "and a label can only narrow this option. Remove the label"
+            "and a label can only narrow this option"
         )
+        warnings.append(Fault(text, "Remove the label"))
         del wishes["slave_control"]
     if request.redirect and not settings.redirect:
-        warnings.append(
+        text = (
             "label rosproxy.redirect=true is ignored: the operator has --no-redirect, and a label "
-            "can't override this option. Remove the label"
+            "can't override this option"
         )
+        warnings.append(Fault(text, "Remove the label"))
     if refused := {peer for peer in request.peers if not _is_allowed_peer(peer, settings)}:
-        warnings.append(
+        text = (
             f"label rosproxy.peers names {', '.join(sorted(refused))}, which the operator does not "
-            "allow in labels. The proxy announces no participants there. To allow these peers, "
-            "start the operator with "
-            f"{' '.join(f'--allow-peer {peer}' for peer in sorted(refused))}"
+            "allow in labels. The proxy announces no participants there"
         )
+        allowing = " ".join(f"--allow-peer {peer}" for peer in sorted(refused))
+        fix = f"To allow these peers, start the operator with {allowing}"
+        warnings.append(Fault(text, fix))
         request = replace(request, peers=request.peers - refused)
     return replace(request, wishes=wishes), tuple(warnings)
 

@@ -12,6 +12,7 @@ from rosproxy_operator.common.problem import (
     NOT_WIRED,
     OPTION_IGNORED,
     UNKNOWN_NAME,
+    Fault,
     Problem,
     bounded,
 )
@@ -41,6 +42,7 @@ from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Master, Place
 
 _PREFIX = "rosproxy"
+_CORRECT_LABEL = "Create the container again, with the right label"
 # An exited container may start again: the proxy stays on its networks for the grace (`desire`).
 _READ_STATES = ALIVE | {"exited"}
 """States of a container in which the operator reads the labels."""
@@ -84,10 +86,10 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
                 requests += granted
                 wrong += warnings
         except UnusableLabel as error:
-            wrong.append(_unusable(container, str(error), error.reason))
+            wrong.append(_unusable(container, error.fault, error.reason))
         problems += wrong if container.alive else []
     shared = peers_of_one_router(requests, observed)
-    problems += (_warning(container, NOT_WIRED, text) for container, text in shared)
+    problems += (_warning(container, NOT_WIRED, fault) for container, fault in shared)
     return LabelReading(tuple(requests), tuple(problems))
 
 
@@ -116,59 +118,56 @@ def find_members(
         host = request.place.advertise_host or _advertised(request, observed)
         place = replace(request.place, advertise_host=host)
         if host:
-            member, text = _placed(replace(request, place=place), observed, settings)
-            texts = [text]
+            member, fault = _placed(replace(request, place=place), observed, settings)
+            faults = [fault]
             if isinstance(place.graph, Master):
-                texts.append(wrong_own_address(container, place, observed))
-            wrong = [_warning(container, NOT_WIRED, text) for text in texts if text]
+                faults.append(wrong_own_address(container, place, observed))
+            wrong = [_warning(container, NOT_WIRED, fault) for fault in faults if fault]
             members.append(member)
         else:
-            text, reason = _why_no_host(place, observed)
-            wrong = [_unusable(container, text, reason)]
+            wrong = [_unusable(container, *_why_no_host(place, observed))]
         problems += wrong if container.alive else []
     return tuple(members), tuple(problems)
 
 
-def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tuple[Member, str]:
+def _placed(
+    request: Member, observed: HostState, settings: PlanSettings
+) -> tuple[Member, Fault | None]:
     """Return the member with the alias or redirect by which nodes find the proxy, and a warning.
 
-    The place of ``request`` is complete. The warning may be empty.
+    The place of ``request`` is complete.
     """
     container = request.container
     place = request.place
     if not isinstance(place.graph, Master):
-        return request, ""
-    needs, text = readers.proxy_alias(container, place)
+        return request, None
+    needs, fault = readers.proxy_alias(container, place)
     if not container.master_uri and ros_versions.is_guessed(container):
-        text = ""  # the container may be of ROS 2, and has a warning about the unknown version
+        fault = None  # the container may be of ROS 2, and has a warning about the unknown version
     by_address = readers.master_by_address(container, place)
     if by_address is None:
-        return replace(request, wanted_alias=needs), text
+        return replace(request, wanted_alias=needs), fault
     internal = {network.name for network in observed.networks if network.internal}
     if not settings.redirect:
-        text += (
-            ". Or start the operator without --no-redirect: the operator then redirects the "
-            "address to the proxy"
-        )
+        more = "Or start the operator without --no-redirect: the operator then redirects"
     elif request.redirect is False:
-        text += (
-            f". Or remove {readers.named(REDIRECT, container.labels)}: the operator then redirects "
-            "the address to the proxy"
-        )
+        more = f"Or remove {readers.named(REDIRECT, container.labels)}: the operator then redirects"
     # Without a route to the master's address connect(2) fails before the rule takes effect: the
     # kernel looks up the route before the first packet (net/ipv4/tcp_ipv4.c, tcp_v4_connect).
     elif (joined := readers.network_owner(container, observed).networks) and joined <= internal:
-        text += (
-            ". The operator can't redirect the address to the proxy, since all networks of the "
+        more = (
+            "The operator can't redirect the address to the proxy, since all networks of the "
             "container are internal"
         )
+        return request, Fault(f"{fault.text}. {more}", fault.fix) if fault else None
     else:
-        return replace(request, redirected=(by_address,)), ""
-    return request, text
+        return replace(request, redirected=(by_address,)), None
+    more += " the address to the proxy"
+    return request, Fault(fault.text, f"{fault.fix}. {more}") if fault else None
 
 
-def _why_no_host(place: Place, observed: HostState) -> tuple[str, str]:
-    """Return why the advertised host is unknown, with the fix, and the reason of the problem.
+def _why_no_host(place: Place, observed: HostState) -> tuple[Fault, str]:
+    """Return why the advertised host is unknown, and the reason of the problem.
 
     The address of the Docker host depends on the route to the master. So an unknown address of the
     master is the first cause.
@@ -177,12 +176,15 @@ def _why_no_host(place: Place, observed: HostState) -> tuple[str, str]:
     if isinstance(place.graph, Master):
         host = place.graph.host
         if observed.masters.get(host.lower()) == "":
-            return f"no address of the master: {unresolved_master(host)}", MASTER_UNKNOWN
+            text, fix = unresolved_master(host)
+            return Fault(f"no address of the master: {text}", fix), MASTER_UNKNOWN
         towards = f" towards the {place.graph}"
-    return (
-        f"the operator does not know this host's address{towards}. Add the label "
-        f"{ADVERTISE_HOST}=ADDRESS, or start the operator with --advertise-host ADDRESS"
-    ), NO_ADVERTISE_HOST
+    fault = Fault(
+        f"the operator does not know this host's address{towards}",
+        f"Add the label {ADVERTISE_HOST}=ADDRESS, or start the operator with --advertise-host "
+        "ADDRESS",
+    )
+    return fault, NO_ADVERTISE_HOST
 
 
 def _requests(
@@ -199,19 +201,19 @@ def _requests(
         _request(version, container, observed, settings, proxies) for version in versions_with_range
     ]
     granted = [bounds.narrowed(r, settings) for r in requests]
-    texts = [*ros_versions.warnings(container, served)]
+    faults = [*ros_versions.warnings(container, served)]
     for request in requests:
         if isinstance(request.place.graph, Domain):
-            texts += ros_versions.static_peer_warnings(container, request.networks, observed)
-    refused = dict.fromkeys(text for _, refusals in granted for text in refusals)
+            faults += ros_versions.static_peer_warnings(container, request.networks, observed)
+    refused = dict.fromkeys(fault for _, refusals in granted for fault in refusals)
     members = [request for request, _ in granted]
     if "zenoh" in served:
         member, warnings = zenoh_member(container, observed, settings)
         members.append(member)
-        texts += warnings
+        faults += warnings
     return members, [
-        *(_warning(container, OPTION_IGNORED, text) for text in texts),
-        *(_warning(container, NOT_ALLOWED, text) for text in refused),
+        *(_warning(container, OPTION_IGNORED, fault) for fault in faults),
+        *(_warning(container, NOT_ALLOWED, fault) for fault in refused),
     ]
 
 
@@ -252,19 +254,20 @@ def _master_uri(container: Container, settings: PlanSettings, proxies: Collectio
         if not ros_versions.is_guessed(container):
             raise
         raise UnusableLabel(
-            f"{ros_versions.UNKNOWN_VERSION}. Add the label {ROS}=2 for ROS 2, or the label "
-            f"{MASTER_URI}=http://HOST:11311 for ROS 1"
+            ros_versions.UNKNOWN_VERSION,
+            f"Add the label {ROS}=2 for ROS 2, or the label {MASTER_URI}=http://HOST:11311 for "
+            "ROS 1",
         ) from None
 
 
-def _warning(container: Container, reason: str, text: str) -> Problem:
-    return Problem(f"container {container.name}", text, fatal=False, reason=reason)
+def _warning(container: Container, reason: str, fault: Fault) -> Problem:
+    return Problem(f"container {container.name}", *fault, fatal=False, reason=reason)
 
 
-def _unusable(container: Container, text: str, reason: str) -> Problem:
+def _unusable(container: Container, fault: Fault, reason: str) -> Problem:
     """Return a problem, fatal if a label is for the operator: a variable alone is no request."""
     fatal = bool(_labels_for_operator(container))
-    return Problem(f"container {container.name}", text, fatal, reason=reason)
+    return Problem(f"container {container.name}", *fault, fatal=fatal, reason=reason)
 
 
 def _is_enabled(container: Container, settings: PlanSettings) -> bool:
@@ -299,22 +302,20 @@ def _labels_for_operator(container: Container) -> list[str]:
 
 def _warnings(container: Container, settings: PlanSettings) -> Iterator[Problem]:
     """Yield warnings about labels without effect."""
+    foreign = ""
     if container.forged:
-        yield _warning(
-            container,
-            OPTION_IGNORED,
+        foreign = (
             f"has the labels of the operator's own containers, but {container.forged}. An image "
-            "can carry such labels, so the operator ignores them. Remove the container (docker rm "
-            f"-f {container.name}) or the labels",
+            "can carry such labels, so the operator ignores them"
         )
     elif container.labels.get(MANAGED) == "true":
-        yield _warning(
-            container,
-            OPTION_IGNORED,
+        foreign = (
             f"has the label {MANAGED}, but not the other labels of the operator's own containers, "
-            "so the operator ignores this label. Remove the container (docker rm -f "
-            f"{container.name}) or the label",
+            "so the operator ignores this label"
         )
+    if foreign:
+        fix = f"Remove the container (docker rm -f {container.name}) or the labels"
+        yield _warning(container, OPTION_IGNORED, Fault(foreign, fix))
     own = _labels_for_operator(container)
     if container.labels.get(ENABLE, "").strip().lower() == "false":
         return
@@ -323,17 +324,18 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[Problem]
     for name in reported:
         near = nearest(name, LABELS, LEAST_SIMILARITY_WITH_PREFIX)
         shown = f"label {bounded(name, MOST_NAME_CHARACTERS)}"
-        yield _warning(container, UNKNOWN_NAME, unknown_name(shown, near, ", ".join(LABELS)))
+        text = unknown_name(shown, near, ", ".join(LABELS))
+        yield _warning(container, UNKNOWN_NAME, Fault(text, _CORRECT_LABEL))
     if left_out := len(unknown) - len(reported):
-        text = f"{left_out} more labels {_PREFIX}.… are unknown and ignored. Remove these labels"
-        yield _warning(container, UNKNOWN_NAME, text)
+        text = f"{left_out} more labels {_PREFIX}.… are unknown and ignored"
+        yield _warning(container, UNKNOWN_NAME, Fault(text, "Remove these labels"))
     misspelt = any(
         nearest(name, LABELS, LEAST_SIMILARITY_WITH_PREFIX) == ENABLE for name in reported
     )  # warned of above
     if own and not misspelt and ENABLE not in container.labels and not settings.expose_by_default:
         names = listed(f"label {bounded(name, MOST_NAME_CHARACTERS)}" for name in own)
-        text = f"{names} ignored, since the label {ENABLE}=true is missing. Add that label"
-        yield _warning(container, OPTION_IGNORED, text)
+        text = f"{names} ignored, since the label {ENABLE}=true is missing"
+        yield _warning(container, OPTION_IGNORED, Fault(text, "Add that label"))
 
 
 def _advertised(request: Member, observed: HostState) -> str:

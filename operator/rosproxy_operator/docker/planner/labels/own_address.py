@@ -9,29 +9,25 @@ the proxy replaces the address. Two values do harm:
 """
 
 from rosproxy.net.addresses import is_loopback
-from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.common.problem import Fault, bounded
 from rosproxy_operator.docker.planner.model import Container, HostState
 from rosproxy_operator.proxy_spec.place import Place
 
 _ADDRESS_VARIABLES = ("ROS_IP", "ROS_HOSTNAME")
 
 
-def wrong_own_address(container: Container, place: Place, observed: HostState) -> str:
-    """Return what is wrong with ROS_IP or ROS_HOSTNAME of a ROS 1 container; empty for no fault."""
+def wrong_own_address(container: Container, place: Place, observed: HostState) -> Fault | None:
+    """Return what is wrong with ROS_IP or ROS_HOSTNAME of a ROS 1 container; None for no fault."""
     for name in _ADDRESS_VARIABLES:
         value = container.variables.get(name, "").strip().lower()
         fix = f"Unset {name}: no node behind a proxy needs this variable"
         if value and is_loopback(value):
-            return (
-                f"variable {name}={bounded(value, 80)} makes the nodes listen on loopback only, so "
-                f"the proxy can't reach them. {fix}"
-            )
+            text = f"variable {name}={bounded(value, 80)} makes the nodes listen on loopback only, "
+            return Fault(f"{text}so the proxy can't reach them", fix)
         if value and value in _names_of_this_host(place, observed):
-            return (
-                f"variable {name}={value} is the address of this host, not of the container. So "
-                f"roslaunch ends with 'Unable to contact my own server'. {fix}"
-            )
-    return ""
+            text = f"variable {name}={value} is the address of this host, not of the container. So "
+            return Fault(f"{text}roslaunch ends with 'Unable to contact my own server'", fix)
+    return None
 
 
 def _names_of_this_host(place: Place, observed: HostState) -> frozenset[str]:

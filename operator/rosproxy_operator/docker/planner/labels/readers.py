@@ -16,6 +16,7 @@ from rosproxy_operator.common.problem import (
     INVALID,
     MASTER_UNKNOWN,
     NOT_ALLOWED,
+    Fault,
     bounded,
 )
 from rosproxy_operator.common.ros2 import MOST_PEERS
@@ -58,6 +59,7 @@ MOST_VALUE_CHARACTERS = 16 * 1024
 MOST_HOST_CHARACTERS = 253
 """Most characters of a host name (RFC 1035, 2.3.4)."""
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
+_GIVE_HOST = "Give the name or address at which outside reaches this host"
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
 Labels = Mapping[str, str]
@@ -65,9 +67,13 @@ Peer = TypeVar("Peer")
 
 
 class UnusableLabel(Exception):
-    """A container gets no proxy. The message says what is wrong, and what to do."""
+    """A container gets no proxy, because of a fault."""
 
     reason = INVALID
+
+    def __init__(self, text: str, fix: str = "") -> None:
+        self.fault = Fault(text, fix)
+        super().__init__(str(self.fault))
 
 
 class NoMaster(UnusableLabel):
@@ -97,9 +103,8 @@ def refuse_long_values(labels: Labels) -> None:
     for label in LABELS:
         if len(labels.get(label, "")) > MOST_VALUE_CHARACTERS:
             fix = "Join rules by globs" if label == POLICY else "Shorten the value"
-            raise UnusableLabel(
-                f"label {label} has more than {MOST_VALUE_CHARACTERS} characters. {fix}"
-            )
+            text = f"label {label} has more than {MOST_VALUE_CHARACTERS} characters"
+            raise UnusableLabel(text, fix)
 
 
 def enabled(labels: Labels) -> bool | None:
@@ -119,8 +124,8 @@ def ports(labels: Labels) -> int:
     digits = labels[PORTS].strip()
     if not re.fullmatch(r"[0-9]{1,6}", digits) or not 1 <= int(digits) <= MOST_PORTS:
         raise UnusableLabel(
-            f"{named(PORTS, labels)} is not a number from 1 to {MOST_PORTS}. Give the number of "
-            f"ports of the whole proxy, one for each node, such as {PORTS}=32"
+            f"{named(PORTS, labels)} is not a number from 1 to {MOST_PORTS}",
+            f"Give the number of ports of the whole proxy, one for each node, such as {PORTS}=32",
         )
     return int(digits)
 
@@ -156,7 +161,7 @@ def links(labels: Labels) -> list[str]:
 def _hosts(label: str, labels: Labels, most: int, read: Callable[[str], Peer]) -> list[Peer]:
     names = [name for name in re.split(r"[,\s]+", labels.get(label, "")) if name]
     if len(names) > most:
-        raise UnusableLabel(f"label {label} names more than {most} hosts. Name fewer hosts")
+        raise UnusableLabel(f"label {label} names more than {most} hosts", "Name fewer hosts")
     try:
         return [*map(read, names)]
     except ValueError as error:
@@ -175,7 +180,7 @@ def policy(labels: Labels) -> tuple[Rule, ...]:
         raise UnusableLabel(f"label {POLICY}: {error}") from None
     if len(rules) > MOST_LABEL_RULES:
         text = f"label {POLICY} has {len(rules)} rules, at most {MOST_LABEL_RULES} are accepted"
-        raise UnusableLabel(f"{text}. Join rules by globs")
+        raise UnusableLabel(text, "Join rules by globs")
     return rules
 
 
@@ -199,7 +204,7 @@ def networks(container: Container, observed: HostState, uplink: str) -> frozense
     if NETWORK in container.labels:
         return frozenset({_named_network(container.labels, own)})
     if not own:
-        raise UnusableLabel(_why_no_network(net_owner))
+        raise UnusableLabel(*_why_no_network(net_owner))
     return own
 
 
@@ -207,8 +212,8 @@ def _flag(label: str, labels: Labels, usual: str = "true") -> bool | None:
     """Return whether a label says true; None without the label. The error proposes ``usual``."""
     value = labels.get(label, "").strip().lower()
     if label in labels and value not in ("true", "false"):
-        text = f"{named(label, labels)} is neither true nor false. Write {label}={usual}"
-        raise UnusableLabel(text)
+        text = f"{named(label, labels)} is neither true nor false"
+        raise UnusableLabel(text, f"Write {label}={usual}")
     return value == "true" if value else None
 
 
@@ -219,22 +224,16 @@ def _wish(wish: Wish, choices: Collection[str], labels: Labels) -> str | bool | 
         return _flag(wish.label, labels)
     if value not in choices:
         text = f"{named(wish.label, labels)} is none of {', '.join(choices)}"
-        raise UnusableLabel(f"{text}. Write {wish.label}={wish.fix}")
+        raise UnusableLabel(text, f"Write {wish.label}={wish.fix}")
     return value
 
 
 def _host(source: str, value: str) -> str:
     bare = value.strip().removeprefix("[").removesuffix("]").lower()
     if not is_address(bare) and not _HOST.fullmatch(bare):
-        raise UnusableLabel(
-            f"{source} is neither a host name nor an address. Give the name or address at which "
-            "outside reaches this host"
-        )
+        raise UnusableLabel(f"{source} is neither a host name nor an address", _GIVE_HOST)
     if is_loopback(bare):
-        raise UnusableLabel(
-            f"{source} is loopback, which no other host can reach. Give the name or address at "
-            "which outside reaches this host"
-        )
+        raise UnusableLabel(f"{source} is loopback, which no other host can reach", _GIVE_HOST)
     return bare
 
 
@@ -275,29 +274,29 @@ def network_owner(container: Container, observed: HostState) -> Container:
         shared = f"shares the network of container {quoted(error.target)}, which"
         if error.is_loop:
             raise UnusableLabel(
-                f"{shared} shares the network of this container. Create one of the two with a "
-                "network of its own"
+                f"{shared} shares the network of this container",
+                "Create one of the two with a network of its own",
             ) from None
         raise UnusableLabel(
-            f"{shared} does not exist. Start that container, then create this container again"
+            f"{shared} does not exist", "Start that container, then create this container again"
         ) from None
 
 
-def _why_no_network(owner: Container) -> str:
+def _why_no_network(owner: Container) -> Fault:
     anew = "docker network create ros; docker run --network ros"
     if "host" in (*owner.networks, owner.network_mode):
-        return (
-            "is on the host's own network, where nodes need no proxy. Remove the labels, or start "
-            f"the container on a user-defined network: {anew}"
+        return Fault(
+            "is on the host's own network, where nodes need no proxy",
+            f"Remove the labels, or start the container on a user-defined network: {anew}",
         )
     # The engine connects no container of the mode none to another network.
     if owner.network_mode == "none":
-        return f"is on no network. Start the container on a user-defined network: {anew}"
+        return Fault("is on no network", f"Start the container on a user-defined network: {anew}")
     live = f"docker network create ros; docker network connect ros {owner.name}"
     if "bridge" in owner.networks or owner.network_mode in ("bridge", "default"):
         where = "is only on the default bridge network, where no names resolve"
-        return f"{where}. Attach the container to another network: {live}"
-    return f"is on no network. Attach the container to a network: {live}"
+        return Fault(where, f"Attach the container to another network: {live}")
+    return Fault("is on no network", f"Attach the container to a network: {live}")
 
 
 def master_uri(container: Container, settings: PlanSettings, proxies: Collection[str]) -> str:
@@ -317,15 +316,16 @@ def master_uri(container: Container, settings: PlanSettings, proxies: Collection
         source = f"the operator's --master-uri {quoted(settings.master_uri)}"
         return _parse_master(source, settings.master_uri, proxies)
     raise NoMaster(
-        f"the ROS master is not known. Add the label {MASTER_URI}=http://HOST:11311 with the real "
-        "master, or start the operator with --master-uri http://HOST:11311"
+        "the ROS master is not known",
+        f"Add the label {MASTER_URI}=http://HOST:11311 with the real master, or start the operator "
+        "with --master-uri http://HOST:11311",
     )
 
 
-def proxy_alias(container: Container, place: Place) -> tuple[str, str]:
+def proxy_alias(container: Container, place: Place) -> tuple[str, Fault | None]:
     """Return the name by which a container's nodes look for the proxy, and a warning.
 
-    The name is empty if no alias can help. The warning is empty if nothing is wrong.
+    The name is empty if no alias can help. The warning is None if nothing is wrong.
     """
     real = place.master
     fix = f"Set ROS_MASTER_URI=http://{ALIAS}:{real.port}"
@@ -333,20 +333,21 @@ def proxy_alias(container: Container, place: Place) -> tuple[str, str]:
         # Without the variable, ROS's setup script sets ROS_MASTER_URI to localhost
         # (ros_comm/tools/roslaunch/env-hooks/10.roslaunch.sh.in).
         nodes = "the nodes look for a master on localhost, unless a script sets the variable"
-        return ALIAS, f"has no variable ROS_MASTER_URI, so {nodes}. {fix}"
+        return ALIAS, Fault(f"has no variable ROS_MASTER_URI, so {nodes}", fix)
     target = parse_slave_uri(container.master_uri)
     variable = f"variable ROS_MASTER_URI={quoted(container.master_uri)}"
     if target is None:
-        return "", f"{variable} is not of the form http://HOST:11311. {fix}"
+        return "", Fault(f"{variable} is not of the form http://HOST:11311", fix)
     host = target.host.lower()
     if not is_address(host) and host in (ALIAS, real.host, proxy_name(place)):
         if target.port == real.port:
-            return host, ""
-        return host, f"{variable} has the wrong port, the proxy listens on {real.port}. {fix}"
+            return host, None
+        text = f"{variable} has the wrong port, the proxy listens on {real.port}"
+        return host, Fault(text, fix)
     if MASTER_URI not in container.labels:
         # A variable that names the proxy does not say which master the container means.
         fix += f" and the label {MASTER_URI}={place.master.uri}"
-    return "", f"{variable} {_wrong_master(host, place, fix)}"
+    return "", _wrong_master(host, place, variable, fix)
 
 
 def master_by_address(container: Container, place: Place) -> HostPort | None:
@@ -367,17 +368,17 @@ def master_by_address(container: Container, place: Place) -> HostPort | None:
     return HostPort(target.host, target.port)
 
 
-def _wrong_master(host: str, place: Place, fix: str) -> str:
+def _wrong_master(host: str, place: Place, variable: str, fix: str) -> Fault:
     if is_proxy_name(host):
-        return f"names the proxy of another master, not {proxy_name(place)}. {fix}"
-    if is_loopback(host):
-        return f"means the container itself. {fix}"
-    if is_address(host):
-        return (
-            "is an address, so the nodes bypass the proxy, and outside can't reach them. "
-            f"{fix}, or use the name of the master's host"
-        )
-    return f"is not the container's {place.graph}, so the nodes bypass the proxy. {fix}"
+        text = f"names the proxy of another master, not {proxy_name(place)}"
+    elif is_loopback(host):
+        text = "means the container itself"
+    elif is_address(host):
+        text = "is an address, so the nodes bypass the proxy, and outside can't reach them"
+        fix += ", or use the name of the master's host"
+    else:
+        text = f"is not the container's {place.graph}, so the nodes bypass the proxy"
+    return Fault(f"{variable} {text}", fix)
 
 
 def _names_proxy(host: str, proxies: Collection[str]) -> bool:
@@ -391,7 +392,7 @@ def _allowed_master(source: str, uri: str, settings: PlanSettings, proxies: Coll
     """
     parsed = _parse_master(source, uri, proxies)
     if refusal := bounds.refused_master(parsed, settings):
-        raise MasterNotAllowed(f"{source} {refusal}")
+        raise MasterNotAllowed(f"{source} {refusal.text}", refusal.fix)
     return parsed
 
 
@@ -407,12 +408,13 @@ def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:
     host = host_port.host.lower()
     if is_loopback(host):
         raise UnusableLabel(
-            f"{source} means the container itself, where no master runs. Give the name of the "
-            f"master's host, or set ROS_MASTER_URI=http://{ALIAS}:{host_port.port} and give the "
-            f"master in the label {MASTER_URI}"
+            f"{source} means the container itself, where no master runs",
+            f"Give the name of the master's host, or set ROS_MASTER_URI=http://{ALIAS}:"
+            f"{host_port.port} and give the master in the label {MASTER_URI}",
         )
     if _names_proxy(host, proxies):
         raise UnusableLabel(
-            f"{source} names a proxy. Give the real master, such as {MASTER_URI}=http://robot:11311"
+            f"{source} names a proxy",
+            f"Give the real master, such as {MASTER_URI}=http://robot:11311",
         )
     return slave_uri(HostPort(host, host_port.port), path)

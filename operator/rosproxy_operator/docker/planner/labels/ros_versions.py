@@ -18,6 +18,7 @@ from collections.abc import Collection, Iterator
 
 from rosproxy.leases.domain_ports import LAST_DOMAIN
 from rosproxy.net.addresses import is_inside, is_loopback
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.common.ros2 import (
     MOST_PEERS,
     ROS1_DISTROS,
@@ -49,9 +50,10 @@ _NOT_ZENOH_LABELS = (
     *(DOMAIN, PORTS, ADVERTISE_HOST, MASTER_URI),
     *(wish.label for wish in WISHES.values() if "zenoh" not in wish.ros),
 )
-_OF_ZENOH = (
-    "the label is for rmw_zenoh, the container is not. Remove the label, or set "
-    f"RMW_IMPLEMENTATION=rmw_zenoh_cpp in the container (or the label {RMW}=zenoh)"
+_OF_ZENOH = Fault(
+    "the label is for rmw_zenoh, the container is not",
+    "Remove the label, or set RMW_IMPLEMENTATION=rmw_zenoh_cpp in the container (or the label "
+    f"{RMW}=zenoh)",
 )
 UNKNOWN_VERSION = "no label and no variable states the ROS version"
 
@@ -72,7 +74,7 @@ def _has_zenoh(container: Container) -> bool:
     labels = container.labels
     if RMW in labels and labels[RMW].strip().lower() != "zenoh":
         fix = f"Write {RMW}=zenoh, or remove the label: the proxy then serves DDS"
-        raise UnusableLabel(f"{named(RMW, labels)} is not zenoh. {fix}")
+        raise UnusableLabel(f"{named(RMW, labels)} is not zenoh", fix)
     # rmw_zenohd itself does not need the variable.
     stated = container.variables.get("RMW_IMPLEMENTATION", "")
     return RMW in labels or (not is_dds(stated) if stated else container.is_zenoh_router)
@@ -82,10 +84,8 @@ def _ros_versions(container: Container) -> frozenset[str]:
     if ROS in container.labels:
         tokens = frozenset(re.split(r"[,\s]+", container.labels[ROS].strip()))
         if not tokens <= {"1", "2"}:
-            text = (
-                f"{named(ROS, container.labels)} is none of 1, 2 and 1,2. Write {ROS}=2 for ROS 2"
-            )
-            raise UnusableLabel(text)
+            text = f"{named(ROS, container.labels)} is none of 1, 2 and 1,2"
+            raise UnusableLabel(text, f"Write {ROS}=2 for ROS 2")
         return tokens
     version = _version_of_image(container) or ("2" if _is_marked_ros2(container) else "1")
     return frozenset({version})
@@ -126,7 +126,7 @@ def domain(container: Container) -> int:
     digits = text.strip()
     if not re.fullmatch(r"[0-9]{1,3}", digits, re.ASCII) or int(digits) > LAST_DOMAIN:
         fix = f"Write the domain of the nodes into the label, such as {DOMAIN}=0"
-        raise UnusableLabel(f"{source} is not a domain from 0 to {LAST_DOMAIN}. {fix}")
+        raise UnusableLabel(f"{source} is not a domain from 0 to {LAST_DOMAIN}", fix)
     return int(digits)
 
 
@@ -135,13 +135,14 @@ def refuse_ipv6_host(host: str) -> None:
     if ":" in host:
         raise UnusableLabel(
             f"advertised host {host} is an IPv6 address, but the operator starts proxies for ROS 2 "
-            "with IPv4 only. Give an IPv4 address"
+            "with IPv4 only",
+            "Give an IPv4 address",
         )
 
 
 def static_peer_warnings(
     container: Container, networks: Collection[str], observed: HostState
-) -> Iterator[str]:
+) -> Iterator[Fault]:
     """Yield warnings for hosts outside that the variable ROS_STATIC_PEERS of a container names.
 
     ``networks`` are the names of the container's networks. The nodes announce inside addresses
@@ -155,10 +156,11 @@ def static_peer_warnings(
     named_hosts = container.variables.get("ROS_STATIC_PEERS", "").split(";")
     for host in filter(None, (host.strip().lower() for host in named_hosts[:MOST_PEERS])):
         if host not in inside and not is_loopback(host) and not is_inside(host, subnets):
-            yield (
+            yield Fault(
                 f"variable ROS_STATIC_PEERS names {quoted(host)}, which is not on a network of "
                 "this container. That host learns an address that it can't reach, and keeps that "
-                f"address. Unset the variable, and add the label {PEERS}={quoted(host)}"
+                "address",
+                f"Unset the variable, and add the label {PEERS}={quoted(host)}",
             )
 
 
@@ -169,24 +171,25 @@ def is_guessed(container: Container) -> bool:
     return not is_stated and not _is_marked_ros2(container)
 
 
-def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[str]:
+def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[Fault]:
     """Yield warnings for a container of these versions. The container gets a proxy nevertheless."""
     labels = container.labels
     if is_guessed(container):
-        yield f"{UNKNOWN_VERSION}, so the operator assumes ROS 1. Add the label {ROS}=1 or {ROS}=2"
+        text = f"{UNKNOWN_VERSION}, so the operator assumes ROS 1"
+        yield Fault(text, f"Add the label {ROS}=1 or {ROS}=2")
     yield from (
-        f"label {label} is ignored: {text}"
-        for label, text in _ignored(ros_versions).items()
+        Fault(f"label {label} is ignored: {fault.text}", fault.fix)
+        for label, fault in _ignored(ros_versions).items()
         if label in labels
     )
 
 
-def _ignored(ros_versions: Collection[str]) -> dict[str, str]:
+def _ignored(ros_versions: Collection[str]) -> dict[str, Fault]:
     """Return the labels without effect on a container of these versions, with reason and fix."""
-    without_effect = "the label has no effect on rmw_zenoh. Remove the label"
+    without_effect = Fault("the label has no effect on rmw_zenoh", "Remove the label")
     if ros_versions == {"zenoh"}:
         return dict.fromkeys(_NOT_ZENOH_LABELS, without_effect)
-    ignored: dict[str, str] = {}
+    ignored: dict[str, Fault] = {}
     if "1" not in ros_versions:
         ignored |= dict.fromkeys(_ROS1_LABELS, _of_another_version("1"))
     if "zenoh" in ros_versions:
@@ -198,8 +201,8 @@ def _ignored(ros_versions: Collection[str]) -> dict[str, str]:
     return ignored
 
 
-def _of_another_version(version: str) -> str:
-    return (
-        f"the label is for ROS {version}, the container is not. Remove the label, or set "
-        f"{ROS}={version} if the nodes use ROS {version}"
+def _of_another_version(version: str) -> Fault:
+    return Fault(
+        f"the label is for ROS {version}, the container is not",
+        f"Remove the label, or set {ROS}={version} if the nodes use ROS {version}",
     )

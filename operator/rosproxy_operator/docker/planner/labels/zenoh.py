@@ -17,6 +17,7 @@ from rosproxy.telemetry.text import listed
 from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy_operator.common.problem import (
     TOO_MANY,
+    Fault,
     Problem,
 )
 from rosproxy_operator.common.zenoh import (
@@ -48,9 +49,10 @@ from rosproxy_operator.proxy_spec.place import ZENOH
 
 _PROXIES = (ALIAS, proxy_name(ZENOH))
 """The names of the proxy on the networks of containers."""
-_NEEDS_REDIRECT = (
-    "has no effect without the redirect, since the container then has no port of its own. Remove "
-    "--no-redirect of the operator and the label rosproxy.redirect, or remove the rules"
+_NEEDS_REDIRECT = Fault(
+    f"label {POLICY} has no effect without the redirect, since the container then has no port of "
+    "its own",
+    "Remove --no-redirect of the operator and the label rosproxy.redirect, or remove the rules",
 )
 
 
@@ -83,7 +85,7 @@ class _Router:
 
 def zenoh_member(
     container: Container, observed: HostState, settings: PlanSettings
-) -> tuple[Member, list[str]]:
+) -> tuple[Member, list[Fault]]:
     """Return what a container with rmw_zenoh asks for, and warnings. Raises UnusableLabel."""
     labels = container.labels
     rules = _rules(labels, settings)
@@ -120,7 +122,7 @@ def zenoh_member(
     warnings += _bypass_warnings(router for router in outside if router not in redirected)
     if not settings.redirect or member.redirect is False:
         if rules:
-            raise UnusableLabel(f"label {POLICY} {_NEEDS_REDIRECT}")
+            raise UnusableLabel(*_NEEDS_REDIRECT)
         return member, [*warnings, _redirect_warning()]
     addresses = (LOCAL_ROUTER, *(router.address for router in redirected))
     return replace(member, redirected=tuple(dict.fromkeys(addresses))), warnings
@@ -128,7 +130,7 @@ def zenoh_member(
 
 def peers_of_one_router(
     members: Iterable[Member], observed: HostState
-) -> Iterator[tuple[Container, str]]:
+) -> Iterator[tuple[Container, Fault]]:
     """Yield a warning for each container whose nodes are peers of the router of other containers.
 
     A router of rmw_zenohd passes no data between two of its peers, in any version of zenoh.
@@ -174,17 +176,18 @@ def _routers_of_peer(
     return near | {(owners[r.neighbour.id], r.address.port) for r in named if r.neighbour}
 
 
-def _shared_router_warning(member: Member, router: str, others: Collection[str]) -> str:
+def _shared_router_warning(member: Member, router: str, others: Collection[str]) -> Fault:
     fix = f'Add mode="client" to the variable {OVERRIDE} of these containers'
     if member.redirected:
         fix += (
             ". Or remove connect/endpoints from the variables, and add the label "
             f"{PEERS}={router}: a router of the proxy then serves each of these containers"
         )
-    return (
+    return Fault(
         f"the nodes are peers of the same router ({quoted(router)}) as the nodes of container "
         f"{listed(others)}. Messages between these containers do not pass: rmw_zenohd passes none "
-        f"between its peers, and neither does zenohd from 1.9 on. {fix}"
+        "between its peers, and neither does zenohd from 1.9 on",
+        fix,
     )
 
 
@@ -203,12 +206,10 @@ def with_bounded_containers(
     """
     every = tuple(members)
     excess = [member for member in every if member.place == ZENOH][MOST_ZENOH_PORTS:]
-    text = (
-        f"a proxy for rmw_zenoh serves at most {MOST_ZENOH_PORTS} containers. Remove labels "
-        f"{readers.ENABLE} of other containers"
-    )
+    text = f"a proxy for rmw_zenoh serves at most {MOST_ZENOH_PORTS} containers"
+    fix = f"Remove labels {readers.ENABLE} of other containers"
     problems = (
-        Problem(f"container {m.container.name}", text, reason=TOO_MANY)
+        Problem(f"container {m.container.name}", text, fix, reason=TOO_MANY)
         for m in excess
         if m.container.alive
     )
@@ -241,7 +242,8 @@ def _refuse_detours(container: Container, has_own_rules: bool, has_router: bool)
     if has_router:
         raise UnusableLabel(
             "has a policy, and a router runs in the container or in its network. Nodes at that "
-            "router bypass the policy. Remove the router, or the rules"
+            "router bypass the policy",
+            "Remove the router, or the rules",
         )
     proxies = () if has_own_rules else _PROXIES
     for protocol, address in connect_endpoints(container.variables.get(OVERRIDE, "")):
@@ -249,8 +251,9 @@ def _refuse_detours(container: Container, has_own_rules: bool, has_router: bool)
         if not is_loopback(address.host) and not is_of_proxy:
             raise UnusableLabel(
                 f"has a policy, and variable {OVERRIDE} connects the nodes to "
-                f"{quoted(str(address))}, past the policy. Remove connect/endpoints from the "
-                f"variable, and name routers outside in the label {PEERS}"
+                f"{quoted(str(address))}, past the policy",
+                "Remove connect/endpoints from the variable, and name routers outside in the label "
+                f"{PEERS}",
             )
 
 
@@ -307,49 +310,49 @@ def _is_redirectable(router: _Router, owner: Container, observed: HostState) -> 
     return is_address(host) and ":" not in host and not owner.networks <= internal
 
 
-def _refusal_warnings(refused: Iterable[_Router]) -> Iterator[str]:
+def _refusal_warnings(refused: Iterable[_Router]) -> Iterator[Fault]:
     for router in refused:
-        yield (
+        yield Fault(
             f"{router.named_by} names {quoted(router.peer)}, which the operator does not allow. "
-            "The proxy does not connect there. To allow this router, start the operator with "
-            f"--allow-peer {router.peer}"
+            "The proxy does not connect there",
+            f"To allow this router, start the operator with --allow-peer {router.peer}",
         )
 
 
-def _link_warnings(refused: Iterable[str], settings: PlanSettings) -> Iterator[str]:
+def _link_warnings(refused: Iterable[str], settings: PlanSettings) -> Iterator[Fault]:
     has_files = settings.zenoh_link_certificates
     directory = "" if has_files else " --zenoh-link-certificates DIRECTORY"
     for link in refused:
-        yield (
+        yield Fault(
             f"label {LINK} names {quoted(link)}, which the operator does not allow. The proxy does "
-            "not connect there. To allow this link, start the operator with "
-            f"--allow-link {link}{directory}"
+            "not connect there",
+            f"To allow this link, start the operator with --allow-link {link}{directory}",
         )
 
 
-def _bypass_warnings(routers: Iterable[_Router]) -> Iterator[str]:
+def _bypass_warnings(routers: Iterable[_Router]) -> Iterator[Fault]:
     """Yield warnings for routers to which the nodes connect directly, not through the proxy."""
     for router in routers:
-        yield (
+        yield Fault(
             f"{router.named_by} connects the nodes to {quoted(router.peer)}, and the operator can "
-            "redirect only an IPv4 address with a route. So the nodes bypass the proxy. Remove "
-            f"connect/endpoints from the variable, and add the label {PEERS}={router.peer}"
+            "redirect only an IPv4 address with a route. So the nodes bypass the proxy",
+            f"Remove connect/endpoints from the variable, and add the label {PEERS}={router.peer}",
         )
 
 
-def _protocol_warnings(container: Container) -> Iterator[str]:
+def _protocol_warnings(container: Container) -> Iterator[Fault]:
     for protocol, address in connect_endpoints(container.variables.get(OVERRIDE, "")):
         if protocol != "tcp":
-            yield (
+            yield Fault(
                 f"variable {OVERRIDE} connects the nodes by {quoted(protocol)}, and the proxy "
-                "connects by tcp only. Remove connect/endpoints from the variable, and add the "
-                f"label {PEERS}={address}"
+                "connects by tcp only",
+                f"Remove connect/endpoints from the variable, and add the label {PEERS}={address}",
             )
 
 
-def _redirect_warning() -> str:
-    return (
+def _redirect_warning() -> Fault:
+    return Fault(
         "is not redirected to the proxy, as --no-redirect of the operator or the label "
-        f"{REDIRECT} says. So the nodes do not find the proxy. Remove the option or label, or set "
-        f"{as_client(proxy_name(ZENOH))}"
+        f"{REDIRECT} says. So the nodes do not find the proxy",
+        f"Remove the option or label, or set {as_client(proxy_name(ZENOH))}",
     )

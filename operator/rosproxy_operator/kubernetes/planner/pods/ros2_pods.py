@@ -10,14 +10,14 @@ import re
 from collections.abc import Iterator
 
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.common.problem import NOT_WIRED
+from rosproxy_operator.common.problem import NOT_WIRED, Fault
 from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
     UNKNOWN_WEBHOOK,
     edit_fix,
     has_peers,
     is_of_service,
-    missing_variable_text,
+    missing_variable,
     recreate_command,
 )
 from rosproxy_operator.kubernetes.resources.cluster import WebhookState
@@ -49,30 +49,33 @@ def ros2_findings(
     problems = dict.fromkeys(
         p for c in pod.containers for p in _problems(c, pod, rosproxy, address)
     )
-    if (text := _peers_problem(pod, rosproxy, address, webhook)) and not any(
+    if (fault := _peers_problem(pod, rosproxy, address, webhook)) and not any(
         r == NOT_WIRED for r, _ in problems
     ):
-        problems[NOT_WIRED, text] = None
-    for reason, text in problems:
-        yield pod_finding(pod, rosproxy, reason, text, fatal=False)
+        problems[NOT_WIRED, fault] = None
+    for reason, fault in problems:
+        yield pod_finding(pod, rosproxy, reason, fault, fatal=False)
 
 
-def _peers_problem(pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState) -> str:
-    """The fault of the ROS_STATIC_PEERS that the webhook sets; empty if there is no fault."""
+def _peers_problem(
+    pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState
+) -> Fault | None:
+    """The fault of the ROS_STATIC_PEERS that the webhook sets; None if there is no fault."""
     if pod.static_peers and pod.static_peers != address:
-        return (
+        return Fault(
             f"was wired to {clean(pod.static_peers)[:200]} (ROS_STATIC_PEERS), but the proxy is at "
-            f"{address} now. Run {recreate_command(pod)}"
+            f"{address} now",
+            f"Run {recreate_command(pod)}",
         )
     if pod.static_peers or any(map(has_peers, pod.containers)):
-        return ""
-    return missing_variable_text("ROS_STATIC_PEERS", pod, rosproxy, webhook)
+        return None
+    return missing_variable("ROS_STATIC_PEERS", pod, rosproxy, webhook)
 
 
 def _problems(
     container: PodContainer, pod: Pod, rosproxy: RosProxy, address: str
-) -> Iterator[tuple[str, str]]:
-    """Yield the reason and the text of each fault of a container."""
+) -> Iterator[tuple[str, Fault]]:
+    """Yield the reason and the fault, for each fault of a container."""
     get = container.variables.get
     removal = edit_fix("Remove the variable from the template", pod)
     rmw = get("RMW_IMPLEMENTATION", "")
@@ -81,7 +84,7 @@ def _problems(
             f"variable RMW_IMPLEMENTATION={_shown(rmw)} is not DDS, and a proxy forwards DDS only"
         )
         fix = edit_fix("Set rmw_fastrtps_cpp or rmw_cyclonedds_cpp in the template", pod)
-        yield "NoDds", f"{text}. {fix}. Or use a RosProxy with spec.ros: zenoh"
+        yield "NoDds", Fault(text, f"{fix}. Or use a RosProxy with spec.ros: zenoh")
     peers = get("ROS_STATIC_PEERS")
     if (
         peers is not None
@@ -90,7 +93,7 @@ def _problems(
     ):
         text = f"variable ROS_STATIC_PEERS={_shown(peers)} of the template does not name the proxy"
         fix = f"Remove the variable from the template, or add {address} to the variable"
-        yield NOT_WIRED, f"{text}. {edit_fix(fix, pod)}"
+        yield NOT_WIRED, Fault(text, edit_fix(fix, pod))
     domain = get("ROS_DOMAIN_ID")
     number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
     # rcl treats an empty variable as unset (rcl, domain_id.c), and the webhook keeps the variable.
@@ -99,19 +102,19 @@ def _problems(
         name = rosproxy.id.name
         text = f"variable ROS_DOMAIN_ID={value} is not domain {number} of RosProxy {name}"
         edit = f"kubectl -n {rosproxy.id.namespace} edit rosproxy {name}"
-        yield "OtherDomain", f"{text}. {removal}. Or change spec.domain: {edit}"
+        yield "OtherDomain", Fault(text, f"{removal}. Or change spec.domain: {edit}")
     distro = _OLD.search(get("ROS_DISTRO", "").lower()) or _OLD.search(container.image.lower())
     if distro:
         text = f"has ROS 2 {distro[1].capitalize()}, which does not support ROS_STATIC_PEERS"
         fix = edit_fix("Use an image with Iron or a later distribution in the template", pod)
-        yield "TooOld", f"{text}. {fix}"
+        yield "TooOld", Fault(text, fix)
     reach = get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
     if reach.upper() in _RANGES_WITHOUT_PEERS:
         text = f"variable ROS_AUTOMATIC_DISCOVERY_RANGE={_shown(reach)} makes ROS 2 ignore static"
-        yield "Alone", f"{text} peers, such as the proxy. {removal}"
+        yield "Alone", Fault(f"{text} peers, such as the proxy", removal)
     if get("ROS_LOCALHOST_ONLY") == "1":
         text = "variable ROS_LOCALHOST_ONLY=1 keeps the participants of the pod from being"
-        yield "Alone", f"{text} discovered. {removal}"
+        yield "Alone", Fault(f"{text} discovered", removal)
 
 
 def _names_service(peers: str, rosproxy: RosProxy, address: str) -> bool:

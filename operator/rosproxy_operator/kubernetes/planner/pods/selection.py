@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 
 from rosproxy.telemetry.text import shorten
+from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.common.zenoh import tcp_endpoint
 from rosproxy_operator.kubernetes.planner.pods.wiring import edit_fix, recreate_fix
 from rosproxy_operator.kubernetes.resources.model import (
@@ -62,37 +63,38 @@ def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | Clus
     wired = [r for r in taking if _is_wired_to(pod, r)]
     if not named and len(taking) > 1 and len(wired) != 1:
         text = f"is selected by RosProxy {_names(taking)}, so the pod gets no proxy"
-        return pod_finding(pod, taking[0], "Ambiguous", f"{text}. {_choice_fix(pod, taking[0])}")
+        return pod_finding(pod, taking[0], "Ambiguous", Fault(text, _choice_fix(pod, taking[0])))
     rosproxy = (named or (wired if len(wired) == 1 else taking))[0]
     if pod.host_network:
         text = (
             "is on the node's own network (hostNetwork), where ROS nodes need no proxy and get none"
         )
         fix = edit_fix(f"Remove hostNetwork or the label {INJECT} from the template", pod)
-        return pod_finding(pod, rosproxy, "HostNetwork", f"{text}. {fix}")
+        return pod_finding(pod, rosproxy, "HostNetwork", Fault(text, fix))
     return rosproxy
 
 
-def ambiguity_warning(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
-    """Return the text about a pod that stays with its RosProxy though several select the pod.
+def ambiguity_warning(pod: Pod, rosproxies: Iterable[RosProxy]) -> Fault | None:
+    """Return the fault of a pod that stays with its RosProxy though several select the pod.
 
-    The result is empty if the choice is clear, or if `select_rosproxy` chooses no RosProxy.
+    The result is None if the choice is clear, or if `select_rosproxy` chooses no RosProxy.
     """
     taking = _taking(pod, rosproxies)
     wired = [r for r in taking if _is_wired_to(pod, r)]
     if len(taking) <= 1 or len(wired) != 1 or _named(pod, taking):
-        return ""
+        return None
     kept = wired[0]
-    return (
+    return Fault(
         f"is selected by RosProxy {_names(taking)}. This pod stays with {kept.id.name}, but a new "
-        f"pod with this label gets no proxy. {_choice_fix(pod, kept)}"
+        "pod with this label gets no proxy",
+        _choice_fix(pod, kept),
     )
 
 
-def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
+def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> Fault | None:
     """Return why no RosProxy selects a labelled pod, and the fix.
 
-    The result is empty if the pod has no label, or a value of `LABEL_OFF_VALUES`. The caller has
+    The result is None if the pod has no label, or a value of `LABEL_OFF_VALUES`. The caller has
     checked that no RosProxy selects the pod.
     """
     label = pod.labels.get(INJECT, "")
@@ -101,30 +103,30 @@ def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
     )
     names = [r.id.name for r in local]
     if label in LABEL_OFF_VALUES:
-        return ""
+        return None
     lost = "outside can't reach the ROS nodes of the pod"
     if not names:
-        return (
-            f"namespace {pod.id.namespace} has no RosProxy, so {lost}. Create a RosProxy there, "
-            f"then {recreate_fix(pod)}"
+        return Fault(
+            f"namespace {pod.id.namespace} has no RosProxy, so {lost}",
+            f"Create a RosProxy there, then {recreate_fix(pod)}",
         )
     if label not in (_ANY, *names):
         value = " or ".join(names[:MOST_NAMES])
         if label.lower() in (_ANY, *LABEL_OFF_VALUES):
             value = f"{label.lower()} in lower case"
-        return (
-            f"label {INJECT}={label} names no RosProxy of namespace {pod.id.namespace}, so {lost}. "
-            f"{edit_fix(f'Set the label to {value} in the template', pod)}"
+        return Fault(
+            f"label {INJECT}={label} names no RosProxy of namespace {pod.id.namespace}, so {lost}",
+            edit_fix(f"Set the label to {value} in the template", pod),
         )
     selectors = [
         f"{r.id.name} ({shown(r.spec.pod_selector)})" for r in local if r.spec.pod_selector
     ]
     named = next((name for name in names if name == label), names[0])
-    return (
+    return Fault(
         "the labels of the pod do not match spec.podSelector of RosProxy "
-        f"{' and '.join(selectors[:MOST_NAMES])}, so {lost}. "
+        f"{' and '.join(selectors[:MOST_NAMES])}, so {lost}",
         f"{edit_fix('Add the missing labels to the template', pod)}. Or correct the selector: "
-        f"kubectl -n {pod.id.namespace} edit rosproxy {named}; then {recreate_fix(pod)}"
+        f"kubectl -n {pod.id.namespace} edit rosproxy {named}; then {recreate_fix(pod)}",
     )
 
 

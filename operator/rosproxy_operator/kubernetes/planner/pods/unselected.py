@@ -7,7 +7,7 @@ an Event. If the namespace has RosProxies, the status of the first also reports 
 from collections.abc import Iterator, Mapping
 from heapq import nsmallest
 
-from rosproxy_operator.common.problem import NOT_WIRED
+from rosproxy_operator.common.problem import NOT_WIRED, Fault
 from rosproxy_operator.kubernetes.planner.cluster_view import View, group_by_key
 from rosproxy_operator.kubernetes.planner.pods.selection import why_not_selected
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Name, Reference
@@ -34,9 +34,9 @@ def unselected_findings(
         of = min((r.id for r in rosproxies), default=Name(namespace, ""))
         for pod in nsmallest(MOST_PODS, group, key=lambda p: p.id):
             about = Reference("Pod", pod.id, pod.uid)
-            text = why_not_selected(pod, rosproxies)
+            fault = why_not_selected(pod, rosproxies) or Fault("")
             yield ClusterFinding(
-                f"pod {pod.id}", text, fatal=False, reason=NOT_WIRED, of=of, about=about
+                f"pod {pod.id}", *fault, fatal=False, reason=NOT_WIRED, of=of, about=about
             )
 
 

@@ -16,7 +16,7 @@ import msgspec
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.common.problem import NOT_WIRED
+from rosproxy_operator.common.problem import NOT_WIRED, Fault
 from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.common.zenoh import OVERRIDE, tcp_endpoint, with_client_override
 from rosproxy_operator.kubernetes.resources import objects
@@ -164,8 +164,8 @@ def wiring_finding(
     Also if the pod has to be recreated: the ROS nodes may not be registered any more. Else None.
     ``cluster_ip`` is the address of the RosProxy's Service.
     """
-    text = _why_not_wired(pod, rosproxy, cluster_ip, webhook)
-    return pod_finding(pod, rosproxy, NOT_WIRED, text, fatal=False) if text else None
+    fault = _why_not_wired(pod, rosproxy, cluster_ip, webhook)
+    return pod_finding(pod, rosproxy, NOT_WIRED, fault, fatal=False) if fault else None
 
 
 def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
@@ -301,60 +301,62 @@ def should_be_wired(
     return datetime.fromisoformat(pod.created) - latest >= WEBHOOK_READY_AFTER
 
 
-def _why_not_wired(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState) -> str:
-    """Return why the ROS 1 nodes of a pod do not use the proxy, and the fix; else empty."""
+def _why_not_wired(
+    pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState
+) -> Fault | None:
+    """Return why the ROS 1 nodes of a pod do not use the proxy, and the fix; else None."""
     masters = _masters_of(rosproxy)
     bypassing = [
         uri for uri in pod.own_masters if not _leads_to_proxy(uri, rosproxy.id, cluster_ip)
     ]
     foreign = [uri for uri in bypassing if not _names_master(uri, masters)]
     if foreign:
-        return (
+        return Fault(
             f"variable ROS_MASTER_URI={clean(foreign[0])[:200]} of the template does not lead to "
-            "the proxy, so the nodes bypass the proxy. "
-            f"{edit_fix('Remove the variable from the template', pod)}"
+            "the proxy, so the nodes bypass the proxy",
+            edit_fix("Remove the variable from the template", pod),
         )
     if pod.wired_master_uri and pod.wired_master_uri != master_uri(cluster_ip):
-        return (
+        return Fault(
             f"was wired to {clean(pod.wired_master_uri)[:200]}, but the proxy is at "
-            f"{master_uri(cluster_ip)} now. Run {recreate_command(pod)}"
+            f"{master_uri(cluster_ip)} now",
+            f"Run {recreate_command(pod)}",
         )
     if lost := _why_lost(pod, rosproxy):
-        return f"{lost}. Run {recreate_command(pod)}"
+        return Fault(lost, f"Run {recreate_command(pod)}")
     if not bypassing and (pod.wired_master_uri or pod.own_masters):
-        return ""
-    return missing_variable_text("ROS_MASTER_URI", pod, rosproxy, webhook)
+        return None
+    return missing_variable("ROS_MASTER_URI", pod, rosproxy, webhook)
 
 
-def missing_variable_text(
-    variable: str, pod: Pod, rosproxy: RosProxy, webhook: WebhookState
-) -> str:
-    """The text about a pod without the variable: the fault, the reason and the fix."""
+def missing_variable(variable: str, pod: Pod, rosproxy: RosProxy, webhook: WebhookState) -> Fault:
+    """The fault of a pod without the variable: the reason and the fix."""
     text = f"has no variable {variable} with the address of the proxy"
     if INJECT not in pod.labels:
         label = f"{INJECT}={rosproxy.id.name}"
         fix = edit_fix(f"Add the label {label} to the template", pod)
-        return f"{text}, since the pod has no label {INJECT}. {fix}"
+        return Fault(f"{text}, since the pod has no label {INJECT}", fix)
     restart = f"Run {recreate_command(pod)}"
     if not webhook.served:
         fix = edit_fix(f"Set {variable} in the template", pod)
-        return f"{text}, since the operator serves no webhook (webhook.enabled=false). {fix}"
+        reason = "the operator serves no webhook (webhook.enabled=false)"
+        return Fault(f"{text}, since {reason}", fix)
     if pod.wired_master_uri or pod.static_peers or pod.router_endpoint:
         changed = f"spec.ros of RosProxy {rosproxy.id.name} has changed"
-        return f"{text}, since {changed} after the pod was created. {restart}"
+        return Fault(f"{text}, since {changed} after the pod was created", restart)
     if younger := _younger_object(pod, rosproxy, webhook.service_since):
-        return f"{text}, since the pod is older than {younger}. {restart}"
+        return Fault(f"{text}, since the pod is older than {younger}", restart)
     reason = (
         "no operator answered the API server at the webhook port (chart value webhook.port) when "
         "the pod was created"
     )
     if should_be_wired(pod, rosproxy, webhook.since, webhook.service_since):
-        return (
-            f"{text}, since {reason}, although an operator was ready. Allow connections from the "
-            "API server to the webhook port of the operator's pods (NetworkPolicy, firewall). "
-            f"{restart}"
+        return Fault(
+            f"{text}, since {reason}, although an operator was ready",
+            "Allow connections from the API server to the webhook port of the operator's pods "
+            f"(NetworkPolicy, firewall). {restart}",
         )
-    return f"{text}, since {reason}. {restart}"
+    return Fault(f"{text}, since {reason}", restart)
 
 
 def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:

@@ -7,13 +7,13 @@ does not see variables that the image sets.
 from collections.abc import Iterator
 
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.common.problem import NOT_WIRED
+from rosproxy_operator.common.problem import NOT_WIRED, Fault
 from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, is_client, tcp_endpoint
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
     UNKNOWN_WEBHOOK,
     edit_fix,
     is_of_service,
-    missing_variable_text,
+    missing_variable,
     recreate_command,
     uses_dds,
     wired_override,
@@ -37,39 +37,42 @@ def zenoh_findings(
     if rosproxy.spec.zenoh is None:
         return
     found = dict.fromkeys(p for c in pod.containers for p in _problems(c, pod, rosproxy, address))
-    text = _wiring_problem(pod, rosproxy, address, webhook)
-    if text and not any(reason == NOT_WIRED for reason, _ in found):
-        found[NOT_WIRED, text] = None
-    for reason, text in found:
-        yield pod_finding(pod, rosproxy, reason, text, fatal=False)
+    fault = _wiring_problem(pod, rosproxy, address, webhook)
+    if fault and not any(reason == NOT_WIRED for reason, _ in found):
+        found[NOT_WIRED, fault] = None
+    for reason, fault in found:
+        yield pod_finding(pod, rosproxy, reason, fault, fatal=False)
 
 
-def _wiring_problem(pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState) -> str:
-    """The fault of the override that the webhook sets; empty if there is no fault."""
+def _wiring_problem(
+    pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState
+) -> Fault | None:
+    """The fault of the override that the webhook sets; None if there is no fault."""
     router = router_of(address)
     endpoint = tcp_endpoint(router)
     if pod.router_endpoint and pod.router_endpoint != endpoint:
-        return (
+        return Fault(
             f"was wired to {clean(pod.router_endpoint)[:200]} ({OVERRIDE}), but the proxy is at "
-            f"{endpoint} now. Run {recreate_command(pod)}"
+            f"{endpoint} now",
+            f"Run {recreate_command(pod)}",
         )
     if pod.router_endpoint:
-        return ""
+        return None
     lacking = (wired_override(c.variables, router, endpoint) for c in pod.containers)
     if not pod.containers or any(lacking):
-        return missing_variable_text(OVERRIDE, pod, rosproxy, webhook)
-    return ""
+        return missing_variable(OVERRIDE, pod, rosproxy, webhook)
+    return None
 
 
 def _problems(
     container: PodContainer, pod: Pod, rosproxy: RosProxy, address: str
-) -> Iterator[tuple[str, str]]:
-    """Yield the reason and the text of each fault of a container."""
+) -> Iterator[tuple[str, Fault]]:
+    """Yield the reason and the fault, for each fault of a container."""
     if uses_dds(container.variables):
         rmw = clean(container.variables["RMW_IMPLEMENTATION"])[:200]
         text = f"variable RMW_IMPLEMENTATION={rmw} is DDS, and RosProxy {rosproxy.id.name} is for "
         fix = edit_fix("Set rmw_zenoh_cpp in the template", pod)
-        yield "NoZenoh", f"{text}rmw_zenoh. {fix}. Or use a RosProxy with spec.ros: 2"
+        yield "NoZenoh", Fault(f"{text}rmw_zenoh", f"{fix}. Or use a RosProxy with spec.ros: 2")
         return
     override = container.variables.get(OVERRIDE, "")
     extended = wired_override(container.variables, router_of(address), pod.router_endpoint)
@@ -78,11 +81,11 @@ def _problems(
     if not _leads_to_proxy(override, rosproxy, address, pod.router_endpoint):
         text = f"variable {OVERRIDE} of the template connects the nodes past the proxy"
         fix = "Remove mode and connect/endpoints from the variable, and name routers outside in "
-        yield NOT_WIRED, f"{text}. {edit_fix(f'{fix}spec.peers', pod)}"
+        yield NOT_WIRED, Fault(text, edit_fix(f"{fix}spec.peers", pod))
     elif not is_client(override):
         text = f"variable {OVERRIDE} of the template makes the nodes peers of the proxy's router, "
         text += "which passes no messages between two peers"
-        yield NOT_WIRED, f"{text}. {edit_fix('Add mode=client to the variable', pod)}"
+        yield NOT_WIRED, Fault(text, edit_fix("Add mode=client to the variable", pod))
 
 
 def _leads_to_proxy(override: str, rosproxy: RosProxy, address: str, wired: str) -> bool:

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import hash_token
 from rosproxy.settings import MOST_ZENOH_HUBS
-from rosproxy_operator.common.problem import EXHAUSTED, MASTER_UNKNOWN, NO_ADVERTISE_HOST
+from rosproxy_operator.common.problem import EXHAUSTED, MASTER_UNKNOWN, NO_ADVERTISE_HOST, Fault
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
 from rosproxy_operator.kubernetes.planner.cluster_view import View
 from rosproxy_operator.kubernetes.planner.manifests import TERMINATION_GRACE_S, ProxySite
@@ -93,40 +93,44 @@ class ClusterContext(msgspec.Struct, frozen=True):
         return NODE_GONE_AFTER_S - (self.now - self.state.lost.get(node, self.now))
 
 
-def master_of(rosproxy: RosProxy, observed: ClusterSnapshot) -> tuple[MasterSpec | None, str]:
+def master_of(
+    rosproxy: RosProxy, observed: ClusterSnapshot
+) -> tuple[MasterSpec | None, Fault | None]:
     """Return the master for the proxies of a RosProxy, or None and the fault.
 
     For a Service, the URI has the Service's DNS name. Without ROS 1 the master is empty.
     """
     master = rosproxy.spec.master
     if master.service is None:
-        return master, ""
-    address, problem = observed.masters.get(master.service, ("", "is not listed yet"))
-    if problem:
-        return None, f"spec.master.service: Service {master.service} {problem}"
+        return master, None
+    address, fault = observed.masters.get(master.service, ("", Fault("is not listed yet")))
+    if fault:
+        text = f"spec.master.service: Service {master.service} {fault.text}"
+        return None, Fault(text, fault.fix)
     host = f"{master.service.name}.{master.service.namespace}.svc"
-    return replace(master, uri=f"http://{host}:{master.service_port}", address=address), ""
+    return replace(master, uri=f"http://{host}:{master.service_port}", address=address), None
 
 
-def advertise_host(rosproxy: RosProxy, node: ClusterNode) -> tuple[str, str]:
+def advertise_host(rosproxy: RosProxy, node: ClusterNode) -> tuple[str, Fault | None]:
     """Return the host name or address at which outside reaches a node, or "" and the fault.
 
-    Both are empty for rmw_zenoh: outside connects to no proxy.
+    There is neither for rmw_zenoh: outside connects to no proxy.
     """
     if rosproxy.spec.zenoh:
-        return "", ""
+        return "", None
     if node.advertise_host:
         problem = host_problem(node.advertise_host)
         fix = "Give the name or address at which outside reaches the node"
-        text = f"annotation rosproxy.io/advertise-host: {problem}. {fix}"
-        return ("", text) if problem else (node.advertise_host, "")
+        fault = Fault(f"annotation rosproxy.io/advertise-host: {problem}", fix)
+        return ("", fault) if problem else (node.advertise_host, None)
     wanted_type = rosproxy.spec.advertise.value
     if address := node.addresses.get(wanted_type):
-        return address, ""
+        return address, None
     types = ", ".join(sorted(node.addresses)) or "none"
-    return "", (
-        f"has no address of type {wanted_type} (types of its addresses: {types}). Set another "
-        f"spec.advertise, or run kubectl annotate node {node.name} rosproxy.io/advertise-host=HOST"
+    return "", Fault(
+        f"has no address of type {wanted_type} (types of its addresses: {types})",
+        "Set another spec.advertise, or run kubectl annotate node "
+        f"{node.name} rosproxy.io/advertise-host=HOST",
     )
 
 
@@ -163,26 +167,27 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
     rosproxy = context.view.rosproxies[place.of]
     node = context.observed.nodes[place.node]
     if not node.ready:
-        text = "is not ready. Until the node is ready, the operator changes nothing there. Read"
-        return Obstacle("NodeNotReady", f"{text} kubectl describe node {node.name}")
-    master, problem = master_of(rosproxy, context.observed)
+        text = "is not ready. Until the node is ready, the operator changes nothing there"
+        return Obstacle("NodeNotReady", text, f"Read kubectl describe node {node.name}")
+    master, fault = master_of(rosproxy, context.observed)
     if master is None:
-        return Obstacle(MASTER_UNKNOWN, problem)
-    host, problem = advertise_host(rosproxy, node)
+        return Obstacle(MASTER_UNKNOWN, *fault or Fault(""))
+    host, fault = advertise_host(rosproxy, node)
     if rosproxy.spec.ros2 and ":" in host:
-        problem = (
+        fault = Fault(
             f"advertised host {host} is an IPv6 address, but the operator starts proxies for ROS 2 "
-            "with IPv4 only. Give an IPv4 address: run kubectl annotate node "
-            f"{node.name} rosproxy.io/advertise-host=ADDRESS"
+            "with IPv4 only",
+            "Give an IPv4 address: run kubectl annotate node "
+            f"{node.name} rosproxy.io/advertise-host=ADDRESS",
         )
-    if problem:
-        return Obstacle(NO_ADVERTISE_HOST, problem)
+    if fault:
+        return Obstacle(NO_ADVERTISE_HOST, *fault)
     if place in context.ranges.exhausted:
-        return Obstacle(EXHAUSTED, context.ranges.exhausted[place])
+        return Obstacle(EXHAUSTED, *context.ranges.exhausted[place])
     name = proxy_id(place.of, place.node)
     if name in context.view.other_pod_names:
         text = f"a pod {name} exists already that {NOT_OURS}"
-        return Obstacle("NameTaken", f"{text}. Delete that pod, or create it under another name")
+        return Obstacle("NameTaken", text, "Delete that pod, or create it under another name")
     publish = master.publish if place in context.ranges.published else 0
     token = token_of(context.observed.key, name, node.name)
     ports = context.ranges.given[place]

@@ -9,7 +9,7 @@ operator recreates the LAN relay. The LAN relay's only privilege is the host's n
 from collections.abc import Iterable, Iterator
 
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common.problem import NO_LAN_ADDRESS
+from rosproxy_operator.common.problem import NO_LAN_ADDRESS, Fault
 from rosproxy_operator.common.ros2 import LAN_RELAY_COMMAND, lan_relay_variables
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateHelper, DeleteHelper
 from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
@@ -89,9 +89,10 @@ def lan_relay_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[
         if isinstance(site, ProxySite) and site.lan_relay is None:
             text = (
                 f"node {place.node} has no IPv4 address of type InternalIP, so its proxy has no "
-                "LAN relay. Name the hosts outside in spec.peers, and remove spec.multicast"
+                "LAN relay"
             )
-            yield finding(rosproxy, NO_LAN_ADDRESS, text)
+            fix = "Name the hosts outside in spec.peers, and remove spec.multicast"
+            yield finding(rosproxy, NO_LAN_ADDRESS, Fault(text, fix))
 
 
 def _reconcile_lan_relay(
