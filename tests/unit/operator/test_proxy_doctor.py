@@ -125,7 +125,7 @@ def test_a_cluster_tells_the_cause_and_no_text_twice() -> None:
         "MasterReachable is False: no master",
         "Ready is False: no proxy is ready",
     ]
-    assert findings[0].fix == "read kubectl -n lab describe rosproxy robot"
+    assert findings[0].fix.startswith("do as the message says; fields of the spec: kubectl -n lab")
 
 
 def test_each_reason_has_its_own_fix() -> None:
