@@ -134,7 +134,7 @@ def _fix(sandbox: Sandbox) -> str:
     """Return the command with which users delete the entries themselves."""
     ports = own_range(sandbox.place, sandbox.range)
     return (
-        "Datagrams of nodes that went on sending while the ports were not published may bypass the "
-        f"ports. Run as root: for port in $(seq {ports.first} {ports.last}); do conntrack -D -p "
-        "udp --orig-port-dst $port; done"
+        f"Run as root: for port in $(seq {ports.first} {ports.last}); do conntrack -D -p udp "
+        "--orig-port-dst $port; done. Until then, datagrams of nodes that went on sending while "
+        "the ports were not published may bypass the ports"
     )

@@ -152,15 +152,15 @@ def redirect_steps(
 def _redirect_fix(place: Place) -> str:
     """What users can do if the operator can't set a redirect."""
     if place == ZENOH:
-        return (
-            "Until the redirect is in place, the nodes do not find the proxy. The operator tries "
-            f"again; or set {as_client(proxy_name(place))}"
+        setting = as_client(proxy_name(place))
+        until = "Until the redirect is in place, the nodes do not find the proxy"
+    else:
+        setting = (
+            f"ROS_MASTER_URI=http://{proxy_name(place)}:{place.master.port} and the label "
+            f"{MASTER_URI}={place.master.uri}"
         )
-    return (
-        "Until the redirect is in place, the nodes bypass the proxy. The operator tries again; or "
-        f"set ROS_MASTER_URI=http://{proxy_name(place)}:{place.master.port} and the label "
-        f"{MASTER_URI}={place.master.uri}"
-    )
+        until = "Until the redirect is in place, the nodes bypass the proxy"
+    return f"Set {setting}; or wait, since the operator tries again. {until}"
 
 
 def redirect_record_name(observed: HostState, place: Place, owner: Container) -> str:

@@ -195,8 +195,8 @@ def test_where_it_fails_users_are_told_the_command_and_nothing_else_waits() -> N
     (group,) = groups(published())
     assert group.subject == f"conntrack entries for {proxy_name(PLACE)}"
     assert not group.fatal
-    assert group.fix.endswith(
-        f"for port in $(seq {RANGE.first} {RANGE.last - 1}); "
+    assert group.fix.startswith(
+        f"Run as root: for port in $(seq {RANGE.first} {RANGE.last - 1}); "
         "do conntrack -D -p udp --orig-port-dst $port; done"
     )
 
