@@ -184,13 +184,13 @@ def test_status_is_in_the_definition() -> None:
         topics=frozenset({"/chatter"}),
         participants={"192.0.2.3": ("01.0f.00.00.00.00.00.00.00.00.00.01",)},
     )
+    stamp = "2026-01-01T00:00:00Z"
     states = (
-        RosProxyOnNode("n", "192.0.2.1", ports, proxy, (pod,), answer),
+        RosProxyOnNode("n", "192.0.2.1", ports, proxy, (pod,), answer, unregistered_at=stamp),
         RosProxyOnNode(
             "m", "192.0.2.2", None, None, (pod,), None, Obstacle("PortsExhausted", "no ports")
         ),
     )
-    stamp = "2026-01-01T00:00:00Z"
     status = status_of(own, states, (), Addresses("192.0.2.9", "http://robot:11311"), stamp)
     link = {"to": ["tls/cloud"], "secretName": "link"}
     spec = {"ros": "zenoh", "listen": {"type": "NodePort"}, "link": link}
