@@ -141,7 +141,8 @@ def free_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
         yield warning("ports", "ports", text, fix)
     if not free:
         text = f"no port is free, {used} used. Further nodes get no port"
-        yield error("ports", "ports", text, larger_range)
+        fix = f"{larger_range}. Then restart the ROS 1 nodes that got no port"
+        yield error("ports", "ports", text, fix)
     elif free < LEAST_FREE_SHARE * (used + free + blocked):
         yield warning("ports", "ports", f"only {free} free, {used} used", larger_range)
     else:

@@ -233,6 +233,8 @@ def test_how_many_ports_are_left(ports: dict[str, int], severity: Severity, text
     (finding,) = of("ports", make_facts(status=make_status(ports=ports)))
     assert finding.severity is severity
     assert text in finding.text
+    is_refused = severity is Severity.ERROR
+    assert finding.fix.endswith("Then restart the ROS 1 nodes that got no port") is is_refused
 
 
 def test_ports_that_other_programs_hold() -> None:

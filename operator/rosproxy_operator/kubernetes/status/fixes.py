@@ -21,7 +21,7 @@ _BY_REASON = {
     "MasterUnreachable": "start the master, allow connections, or correct spec.master, as the "
     f"message says: {_EDIT}",
     "HubRefused": f"wait until the operator has recreated all proxies, then {_PODS}",
-    "NoAdvertiseHost": ADDRESS_FIX,
+    "NoAdvertiseHost": f"{ADDRESS_FIX}; fields of the spec: {_EDIT}",
     "NoAddress": "install a controller for Services of type LoadBalancer, or correct spec.listen: "
     f"{_EDIT}",
     "NodeLeftOut": f"correct spec.nodeSelector: {_EDIT}",

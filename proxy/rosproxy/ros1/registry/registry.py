@@ -113,7 +113,7 @@ class Registry:
                 raise RangeExhausted(
                     f"rosproxy: all ports of the range {self.pool.range} are in use ({len(self)} "
                     f"leases held, {len(self.pool.blocked)} taken by other programs). "
-                    + how_to_in_a_sentence("larger range")
+                    f"{how_to_in_a_sentence('larger range')}. Then restart the node"
                 )
             endpoint = self._add(uri, node, location, port, source)
         elif location.confirmed or not endpoint.location.confirmed:
