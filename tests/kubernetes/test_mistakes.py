@@ -198,6 +198,20 @@ def _two_nodes_for_a_port(site: Site) -> None:
     site.create_app(command=("sh", "-c", " & exec ".join(nodes)))
 
 
+def _more_ports(site: Site, said: str) -> None:
+    """ROS 1 nodes register only at their start, also the node that got no port."""
+    assert "Then restart the ROS 1 nodes that got no port" in said
+    edit_rosproxy(ports=8)(site, said)
+    wait_until(site.is_well, 90, site.rosproxy.tell)
+    site.restart_app()
+
+
+def _name_of_the_node(site: Site) -> None:
+    site.create_rosproxy(advertise="Hostname")
+    site.create_app()
+    wait_until(lambda: bool(site.robot.uri(site.node)), START, site.rosproxy.tell)
+
+
 def _taint(site: Site) -> None:
     kubectl("taint", "node", "node2", "robots=only:NoSchedule")
     site.create_rosproxy()
@@ -407,7 +421,7 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "fewer ports than ROS nodes": Mistake(
         _two_nodes_for_a_port, "ProxyWarns",
-        (Cure("no port is free, 1 used", "set a larger spec.ports", edit_rosproxy(ports=8)),),
+        (Cure("no port is free, 1 used", "set a larger spec.ports", _more_ports),),
         words=("one", "two"),
         is_silent=False,  # one of both nodes has the port
     ),
@@ -444,8 +458,9 @@ MISTAKES: dict[str, Mistake] = {
               edit_rosproxy(advertise="InternalIP")),),
     ),
     "name that outside does not know": Mistake(
-        _spec(advertise="Hostname"), "ProxyWarns",
-        (Cure("can't be resolved", "set spec.advertise", edit_rosproxy(advertise="InternalIP")),),
+        _name_of_the_node, "ProxyWarns",
+        (Cure("can't be resolved", "set spec.advertise", edit_rosproxy(advertise="InternalIP")),
+         Cure("The ROS nodes of this pod may have been unregistered", "Run kubectl", restart)),
     ),
     "program at the ports of the proxy": Mistake(
         _program_at_the_ports, "PortsUnreachable",
