@@ -236,6 +236,8 @@ class DockerController:
             raise LookImpossible(str(error), away=True) from error
         except EngineError as error:
             raise LookFailed(str(error), away=isinstance(error, Unavailable)) from error
+        retired = self._proxy_sync.retired(snapshot)
+        snapshot = replace(snapshot, state=replace(snapshot.state, retired=retired))
         planned = self._decide(
             snapshot.state, snapshot.labels, self._settings, self._memory, time.monotonic()
         )

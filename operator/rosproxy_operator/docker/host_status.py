@@ -11,9 +11,11 @@ import asyncio
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from rosproxy import __version__
 from rosproxy.admin.admin_client import AdminClient, AdminError, default_url
+from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.cli.terminal import size, watch, write
 from rosproxy.net.addresses import HostPort
 from rosproxy.telemetry.text import clean
@@ -171,5 +173,7 @@ async def survey(settings: PlanSettings) -> Json:
         answers = await ask_proxies(proxies, snapshot, settings.uplink)
     finally:
         await proxies.close()
-    planned = plan(snapshot.state, snapshot.labels, settings, DockerMemory(), time.monotonic())
-    return host_document(snapshot.state, planned, planned.problems, answers, settings, time.time())
+    retired = (name for name, a in answers.items() if isinstance(a, ProxyStatus) and a.retired)
+    state = replace(snapshot.state, retired=frozenset(retired))
+    planned = plan(state, snapshot.labels, settings, DockerMemory(), time.monotonic())
+    return host_document(state, planned, planned.problems, answers, settings, time.time())

@@ -46,7 +46,9 @@ RETRY_PAUSES_S = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 
 class ProxyUpdater:
-    """Keeps one run of one proxy up to date. Calls ``answered`` when the proxy begins to answer.
+    """Keeps one run of one proxy up to date.
+
+    Calls ``answered`` when the proxy begins to answer, or answers that the proxy has retired.
 
     After each look, the updater sends the policy if the policy has changed, and always sends the
     allowed callers. Then the updater reads the status and sends what is new (`ProxyUpdate`).
@@ -80,6 +82,11 @@ class ProxyUpdater:
         self._status = ProxyStatus()
         self._nodes_due = asyncio.Event()
         self._callers_due = asyncio.Event()
+
+    @property
+    def retired(self) -> bool:
+        """Whether the last status says that the proxy accepts no nodes any more."""
+        return self._status.retired
 
     def update(self, network_facts: NetworkFacts) -> None:
         """Store the facts of a look, and wake both tasks."""
@@ -144,12 +151,15 @@ class ProxyUpdater:
     async def _send_updates(self) -> None:
         self._nodes_due.clear()
         refusal: ProxyError | None = await self._policy_refusal()
+        had_retired = self.retired
         try:
             self._status = await self._session.status()
         except ProxyError as error:
             if not error.is_unreadable:
                 raise
             refusal = refusal or error  # go on with the last status that was readable
+        if self.retired and not had_retired:
+            self._answered()  # before other calls: a retired proxy may refuse these
         status = self._status
         self.leases = leases(status)
         # Read the facts only now: a look may have ended while the calls above waited.
@@ -190,7 +200,7 @@ class ProxyUpdater:
 
 
 class DockerProxySync:
-    """Keeps all running proxies up to date. Calls ``answered`` when a silent proxy answers."""
+    """Keeps all running proxies up to date. Calls ``answered`` as `ProxyUpdater` does."""
 
     def __init__(
         self,
@@ -205,6 +215,7 @@ class DockerProxySync:
         self._answered = answered
         self._running: dict[str, tuple[ProxyUpdater, asyncio.Task[None]]] = {}
         self._leases: dict[str, Leases] = {}
+        self._retired_runs: set[str] = set()
 
     def update(self, snapshot: DockerSnapshot, members: Collection[Member]) -> None:
         """Begin to send each running proxy the facts of a look.
@@ -240,6 +251,18 @@ class DockerProxySync:
         previous = self._leases.get(name, {})
         is_kept = all(port in ports for leased in previous.values() for port in leased)
         return {} if is_kept else previous
+
+    def retired(self, snapshot: DockerSnapshot) -> frozenset[str]:
+        """Return the names of the proxies that have retired, by the last status of each proxy.
+
+        The updater of a proxy ends if the operator gives the container another name, so the runs of
+        the proxies are kept.
+        """
+        updaters = (updater for updater, _ in self._running.values())
+        self._retired_runs |= {updater.access.run for updater in updaters if updater.retired}
+        self._retired_runs &= {access.run for access in snapshot.access.values()}
+        running = snapshot.access.items()
+        return frozenset(name for name, access in running if access.run in self._retired_runs)
 
     def answers(self, name: str) -> bool:
         """Whether the last exchange of updates with a proxy succeeded."""

@@ -57,6 +57,8 @@ from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Place
 
 REPLACED = "replaced by another container"
 """The reason in `Remove` for a container that has a successor."""
+RETIRED = "the proxy has unregistered its nodes, and accepts no others"
+"""The reason in `Remove` for a proxy that was to go, but is needed again."""
 _CONNECTABLE_STATES = frozenset({"created", "running", "paused", "exited"})
 """States in which the operator disconnects a sandbox from a network."""
 
@@ -107,12 +109,13 @@ class PlanContext:
     ) -> Selection:
         """Decide which of the containers ``own`` stays and which goes.
 
-        A container that fits has the planned ports and the ``fingerprint``, and ``fits`` returns
-        true for it. If no container can be created, any fingerprint counts. ``name`` is the name
-        for the container that stays.
+        A container that fits has the planned ports and the ``fingerprint``, has not retired, and
+        ``fits`` returns true for it. If no container can be created, any fingerprint counts.
+        ``name`` is the name for the container that stays.
         """
         matching = [o for o in own if o.fingerprint == fingerprint or not self.creatable]
         candidates = [o.container for o in matching if o.range == self.ports]
+        candidates = [c for c in candidates if c.name not in self.observed.retired]
         return select(own, name, {c.id for c in candidates if fits(c)}, self.creatable)
 
 
@@ -354,7 +357,9 @@ def _proxy_steps(
     removed = [p.container.name for p in proxies if p.container.name in gone]
     replaces = former or next(iter(removed), "")
     action = replace(action, fingerprint=expected, replaces=replaces)
-    return [*actions, *creation_steps(selection, action, former)]
+    old = selection.predecessor
+    reason = RETIRED if old and old.name in observed.retired else REPLACED
+    return [*actions, *creation_steps(selection, action, former, reason=reason)]
 
 
 def keep_running_steps(
@@ -398,15 +403,17 @@ def creation_steps(
     action: CreateSandbox | Create | CreateLanRelay,
     former: str,
     before_removal: Iterable[Action] = (),
+    reason: str = REPLACED,
 ) -> Iterator[Action]:
     """Yield the actions that create and start a container, in place of the predecessor, if any.
 
-    The predecessor is renamed to ``former``, and removed after the actions ``before_removal``.
+    The predecessor is renamed to ``former``, and removed after the actions ``before_removal``, for
+    the ``reason``.
     """
     if selection.predecessor and selection.predecessor.name != former:
         yield Rename(selection.predecessor.name, former)
     yield action
     if selection.predecessor:
         yield from before_removal
-        yield Remove(former, REPLACED)
+        yield Remove(former, reason)
     yield Start(action.name)

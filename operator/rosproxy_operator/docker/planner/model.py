@@ -196,6 +196,8 @@ class HostState:
         masters: The addresses of the masters' hosts, by host name; empty if unknown.
         busy: The names of own containers without a current inspection. The operator leaves these
             containers alone in this look.
+        retired: The names of the proxies that have unregistered their ROS 1 nodes, and accept no
+            others. The operator reads this from the status of a proxy, so a name may come later.
         addresses: The addresses of all containers, the operator's own included.
         secret: The secret from which the operator makes the tokens of the proxies.
         deletes_udp_entries: Whether the engine itself deletes outdated conntrack entries for UDP.
@@ -216,6 +218,7 @@ class HostState:
     flushes: tuple[FlushContainer, ...] = ()
     masters: Mapping[str, str] = field(default_factory=dict)
     busy: frozenset[str] = frozenset()
+    retired: frozenset[str] = frozenset()
     addresses: frozenset[str] = frozenset()
     secret: str = field(default="", repr=False)
     deletes_udp_entries: bool = False

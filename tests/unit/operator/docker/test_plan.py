@@ -291,12 +291,12 @@ def test_a_proxy_in_a_namespace_that_is_gone(proxys: str, sandboxs: str, lost: b
 # replacement
 
 
-def replacement(image: str = IMAGE) -> list[Action]:
+def replacement(image: str = IMAGE, reason: str = "replaced by another container") -> list[Action]:
     old = f"{NAME}-old"
     return [
         Rename(NAME, old),
         new_proxy(replaces=old, image=image),
-        Remove(old, "replaced by another container"),
+        Remove(old, reason),
         Start(NAME),
     ]
 
@@ -306,6 +306,18 @@ def test_what_replaces_the_proxy_and_not_the_sandbox() -> None:
     in_another = proxy(sandbox_id="gone")
     seen = observed(container(), sandboxes=[sandbox()], proxies=[in_another])
     assert actions(seen) == replacement()
+
+
+def test_a_proxy_that_has_retired_in_vain_is_replaced() -> None:
+    """A container is labelled again before the proxy is removed. The ports stay."""
+    reason = "the proxy has unregistered its nodes, and accepts no others"
+    retired = frozenset({NAME})
+    assert actions(observed(container(), retired=retired, **both())) == replacement(reason=reason)
+    without_image = observed(container(), image="", retired=retired, **both())
+    assert actions(without_image) == []
+    kept = [proxy(name=f"{NAME}-old"), proxy()]
+    seen = observed(container(), retired={f"{NAME}-old"}, sandboxes=[sandbox()], proxies=kept)
+    assert actions(seen) == [Remove(f"{NAME}-old", "left over")]
 
 
 def test_a_controller_killed_while_replacing_goes_on() -> None:
