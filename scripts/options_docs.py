@@ -4,14 +4,14 @@
 
 Each table stands between two comments with the name of a program. The rows come from the
 annotations of the program's settings classes. Example: ``rosproxy run`` has the class
-`rosproxy.settings.Settings`.
+`rosproxy.shared.settings.Settings`.
 """
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from rosproxy.setting_kinds import Setting, declared
-from rosproxy.settings import Settings
+from rosproxy.shared.setting_kinds import Setting, declared
+from rosproxy.shared.settings import Settings
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.kubernetes.settings import (
     Bounds,

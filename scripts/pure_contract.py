@@ -15,7 +15,8 @@ from importlinter.domain.imports import ModuleExpression
 
 
 class RoomsField(fields.Field[Any]):
-    """Module expressions by package: ``{"rosproxy.net": ["sockets"]}`` is rosproxy.net.sockets."""
+    """Module expressions by package: ``{"rosproxy.net": ["proxy_signs"]}`` is
+    rosproxy.net.proxy_signs."""
 
     def parse(self, raw_data: Any) -> set[ModuleExpression]:
         """Return the full module expressions."""

@@ -9,8 +9,8 @@ import click
 
 from rosproxy.cli.main import run
 from rosproxy.cli.options import OneLineError
-from rosproxy.setting_kinds import SettingError, make_settings
-from rosproxy.settings import Settings
+from rosproxy.shared.setting_kinds import SettingError, make_settings
+from rosproxy.shared.settings import Settings
 
 
 def parse_settings(options: Mapping[str, Any]) -> Settings:

@@ -18,7 +18,7 @@ from enum import Enum
 from typing import Any
 from urllib.parse import urlsplit
 
-from rosproxy.net.resolver import resolve
+from rosproxy.shared.machine.resolver import resolve
 
 Address = tuple[str, int]
 """Host and port."""

@@ -23,13 +23,13 @@ from time import monotonic
 
 from examples.demo.reliable_topics import ReliableReader, ReliableWriter
 from examples.demo.rtps_messages import VENDOR, Told, data, message, parameter_list, string, told
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import VERSION, RtpsError, SubmessageId, samples, source_prefix
 from rosproxy.ros2.registry.participants import EndpointKind
 from rosproxy.ros2.rewriting.discovery import Announcement, BuiltinWriter, read_discovery
+from rosproxy.shared.addresses import HostPort
 
 ANNOUNCE_INTERVAL = 1.0
 """Seconds between announcements. Fast DDS waits three."""

@@ -24,14 +24,14 @@ from examples.demo.players import RATE
 from examples.demo.proxy_process import DemoError
 from examples.demo.reliable_topics import ReliableReader, ReliableWriter
 from examples.demo.rtps_messages import pack_string, unpack_string
-from rosproxy.leases.domain_ports import (
+from rosproxy.ros2.rewriting.discovery import BuiltinWriter
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.domain_ports import (
     PORTS_PER_DOMAIN,
     SPDP_MULTICAST,
     first_unicast_port,
     multicast_port,
 )
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 DOMAINS = range(1, 31)
 """Domains with ports below the range of `free_ports`, without the default domain 0."""

@@ -22,7 +22,7 @@ from examples.demo.fake_master import CALL_ERRORS, FakeMaster
 from examples.demo.players import Actor, Adder, Listener, Talker, in_words
 from examples.demo.proxy_process import DemoError, ProxyProcess
 from examples.demo.ros2_acts import Ros2Acts, Ros2Listener, Ros2Talker
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 
 PATIENCE = 30.0
 """Seconds to wait for an event. Long, so that a slow machine does not fail the demonstration."""

@@ -25,7 +25,7 @@ from rosproxy.cli.options import (
     unknown_variables,
 )
 from rosproxy.cli.variables import UnknownVariable
-from rosproxy.net.addresses import HostPort, parse_host_port
+from rosproxy.shared.addresses import HostPort, parse_host_port
 from rosproxy_operator.common.command_errors import exit_on_error, exit_with, fail
 from rosproxy_operator.common.problem import (
     UNKNOWN_NAME,
@@ -116,7 +116,7 @@ def docker(
     variable: ROSPROXY_ and the option's name, such as ROSPROXY_PORTS. --master-uri also has
     ROS_MASTER_URI.
     """
-    from rosproxy.telemetry import logs
+    from rosproxy.shared.output import logs
 
     _require_library("docker", "docker")
     logs.set_up(log_format, log_level)
@@ -228,7 +228,7 @@ kubernetes.add_command(kubernetes_commands.doctor)
 
 
 def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
-    from rosproxy.telemetry import logs
+    from rosproxy.shared.output import logs
     from rosproxy_operator.kubernetes.api.api_client import ApiError
     from rosproxy_operator.kubernetes.run import run
     from rosproxy_operator.kubernetes.serving import quiet_library_logs
@@ -243,7 +243,7 @@ def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
 @main.command()
 def health() -> None:
     """Exit with 0 if the operator is alive, with 1 if not; for container health checks."""
-    from rosproxy.admin.admin_client import AdminClient, AdminError, default_url
+    from rosproxy.shared.http.admin_client import AdminClient, AdminError, default_url
 
     # Without the variable, default_url() has port 11312, of a proxy. The operator listens on 11313.
     url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else f"http://{DEFAULT_ADMIN}"

@@ -6,9 +6,9 @@ import logging
 from collections.abc import Collection, Iterator, Sequence
 
 from rosproxy.net import proxy_signs
-from rosproxy.setting_kinds import SettingError
-from rosproxy.settings import Settings
-from rosproxy.telemetry.problems import Problems
+from rosproxy.shared.output.problems import Problems
+from rosproxy.shared.setting_kinds import SettingError
+from rosproxy.shared.settings import Settings
 
 log = logging.getLogger(__name__)
 

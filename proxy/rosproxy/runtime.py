@@ -8,10 +8,10 @@ import uuid
 from collections.abc import Callable
 
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.net.tasks import Tasks
-from rosproxy.settings import Settings
+from rosproxy.shared.output.problems import Problems
+from rosproxy.shared.settings import Settings
+from rosproxy.shared.tasks import Tasks
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
 
 

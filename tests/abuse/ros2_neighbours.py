@@ -13,10 +13,10 @@ from contextlib import suppress
 from time import monotonic
 from types import TracebackType
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import FAST_DDS, NO_VENDOR, source_prefix, source_vendor
 from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.discovery.domains import of_vendor, spdp
 from tests.unit.ros2.protocol.messages import message, submessage
 

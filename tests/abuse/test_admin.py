@@ -9,10 +9,10 @@ from functools import partial
 import pytest
 
 from examples.demo.fake_http import free_ports
-from rosproxy.admin.status_bounds import MOST_BYTES
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import MOST_ENDPOINT_BYTES_PER_ADDRESS
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_bounds import MOST_BYTES
 from rosproxy_operator.common.proxy_client import ProxyClient
 from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES, STRANGERS
 from tests.abuse.conftest import Abused

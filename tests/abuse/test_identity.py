@@ -8,7 +8,7 @@ from time import monotonic
 import pytest
 
 from examples.demo.fake_http import free_ports
-from rosproxy.setting_kinds import hash_token
+from rosproxy.shared.setting_kinds import hash_token
 from tests.abuse.apart import APART_HOST, NODES, STRANGERS
 from tests.integration.claims import claim, silent_servers
 from tests.integration.net import (

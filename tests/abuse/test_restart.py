@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 
 from examples.demo.fake_http import free_ports
-from rosproxy.leases.ports import PortRange
 from rosproxy.ros2.ports.store import PortStore, port_store_key
 from rosproxy.ros2.protocol.relay_envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import NO_VENDOR, source_prefix, source_vendor
+from rosproxy.shared.ports import PortRange
 from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES, STRANGERS
 from tests.abuse.conftest import Abused
 from tests.abuse.ros2_neighbours import PADDING, WELL_KNOWN, Participant, udp

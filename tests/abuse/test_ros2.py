@@ -13,7 +13,6 @@ import pytest
 
 from examples.demo.fake_http import free_ports
 from examples.demo.proxy_process import clean_environment
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import MOST_OUTSIDE_UNPROVEN, MOST_PER_UNPROVEN
 from rosproxy.ros2.lan_relay.sources import UNPROVEN_BURST, UNPROVEN_PER_SECOND
 from rosproxy.ros2.protocol.locators import pack_locator
@@ -22,6 +21,7 @@ from rosproxy.ros2.protocol.relay_envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.servers.groups import group_socket, join
 from rosproxy.ros2.sources.rates import cost
+from rosproxy.shared.addresses import HostPort
 from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES, STRANGERS
 from tests.abuse.conftest import Abused
 from tests.abuse.ros2_neighbours import (

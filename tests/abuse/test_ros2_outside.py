@@ -12,10 +12,10 @@ from functools import partial
 import pytest
 
 from examples.demo.fake_http import free_ports
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import FAST_DDS, HEADER_BYTES, VERSION, source_prefix
+from rosproxy.shared.addresses import HostPort
 from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES
 from tests.abuse.conftest import Abused
 from tests.abuse.ros2_neighbours import WELL_KNOWN, Flood, Participant

@@ -5,8 +5,8 @@ from contextlib import AsyncExitStack
 from xmlrpc.client import Fault
 
 from examples.demo.fake_http import value
-from rosproxy.admin.status_bounds import MOST_BYTES
 from rosproxy.ros1.protocol.name_lengths import LONGEST_NAME
+from rosproxy.shared.documents.status_bounds import MOST_BYTES
 from tests.integration.net import (
     HOST,
     NODE,

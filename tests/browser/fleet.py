@@ -20,7 +20,6 @@ from typing import Any
 from aiohttp import web
 from msgspec.structs import replace
 
-from rosproxy.net.tasks import Tasks
 from rosproxy.page.feed import Feed
 from rosproxy.page.page_document import (
     BROKEN,
@@ -36,6 +35,7 @@ from rosproxy.page.page_document import (
 )
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.merged_page import merged
 
 PROXIES = {"ros1": "", "domain-0": "0", "domain-7": "7"}

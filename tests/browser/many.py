@@ -17,7 +17,13 @@ from typing import Any
 
 from aiohttp import web
 
-from rosproxy.admin.status_document import (
+from rosproxy.doctor.facts import SystemState
+from rosproxy.page.feed import Feed
+from rosproxy.page.graph_document import graph_document, relayed
+from rosproxy.page.measures import Measures
+from rosproxy.page.routes import Page
+from rosproxy.page.visitors import Visitors
+from rosproxy.shared.documents.status_document import (
     ConnectionStatus,
     EndpointStatus,
     MasterStatus,
@@ -25,13 +31,7 @@ from rosproxy.admin.status_document import (
     ProxyStatus,
     StatusSettings,
 )
-from rosproxy.doctor.facts import SystemState
-from rosproxy.net.tasks import Tasks
-from rosproxy.page.feed import Feed
-from rosproxy.page.graph_document import graph_document, relayed
-from rosproxy.page.measures import Measures
-from rosproxy.page.routes import Page
-from rosproxy.page.visitors import Visitors
+from rosproxy.shared.tasks import Tasks
 
 FIRST_PORT = 11000
 

@@ -15,8 +15,8 @@ import sys
 
 from prometheus_client import CollectorRegistry
 
-from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy.page.page_document import Document
+from rosproxy.shared.addresses import HostPort, parse_host_port
 from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.proxy_client import ProxyClient

@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 from scripts.custom_resource_docs import custom_resource
 
-from rosproxy.access.rules import LONGEST_GLOB
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
-from rosproxy.settings import MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.rules import LONGEST_GLOB
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.settings import MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
 from rosproxy_operator.common.policy import MOST_RULES_OF_AUTHOR
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.cluster import (

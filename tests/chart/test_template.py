@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from rosproxy import __version__
-from rosproxy.access.layers import PolicyMode
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyMode
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.cli import main
 from rosproxy_operator.common.proxy_bounds import ProxyBounds
 from rosproxy_operator.common.zenoh import client_override

@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from rosproxy.admin.status_document import EndpointStatus, parse_status
+from rosproxy.shared.documents.status_document import EndpointStatus, parse_status
 from tests.clients.matrix import CALL, LIBRARIES, PEERS, SERVE, able, each_client
 from tests.ros.lab import Lab
 from tests.ros.processes import Process, wait_until

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from rosproxy.admin.status_document import DomainStatus, parse_status
+from rosproxy.shared.documents.status_document import DomainStatus, parse_status
 from tests.docker.controller import Proxy, proxies
 from tests.docker.engine import docker, inspect, run, wait_until
 from tests.docker.inside import ENABLE, Container, Inside, unique

@@ -9,7 +9,7 @@ import pytest
 from rosproxy.forwarding.kernel import plane, syncer
 from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
-from rosproxy.net.addresses import Route
+from rosproxy.shared.addresses import Route
 
 PAIRS = ("marks", "hosts4", "hosts6", "ports", "sources4", "sources6")
 OWN = "192.0.2.1"

@@ -6,7 +6,7 @@ multicast. With the same domain, tests in two processes disturb each other.
 
 import socket
 
-from rosproxy.leases.domain_ports import multicast_port
+from rosproxy.shared.domain_ports import multicast_port
 
 _DOMAINS = range(29, 0, -1)
 """Domains with ports below the ports that tests draw (`PortDraws`)."""

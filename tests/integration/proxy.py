@@ -7,11 +7,11 @@ from typing import Any
 from examples.demo.fake_http import Address, free_ports, host_and_port
 from examples.demo.fake_node import FakeNode
 from rosproxy.app.process import App
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.stack import Ros1
-from rosproxy.settings import Settings
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.settings import Settings
 from tests.integration.net import HOST, PATIENCE, PROXY, refuses, until
 from tests.run_options import parse_settings
 

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from examples.demo.fake_http import value
-from rosproxy.net import gate, sockets
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import INVALID_PARAMS, INVALID_REQUEST, PARSE_ERROR
 from rosproxy.ros1.protocol.xmlrpc.limits import lease_call, master_call
+from rosproxy.shared.connections import gate, sockets
 from tests.clock import PatientLoop, pass_time
 from tests.integration.net import (
     MASTER,

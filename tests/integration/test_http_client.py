@@ -9,9 +9,9 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 import aiohttp
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import HttpClient, LongReply
 from rosproxy.net.late_answers import LATE_TIMEOUT_S
+from rosproxy.shared.addresses import HostPort
 from tests.clock import pass_time
 from tests.integration.net import MASTER, until
 

@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 
 from examples.demo.fake_http import Address
-from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_server import HttpConnection
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS
 from rosproxy.ros1.protocol.xmlrpc.limits import lease_call, master_call
 from rosproxy.ros1.servers.xmlrpc_server import HEADER_TIMEOUT_S, XmlRpcServer
+from rosproxy.shared.addresses import HostPort
 from tests.integration.net import HOST, NODE, connect, exchange, post, rpc, until, xml
 
 BOTH_LOOPS = True

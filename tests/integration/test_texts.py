@@ -9,7 +9,7 @@ import pytest
 
 from rosproxy.ros1.protocol.name_lengths import LONGEST_NAME
 from rosproxy.ros1.protocol.tcpros import encode_header
-from rosproxy.ros1.protocol.uris import LONGEST_URI
+from rosproxy.shared.uris import LONGEST_URI
 from tests.integration.net import (
     NODE,
     OUTSIDE,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rosproxy.admin.status_document import DomainStatus, parse_status
+from rosproxy.shared.documents.status_document import DomainStatus, parse_status
 from tests.docker.engine import docker, inspect
 from tests.docker.images import ROS2, build_image
 from tests.docker.nodes import Log

@@ -13,11 +13,11 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.kept_connections import KeptConnections
 from rosproxy.ros1.clients.master_client import MasterClient
 from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.registry.node_health import ProbeResult
+from rosproxy.shared.addresses import HostPort
 from rosproxy.telemetry.metrics import Metrics
 from tests.ros.combinations import LIBRARIES, each_library
 from tests.ros.lab import Lab

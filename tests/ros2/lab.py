@@ -12,8 +12,8 @@ from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
-from rosproxy.admin.status_document import DomainStatus, ProxyStatus, parse_status
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_document import DomainStatus, ProxyStatus, parse_status
 from tests.ros.processes import Process, stop_all, wait_until
 from tests.ros.topology import Place, Topology, run_command
 from tests.ros2.machines import PORTS

@@ -13,10 +13,10 @@ from socket import AF_INET, SOCK_DGRAM, socket
 
 import pytest
 
-from rosproxy.admin.status_document import LocatorStatus
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_document import LocatorStatus
 from tests.ros.processes import Process, wait_until
 from tests.ros.topology import Place, run_command
 from tests.ros2.lab import Lab

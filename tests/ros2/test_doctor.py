@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rosproxy.doctor.rules.participant import SETTLED_AFTER_S
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from tests.ros.processes import wait_until
 from tests.ros.topology import run_command
 from tests.ros2.lab import Lab

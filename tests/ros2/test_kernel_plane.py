@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from rosproxy.admin.status_document import LocatorStatus
+from rosproxy.shared.documents.status_document import LocatorStatus
 from tests.ros.processes import Process, wait_until
 from tests.ros.topology import MASTER_PORT, OUT_NODE
 from tests.ros2.lab import Lab

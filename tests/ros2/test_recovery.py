@@ -8,9 +8,9 @@ import time
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.shared.addresses import HostPort
 from tests.ros.processes import wait_until
 from tests.ros2.lab import Lab, is_whole
 from tests.unit.ros2.protocol.messages import data, message, payload

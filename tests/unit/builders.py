@@ -8,10 +8,7 @@ from ipaddress import ip_network
 from typing import Any
 from xml.sax.saxutils import escape
 
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.ros1.protocol.xmlrpc.values import Edit
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
@@ -26,7 +23,10 @@ from rosproxy.ros1.rewriting.master_calls import (
     RegistryChange,
     refusal,
 )
-from rosproxy.settings import Settings
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortMap, PortRange
+from rosproxy.shared.settings import Settings
+from rosproxy.shared.uris import parse_slave_uri, slave_uri
 
 HOST = "robot-host"
 PROXY = "10.0.0.1"

@@ -11,7 +11,7 @@ from contextlib import closing, contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
 
-from rosproxy.admin.status_document import ProxyStatus, ZenohStatus, parse_status
+from rosproxy.shared.documents.status_document import ProxyStatus, ZenohStatus, parse_status
 from tests.ros.processes import Process, stop_all, wait_until
 from tests.ros.topology import Plan, PortMap, Topology, run_command
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rosproxy.admin.status_document import ZenohSessionStatus
+from rosproxy.shared.documents.status_document import ZenohSessionStatus
 from rosproxy_operator.kubernetes.proxies.hub_certificate import hub_certificate
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.resources.names import hub_address

@@ -7,7 +7,7 @@ from typing import NoReturn
 
 import click
 
-from rosproxy.telemetry.text import clean
+from rosproxy.shared.output.text import clean
 from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.problem import Problem
 

@@ -1,6 +1,6 @@
 """The kind of options that name a container image."""
 
-from rosproxy.setting_kinds import Text
+from rosproxy.shared.setting_kinds import Text
 
 
 def read_image(text: str) -> str:

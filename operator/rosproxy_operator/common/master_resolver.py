@@ -4,8 +4,8 @@ import asyncio
 import time
 from collections.abc import Callable, Iterable, Mapping
 
-from rosproxy.net.addresses import is_address, is_loopback, plain_address
-from rosproxy.net.resolver import resolve
+from rosproxy.shared.addresses import is_address, is_loopback, plain_address
+from rosproxy.shared.machine.resolver import resolve
 
 RESOLVE_INTERVAL_S = 15.0
 """Seconds after which the resolver resolves a name again."""

@@ -22,13 +22,6 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.admin.status_bounds import fair_choice, fair_shares
-from rosproxy.net.addresses import (
-    is_loopback,
-    parse_authority,
-    parse_host_port,
-    plain_address,
-)
 from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
@@ -48,7 +41,14 @@ from rosproxy.page.page_document import (
     within_bounds,
 )
 from rosproxy.page.zenoh_graph import HUB, NODE, ROUTER
-from rosproxy.telemetry.text import plural
+from rosproxy.shared.addresses import (
+    is_loopback,
+    parse_authority,
+    parse_host_port,
+    plain_address,
+)
+from rosproxy.shared.documents.status_bounds import fair_choice, fair_shares
+from rosproxy.shared.output.text import plural
 from rosproxy_operator.common.problem import SILENT, Problem
 
 Json = dict[str, Any]

@@ -2,7 +2,7 @@
 
 The same rules hold as at the admin endpoint of a proxy. The server answers only requests whose
 ``Host`` no stranger can register, such as an IP address or the server's own host name
-(`rosproxy.admin.host_rule`, DNS rebinding). Each client address may have `MOST_CONNECTIONS`
+(`rosproxy.shared.http.host_rule`, DNS rebinding). Each client address may have `MOST_CONNECTIONS`
 connections. Callers that request the metrics at the same time share a reply.
 """
 
@@ -15,15 +15,15 @@ from aiohttp import web
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
-from rosproxy.admin.host_rule import is_own_host, refusal
-from rosproxy.admin.replies import send_shared
-from rosproxy.admin.shared_document import SharedDocument
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.bounded_server import BoundedServer
-from rosproxy.net.sockets import MOST_BACKLOG
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
-from rosproxy.setting_kinds import SettingError
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.connections.sockets import MOST_BACKLOG
+from rosproxy.shared.http.bounded_server import BoundedServer
+from rosproxy.shared.http.host_rule import is_own_host, refusal
+from rosproxy.shared.http.replies import send_shared
+from rosproxy.shared.http.shared_document import SharedDocument
+from rosproxy.shared.setting_kinds import SettingError
 from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.proxy_client import Json
 
@@ -90,7 +90,8 @@ async def _answer(
     routes: Mapping[tuple[str, str], Handler], request: web.BaseRequest
 ) -> web.StreamResponse:
     host = request.headers.get("Host", "")
-    # A stranger may have registered any other name: DNS rebinding (`rosproxy.admin.host_rule`).
+    # A stranger may have registered any other name: DNS rebinding
+    # (`rosproxy.shared.http.host_rule`).
     if not is_own_host(host, {socket.gethostname().lower()}):
         return web.Response(status=403, text=refusal(host))
     method = "GET" if request.method == "HEAD" else request.method

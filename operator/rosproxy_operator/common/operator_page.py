@@ -12,12 +12,12 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from typing import Any
 
 from rosproxy import __version__
-from rosproxy.net.tasks import Tasks
 from rosproxy.page.feed import Feed
 from rosproxy.page.page_document import Document
 from rosproxy.page.problem_ages import ProblemAges
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.merged_page import merged
 from rosproxy_operator.common.problem import Problem
 

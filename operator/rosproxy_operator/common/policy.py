@@ -14,9 +14,9 @@ that are too long for the variable become a layer that denies more (`as_variable
 import json
 from collections.abc import Iterable, Sequence
 
-from rosproxy.access.layers import PolicyLayer, PolicyMode, layers_as_json
-from rosproxy.access.rules import MOST_RULES, Rule, RuleAction, RuleKind
-from rosproxy.setting_kinds import SettingError
+from rosproxy.shared.policy.layers import PolicyLayer, PolicyMode, layers_as_json
+from rosproxy.shared.policy.rules import MOST_RULES, Rule, RuleAction, RuleKind
+from rosproxy.shared.setting_kinds import SettingError
 
 ADMINISTRATOR = "administrator"
 """Name of the layer from the operator's options. This layer is for all proxies."""

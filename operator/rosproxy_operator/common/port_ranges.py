@@ -10,7 +10,7 @@ from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 
 LAST_PORT = 65535
 REFUSED_RANGE_KEPT_S = 20.0

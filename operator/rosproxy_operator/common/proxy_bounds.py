@@ -5,8 +5,8 @@ from typing import Any
 
 import msgspec
 
-from rosproxy.setting_kinds import declared
-from rosproxy.settings import Settings
+from rosproxy.shared.setting_kinds import declared
+from rosproxy.shared.settings import Settings
 
 OPTION_PREFIX = "proxy-"
 """The prefix of the operator's options for the bounds of proxies."""

@@ -10,12 +10,17 @@ from urllib.parse import quote
 import aiohttp
 import msgspec
 
-from rosproxy.access.layers import PolicyLayer, layers_as_json
-from rosproxy.admin.status_bounds import MOST_BYTES
-from rosproxy.admin.status_document import NotAStatus, ProxyStatus, parse_status, read_status
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.bodies import TooLong, read_bounded
 from rosproxy.page.page_document import Document
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_bounds import MOST_BYTES
+from rosproxy.shared.documents.status_document import (
+    NotAStatus,
+    ProxyStatus,
+    parse_status,
+    read_status,
+)
+from rosproxy.shared.http.bodies import TooLong, read_bounded
+from rosproxy.shared.policy.layers import PolicyLayer, layers_as_json
 from rosproxy_operator.common.merged_page import read_document
 
 Json = dict[str, Any]

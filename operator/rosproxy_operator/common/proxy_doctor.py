@@ -8,8 +8,8 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, Severity, warning
-from rosproxy.telemetry.text import brief
+from rosproxy.shared.documents.doctor_finding import UNKNOWN_NAME, DoctorFinding, Severity, warning
+from rosproxy.shared.output.text import brief
 
 MOST_FINDINGS = 500
 """The most findings that the operator reads from a proxy's doctor."""

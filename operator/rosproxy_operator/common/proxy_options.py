@@ -6,8 +6,8 @@ The values are the values of the options of ``rosproxy run``.
 import click
 
 from rosproxy.cli.options import Command, click_option, click_type, with_options
-from rosproxy.setting_kinds import POLICY_RULES, declared
-from rosproxy.settings import Settings
+from rosproxy.shared.setting_kinds import POLICY_RULES, declared
+from rosproxy.shared.settings import Settings
 from rosproxy_operator.common.proxy_bounds import OPTION_PREFIX, ProxyBounds
 
 _POLICY = (

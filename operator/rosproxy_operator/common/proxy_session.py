@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_document import ProxyStatus
+from rosproxy.shared.policy.layers import PolicyLayer
 from rosproxy_operator.common.proxy_client import Json, ProxyClient
 from rosproxy_operator.common.proxy_status import Leases
 

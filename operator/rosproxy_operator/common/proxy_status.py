@@ -1,22 +1,22 @@
 """Reads facts for the operator from the ``/status`` of a proxy, for all engines.
 
-The document is `rosproxy.admin.status_document`. ROS nodes choose many texts in the document, and
-an attacker may control the proxy. So the operator bounds all sizes, and drops values that the next
-proxy would refuse.
+The document is `rosproxy.shared.documents.status_document`. ROS nodes choose many texts in the
+document, and an attacker may control the proxy. So the operator bounds all sizes, and drops values
+that the next proxy would refuse.
 """
 
 from collections import defaultdict
 from collections.abc import Mapping
 from itertools import islice
 
-from rosproxy.admin.requests import is_guid_prefix
-from rosproxy.admin.status_document import (
+from rosproxy.shared.addresses import parse_host_port, plain_address
+from rosproxy.shared.documents.requests import is_guid_prefix
+from rosproxy.shared.documents.status_document import (
     EndpointStatus,
     ParticipantStatus,
     ProxyStatus,
     ZenohNodeStatus,
 )
-from rosproxy.net.addresses import parse_host_port, plain_address
 
 Leases = Mapping[str, tuple[int, ...]]
 """The ports of participants by GUID prefix, in the order of the participant's locators."""

@@ -3,10 +3,10 @@
 import hashlib
 import hmac
 
-from rosproxy.leases.domain_ports import first_unicast_port, multicast_port
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import read_peer
-from rosproxy.settings import LEAST_PORTS_PER_DOMAIN
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.domain_ports import first_unicast_port, multicast_port
+from rosproxy.shared.setting_kinds import read_peer
+from rosproxy.shared.settings import LEAST_PORTS_PER_DOMAIN
 
 MOST_PEERS = 32
 """The most hosts in a label or field. Each announcement goes to at least 32 ports of each host."""

@@ -6,7 +6,7 @@ operator reports these variables only if the proxy discovers no participant of t
 
 from collections.abc import Callable, Mapping
 
-from rosproxy.telemetry.text import brief
+from rosproxy.shared.output.text import brief
 from rosproxy_operator.common.problem import Fault
 
 MOST_VALUE_CHARACTERS = 80

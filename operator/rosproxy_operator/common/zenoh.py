@@ -8,9 +8,9 @@ import re
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from rosproxy.access.rules import Rule, format_rules
-from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
-from rosproxy.setting_kinds import ZENOH_PORT, read_site_link, read_zenoh_peer
+from rosproxy.shared.addresses import HostPort, is_loopback, parse_host_port
+from rosproxy.shared.policy.rules import Rule, format_rules
+from rosproxy.shared.setting_kinds import ZENOH_PORT, read_site_link, read_zenoh_peer
 
 OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
 SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import click
 
 from rosproxy.cli.options import Command, Seconds
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.common.command_errors import exit_on_error, exit_with, fail
 from rosproxy_operator.docker.settings import PlanSettings
 

@@ -18,9 +18,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from rosproxy import __version__
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.tasks import Tasks
 from rosproxy.page.page_document import Document
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.control_loop import (
     ControlLoop,
     LookFailed,

@@ -9,9 +9,9 @@ proxy (``docker exec``), unless the proxy has just been started.
 import asyncio
 from collections.abc import Iterator, Sequence
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
 from rosproxy.doctor.rules.participant import OTHER_DOMAIN, OWN_MACHINE
-from rosproxy.telemetry.text import plural
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, error, note, ok, warning
+from rosproxy.shared.output.text import plural
 from rosproxy_operator.common.proxy_client import Json
 from rosproxy_operator.common.proxy_doctor import command, read_findings, without_names_of_others
 from rosproxy_operator.common.threads import in_thread

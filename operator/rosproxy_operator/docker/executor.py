@@ -15,7 +15,7 @@ import time
 from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
 
-from rosproxy.net.tasks import Tasks
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.problem import (
     FAILED,
     NOT_ADMITTED,

@@ -3,9 +3,9 @@
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import is_loopback
-from rosproxy.net.interfaces import address_towards
+from rosproxy.shared.addresses import is_loopback
+from rosproxy.shared.machine.interfaces import address_towards
+from rosproxy.shared.ports import PortRange
 
 _DEFAULT_EPHEMERAL_PORTS = "32768 60999"
 # TCP_LISTEN of the kernel's include/net/tcp_states.h, as hexadecimal digits.

@@ -10,9 +10,13 @@ from dataclasses import asdict
 from datetime import datetime
 
 from rosproxy import __version__
-from rosproxy.admin.status_document import ParticipantStatus, ProxyStatus, ZenohNodeStatus
-from rosproxy.net.addresses import parse_host_port, plain_address
-from rosproxy.telemetry.text import brief, listed
+from rosproxy.shared.addresses import parse_host_port, plain_address
+from rosproxy.shared.documents.status_document import (
+    ParticipantStatus,
+    ProxyStatus,
+    ZenohNodeStatus,
+)
+from rosproxy.shared.output.text import brief, listed
 from rosproxy_operator.common.problem import (
     NOT_WIRED,
     Problem,

@@ -14,11 +14,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from rosproxy import __version__
-from rosproxy.admin.admin_client import AdminClient, AdminError, default_url
-from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.cli.terminal import size, watch, write
-from rosproxy.net.addresses import HostPort
-from rosproxy.telemetry.text import clean
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_document import ProxyStatus
+from rosproxy.shared.http.admin_client import AdminClient, AdminError, default_url
+from rosproxy.shared.output.text import clean
 from rosproxy_operator.common.master_resolver import MasterResolver
 from rosproxy_operator.common.proxy_client import Json, ProxyClient
 from rosproxy_operator.docker.engine_client import DockerClient

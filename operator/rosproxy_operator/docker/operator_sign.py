@@ -1,4 +1,4 @@
-"""Finds the Docker operators of this machine by the signs that they publish (`rosproxy.net.signs`).
+"""Finds the Docker operators of this machine by their signs (`rosproxy.shared.machine.signs`).
 
 So a command also finds an operator that listens at another address than --admin-bind. Any program
 can publish a sign, so a command follows signs to loopback alone, where only programs of this
@@ -8,8 +8,8 @@ machine listen.
 import hashlib
 import socket
 
-from rosproxy.net import signs
-from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
+from rosproxy.shared.addresses import HostPort, is_loopback, parse_host_port
+from rosproxy.shared.machine import signs
 
 MOST_ENDPOINTS_ASKED = 4
 """The highest number of endpoints that a command asks."""

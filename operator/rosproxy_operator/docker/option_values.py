@@ -1,11 +1,17 @@
-"""Kinds of values of the Docker operator's options. See `rosproxy.setting_kinds`."""
+"""Kinds of values of the Docker operator's options. See `rosproxy.shared.setting_kinds`."""
 
 import re
 from pathlib import Path
 
-from rosproxy.net.addresses import is_loopback
-from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.setting_kinds import LINK_PROTOCOLS, Number, Text, read_address, read_master_uri
+from rosproxy.shared.addresses import is_loopback
+from rosproxy.shared.setting_kinds import (
+    LINK_PROTOCOLS,
+    Number,
+    Text,
+    read_address,
+    read_master_uri,
+)
+from rosproxy.shared.uris import parse_slave_uri
 from rosproxy_operator.common.ros2 import read_peer_name
 from rosproxy_operator.common.zenoh import read_link_name
 

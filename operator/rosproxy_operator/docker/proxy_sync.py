@@ -20,9 +20,9 @@ import logging
 import time
 from collections.abc import Callable, Collection
 
-from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.tasks import Tasks
+from rosproxy.shared.documents.status_document import ProxyStatus
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.problem import (
     REFUSES,
     SILENT,

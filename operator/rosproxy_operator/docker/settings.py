@@ -1,18 +1,18 @@
 """The settings of ``rosproxy-operator docker``: plain data, each setting written once.
 
-See `rosproxy.settings`.
+See `rosproxy.shared.settings`.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-from rosproxy import setting_kinds as kinds
-from rosproxy.access.layers import PolicyLayer, check_bounds
-from rosproxy.access.rules import Rule
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import (
+from rosproxy.shared import setting_kinds as kinds
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyLayer, check_bounds
+from rosproxy.shared.policy.rules import Rule
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import (
     DataPlane,
     Direction,
     Option,
@@ -22,9 +22,9 @@ from rosproxy.setting_kinds import (
     make_settings,
     time,
 )
-from rosproxy.settings import MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
-from rosproxy.zenoh.policy.key_expressions import check_limits
-from rosproxy.zenoh.policy.name_sets import check_layers
+from rosproxy.shared.settings import MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
+from rosproxy.shared.zenoh_rules.key_expressions import check_limits
+from rosproxy.shared.zenoh_rules.name_sets import check_layers
 from rosproxy_operator.common.images import IMAGE
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds, make_proxy_bounds

@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.common.master_resolver import MasterResolver
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker import engine_json, host

@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterable, Iterator
 
 from msgspec.structs import replace
 
-from rosproxy.net.tasks import Tasks
 from rosproxy.page.page_document import Document
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog

@@ -16,7 +16,7 @@ from kubernetes.client.exceptions import ApiException
 from kubernetes.stream import stream
 from websocket import WebSocketException
 
-from rosproxy.admin.doctor_finding import DoctorFinding, warning
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, warning
 from rosproxy_operator.common.proxy_doctor import (
     command,
     read_findings,

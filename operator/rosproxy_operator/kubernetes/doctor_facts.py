@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import TypeVar
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error, note, warning
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, error, note, warning
 from rosproxy_operator.kubernetes.api.api_client import (
     ENDPOINTS,
     WEBHOOKS,

@@ -1,8 +1,8 @@
-"""Kinds of values of the Kubernetes operator's options; see `rosproxy.setting_kinds`."""
+"""Kinds of values of the Kubernetes operator's options; see `rosproxy.shared.setting_kinds`."""
 
 import msgspec
 
-from rosproxy.setting_kinds import Number, Text
+from rosproxy.shared.setting_kinds import Number, Text
 from rosproxy_operator.kubernetes.resources.checks import is_label, is_subdomain
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import Json, Name

@@ -19,8 +19,8 @@ from typing import Any, cast
 import kopf
 from aiohttp import web
 
-from rosproxy.net.bounded_server import BoundedServer
-from rosproxy.net.sockets import MOST_BACKLOG
+from rosproxy.shared.connections.sockets import MOST_BACKLOG
+from rosproxy.shared.http.bounded_server import BoundedServer
 from rosproxy_operator.common.operator_admin import MOST_CONNECTIONS
 from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.resources.names import INJECT

@@ -1,7 +1,7 @@
 """The settings of ``rosproxy-operator kubernetes``: plain data, each setting written once.
 
-See `rosproxy.settings`. The option ``--webhook-bind`` is in `rosproxy_operator.cli`. Without this
-option, the operator serves no webhook.
+See `rosproxy.shared.settings`. The option ``--webhook-bind`` is in `rosproxy_operator.cli`. Without
+this option, the operator serves no webhook.
 """
 
 from collections.abc import Mapping
@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from rosproxy import setting_kinds as kinds
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import (
+from rosproxy.shared import setting_kinds as kinds
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import (
     DataPlane,
     Option,
     SettingError,

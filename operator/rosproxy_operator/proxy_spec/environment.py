@@ -3,9 +3,9 @@
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from rosproxy import fixes
-from rosproxy.setting_kinds import declared
-from rosproxy.settings import Settings
+from rosproxy.shared import fixes
+from rosproxy.shared.setting_kinds import declared
+from rosproxy.shared.settings import Settings
 
 _SETTINGS = {setting.field: setting for setting in declared(Settings)}
 

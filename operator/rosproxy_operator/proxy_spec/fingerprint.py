@@ -5,14 +5,14 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from rosproxy import fixes
+from rosproxy.shared import fixes
 from rosproxy_operator.proxy_spec.environment import variable
 
 LIVE_VARIABLES = frozenset({fixes.VARIABLE, *map(variable, ("await_policy", "policy_layers"))})
 """Variables that no fingerprint contains: a change of these recreates no proxy.
 
 A running proxy gets a new policy from the operator, without a restart. The name of the operator
-only selects the words of fixes (`rosproxy.fixes`).
+only selects the words of fixes (`rosproxy.shared.fixes`).
 """
 
 

@@ -7,8 +7,8 @@ containers of a master and of a domain may differ.
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.uris import parse_slave_uri
 
 
 @dataclass(frozen=True, slots=True)

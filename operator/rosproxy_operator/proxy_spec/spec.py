@@ -1,7 +1,7 @@
 """The options of a proxy that users may set, for all engines.
 
 A container sets an option by a label, a RosProxy by a field of the spec. An option means the same
-as the proxy's setting of this name (`rosproxy.settings.Settings`).
+as the proxy's setting of this name (`rosproxy.shared.settings.Settings`).
 """
 
 from collections.abc import Iterable, Mapping
@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 import msgspec
 
-from rosproxy.setting_kinds import DataPlane, Direction, LogLevel, SlaveControl
+from rosproxy.shared.setting_kinds import DataPlane, Direction, LogLevel, SlaveControl
 
 Wishes = Mapping[str, Any]
 """The values that a container asks for, by the fields of `ProxySpec`."""

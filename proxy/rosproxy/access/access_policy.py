@@ -9,7 +9,9 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Collection, Sequence
 
-from rosproxy.access.layers import (
+from rosproxy.access.rule_index import RuleIndex
+from rosproxy.shared.output.problems import DENIED, WOULD_BE_DENIED
+from rosproxy.shared.policy.layers import (
     ALLOWED,
     PolicyLayer,
     PolicyMode,
@@ -19,10 +21,8 @@ from rosproxy.access.layers import (
     may_deny,
     of_kind,
 )
-from rosproxy.access.rule_index import RuleIndex
-from rosproxy.access.rules import RuleKind
+from rosproxy.shared.policy.rules import RuleKind
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import DENIED, WOULD_BE_DENIED
 from rosproxy.telemetry.refusals import Refusals
 
 OFFER_KINDS = frozenset({RuleKind.PUBLISH, RuleKind.SERVE})

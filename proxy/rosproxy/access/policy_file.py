@@ -9,9 +9,9 @@ import os
 from pathlib import Path
 
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.access.layers import PolicyLayer, PolicyMode
-from rosproxy.access.rules import parse_rules
-from rosproxy.telemetry.problems import Problems
+from rosproxy.shared.output.problems import Problems
+from rosproxy.shared.policy.layers import PolicyLayer, PolicyMode
+from rosproxy.shared.policy.rules import parse_rules
 
 log = logging.getLogger(__name__)
 

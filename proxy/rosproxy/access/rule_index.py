@@ -12,8 +12,8 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from itertools import compress, groupby
 
-from rosproxy.access.layers import ALLOWED, PolicyLayer, PolicyMode, Verdict
-from rosproxy.access.rules import MOST_RULES, Rule, RuleAction, RuleKind, matches
+from rosproxy.shared.policy.layers import ALLOWED, PolicyLayer, PolicyMode, Verdict
+from rosproxy.shared.policy.rules import MOST_RULES, Rule, RuleAction, RuleKind, matches
 
 MOST_CALLER_COMPARISONS = 20_000
 """Comparisons of node names with rules for a verdict, about 10 ms. Beyond the bound, each rule

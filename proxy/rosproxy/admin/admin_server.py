@@ -29,18 +29,18 @@ from aiohttp import web
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
-from rosproxy.admin.host_rule import is_own_host, refusal
-from rosproxy.admin.replies import send_shared, unavailable
-from rosproxy.admin.requests import BodyError
-from rosproxy.admin.shared_document import SharedDocument
 from rosproxy.admin.status_changes import StatusChanges, StatusSnapshot
-from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.net.addresses import HostPort, is_loopback, plain_address
-from rosproxy.net.bodies import TooLong, read_bounded
-from rosproxy.net.bounded_server import BoundedServer
 from rosproxy.net.fair_slots import FairSlots, NoSlot
 from rosproxy.net.http_client import CallFailed
-from rosproxy.net.sockets import MOST_BACKLOG
+from rosproxy.shared.addresses import HostPort, is_loopback, plain_address
+from rosproxy.shared.connections.sockets import MOST_BACKLOG
+from rosproxy.shared.documents.requests import BodyError
+from rosproxy.shared.documents.status_document import ProxyStatus
+from rosproxy.shared.http.bodies import TooLong, read_bounded
+from rosproxy.shared.http.bounded_server import BoundedServer
+from rosproxy.shared.http.host_rule import is_own_host, refusal
+from rosproxy.shared.http.replies import send_shared, unavailable
+from rosproxy.shared.http.shared_document import SharedDocument
 
 log = logging.getLogger(__name__)
 

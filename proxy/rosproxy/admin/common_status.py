@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from rosproxy import __version__
-from rosproxy.admin.status_document import (
+from rosproxy.runtime import Runtime
+from rosproxy.shared.documents.status_document import (
     HiddenStatus,
     LayerStatus,
     PolicyStatus,
@@ -16,8 +17,7 @@ from rosproxy.admin.status_document import (
     ProxyStatus,
     StatusSettings,
 )
-from rosproxy.runtime import Runtime
-from rosproxy.telemetry.problems import Problems
+from rosproxy.shared.output.problems import Problems
 
 MOST_HIDDEN = 2000
 """Hidden names that the status lists for each version of ROS, with fair shares by address.

@@ -12,10 +12,10 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import cached_property
 
-from rosproxy.admin.status_bounds import encode
-from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.admin.status_version import version_of
 from rosproxy.net.fair_slots import FairSlots
+from rosproxy.shared.documents.status_bounds import encode
+from rosproxy.shared.documents.status_document import ProxyStatus
 
 POLL_INTERVAL = 0.5
 """Shortest time between two polls for a caller, in seconds."""

@@ -8,7 +8,12 @@ import hashlib
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import DomainStatus, EndpointStatus, ProxyStatus, ZenohStatus
+from rosproxy.shared.documents.status_document import (
+    DomainStatus,
+    EndpointStatus,
+    ProxyStatus,
+    ZenohStatus,
+)
 
 
 def version_of(status: ProxyStatus) -> str:

@@ -12,18 +12,18 @@ from collections.abc import Sequence
 from typing import Any
 
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.access.layers import PolicyMode, read_layer
 from rosproxy.access.policy_file import CHECK_INTERVAL_S, OPTION, PolicyFile
-from rosproxy.admin.requests import BodyError, PolicyUpdate, read_body
-from rosproxy.admin.status_document import to_json
 from rosproxy.app.stacks import Stack
 from rosproxy.runtime import Runtime
-from rosproxy.setting_kinds import SettingError
-from rosproxy.settings import Settings
+from rosproxy.shared.documents.requests import BodyError, PolicyUpdate, read_body
+from rosproxy.shared.documents.status_document import to_json
+from rosproxy.shared.output.problems import Problems
+from rosproxy.shared.policy.layers import PolicyMode, read_layer
+from rosproxy.shared.setting_kinds import SettingError
+from rosproxy.shared.settings import Settings
+from rosproxy.shared.zenoh_rules.name_sets import check_layers
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
-from rosproxy.zenoh.policy.name_sets import check_layers
 
 log = logging.getLogger(__name__)
 

@@ -11,23 +11,24 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from rosproxy.admin.admin_client import default_url
 from rosproxy.admin.admin_server import Action, AdminServer
 from rosproxy.admin.common_status import common_status
-from rosproxy.admin.status_bounds import bounded
-from rosproxy.admin.status_document import ProxyStatus, to_json
 from rosproxy.app.policy_sources import PolicySources
 from rosproxy.app.self_check import SelfCheck
 from rosproxy.app.signals import stop_event
 from rosproxy.app.stacks import make_stacks
 from rosproxy.binding import setting_error_if_taken
-from rosproxy.net import proxy_signs, sockets
+from rosproxy.net import proxy_signs
 from rosproxy.page.feed import Feed, PageWatch
 from rosproxy.page.problem_ages import ProblemAges
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
 from rosproxy.runtime import Runtime
-from rosproxy.settings import Settings
+from rosproxy.shared.connections import sockets
+from rosproxy.shared.documents.status_bounds import bounded
+from rosproxy.shared.documents.status_document import ProxyStatus, to_json
+from rosproxy.shared.http.admin_client import default_url
+from rosproxy.shared.settings import Settings
 
 log = logging.getLogger(__name__)
 

@@ -21,9 +21,12 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.admin.requests import RangeProbe
-from rosproxy.admin.setup_rules import (
+from rosproxy.app.stacks import Stack
+from rosproxy.runtime import Runtime
+from rosproxy.shared.addresses import parse_authority
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
+from rosproxy.shared.documents.requests import RangeProbe
+from rosproxy.shared.documents.setup_rules import (
     HOST,
     RANGE,
     advertised_host,
@@ -31,12 +34,9 @@ from rosproxy.admin.setup_rules import (
     probe_result,
     published_range,
 )
-from rosproxy.admin.status_document import PortsStatus, RangeProbeStatus, to_json
-from rosproxy.app.stacks import Stack
-from rosproxy.net.addresses import parse_authority
-from rosproxy.net.resolver import resolve
-from rosproxy.runtime import Runtime
-from rosproxy.settings import Settings
+from rosproxy.shared.documents.status_document import PortsStatus, RangeProbeStatus, to_json
+from rosproxy.shared.machine.resolver import resolve
+from rosproxy.shared.settings import Settings
 
 log = logging.getLogger(__name__)
 

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from rosproxy.admin.admin_server import Action
-from rosproxy.admin.requests import EnforcementCounts, PortProbe
-from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.ros1.stack import Ros1
 from rosproxy.ros2.stack import Ros2
 from rosproxy.runtime import Runtime
+from rosproxy.shared.documents.requests import EnforcementCounts, PortProbe
+from rosproxy.shared.documents.status_document import ProxyStatus
 from rosproxy.zenoh.stack import Zenoh
 
 

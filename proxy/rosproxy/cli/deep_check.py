@@ -9,20 +9,25 @@ import asyncio
 
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error
-from rosproxy.admin.requests import RangeProbe
-from rosproxy.admin.status_document import DomainStatus, PortsStatus, ProxyStatus, StatusSettings
 from rosproxy.app.self_check import peer_addresses
 from rosproxy.app.stacks import make_stacks
 from rosproxy.binding import setting_error_if_taken
 from rosproxy.doctor.facts import DoctorFacts, SystemState
 from rosproxy.doctor.graph_survey import look_at_master
 from rosproxy.doctor.rules import proxy as rules
-from rosproxy.net import sockets
-from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
-from rosproxy.setting_kinds import SettingError
-from rosproxy.settings import Settings
+from rosproxy.shared.connections import sockets
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, error
+from rosproxy.shared.documents.requests import RangeProbe
+from rosproxy.shared.documents.status_document import (
+    DomainStatus,
+    PortsStatus,
+    ProxyStatus,
+    StatusSettings,
+)
+from rosproxy.shared.machine.resolver import resolve
+from rosproxy.shared.setting_kinds import SettingError
+from rosproxy.shared.settings import Settings
 
 
 def deep_check(settings: Settings) -> list[DoctorFinding]:

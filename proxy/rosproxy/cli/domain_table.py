@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 
-from rosproxy.admin import status_document as document
-from rosproxy.telemetry.tables import GAP, besides_first, table
-from rosproxy.telemetry.text import clean, listed, plural, size, wrap
+from rosproxy.shared.documents import status_document as document
+from rosproxy.shared.output.tables import GAP, besides_first, table
+from rosproxy.shared.output.text import clean, listed, plural, size, wrap
 
 HEADING = ("PARTICIPANT", "SIDE", "ADDRESS", "VENDOR", "PUB", "SUB", "SRV", "PORTS", "IN", "RATE")
 MOST_LINES = 3

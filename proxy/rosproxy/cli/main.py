@@ -8,10 +8,11 @@ from typing import Any
 
 import click
 
-from rosproxy import __version__, fixes
-from rosproxy import setting_kinds as kinds
+from rosproxy import __version__
 from rosproxy.cli import options, questions
-from rosproxy.settings import Settings
+from rosproxy.shared import fixes
+from rosproxy.shared import setting_kinds as kinds
+from rosproxy.shared.settings import Settings
 
 
 @click.group(cls=options.Commands, context_settings=options.GROUP_SETTINGS)
@@ -44,7 +45,7 @@ def run(check: bool, deep: bool, log_format: str, **given: Any) -> None:
     The command line overrides the environment variable, and the variable overrides the file of
     --config.
     """
-    from rosproxy.telemetry import logs
+    from rosproxy.shared.output import logs
 
     if deep and not check:
         raise click.UsageError("--deep needs --check")
@@ -116,7 +117,7 @@ def lan_relay(log_format: str, log_level: str, **given: Any) -> None:
     """
     from rosproxy.app.lan_relay_program import run_lan_relay
     from rosproxy.ros2.lan_relay.relay import LanRelaySettings
-    from rosproxy.telemetry import logs
+    from rosproxy.shared.output import logs
 
     with options.setting_errors():
         logs.set_up(log_format, log_level)

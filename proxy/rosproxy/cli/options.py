@@ -15,12 +15,12 @@ from typing import Any, get_args
 
 import click
 
-from rosproxy import setting_kinds as kinds
 from rosproxy.cli import variables
 from rosproxy.cli.config_file import read_config
 from rosproxy.cli.variables import UnknownVariable
-from rosproxy.fixes import VARIABLE
-from rosproxy.setting_kinds import Setting, SettingError, declared
+from rosproxy.shared import setting_kinds as kinds
+from rosproxy.shared.fixes import VARIABLE
+from rosproxy.shared.setting_kinds import Setting, SettingError, declared
 
 Command = Callable[..., Any]
 GROUP_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}

@@ -11,15 +11,15 @@ from typing import Any, NoReturn
 
 import click
 
-from rosproxy import setting_kinds as kinds
 from rosproxy.cli import options
+from rosproxy.shared import setting_kinds as kinds
 
 WAIT_INTERVAL_S = 0.5
 """Seconds between two requests of ``status --wait``."""
 
 
 def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
-    from rosproxy.admin.admin_client import AdminClient, default_url
+    from rosproxy.shared.http.admin_client import AdminClient, default_url
 
     # As for the proxy itself, the command line and the variable override the file.
     bound = None if url or "ROSPROXY_ADMIN_BIND" in os.environ else _bound_by_file()
@@ -103,7 +103,7 @@ def _open_page(admin: Any) -> None:
 
 def _why_not_ready(admin: Any) -> str:
     """The reason why nodes can't use the proxy; empty if nodes can."""
-    from rosproxy.admin.admin_client import AdminError
+    from rosproxy.shared.http.admin_client import AdminError
 
     try:
         admin.get("/readyz")
@@ -189,9 +189,9 @@ def print_findings(findings: Any, as_json: bool) -> NoReturn:
     """Print findings, and exit with 1 if there is an error, else with 0."""
     import json
 
-    from rosproxy.admin.doctor_finding import failed
     from rosproxy.cli import terminal
     from rosproxy.doctor import presentation
+    from rosproxy.shared.documents.doctor_finding import failed
 
     if as_json:
         terminal.write(json.dumps(presentation.as_json(findings), indent=2))
@@ -202,7 +202,7 @@ def print_findings(findings: Any, as_json: bool) -> NoReturn:
 
 def _or_exit(ask: Callable[[], object]) -> None:
     """Call a function; on an AdminError, print the message and exit with 1."""
-    from rosproxy.admin.admin_client import AdminError
+    from rosproxy.shared.http.admin_client import AdminError
 
     try:
         ask()

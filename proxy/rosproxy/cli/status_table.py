@@ -7,13 +7,13 @@ names in the status, so `clean` makes these names harmless.
 
 from collections.abc import Iterator, Sequence
 
-from rosproxy.admin import status_document as document
-from rosproxy.admin.status_bounds import left_out
 from rosproxy.cli.domain_table import domain_lines
 from rosproxy.cli.zenoh_table import zenoh_lines
-from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.telemetry.tables import GAP, besides_first, table
-from rosproxy.telemetry.text import clean, duration, listed, plural, size, wrap
+from rosproxy.shared.documents import status_document as document
+from rosproxy.shared.documents.status_bounds import left_out
+from rosproxy.shared.output.tables import GAP, besides_first, table
+from rosproxy.shared.output.text import clean, duration, listed, plural, size, wrap
+from rosproxy.shared.uris import parse_slave_uri
 
 HEADING = ("NODE", "INSIDE", "OUTSIDE", "STATE", "PUB", "SUB", "SRV", "CONN", "OUT", "IN")
 LEAST_NAME_COLUMNS = 20

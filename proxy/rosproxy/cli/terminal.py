@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.highlighter import RegexHighlighter
 from rich.live import Live
 
-from rosproxy.admin.admin_client import AdminClient, AdminError
 from rosproxy.cli.status_table import render
+from rosproxy.shared.http.admin_client import AdminClient, AdminError
 
 WATCH_INTERVAL_S = 2.0
 """Seconds between two drawings, and between two measurements of rates in the proxy."""

@@ -3,16 +3,16 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from rosproxy.admin.status_document import (
+from rosproxy.shared.addresses import parse_host_port
+from rosproxy.shared.documents.status_document import (
     ZenohLinkStatus,
     ZenohNodeStatus,
     ZenohQosStatus,
     ZenohSessionStatus,
     ZenohStatus,
 )
-from rosproxy.net.addresses import parse_host_port
-from rosproxy.telemetry.tables import GAP, besides_first, table
-from rosproxy.telemetry.text import clean, duration, listed, plural, shorten, wrap
+from rosproxy.shared.output.tables import GAP, besides_first, table
+from rosproxy.shared.output.text import clean, duration, listed, plural, shorten, wrap
 
 SESSIONS_HEADING = ("REMOTE", "MODE", "LOCAL", "ROUTER")
 NODES_HEADING = ("NODE", "DOMAIN", "ADDRESS", "PUB", "SUB", "SRV")

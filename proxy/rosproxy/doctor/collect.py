@@ -14,12 +14,12 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from rosproxy.admin.admin_client import AdminClient, AdminError
-from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.domain_survey import ask_participants
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant, SystemState
 from rosproxy.doctor.graph_survey import ask_graph
-from rosproxy.net.resolver import resolve
+from rosproxy.shared.documents.status_document import ProxyStatus
+from rosproxy.shared.http.admin_client import AdminClient, AdminError
+from rosproxy.shared.machine.resolver import resolve
 
 
 async def collect(

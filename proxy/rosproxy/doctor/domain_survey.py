@@ -19,15 +19,6 @@ from ipaddress import ip_network
 
 from rosproxy.doctor.facts import HeardParticipant
 from rosproxy.forwarding import datagrams
-from rosproxy.leases.domain_ports import (
-    LAST_DOMAIN,
-    PORTS_PER_DOMAIN,
-    SPDP_MULTICAST,
-    first_unicast_port,
-    multicast_port,
-)
-from rosproxy.net.addresses import HostPort, is_inside, plain_address
-from rosproxy.net.interfaces import address_into
 from rosproxy.ros2.domain_settings import PARTICIPANTS_TRIED
 from rosproxy.ros2.protocol.announcement import SPDP_ENDPOINTS, announcement, dispose_message
 from rosproxy.ros2.protocol.parameters import Pid
@@ -36,6 +27,15 @@ from rosproxy.ros2.registry.participants import Participant
 from rosproxy.ros2.rewriting.announced_participant import traits
 from rosproxy.ros2.rewriting.discovery import Announcement, read_discovery
 from rosproxy.ros2.servers.groups import family_of, groups_of, send_through
+from rosproxy.shared.addresses import HostPort, is_inside, plain_address
+from rosproxy.shared.domain_ports import (
+    LAST_DOMAIN,
+    PORTS_PER_DOMAIN,
+    SPDP_MULTICAST,
+    first_unicast_port,
+    multicast_port,
+)
+from rosproxy.shared.machine.interfaces import address_into
 
 ALL_HOSTS = {socket.AF_INET: "224.0.0.1", socket.AF_INET6: "ff02::1"}
 ANSWER_TIMEOUT_S = 2.0

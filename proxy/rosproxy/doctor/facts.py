@@ -15,13 +15,13 @@ from typing import Any
 
 import msgspec
 
-from rosproxy.admin.requests import RangeProbe
-from rosproxy.admin.status_document import EndpointStatus, ProxyStatus
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.bus_stats import read_bus_stats
-from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.graph import read_types
 from rosproxy.ros2.registry.matching import in_turn
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.requests import RangeProbe
+from rosproxy.shared.documents.status_document import EndpointStatus, ProxyStatus
+from rosproxy.shared.uris import parse_slave_uri
 
 MOST_PAIRS = 5000
 """Pairs that the doctor examines at most: a topic with 1,000 subscribers of 5 publishers."""

@@ -17,7 +17,6 @@ from urllib.parse import urlsplit
 import aiohttp
 from msgspec.structs import replace
 
-from rosproxy.admin.status_bounds import fair_choice
 from rosproxy.doctor.facts import (
     Attempt,
     DoctorFacts,
@@ -30,18 +29,19 @@ from rosproxy.doctor.facts import (
     system_state,
 )
 from rosproxy.doctor.rules.pair import is_connected
-from rosproxy.net.addresses import HostPort, parse_host_port
-from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.clients.master_client import CALLER_ID, MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
-from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc.limits import ALL_LEASES, FLAG, SHORT_REPLY, Limits
 from rosproxy.ros1.registry.remembered_leases import NAMESPACE, LeasesAtMaster
+from rosproxy.shared.addresses import HostPort, parse_host_port
+from rosproxy.shared.documents.status_bounds import fair_choice
+from rosproxy.shared.machine.resolver import NODES, resolve
+from rosproxy.shared.output.text import brief
+from rosproxy.shared.uris import parse_inside_path, parse_service_uri, parse_slave_uri
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.text import brief
 
 MOST_QUESTIONS = 32
-"""Nodes asked at once; fewer than the look-ups of names (`rosproxy.net.resolver`)."""
+"""Nodes asked at once; fewer than the look-ups of names (`rosproxy.shared.machine.resolver`)."""
 MOST_TRIED = 1500
 """Nodes that the doctor tries at most, with fair shares for the hosts in their URIs. Any program
 can register nodes at the master, and a node that does not answer takes ANSWER_TIMEOUT_S."""

@@ -11,9 +11,9 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity, failed, note
-from rosproxy.admin.status_bounds import fair_choice
-from rosproxy.telemetry.text import brief, plural, wrap
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity, failed, note
+from rosproxy.shared.documents.status_bounds import fair_choice
+from rosproxy.shared.output.text import brief, plural, wrap
 
 MOST_ALIKE = 10
 """Findings of the same check with the same fix that are shown at most."""

@@ -12,7 +12,7 @@ import socket
 from collections.abc import Callable, Collection
 
 from rosproxy.forwarding.buffer_sizes import UDP_RECEIVE_BUFFER_BYTES
-from rosproxy.net.addresses import HostPort, plain_address
+from rosproxy.shared.addresses import HostPort, plain_address
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-from rosproxy.net.sockets import reset_on_close
+from rosproxy.shared.connections.sockets import reset_on_close
 
 log = logging.getLogger(__name__)
 

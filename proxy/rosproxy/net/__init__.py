@@ -1,1 +1,1 @@
-"""Sockets, HTTP, names and addresses, for ROS 1, ROS 2 and rmw_zenoh."""
+"""HTTP for XML-RPC, changes of networks, and the signs of proxies."""

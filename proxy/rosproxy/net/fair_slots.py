@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rosproxy.net.source_shares import SourceShares
+from rosproxy.shared.connections.source_shares import SourceShares
 
 
 class NoSlot(Exception):

@@ -24,13 +24,13 @@ import aiohttp
 from aiohttp.http import HttpResponseParser, RawResponseMessage
 from aiohttp.http_exceptions import HttpProcessingError
 
-from rosproxy.net import resolver
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.bodies import BadResponse, TooLong, is_plain, read_bounded
 from rosproxy.net.http_protocol import HttpProtocol, wake
 from rosproxy.net.late_answers import LateAnswers
-from rosproxy.net.sockets import dial
 from rosproxy.net.time_limits import TimeLimit, TimeLimits
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.connections.sockets import dial
+from rosproxy.shared.http.bodies import BadResponse, TooLong, is_plain, read_bounded
+from rosproxy.shared.machine import resolver
 
 MOST_BODY_BYTES = 64 * 1024 * 1024
 """Default bound of an XML-RPC body in bytes."""

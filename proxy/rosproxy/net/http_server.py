@@ -18,9 +18,9 @@ from aiohttp import HttpVersion, HttpVersion11, StreamReader
 from aiohttp.http import HttpRequestParser, RawRequestMessage
 from aiohttp.http_exceptions import HttpProcessingError
 
-from rosproxy.net.addresses import HostPort, plain_address
 from rosproxy.net.http_protocol import READ_AHEAD_BYTES, HttpProtocol, wake
-from rosproxy.net.sockets import reset_on_close
+from rosproxy.shared.addresses import HostPort, plain_address
+from rosproxy.shared.connections.sockets import reset_on_close
 
 log = logging.getLogger(__name__)
 

@@ -10,8 +10,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import islice
 
-from rosproxy.net import signs
-from rosproxy.net.addresses import HostPort, is_address, parse_host_port
+from rosproxy.shared.addresses import HostPort, is_address, parse_host_port
+from rosproxy.shared.machine import signs
 
 MOST_SIGNS = 8
 """Most proxies that a message names."""

@@ -9,16 +9,8 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding
-from rosproxy.admin.status_document import (
-    DomainStatus,
-    LocatorStatus,
-    ParticipantStatus,
-    ProxyStatus,
-)
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.doctor.rules.participant import check
-from rosproxy.net.addresses import is_loopback
 from rosproxy.page.measures import FLOW_PERIOD_S, Measures
 from rosproxy.page.page_document import (
     BROKEN,
@@ -38,6 +30,14 @@ from rosproxy.page.page_document import (
 )
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, mismatch_problems
 from rosproxy.ros2.registry.participants import TrafficKind
+from rosproxy.shared.addresses import is_loopback
+from rosproxy.shared.documents.doctor_finding import DoctorFinding
+from rosproxy.shared.documents.status_document import (
+    DomainStatus,
+    LocatorStatus,
+    ParticipantStatus,
+    ProxyStatus,
+)
 
 _QUIET_ENDINGS = (
     *("/describe_parameters", "/get_parameters", "/get_parameter_types", "/list_parameters"),

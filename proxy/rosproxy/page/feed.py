@@ -18,17 +18,17 @@ import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Sequence
 from functools import partial
 
-from rosproxy.admin.doctor_finding import DoctorFinding
-from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.collect import collect_running
 from rosproxy.net.fair_slots import FairSlots
-from rosproxy.net.tasks import Tasks
 from rosproxy.page import domain_graph
 from rosproxy.page.graph_document import graph_document, relayed
 from rosproxy.page.judgement import JudgedFacts, judge, topics_to_ask_about
 from rosproxy.page.measures import Measures
 from rosproxy.page.page_document import Json
 from rosproxy.page.problem_ages import ProblemAges
+from rosproxy.shared.documents.doctor_finding import DoctorFinding
+from rosproxy.shared.documents.status_document import ProxyStatus
+from rosproxy.shared.tasks import Tasks
 
 log = logging.getLogger(__name__)
 

@@ -10,10 +10,7 @@ from itertools import product
 
 import msgspec
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error
-from rosproxy.admin.status_document import EndpointStatus, ProxyStatus, StandInStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, SystemState
-from rosproxy.net.addresses import is_loopback
 from rosproxy.page import domain_graph, zenoh_graph
 from rosproxy.page.judgement import JudgedFacts, inside_nodes, without_ended
 from rosproxy.page.measures import Key, Measures
@@ -36,8 +33,11 @@ from rosproxy.page.page_document import (
     shown_name,
     shown_text,
 )
-from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.telemetry.text import quoted
+from rosproxy.shared.addresses import is_loopback
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity, error
+from rosproxy.shared.documents.status_document import EndpointStatus, ProxyStatus, StandInStatus
+from rosproxy.shared.output.text import quoted
+from rosproxy.shared.uris import parse_slave_uri
 
 MASTER = "master"
 PROXY = "rosproxy"

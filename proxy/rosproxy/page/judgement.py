@@ -9,13 +9,13 @@ from collections.abc import Collection, Mapping
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.admin.status_document import EndpointStatus, ProxyStatus
 from rosproxy.doctor.facts import DoctorFacts, SystemState
 from rosproxy.doctor.rules import diagnose_running
 from rosproxy.doctor.rules.pair import judge_pair
 from rosproxy.page.measures import Key
 from rosproxy.page.page_document import MOST_LINKS, QUIET
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
+from rosproxy.shared.documents.status_document import EndpointStatus, ProxyStatus
 
 
 class JudgedFacts(msgspec.Struct, frozen=True):

@@ -15,8 +15,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from rosproxy.doctor.facts import DoctorFacts, SlaveReport
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.uris import parse_slave_uri
 
 STALLED_AFTER_S = 5.0
 """Seconds without a message at the subscriber after which a link counts as stalled."""

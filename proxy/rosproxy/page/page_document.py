@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.admin.status_bounds import encoded_size
-from rosproxy.telemetry.text import brief
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
+from rosproxy.shared.documents.status_bounds import encoded_size
+from rosproxy.shared.output.text import brief
 
 ROBOT = "robot"
 HOST = "host"

@@ -10,12 +10,12 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.page.graph_document import MASTER
 from rosproxy.page.judgement import inside_nodes
 from rosproxy.page.page_document import BROKEN, WARNING, Json, shown_name
 from rosproxy.page.zenoh_graph import router_key
-from rosproxy.telemetry.text import brief
+from rosproxy.shared.documents.status_document import ProxyStatus
+from rosproxy.shared.output.text import brief
 
 NOTICED_WITHIN_S = 30.0
 """Seconds in which the proxy itself notices a problem that an open page shows at once."""

@@ -18,15 +18,15 @@ from urllib.parse import parse_qs
 
 from aiohttp import web
 
-from rosproxy.admin.replies import send_shared, unavailable, write_pieces
-from rosproxy.admin.status_bounds import encode
-from rosproxy.net.addresses import plain_address
-from rosproxy.net.bodies import TooLong, read_bounded
 from rosproxy.net.fair_slots import NoSlot
 from rosproxy.page.changes import changes
 from rosproxy.page.feed import Ended, Feed
 from rosproxy.page.page_document import Json
 from rosproxy.page.visitors import SESSION_S, Visitors, cookie_name
+from rosproxy.shared.addresses import plain_address
+from rosproxy.shared.documents.status_bounds import encode
+from rosproxy.shared.http.bodies import TooLong, read_bounded
+from rosproxy.shared.http.replies import send_shared, unavailable, write_pieces
 
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 HEARTBEAT_S = 15.0

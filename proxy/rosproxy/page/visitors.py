@@ -1,7 +1,8 @@
 """Decides which requests may see the live page.
 
 Without a token, every caller may see the page, as ``/status``. With a token, callers on loopback
-and callers with the token may. A web page of another site may not (`rosproxy.admin.host_rule`).
+and callers with the token may. A web page of another site may not
+(`rosproxy.shared.http.host_rule`).
 
 A browser can't send the token with each request. A cookie with the token would be a risk, because
 browsers send a cookie to all ports of the host. So the user enters the token once, in a form, and
@@ -20,9 +21,9 @@ from typing import Any
 
 from aiohttp import web
 
-from rosproxy.admin.host_rule import is_own_host
-from rosproxy.admin.requests import EmptyBody, read_body
-from rosproxy.net.addresses import is_loopback
+from rosproxy.shared.addresses import is_loopback
+from rosproxy.shared.documents.requests import EmptyBody, read_body
+from rosproxy.shared.http.host_rule import is_own_host
 
 SESSION_S = 12 * 3600.0
 """Seconds until a cookie expires."""

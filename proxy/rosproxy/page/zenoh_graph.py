@@ -9,16 +9,8 @@ from collections.abc import Iterable
 
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.admin.status_document import (
-    ProxyStatus,
-    ZenohLinkStatus,
-    ZenohNodeStatus,
-    ZenohStatus,
-)
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.doctor.rules.zenoh import check
-from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.page.domain_graph import is_quiet_ros2_service
 from rosproxy.page.page_document import (
     BROKEN,
@@ -35,7 +27,15 @@ from rosproxy.page.page_document import (
     shown_name,
     shown_text,
 )
-from rosproxy.telemetry.text import listed
+from rosproxy.shared.addresses import is_loopback, parse_host_port
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
+from rosproxy.shared.documents.status_document import (
+    ProxyStatus,
+    ZenohLinkStatus,
+    ZenohNodeStatus,
+    ZenohStatus,
+)
+from rosproxy.shared.output.text import listed
 from rosproxy.zenoh.findings import PEER, link_subject
 from rosproxy.zenoh.pairs import MATCH, SERVICE, Graph, Pair, is_inside
 

@@ -7,10 +7,6 @@ import asyncio
 from collections.abc import Sequence
 from ipaddress import IPv4Network, IPv6Network, collapse_addresses, ip_network
 
-from rosproxy.net.addresses import Network
-from rosproxy.net.budget import Budget
-from rosproxy.net.gate import Gate
-from rosproxy.net.interfaces import address_towards, interface_networks
 from rosproxy.net.network_changes import NetworkChanges
 from rosproxy.ros1.clients.master_client import MasterClient
 from rosproxy.ros1.clients.node_client import NodeClient
@@ -23,7 +19,11 @@ from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.stand_ins import StandIns
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.runtime import Runtime
-from rosproxy.settings import MEBIBYTE
+from rosproxy.shared.addresses import Network
+from rosproxy.shared.connections.budget import Budget
+from rosproxy.shared.connections.gate import Gate
+from rosproxy.shared.machine.interfaces import address_towards, interface_networks
+from rosproxy.shared.settings import MEBIBYTE
 
 REGISTRATION_GRACE_S = 0.5
 """The longest time in seconds that a publisherUpdate waits for a registration of the node."""

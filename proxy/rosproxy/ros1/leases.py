@@ -3,11 +3,11 @@
 A port listens only while it is a lease or a fast port of an endpoint, or while it is lent.
 
 Each endpoint holds a *lease*, which is a port of the range. An endpoint may also have a *fast port*
-for its topics, which the kernel forwards where possible (`rosproxy.leases.fast_ports`). Both ports
-listen, and the proxy serves both in the same way. The proxy reserves all ports at the start
-(`rosproxy.net.sockets.reserve`). So the kernel gives no port of the range to an outgoing
-connection, no other program binds one, and the proxy learns which ports are taken. A reserved port
-refuses connections.
+for its topics, which the kernel forwards where possible (`rosproxy.forwarding.fast_ports`). Both
+ports listen, and the proxy serves both in the same way. The proxy reserves all ports at the start
+(`rosproxy.shared.connections.sockets.reserve`). So the kernel gives no port of the range to an
+outgoing connection, no other program binds one, and the proxy learns which ports are taken. A
+reserved port refuses connections.
 """
 
 import logging
@@ -17,11 +17,11 @@ from contextlib import asynccontextmanager
 from typing import Protocol
 
 from rosproxy.binding import PORTS
+from rosproxy.forwarding import fast_ports
 from rosproxy.forwarding.kernel.syncer import ForwardSyncer
-from rosproxy.leases import fast_ports
-from rosproxy.net.sockets import Acceptor, Handler, listen_on, reserve
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.shared.connections.sockets import Acceptor, Handler, listen_on, reserve
 
 log = logging.getLogger(__name__)
 

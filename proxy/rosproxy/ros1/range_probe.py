@@ -14,14 +14,14 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
-from rosproxy.admin.requests import PortProbe
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master_client import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.leases import Leases
-from rosproxy.ros1.protocol.uris import slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.requests import PortProbe
+from rosproxy.shared.machine.resolver import resolve
+from rosproxy.shared.uris import slave_uri
 
 log = logging.getLogger(__name__)
 

@@ -12,24 +12,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from rosproxy.admin.admin_server import Action
-from rosproxy.admin.requests import (
-    ContainerUpdate,
-    EmptyBody,
-    EnforcementCounts,
-    MasterAddress,
-    PortProbe,
-    read_body,
-)
-from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.binding import RANGE_OPTION, report_taken_ports, setting_error_if_taken
+from rosproxy.forwarding.fast_ports import BothSides
 from rosproxy.forwarding.kernel.connection_table import ConnectionTable
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import TrackedTable
 from rosproxy.forwarding.kernel.tools import Tools
-from rosproxy.leases.fast_ports import BothSides
-from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.api.master import MasterApi, PublishedMaster
 from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.context import Context
@@ -54,7 +42,19 @@ from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import RESUBSCRIBE_INTERVAL_S, Resubscriber
 from rosproxy.runtime import Runtime
-from rosproxy.setting_kinds import SettingError
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.connections import sockets
+from rosproxy.shared.connections.sockets import Acceptor
+from rosproxy.shared.documents.requests import (
+    ContainerUpdate,
+    EmptyBody,
+    EnforcementCounts,
+    MasterAddress,
+    PortProbe,
+    read_body,
+)
+from rosproxy.shared.documents.status_document import ProxyStatus
+from rosproxy.shared.setting_kinds import SettingError
 
 log = logging.getLogger(__name__)
 

@@ -8,12 +8,10 @@ import msgspec
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from rosproxy.admin import status_document as document
 from rosproxy.admin.common_status import MOST_HIDDEN, with_hidden
-from rosproxy.admin.status_bounds import fair_choice
+from rosproxy.forwarding import fast_ports
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
-from rosproxy.leases import fast_ports
 from rosproxy.net import proxy_signs
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.policy.checks import RULE_KINDS
@@ -23,6 +21,8 @@ from rosproxy.ros1.servers.tcpros_server import TcprosServer
 from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 from rosproxy.ros1.upkeep.message_counter import MessageCounter
+from rosproxy.shared.documents import status_document as document
+from rosproxy.shared.documents.status_bounds import fair_choice
 from rosproxy.telemetry.metrics import NamedNodes
 
 MOST_CONNECTIONS = 1000

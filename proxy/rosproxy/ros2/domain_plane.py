@@ -7,7 +7,6 @@ import msgspec
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from rosproxy.admin import status_document as document
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.ros2.ports.kernel_ports import KernelPorts
 from rosproxy.ros2.registry.participants import (
@@ -16,6 +15,7 @@ from rosproxy.ros2.registry.participants import (
     PortMapping,
     TrafficKind,
 )
+from rosproxy.shared.documents import status_document as document
 
 
 @dataclass(eq=False)

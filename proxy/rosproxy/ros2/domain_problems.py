@@ -10,12 +10,16 @@ from collections.abc import Iterator
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
-from rosproxy.fixes import how_to
 from rosproxy.forwarding.buffer_sizes import UDP_RECEIVE_BUFFER_BYTES
 from rosproxy.ros2.protocol.rtps import CYCLONE_DDS, FAST_DDS
 from rosproxy.ros2.registry.participants import VENDORS, DdsSecurity, LocatorFault, ShortageKind
-from rosproxy.telemetry.text import plural
+from rosproxy.shared.documents.status_document import (
+    DomainStatus,
+    MismatchStatus,
+    ParticipantStatus,
+)
+from rosproxy.shared.fixes import how_to
+from rosproxy.shared.output.text import plural
 
 
 class DomainProblem(msgspec.Struct, frozen=True):

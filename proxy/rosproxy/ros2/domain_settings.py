@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.leases.domain_ports import first_unicast_port, multicast_port
-from rosproxy.leases.ports import PortMap
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.domain_ports import first_unicast_port, multicast_port
+from rosproxy.shared.policy.rules import RuleKind
+from rosproxy.shared.ports import PortMap
 
 PARTICIPANTS_TRIED = 32
 """The number of well-known ports of a peer to which announcements go. Each process binds one port.

@@ -6,10 +6,10 @@ appeared, and readers and writers that are not all known yet. The problem disapp
 
 import logging
 
-from rosproxy.admin.status_bounds import fair_choice
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems
 from rosproxy.ros2.status import Ros2State
-from rosproxy.telemetry.problems import Problems
+from rosproxy.shared.documents.status_bounds import fair_choice
+from rosproxy.shared.output.problems import Problems
 
 log = logging.getLogger(__name__)
 

@@ -10,32 +10,14 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from rosproxy.access.rules import RuleKind
 from rosproxy.admin.admin_server import Action
 from rosproxy.admin.common_status import with_hidden
-from rosproxy.admin.requests import (
-    ContainerUpdate,
-    EmptyBody,
-    EnforcementCounts,
-    PortProbe,
-    read_body,
-)
-from rosproxy.admin.status_document import PortsStatus, ProxyStatus
 from rosproxy.binding import report_taken_ports, setting_error_if_taken
 from rosproxy.forwarding.kernel.datagram_table import DatagramTable
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import Tools
-from rosproxy.leases.ports import PortMap, PortPool, PortRange
-from rosproxy.net import addresses, proxy_signs
-from rosproxy.net.addresses import HostPort, Network
-from rosproxy.net.interfaces import (
-    address_into,
-    address_towards,
-    default_gateways,
-    interface_networks,
-)
-from rosproxy.net.resolver import resolve
+from rosproxy.net import proxy_signs
 from rosproxy.ros2.discovery.discovery_participant import ANNOUNCE_INTERVAL_S
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
@@ -49,9 +31,28 @@ from rosproxy.ros2.sources.selected import FIRST_SELECTION_TIMEOUT_S
 from rosproxy.ros2.status import Ros2State
 from rosproxy.ros2.udp_probe import try_ports, try_udp
 from rosproxy.runtime import Runtime
-from rosproxy.setting_kinds import SettingError
-from rosproxy.settings import Settings
-from rosproxy.telemetry.text import listed
+from rosproxy.shared import addresses
+from rosproxy.shared.addresses import HostPort, Network
+from rosproxy.shared.documents.requests import (
+    ContainerUpdate,
+    EmptyBody,
+    EnforcementCounts,
+    PortProbe,
+    read_body,
+)
+from rosproxy.shared.documents.status_document import PortsStatus, ProxyStatus
+from rosproxy.shared.machine.interfaces import (
+    address_into,
+    address_towards,
+    default_gateways,
+    interface_networks,
+)
+from rosproxy.shared.machine.resolver import resolve
+from rosproxy.shared.output.text import listed
+from rosproxy.shared.policy.rules import RuleKind
+from rosproxy.shared.ports import PortMap, PortPool, PortRange
+from rosproxy.shared.setting_kinds import SettingError
+from rosproxy.shared.settings import Settings
 
 log = logging.getLogger(__name__)
 

@@ -11,10 +11,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.admin import status_document as document
 from rosproxy.admin.common_status import MOST_HIDDEN
-from rosproxy.admin.status_bounds import fair_choice, fair_shares_by_owner
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.ros_names import (
@@ -34,6 +31,9 @@ from rosproxy.ros2.registry.participants import (
     PortShortage,
 )
 from rosproxy.ros2.servers.domain_server import DomainServer
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents import status_document as document
+from rosproxy.shared.documents.status_bounds import fair_choice, fair_shares_by_owner
 
 MOST_LISTED_ENDPOINTS = 8192
 """The most readers and writers that the status lists by name, for each side of a domain.

@@ -10,12 +10,12 @@ import contextlib
 import secrets
 import socket
 
-from rosproxy.admin.requests import PortProbe
 from rosproxy.binding import report_taken_ports
 from rosproxy.forwarding import datagrams
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.requests import PortProbe
+from rosproxy.shared.machine.resolver import resolve
 
 ATTEMPTS = 3
 """Datagrams that the proxy sends, because UDP may lose some."""

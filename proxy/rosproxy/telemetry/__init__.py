@@ -1,1 +1,1 @@
-"""Logs, metrics, and the problems that a user should know."""
+"""Metrics, and refusals above a bound."""

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 
+from rosproxy.shared.output.problems import Problems, refusal_subject
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import Problems, refusal_subject
 
 log = logging.getLogger(__name__)
 

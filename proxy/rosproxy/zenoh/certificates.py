@@ -11,7 +11,7 @@ import ssl
 from collections.abc import Collection, Mapping
 from typing import Any, Literal, NamedTuple
 
-from rosproxy.setting_kinds import Credentials
+from rosproxy.shared.setting_kinds import Credentials
 
 Part = Literal["certificate", "key", "CA"]
 _NO_CHECK_TIME = 0x200000

@@ -5,10 +5,17 @@ The proxy reports these findings by itself, and the doctor reports them, too.
 
 from collections.abc import Iterator
 
-from rosproxy.access.rules import matches
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
-from rosproxy.admin.status_bounds import fair_choice
-from rosproxy.admin.status_document import (
+from rosproxy.shared.addresses import parse_host_port
+from rosproxy.shared.documents.doctor_finding import (
+    DoctorFinding,
+    Severity,
+    error,
+    note,
+    ok,
+    warning,
+)
+from rosproxy.shared.documents.status_bounds import fair_choice
+from rosproxy.shared.documents.status_document import (
     MismatchStatus,
     ZenohApartStatus,
     ZenohCertificateStatus,
@@ -17,9 +24,9 @@ from rosproxy.admin.status_document import (
     ZenohNodeStatus,
     ZenohStatus,
 )
-from rosproxy.fixes import how_to
-from rosproxy.net.addresses import parse_host_port
-from rosproxy.telemetry.text import brief, listed, plural, quoted
+from rosproxy.shared.fixes import how_to
+from rosproxy.shared.output.text import brief, listed, plural, quoted
+from rosproxy.shared.policy.rules import matches
 from rosproxy.zenoh.links import CERTIFICATE_FAULTS, LinkFault
 from rosproxy.zenoh.matching import DURABILITY, TYPE, TYPE_HASH
 

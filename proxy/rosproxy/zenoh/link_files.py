@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from rosproxy.access.policy_file import file_signature
-from rosproxy.setting_kinds import Credentials
-from rosproxy.settings import Settings
+from rosproxy.shared.setting_kinds import Credentials
+from rosproxy.shared.settings import Settings
 from rosproxy.zenoh.certificates import (
     CLIENTS,
     SERVERS,

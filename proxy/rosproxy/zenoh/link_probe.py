@@ -4,8 +4,8 @@ import asyncio
 import socket
 import ssl
 
-from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.connections import sockets
 from rosproxy.zenoh.links import Link, LinkFault, alert_fault, verify_fault
 
 HANDSHAKE_TIMEOUT_S = 5.0

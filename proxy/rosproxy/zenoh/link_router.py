@@ -10,11 +10,17 @@ The limits of topics and the rules of ``--zenoh-link-policy`` hold for what pass
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import LINK_PROTOCOLS, Credentials, LinkPort, SiteLink, TopicLimit
-from rosproxy.zenoh.policy.access_control import AT_LINKS, access_control
-from rosproxy.zenoh.policy.key_expressions import data_keys
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.setting_kinds import (
+    LINK_PROTOCOLS,
+    Credentials,
+    LinkPort,
+    SiteLink,
+    TopicLimit,
+)
+from rosproxy.shared.zenoh_rules.key_expressions import data_keys
+from rosproxy.zenoh.access_control import AT_LINKS, access_control
 from rosproxy.zenoh.router_configs import LEASE, RouterConfig, router_config, tls_values
 
 _HUB_RETRY = "#retry_period_init_ms=50"

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from rosproxy.net.addresses import HostPort, is_address
+from rosproxy.shared.addresses import HostPort, is_address
 from rosproxy.zenoh.protocol.report import Ends, RouterReport, all_ends_of
 
 

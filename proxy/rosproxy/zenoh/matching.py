@@ -13,7 +13,7 @@ from itertools import chain, islice, product
 from math import prod
 from typing import NamedTuple
 
-from rosproxy.admin.status_document import MismatchStatus
+from rosproxy.shared.documents.status_document import MismatchStatus
 from rosproxy.zenoh.protocol.liveliness import Entity, EntityKind, ros_type
 
 TYPE = "type"

@@ -10,10 +10,10 @@ from collections.abc import Iterable, Iterator
 from itertools import chain, islice
 from typing import NamedTuple
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.admin.doctor_finding import DoctorFinding, note, ok, warning
-from rosproxy.admin.status_document import PolicyStatus, ZenohNodeStatus, ZenohStatus
-from rosproxy.telemetry.text import listed
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, note, ok, warning
+from rosproxy.shared.documents.status_document import PolicyStatus, ZenohNodeStatus, ZenohStatus
+from rosproxy.shared.output.text import listed
+from rosproxy.shared.policy.rules import RuleKind
 from rosproxy.zenoh.findings import PEER, mismatch_findings, place, shared_ports
 from rosproxy.zenoh.links import LinkFault
 

@@ -8,7 +8,7 @@ a laptop, ``ZENOH_CONFIG_OVERRIDE`` names the robot's router without ``mode="cli
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from typing import NamedTuple
 
-from rosproxy.net.addresses import is_loopback
+from rosproxy.shared.addresses import is_loopback
 from rosproxy.zenoh.protocol.report import Ends, RouterReport, ends_of
 
 PEER = "peer"

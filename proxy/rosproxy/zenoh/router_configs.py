@@ -22,10 +22,10 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import Credentials
-from rosproxy.zenoh.policy.access_control import HUB_PROTOCOL, NODE_PROTOCOL
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import Credentials
+from rosproxy.zenoh.access_control import HUB_PROTOCOL, NODE_PROTOCOL
 from rosproxy.zenoh.protocol.report import MOST_SESSIONS
 
 NO_FILE_LIMIT = -1

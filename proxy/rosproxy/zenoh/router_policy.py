@@ -10,14 +10,14 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.access.layers import PolicyLayer, Verdict, decide
-from rosproxy.access.rules import RuleKind
 from rosproxy.admin.common_status import MOST_HIDDEN
-from rosproxy.admin.status_bounds import fair_choice
-from rosproxy.admin.status_document import HiddenStatus
-from rosproxy.leases.ports import PortRange
-from rosproxy.zenoh.policy.access_control import access_control
-from rosproxy.zenoh.policy.name_sets import layers_at
+from rosproxy.shared.documents.status_bounds import fair_choice
+from rosproxy.shared.documents.status_document import HiddenStatus
+from rosproxy.shared.policy.layers import PolicyLayer, Verdict, decide
+from rosproxy.shared.policy.rules import RuleKind
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.zenoh_rules.name_sets import layers_at
+from rosproxy.zenoh.access_control import access_control
 
 MOST_JUDGED_NAMES = 200
 """Names that the proxy compares with the rules at a time. With 1,000 rules, a name takes 0.7 ms."""

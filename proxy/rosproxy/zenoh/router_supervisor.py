@@ -16,9 +16,9 @@ from asyncio.subprocess import PIPE, Process
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from typing import TypeVar
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.tasks import Tasks
-from rosproxy.telemetry.text import brief
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.output.text import brief
+from rosproxy.shared.tasks import Tasks
 from rosproxy.zenoh.protocol.library_log import certificate_refusal, is_about_links
 from rosproxy.zenoh.protocol.report import LONGEST_REPORT, Report, read_report
 from rosproxy.zenoh.router_configs import RouterConfig

@@ -10,9 +10,11 @@ import logging
 import time
 from collections.abc import Iterator
 
-from rosproxy.admin.status_document import ZenohCertificateStatus
-from rosproxy.setting_kinds import SettingError
-from rosproxy.settings import Settings
+from rosproxy.shared.documents.status_document import ZenohCertificateStatus
+from rosproxy.shared.setting_kinds import SettingError
+from rosproxy.shared.settings import Settings
+from rosproxy.shared.zenoh_rules.key_expressions import check_limits
+from rosproxy.shared.zenoh_rules.name_sets import check_layers
 from rosproxy.zenoh.link_files import (
     CERTIFICATE,
     LinkFiles,
@@ -22,8 +24,6 @@ from rosproxy.zenoh.link_files import (
     signatures,
 )
 from rosproxy.zenoh.link_router import LinkPlan
-from rosproxy.zenoh.policy.key_expressions import check_limits
-from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy.zenoh.router_configs import RouterConfig
 
 log = logging.getLogger(__name__)

@@ -12,27 +12,27 @@ from importlib import metadata
 
 from msgspec.structs import replace
 
-from rosproxy.access.layers import PolicyLayer
 from rosproxy.admin.admin_server import Action
 from rosproxy.admin.common_status import with_hidden
-from rosproxy.admin.doctor_finding import DoctorFinding
-from rosproxy.admin.requests import EnforcementCounts, PortProbe
-from rosproxy.admin.status_document import ProxyStatus, ZenohCertificateStatus
 from rosproxy.binding import setting_error_if_taken
-from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.interfaces import is_own
-from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
-from rosproxy.setting_kinds import SettingError
-from rosproxy.settings import Settings
-from rosproxy.telemetry.text import listed
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.connections import sockets
+from rosproxy.shared.documents.doctor_finding import DoctorFinding
+from rosproxy.shared.documents.requests import EnforcementCounts, PortProbe
+from rosproxy.shared.documents.status_document import ProxyStatus, ZenohCertificateStatus
+from rosproxy.shared.machine.interfaces import is_own
+from rosproxy.shared.machine.resolver import resolve
+from rosproxy.shared.output.text import listed
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.setting_kinds import SettingError
+from rosproxy.shared.settings import Settings
+from rosproxy.shared.zenoh_rules.name_sets import check_layers
 from rosproxy.zenoh import findings
+from rosproxy.zenoh.access_control import access_control
 from rosproxy.zenoh.certificates import CLIENTS, SERVERS, Checked, Unusable, check_credentials
 from rosproxy.zenoh.link_probe import accepts, try_link
 from rosproxy.zenoh.links import Link, LinkFault, own_peers
-from rosproxy.zenoh.policy.access_control import access_control
-from rosproxy.zenoh.policy.name_sets import check_layers
 from rosproxy.zenoh.protocol.liveliness import graph_of
 from rosproxy.zenoh.protocol.report import Report
 from rosproxy.zenoh.router_configs import RouterConfig, RouterPlan

@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.admin.status_bounds import fair_choice
-from rosproxy.admin.status_document import (
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_bounds import fair_choice
+from rosproxy.shared.documents.status_document import (
     MismatchStatus,
     NamedTypeStatus,
     ZenohApartStatus,
@@ -25,8 +25,8 @@ from rosproxy.admin.status_document import (
     ZenohSessionStatus,
     ZenohStatus,
 )
-from rosproxy.net.addresses import HostPort
-from rosproxy.settings import Settings
+from rosproxy.shared.policy.rules import RuleKind
+from rosproxy.shared.settings import Settings
 from rosproxy.zenoh.links import Link, is_linked, left_behind
 from rosproxy.zenoh.matching import Comparison, compare
 from rosproxy.zenoh.peers_apart import PeersApart, peers_apart

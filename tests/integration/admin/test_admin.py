@@ -331,7 +331,7 @@ async def test_probe_is_not_deceived_by_who_knows_no_secret(
 
 
 async def test_a_taken_admin_port_names_the_option(make_proxy: MakeProxy) -> None:
-    from rosproxy.setting_kinds import SettingError
+    from rosproxy.shared.setting_kinds import SettingError
 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -8,10 +8,10 @@ import pytest
 from examples.demo.fake_http import End, free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.node_client import ProbeAnswer
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.setting_kinds import hash_token
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.setting_kinds import hash_token
 from tests.integration.admin_calls import post, tell, update
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy

@@ -12,12 +12,12 @@ from aiohttp import web
 from msgspec.structs import replace
 
 from examples.demo.fake_node import FakeNode
-from rosproxy.admin.admin_client import AdminClient
 from rosproxy.admin.admin_server import MOST_CONNECTIONS, MOST_REPLIES, MOST_REPLIES_EACH
-from rosproxy.admin.replies import PIECE_BYTES, REPLY_TIMEOUT
-from rosproxy.admin.status_bounds import MOST_BYTES
-from rosproxy.admin.status_document import ProblemStatus
-from rosproxy.net.bounded_server import BoundedServer
+from rosproxy.shared.documents.status_bounds import MOST_BYTES
+from rosproxy.shared.documents.status_document import ProblemStatus
+from rosproxy.shared.http.admin_client import AdminClient
+from rosproxy.shared.http.bounded_server import BoundedServer
+from rosproxy.shared.http.replies import PIECE_BYTES, REPLY_TIMEOUT
 from tests.clock import pass_time
 from tests.integration.admin_calls import tell
 from tests.integration.conftest import MakeProxy
@@ -239,7 +239,7 @@ async def test_many_addresses_have_so_many_connections_in_all(
     proxy: Proxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each address had its own bound, and addresses are many."""
-    monkeypatch.setattr("rosproxy.net.bounded_server.MOST_IN_ALL", 4)
+    monkeypatch.setattr("rosproxy.shared.http.bounded_server.MOST_IN_ALL", 4)
     address = (proxy.settings.admin.host, proxy.settings.admin.port)
     async with AsyncExitStack() as stack:
         wires = []
@@ -263,8 +263,8 @@ async def test_many_addresses_of_a_network_end_no_connection_of_another_network(
     def network(address: str) -> str:
         return "127.0.6.0/24" if address.startswith("127.0.6.") else address
 
-    monkeypatch.setattr("rosproxy.net.bounded_server.MOST_IN_ALL", 4)
-    monkeypatch.setattr("rosproxy.net.bounded_server.subnet", network, raising=False)
+    monkeypatch.setattr("rosproxy.shared.http.bounded_server.MOST_IN_ALL", 4)
+    monkeypatch.setattr("rosproxy.shared.http.bounded_server.subnet", network, raising=False)
     address = (proxy.settings.admin.host, proxy.settings.admin.port)
     async with AsyncExitStack() as stack:
         wires = []
@@ -278,7 +278,7 @@ async def test_many_addresses_of_a_network_end_no_connection_of_another_network(
 
 async def test_many_addresses_end_no_request_that_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     """An operator that waits for changes was the first to go: it had connected first."""
-    monkeypatch.setattr("rosproxy.net.bounded_server.MOST_IN_ALL", 4)
+    monkeypatch.setattr("rosproxy.shared.http.bounded_server.MOST_IN_ALL", 4)
     is_asked = asyncio.Event()
     is_changed = asyncio.Event()
 

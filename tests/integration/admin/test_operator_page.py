@@ -11,8 +11,8 @@ from prometheus_client import CollectorRegistry
 
 from examples.demo.fake_http import free_ports
 from examples.demo.fake_node import FakeNode
-from rosproxy.net.addresses import HostPort
 from rosproxy.page.page_document import Document
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.common.operator_admin import OperatorAdminServer
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.problem import Problem

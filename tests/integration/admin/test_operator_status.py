@@ -13,7 +13,7 @@ from prometheus_client.exposition import generate_latest
 
 from examples.demo.fake_http import free_ports
 from rosproxy import __version__
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.common import operator_admin
 from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.operator_admin import MOST_CONNECTIONS, OperatorAdminServer

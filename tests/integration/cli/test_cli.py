@@ -18,7 +18,7 @@ import pytest
 from examples.demo.fake_http import FakeHttpServer, FakeRequest, ok
 from examples.demo.fake_node import FakeNode
 from examples.demo.proxy_process import clean_environment
-from rosproxy.admin.admin_client import AdminClient, default_url
+from rosproxy.shared.http.admin_client import AdminClient, default_url
 from tests.integration.commands import admin_url, run
 from tests.integration.net import HOST, connect, read_header, topic_header, until
 from tests.integration.proxy import Proxy

@@ -10,9 +10,9 @@ import pytest
 from examples.demo.fake_http import FakeHttpServer, FakeRequest, free_ports, value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.proxy_process import clean_environment
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.admin.requests import PortProbe
 from rosproxy.ros1.range_probe import probe_range
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
+from rosproxy.shared.documents.requests import PortProbe
 from tests.clock import pass_time
 from tests.integration.admin_calls import tell
 from tests.integration.commands import run

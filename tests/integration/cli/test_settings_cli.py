@@ -14,7 +14,7 @@ import pytest
 
 from examples.demo.fake_http import Address, End, host_and_port
 from examples.demo.proxy_process import clean_environment
-from rosproxy.setting_kinds import SettingError
+from rosproxy.shared.setting_kinds import SettingError
 from tests import certificates
 from tests.certificates import Authority
 from tests.integration.net import (
@@ -96,7 +96,7 @@ def command(arguments: list[str], **environment: str) -> tuple[int, str]:
 @pytest.fixture(autouse=True)
 def _no_logging(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command line run in this process must not take the tests' log away."""
-    monkeypatch.setattr("rosproxy.telemetry.logs.set_up", lambda *_: None)
+    monkeypatch.setattr("rosproxy.shared.output.logs.set_up", lambda *_: None)
 
 
 def arguments(options: dict[str, Any]) -> list[str]:

@@ -10,11 +10,11 @@ import pytest
 from examples.demo.fake_http import End, FakeHttpServer, FakeRequest, free_ports, ok, value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode, Header
-from rosproxy.admin.admin_client import AdminClient
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.doctor.collect import collect
 from rosproxy.doctor.rules import diagnose
 from rosproxy.ros1.protocol.tcpros import encode_header
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
+from rosproxy.shared.http.admin_client import AdminClient
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (

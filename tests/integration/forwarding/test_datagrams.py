@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from rosproxy.forwarding.datagrams import DatagramRelay, bind
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from tests.integration.net import NODE, OTHER_NODE, OUTSIDE, PROXY, until
 
 BOTH_LOOPS = True

@@ -9,8 +9,8 @@ from rosproxy.forwarding.kernel import decisions, syncer
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.tools import Tools
-from rosproxy.net.addresses import Route
 from rosproxy.ros1 import stack
+from rosproxy.shared.addresses import Route
 from tests.integration.admin_calls import tell
 from tests.integration.kernel_fake import FakeTools
 from tests.integration.net import (

@@ -6,18 +6,18 @@ from typing import Any
 
 import pytest
 
+from rosproxy.forwarding import fast_ports
+from rosproxy.forwarding.fast_ports import BothSides
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel import syncer
 from rosproxy.forwarding.kernel.connection_table import ConnectionTable, Marks
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import TrackedTable
-from rosproxy.leases import fast_ports
-from rosproxy.leases.fast_ports import BothSides
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.runtime import Runtime
+from rosproxy.shared.addresses import HostPort
 from tests.integration.kernel_fake import FakeTools, clear_the_way
 from tests.integration.net import PATIENCE
 from tests.run_options import parse_settings

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from rosproxy import fixes
 from rosproxy.forwarding.kernel import preflight
 from rosproxy.forwarding.kernel import tools as kernel_tools
 from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
+from rosproxy.shared import fixes
 from tests.integration.kernel_fake import FakeTools
 from tests.integration.net import until
 

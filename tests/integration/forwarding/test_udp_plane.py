@@ -10,8 +10,6 @@ from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import ToolError
-from rosproxy.leases.ports import PortMap, PortPool, PortRange
-from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros2.domain_settings import DomainSettings, Refused
 from rosproxy.ros2.ports.kernel_ports import KernelPorts
 from rosproxy.ros2.ports.locator_ports import LocatorPorts
@@ -20,6 +18,8 @@ from rosproxy.ros2.protocol.rtps import FAST_DDS
 from rosproxy.ros2.registry.participants import InsideParticipant, PortMapping, TrafficKind
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 from rosproxy.runtime import Runtime
+from rosproxy.shared.addresses import HostPort, Route
+from rosproxy.shared.ports import PortMap, PortPool, PortRange
 from tests.integration.kernel_fake import OWN, FakeTools, clear_the_way
 from tests.integration.net import until
 from tests.run_options import parse_settings

@@ -13,7 +13,7 @@ from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.servers import callers
-from rosproxy.setting_kinds import hash_token
+from rosproxy.shared.setting_kinds import hash_token
 from tests.integration.admin.test_admin import metrics
 from tests.integration.admin_calls import update
 from tests.integration.conftest import MakeNode, MakeProxy
@@ -265,7 +265,7 @@ async def test_nothing_happens_without_need(
     async def resolve(host: str, source: str) -> list[str]:
         return [MASTER]
 
-    monkeypatch.setattr("rosproxy.net.resolver.resolve", resolve)
+    monkeypatch.setattr("rosproxy.shared.machine.resolver.resolve", resolve)
     port = host_and_port(master.uri)[1]
     changed = {name: text and text.format(port=port) for name, text in options.items()}
     proxy = await make_proxy(**behind_its_name(master, **changed))

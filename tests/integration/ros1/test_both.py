@@ -11,11 +11,11 @@ from examples.demo.fake_http import host_and_port, value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.forwarding.datagrams import bind
-from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.tcpros import encode_header
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.stand_ins.outside_nodes import RETRY_TIMEOUT_S, Outside
+from rosproxy.shared.addresses import HostPort, is_address, is_loopback
 from tests.integration.admin_calls import tell
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
@@ -450,7 +450,7 @@ async def test_a_name_that_changes_its_address_leads_nowhere_else(
         asked.append(host)
         return [MASTER] if len(asked) == 1 else [NODE]
 
-    for module in ("net.resolver", "ros1.stand_ins.outside_nodes"):
+    for module in ("shared.machine.resolver", "ros1.stand_ins.outside_nodes"):
         monkeypatch.setattr(f"rosproxy.{module}.resolve", resolve)
     assert (await rpc(at, "getPid", "/tool", source=NODE))[2] == robot.pid
     assert asked == ["robot.example"]

@@ -10,7 +10,7 @@ from examples.demo.fake_http import End, FakeHttpServer, call, host_and_port, va
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.servers import callers
-from rosproxy.setting_kinds import hash_token
+from rosproxy.shared.setting_kinds import hash_token
 from tests.integration.admin.test_admin import metrics
 from tests.integration.admin_calls import post, tell, update
 from tests.integration.claims import claim, silent_servers

@@ -9,12 +9,12 @@ import pytest
 
 from examples.demo.fake_http import End, ok, value
 from examples.demo.fake_node import FakeNode
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.kept_connections import KeptConnections
 from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.runtime import Runtime
+from rosproxy.shared.addresses import HostPort
 from tests.integration.net import until
 from tests.integration.proxy import settings_for
 

@@ -8,10 +8,10 @@ import pytest
 
 from examples.demo.fake_http import End, free_ports, ok, value
 from examples.demo.fake_node import FakeNode
-from rosproxy.net import sockets
 from rosproxy.ros1 import leases
 from rosproxy.ros1.clients.master_client import CALLER_ID
 from rosproxy.ros1.protocol.tcpros import encode_header
+from rosproxy.shared.connections import sockets
 from tests.integration.net import (
     HOST,
     MASTER,
@@ -116,7 +116,7 @@ async def test_a_malformed_header_is_answered_with_an_error(proxy, node, header)
 
 
 async def test_a_header_that_never_ends_costs_a_time_out(proxy, node, monkeypatch):
-    monkeypatch.setattr("rosproxy.net.sockets.SILENCE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("rosproxy.shared.connections.sockets.SILENCE_TIMEOUT_S", 0.2)
     await node.publish(proxy.master)
     for sent in (b"", b"\x01\0", topic_header()[:-1]):
         async with connect(proxy.lease(node)) as wire:
@@ -417,7 +417,7 @@ async def test_a_node_gets_a_header_of_a_subscriber_that_has_gone_meanwhile(
     """A rospy publisher accepts no connection while reporting a connection without a header."""
     await node.publish(proxy.master)
     has_ended = iter([False, True])  # after its header; after the connection to the node
-    monkeypatch.setattr("rosproxy.net.sockets.has_ended", lambda _: next(has_ended))
+    monkeypatch.setattr("rosproxy.shared.connections.sockets.has_ended", lambda _: next(has_ended))
     async with connect(proxy.lease(node)) as wire:
         await wire.send(topic_header(caller="/n"))
         assert await wire.reader.read() == b""

@@ -7,9 +7,9 @@ import pytest
 from examples.demo.fake_http import host_and_port
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from rosproxy.admin.admin_client import AdminClient
 from rosproxy.doctor.collect import collect
 from rosproxy.doctor.facts import ReachOutcome
+from rosproxy.shared.http.admin_client import AdminClient
 from tests.integration.admin_calls import post, tell
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy

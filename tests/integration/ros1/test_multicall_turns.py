@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import LONG_BODY_BYTES
 from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.clients import master_client
@@ -16,6 +15,7 @@ from rosproxy.ros1.protocol.xmlrpc.passing import PIECE_BYTES, MulticallWatch
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.stand_ins.stand_in_ports import URIS_PER_TURN
 from rosproxy.ros1.upkeep.decisions import registration as decisions
+from rosproxy.shared.addresses import HostPort
 from tests.integration.net import NODE, PROXY, exchange, post, rpc, until, xml
 
 CALLS = 100

@@ -12,7 +12,7 @@ from examples.demo.fake_http import host_and_port
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from examples.demo.players import Adder, Listener, Talker
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from tests.integration.net import (
     HOST,
     NODE,

@@ -12,9 +12,9 @@ from examples.demo.fake_http import End
 from examples.demo.fake_http import value as answer
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1 import stack
 from rosproxy.ros1.upkeep import resubscriber
+from rosproxy.shared.addresses import HostPort
 from tests.integration.net import (
     OTHER_NODE,
     OUTSIDE,

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.servers.discovery_scheduler import (
     LONGEST_ROUND_S,
@@ -17,6 +16,7 @@ from rosproxy.ros2.servers.discovery_scheduler import (
 )
 from rosproxy.ros2.sources.fair_queue import MOST_BYTES_PER_SOURCE, OVERHEAD_BYTES
 from rosproxy.ros2.sources.rates import Standing
+from rosproxy.shared.addresses import HostPort
 
 
 class Time:

@@ -11,8 +11,6 @@ import pytest
 
 from examples.demo.fake_http import free_ports
 from rosproxy.forwarding.datagrams import bind
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink, Outgoing
 from rosproxy.ros2.ports.former_ports import ANSWER_TIMEOUT_S
 from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S, SETTLING_PERIOD_S
@@ -28,6 +26,8 @@ from rosproxy.ros2.servers.domain_server import (
 )
 from rosproxy.ros2.sources.fair_queue import DiscoveryQueue
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortMap, PortRange
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import (

@@ -16,8 +16,6 @@ import pytest
 
 from examples.demo.fake_http import free_ports
 from rosproxy.forwarding.datagrams import bind
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.lan_relay import relay as lan_relay
 from rosproxy.ros2.lan_relay import sources
@@ -29,6 +27,8 @@ from rosproxy.ros2.protocol.rtps import SubmessageId, source_prefix
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
 from rosproxy.ros2.sources.rates import Standing
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortMap, PortRange
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import A, B, spdp

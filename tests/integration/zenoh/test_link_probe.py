@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.runtime import Runtime
-from rosproxy.setting_kinds import Credentials, SettingError, read_hub_certificate
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.setting_kinds import Credentials, SettingError, read_hub_certificate
 from rosproxy.zenoh import link_probe, stack
 from rosproxy.zenoh.certificates import CLIENTS, SERVERS, check_credentials
 from rosproxy.zenoh.link_probe import try_link

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 from rosproxy.admin.common_status import common_status
-from rosproxy.net import sockets
 from rosproxy.page.feed import PageWatch
 from rosproxy.page.problem_ages import ProblemAges
 from rosproxy.runtime import Runtime
+from rosproxy.shared.connections import sockets
 from rosproxy.zenoh import stack
 from rosproxy.zenoh.stack import Zenoh
 from tests.integration.net import PATIENCE, until

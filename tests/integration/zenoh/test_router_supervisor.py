@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.tasks import Tasks
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.tasks import Tasks
 from rosproxy.zenoh import router_supervisor
 from rosproxy.zenoh.protocol.report import Report
 from rosproxy.zenoh.router_supervisor import RoutersFailed, RouterSupervisor

@@ -13,15 +13,15 @@ from typing import Any
 
 import pytest
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.access.rules import parse_rules
-from rosproxy.admin.requests import BodyError
-from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.app.policy_sources import PolicySources
-from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort
 from rosproxy.runtime import Runtime
-from rosproxy.setting_kinds import SettingError
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.connections import sockets
+from rosproxy.shared.documents.requests import BodyError
+from rosproxy.shared.documents.status_document import ProxyStatus
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.setting_kinds import SettingError
 from rosproxy.zenoh import stack, status
 from rosproxy.zenoh.links import LinkFault
 from rosproxy.zenoh.protocol.report import (

@@ -8,7 +8,7 @@ import sys
 
 from examples.demo.ros2_acts import Ros2Listener, Ros2Talker
 from examples.demo.rtps_messages import unpack_string
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 
 
 class PrintingListener(Ros2Listener):

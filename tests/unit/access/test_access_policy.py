@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.access.layers import PolicyLayer, PolicyMode
 from rosproxy.access.policy_file import PolicyFile
-from rosproxy.access.rules import RuleKind, parse_rules
+from rosproxy.shared.output.problems import Problems
+from rosproxy.shared.policy.layers import PolicyLayer, PolicyMode
+from rosproxy.shared.policy.rules import RuleKind, parse_rules
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
 
 PUBLISH = RuleKind.PUBLISH

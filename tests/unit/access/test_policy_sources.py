@@ -2,9 +2,9 @@
 
 import pytest
 
-from rosproxy.admin.requests import BodyError
 from rosproxy.app.policy_sources import PolicySources
 from rosproxy.runtime import Runtime
+from rosproxy.shared.documents.requests import BodyError
 from tests.run_options import parse_settings
 
 

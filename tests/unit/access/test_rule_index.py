@@ -5,10 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.access import rule_index
-from rosproxy.access.layers import PolicyLayer, PolicyMode, decide
 from rosproxy.access.rule_index import MOST_CALLER_COMPARISONS, RuleIndex
-from rosproxy.access.rules import MOST_RULES, RuleKind, matches, parse_rules
-from tests.unit.access.test_layers import LAYERS, NAMES, PUBLISH
+from rosproxy.shared.policy.layers import PolicyLayer, PolicyMode, decide
+from rosproxy.shared.policy.rules import MOST_RULES, RuleKind, matches, parse_rules
+from tests.unit.shared.policy.test_layers import LAYERS, NAMES, PUBLISH
 
 ADDRESS = "10.0.0.1"
 CALLERS = st.lists(st.sampled_from(["/a", "/b", "/ab", ""]), min_size=1, max_size=3)

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.admin.status_document import read_status
 from rosproxy.admin.status_version import version_of
+from rosproxy.shared.documents.status_document import read_status
 
 NODE = {"nodes": ["/talker"], "address": "10.0.0.5:40001", "publishes": ["/chatter"]}
 MEMBER = {

@@ -2,7 +2,8 @@
 
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import (
+from rosproxy.cli.status_table import render
+from rosproxy.shared.documents.status_document import (
     DataPlaneStatus,
     DomainStatus,
     LocatorStatus,
@@ -11,7 +12,6 @@ from rosproxy.admin.status_document import (
     ProxyStatus,
     StatusSettings,
 )
-from rosproxy.cli.status_table import render
 
 INSIDE = ParticipantStatus(
     guid_prefix="01.0f.aa",

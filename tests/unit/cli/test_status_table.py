@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
-from rosproxy.admin.status_document import read_status
 from rosproxy.cli.status_table import render
-from rosproxy.telemetry.text import width
+from rosproxy.shared.documents.status_document import read_status
+from rosproxy.shared.output.text import width
 from tests.unit.status_json import make_connection, make_node, make_status
 
 

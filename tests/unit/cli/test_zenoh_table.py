@@ -2,7 +2,9 @@
 
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import (
+from rosproxy.cli.status_table import render
+from rosproxy.cli.zenoh_table import MOST_NAMES, MOST_TYPE_COLUMNS, zenoh_lines
+from rosproxy.shared.documents.status_document import (
     NamedTypeStatus,
     ProxyStatus,
     StatusSettings,
@@ -12,8 +14,6 @@ from rosproxy.admin.status_document import (
     ZenohSessionStatus,
     ZenohStatus,
 )
-from rosproxy.cli.status_table import render
-from rosproxy.cli.zenoh_table import MOST_NAMES, MOST_TYPE_COLUMNS, zenoh_lines
 
 STATUS = ProxyStatus(
     version="0.1.0",

@@ -3,9 +3,6 @@
 from collections.abc import Iterable
 from typing import Any
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.admin.requests import read_probe
-from rosproxy.admin.status_document import read_status
 from rosproxy.doctor.facts import (
     Attempt,
     DoctorFacts,
@@ -15,7 +12,10 @@ from rosproxy.doctor.facts import (
     SlaveReport,
     SystemState,
 )
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
+from rosproxy.shared.documents.requests import read_probe
+from rosproxy.shared.documents.status_document import read_status
 from tests.unit.status_json import HOST, make_node, make_status
 
 ANSWERED = Attempt(ReachOutcome.ANSWERED)

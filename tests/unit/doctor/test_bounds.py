@@ -20,9 +20,9 @@ from rosproxy.doctor.graph_survey import MOST_QUESTIONS, MOST_TRIED, ask_graph
 from rosproxy.doctor.rules import node as node_rules
 from rosproxy.doctor.rules import pair as pair_rules
 from rosproxy.doctor.rules.pair import MOST_COMPARED_NAMES, MOST_ONE_SIDED
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.resolver import NODES
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, Limits
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.machine.resolver import NODES
 from tests.unit.doctor.cases import make_facts
 
 

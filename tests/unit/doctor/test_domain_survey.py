@@ -14,10 +14,10 @@ from rosproxy.doctor.domain_survey import (
     heard_participant,
 )
 from rosproxy.doctor.facts import HeardParticipant
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.protocol.messages import PREFIX, data, message, payload
 
 SOURCE = "172.30.0.5"

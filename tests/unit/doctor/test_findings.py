@@ -1,8 +1,8 @@
 """The output of findings."""
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity, failed
 from rosproxy.doctor.presentation import MOST_FINDINGS, as_json, render
 from rosproxy.doctor.rules import diagnose
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity, failed
 from tests.unit.doctor.cases import make_facts
 
 OK = DoctorFinding(Severity.OK, "ports", "ports", "100 free")

@@ -14,9 +14,9 @@ from rosproxy.doctor.facts import (
     SystemState,
 )
 from rosproxy.doctor.rules import diagnose, diagnose_running
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.registry.endpoint import STATES
-from rosproxy.telemetry.text import LONGEST_QUOTED, quoted
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.output.text import LONGEST_QUOTED, quoted
 from tests.unit.doctor.cases import by_name, make_facts, make_master, probes
 from tests.unit.status_json import HOST, make_node, make_status
 

@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, ReachOutcome, SystemState
 from rosproxy.doctor.rules import node as node_rules
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
 from tests.unit.doctor.cases import (
     ANSWERED,
     INSIDE,

@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.doctor.facts import (
     Attempt,
     DoctorFacts,
@@ -16,6 +15,7 @@ from rosproxy.doctor.facts import (
     scope,
 )
 from rosproxy.doctor.rules import pair as pair_rules
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
 from tests.unit.doctor.cases import (
     INSIDE_URI,
     OUTSIDE_URI,

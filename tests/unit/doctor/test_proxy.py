@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.doctor.facts import Attempt, DoctorFacts, ReachOutcome
 from rosproxy.doctor.rules import proxy as proxy_rules
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
 from tests.unit.doctor.cases import (
     make_facts,
     make_master,

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from rosproxy.doctor.facts import SlaveReport, SystemState, data_port, slave_report, system_state
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 
 
 def test_graph() -> None:

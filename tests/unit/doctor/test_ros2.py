@@ -3,9 +3,11 @@
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import Severity, failed
-from rosproxy.admin.requests import PortProbe, RangeProbe
-from rosproxy.admin.status_document import (
+from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
+from rosproxy.doctor.rules import diagnose
+from rosproxy.shared.documents.doctor_finding import Severity, failed
+from rosproxy.shared.documents.requests import PortProbe, RangeProbe
+from rosproxy.shared.documents.status_document import (
     DomainStatus,
     MismatchStatus,
     ParticipantStatus,
@@ -14,8 +16,6 @@ from rosproxy.admin.status_document import (
     ProxyStatus,
     StatusSettings,
 )
-from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
-from rosproxy.doctor.rules import diagnose
 
 INSIDE = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
 OUTSIDE = ParticipantStatus("01.10.bb", "10.0.0.9", "Cyclone DDS")

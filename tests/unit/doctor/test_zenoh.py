@@ -4,8 +4,10 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.admin.status_document import (
+from rosproxy.doctor.facts import DoctorFacts
+from rosproxy.doctor.rules import diagnose
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
+from rosproxy.shared.documents.status_document import (
     MismatchStatus,
     ProxyStatus,
     StatusSettings,
@@ -14,8 +16,6 @@ from rosproxy.admin.status_document import (
     ZenohSessionStatus,
     ZenohStatus,
 )
-from rosproxy.doctor.facts import DoctorFacts
-from rosproxy.doctor.rules import diagnose
 from rosproxy.zenoh.links import LinkFault
 
 GOOD = ZenohStatus(

@@ -5,15 +5,15 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.forwarding import fast_ports
 from rosproxy.forwarding.kernel import accounting
 from rosproxy.forwarding.kernel.accounting import Account, CounterDeltas, KernelAccounts
 from rosproxy.forwarding.kernel.nft import Counts
-from rosproxy.leases import fast_ports
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
 
 
 def holder(registry: Registry, number: int) -> Endpoint:

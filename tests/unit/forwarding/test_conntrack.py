@@ -12,7 +12,7 @@ from rosproxy.forwarding.kernel.conntrack import (
     Survey,
     Watch,
 )
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 
 MARKS = Marks(11311)
 MARK = MARKS.of(45050)

@@ -9,8 +9,8 @@ import pytest
 from rosproxy.forwarding.kernel.datagram_table import DatagramTable
 from rosproxy.forwarding.kernel.decisions import Changes
 from rosproxy.forwarding.kernel.nft import Counts, NftError, Surroundings, TableState
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
 
 TABLE = DatagramTable(PortRange(45000, 45999))
 FOUR = HostPort("10.0.0.5", 7411)

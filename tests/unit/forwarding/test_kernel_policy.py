@@ -15,9 +15,9 @@ from rosproxy.forwarding.kernel.decisions import (
     forwards_to_keep,
     unchanged_forwards,
 )
-from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.node_health import ProbeResult
+from rosproxy.shared.addresses import HostPort, Route
 
 NODE = "10.0.0.5"
 ROUTE = Route("10.0.0.2", 1500)

@@ -20,8 +20,8 @@ from rosproxy.forwarding.kernel.syncer import (
     Clock,
 )
 from rosproxy.forwarding.kernel.tools import ToolError
-from rosproxy.net.addresses import HostPort
-from rosproxy.telemetry.problems import Problems
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.output.problems import Problems
 from tests.run_options import parse_settings
 
 

@@ -25,8 +25,8 @@ from rosproxy.forwarding.kernel.nft import (
     TableState,
     dropping_chains,
 )
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
 
 TABLE = ConnectionTable(11311, PortRange(45000, 45999))
 NOTHING = Surroundings()

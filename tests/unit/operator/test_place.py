@@ -2,7 +2,7 @@
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.proxy_spec.place import ZENOH, Domain, Graph, Master, Place, ZenohNetwork
 
 ROBOT = Master("http://robot:11311")

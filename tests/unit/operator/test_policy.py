@@ -10,10 +10,10 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 from msgspec import structs
 
-from rosproxy.access.layers import PolicyLayer, PolicyMode, layers_as_json, read_layers
-from rosproxy.access.rules import parse_rules
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import SettingError
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyLayer, PolicyMode, layers_as_json, read_layers
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.setting_kinds import SettingError
 from rosproxy_operator.common.policy import (
     LONGEST_POLICY_BYTES,
     MOST_RULES_OF_AUTHOR,

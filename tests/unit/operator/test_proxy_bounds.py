@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from rosproxy.settings import Settings
+from rosproxy.shared.settings import Settings
 from rosproxy_operator.cli import main
 from rosproxy_operator.common.proxy_bounds import ProxyBounds, make_proxy_bounds
 from rosproxy_operator.docker.planner.specs import container_config

@@ -6,8 +6,8 @@ from collections.abc import AsyncIterator, Callable
 import pytest
 from aiohttp import web
 
-from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_document import ProxyStatus
 from rosproxy_operator.common import proxy_client
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.admin.doctor_finding import (
+from rosproxy.doctor.presentation import as_json
+from rosproxy.shared.documents.doctor_finding import (
     UNKNOWN_NAME,
     DoctorFinding,
     Severity,
@@ -16,7 +17,6 @@ from rosproxy.admin.doctor_finding import (
     ok,
     warning,
 )
-from rosproxy.doctor.presentation import as_json
 from rosproxy_operator.common.proxy_doctor import read_findings, without_names_of_others
 from rosproxy_operator.docker import doctor as docker_doctor
 from rosproxy_operator.docker.doctor import host_findings

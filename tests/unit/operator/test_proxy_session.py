@@ -5,8 +5,8 @@ from collections.abc import Collection, Mapping, Sequence
 
 import pytest
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyLayer
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.setting_kinds import declared
-from rosproxy.settings import Settings
+from rosproxy.shared.setting_kinds import declared
+from rosproxy.shared.settings import Settings
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.environment import environment
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, merged, options, words

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from rosproxy.admin.requests import ContainerUpdate, read_body
-from rosproxy.admin.status_document import MOST_ROWS, read_status
+from rosproxy.shared.documents.requests import ContainerUpdate, read_body
+from rosproxy.shared.documents.status_document import MOST_ROWS, read_status
 from rosproxy_operator.common.proxy_status import (
     MOST_PARTICIPANTS,
     inside_addresses,

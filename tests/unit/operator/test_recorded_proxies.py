@@ -15,9 +15,9 @@ from typing import Any
 import msgspec
 import pytest
 
-from rosproxy.access.rules import parse_rules
-from rosproxy.leases.ports import PortRange
-from rosproxy.setting_kinds import TopicLimit
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import TopicLimit
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import ProxyBounds
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 from msgspec.structs import replace as replace_struct
 
-from rosproxy.admin.doctor_finding import Severity
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.tasks import Tasks
 from rosproxy.page.page_document import shown_text
+from rosproxy.shared.documents.doctor_finding import Severity
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.merged_page import merged
 from rosproxy_operator.common.problem import SILENT, Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyError

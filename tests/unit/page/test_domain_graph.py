@@ -5,7 +5,10 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import (
+from rosproxy.page.domain_graph import received
+from rosproxy.page.graph_document import graph_document
+from rosproxy.page.measures import Measures
+from rosproxy.shared.documents.status_document import (
     DomainStatus,
     LocatorStatus,
     MismatchStatus,
@@ -13,9 +16,6 @@ from rosproxy.admin.status_document import (
     ProxyStatus,
     StatusSettings,
 )
-from rosproxy.page.domain_graph import received
-from rosproxy.page.graph_document import graph_document
-from rosproxy.page.measures import Measures
 
 DATA = LocatorStatus(11402, "172.30.0.5:7411", "data", rate=123.0, plane="kernel")
 INSIDE = ParticipantStatus(

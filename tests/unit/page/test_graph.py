@@ -6,13 +6,6 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import error
-from rosproxy.admin.status_document import (
-    DomainStatus,
-    ProxyStatus,
-    StatusSettings,
-    read_status,
-)
 from rosproxy.doctor.facts import (
     Attempt,
     DoctorFacts,
@@ -34,6 +27,13 @@ from rosproxy.page.page_document import (
     PageLink,
     PageNode,
     document,
+)
+from rosproxy.shared.documents.doctor_finding import error
+from rosproxy.shared.documents.status_document import (
+    DomainStatus,
+    ProxyStatus,
+    StatusSettings,
+    read_status,
 )
 from tests.unit.doctor.cases import ANSWERED, INSIDE_URI, by_name, listener, make_facts, talker
 from tests.unit.status_json import make_connection, make_node, make_status

@@ -6,10 +6,10 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, SlaveReport, slave_report
-from rosproxy.net.addresses import HostPort
 from rosproxy.page import measures as module
 from rosproxy.page.measures import FLOW_PERIOD_S, STALLED_AFTER_S, Measures
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.uris import parse_slave_uri
 
 KEY = ("/chatter", "/talker", "/listener")
 URI = "http://robot-host:45000/"

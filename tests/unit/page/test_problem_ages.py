@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.admin.status_document import (
+from rosproxy.page.problem_ages import ProblemAges
+from rosproxy.shared.documents.status_document import (
     EndpointStatus,
     MasterStatus,
     ProblemStatus,
@@ -12,8 +13,7 @@ from rosproxy.admin.status_document import (
     ZenohLinkStatus,
     ZenohStatus,
 )
-from rosproxy.page.problem_ages import ProblemAges
-from rosproxy.telemetry.text import brief
+from rosproxy.shared.output.text import brief
 
 EPOCH = 1000.0
 

@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from rosproxy.net.tasks import Tasks
 from rosproxy.page import routes
 from rosproxy.page.feed import Feed
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
+from rosproxy.shared.tasks import Tasks
 
 
 def document(state: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from typing import Any
 from aiohttp.test_utils import make_mocked_request
 
 from rosproxy.page.visitors import KEY_LIFETIME_S, MOST_TOKENS, SESSION_S, ExpiringTokens, Visitors
-from rosproxy.setting_kinds import hash_token
+from rosproxy.shared.setting_kinds import hash_token
 
 TOKEN = "a token of a test"
 

@@ -7,7 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import (
+from rosproxy.page.graph_document import graph_document
+from rosproxy.page.measures import Measures
+from rosproxy.page.page_document import MOST_LINKS
+from rosproxy.shared.documents.status_document import (
     HiddenStatus,
     MismatchStatus,
     NamedTypeStatus,
@@ -21,9 +24,6 @@ from rosproxy.admin.status_document import (
     ZenohSessionStatus,
     ZenohStatus,
 )
-from rosproxy.page.graph_document import graph_document
-from rosproxy.page.measures import Measures
-from rosproxy.page.page_document import MOST_LINKS
 from rosproxy.zenoh.links import LinkFault
 
 STRING = NamedTypeStatus("/chatter", "std_msgs/msg/String")

@@ -4,13 +4,13 @@ from typing import Any
 
 import pytest
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
 from rosproxy.ros1.registry import stand_ins as book
 from rosproxy.ros1.rewriting import master_api, master_calls, slave_api
-from rosproxy.settings import Settings
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.settings import Settings
 from tests.unit.builders import (
     DIALECTS,
     make_addressing,

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1 import range_probe
 from rosproxy.ros1.clients.master_client import Unreachable
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortMap, PortRange
 
 Greet = Callable[[socket.socket, str], Awaitable[None]]
 # Nothing listens at port 1, so the proxy's own attempt is refused.

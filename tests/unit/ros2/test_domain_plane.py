@@ -6,10 +6,10 @@ from typing import cast
 import pytest
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.leases.ports import PortPool
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.ports.kernel_ports import KernelPorts
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortPool
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NOW,

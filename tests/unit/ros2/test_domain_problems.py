@@ -5,13 +5,13 @@ import re
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import (
+from rosproxy.ros2.domain_problems import LEAST_OVERFLOWED, DomainProblem, domain_problems
+from rosproxy.shared.documents.status_document import (
     DataPlaneStatus,
     DomainStatus,
     MismatchStatus,
     ParticipantStatus,
 )
-from rosproxy.ros2.domain_problems import LEAST_OVERFLOWED, DomainProblem, domain_problems
 
 INSIDE = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
 OUTSIDE = ParticipantStatus("01.10.bb", "10.0.0.9", "Cyclone DDS")

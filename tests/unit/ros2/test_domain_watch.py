@@ -7,11 +7,11 @@ from typing import cast
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_watch import MOST_NOTED, DomainWatch
 from rosproxy.ros2.status import Ros2State
-from rosproxy.telemetry.problems import MOST_PROBLEMS, Problems
+from rosproxy.shared.documents.status_document import DomainStatus, ParticipantStatus
+from rosproxy.shared.output.problems import MOST_PROBLEMS, Problems
 
 GOOD = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
 TCP = replace(GOOD, locator_fault="tcp")

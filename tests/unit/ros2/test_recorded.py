@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.addressing import may_be_discovery
@@ -23,6 +22,7 @@ from rosproxy.ros2.rewriting.discovery import (
     read_discovery,
     rewritten,
 )
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.discovery.domains import HOST, NOW, B, make_domain, spdp
 from tests.unit.ros2.recorded import PUBLISHER, SUBSCRIBER, VENDORS, Datagram, recorded
 

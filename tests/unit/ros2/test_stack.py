@@ -6,12 +6,12 @@ from typing import Any, cast
 
 import pytest
 
-from rosproxy.net.addresses import HostPort, Network
 from rosproxy.ros2 import stack
 from rosproxy.ros2.protocol.rtps import RtpsError
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.stack import Ros2, advertised_hosts, networks_inside
 from rosproxy.runtime import Runtime
+from rosproxy.shared.addresses import HostPort, Network
 from tests.run_options import parse_settings
 
 

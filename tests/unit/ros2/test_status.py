@@ -7,13 +7,6 @@ from typing import cast
 
 import pytest
 
-from rosproxy.admin.status_document import (
-    DataPlaneStatus,
-    DomainStatus,
-    LocatorStatus,
-    NamedTypeStatus,
-)
-from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.parameters import Pid
@@ -27,6 +20,13 @@ from rosproxy.ros2.registry.participants import (
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.servers.receive_buffers import ReceiveBuffers
 from rosproxy.ros2.status import MOST_STEPS_AT_ONCE, Ros2State, _first_endpoints
+from rosproxy.shared.documents.status_document import (
+    DataPlaneStatus,
+    DomainStatus,
+    LocatorStatus,
+    NamedTypeStatus,
+)
+from rosproxy.shared.ports import PortMap, PortRange
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
     INSIDE,

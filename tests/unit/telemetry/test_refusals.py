@@ -2,8 +2,8 @@
 
 import pytest
 
+from rosproxy.shared.output.problems import Problems
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import (
     MOST_LINES,
     MOST_REMEMBERED_LINES,

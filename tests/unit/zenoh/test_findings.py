@@ -3,8 +3,8 @@
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import Severity
-from rosproxy.admin.status_document import (
+from rosproxy.shared.documents.doctor_finding import Severity
+from rosproxy.shared.documents.status_document import (
     MismatchStatus,
     ZenohApartStatus,
     ZenohCertificateStatus,

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from rosproxy.settings import Settings
+from rosproxy.shared.settings import Settings
 from rosproxy.zenoh import certificates as checks
 from rosproxy.zenoh.link_files import UnusableFile, read_link_files
 from tests import certificates

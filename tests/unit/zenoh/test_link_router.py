@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.access.rules import parse_rules
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import Credentials, LinkPort, SiteLink, TopicLimit
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import Credentials, LinkPort, SiteLink, TopicLimit
+from rosproxy.shared.zenoh_rules.key_expressions import check_limits
 from rosproxy.zenoh.link_router import LinkPlan
-from rosproxy.zenoh.policy.key_expressions import check_limits
 from rosproxy.zenoh.router_configs import RouterPlan
 
 CREDENTIALS = Credentials(b"certificate", b"secret key", b"authority")

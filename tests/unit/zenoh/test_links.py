@@ -2,7 +2,7 @@
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy.zenoh.links import (
     Link,
     LinkFault,

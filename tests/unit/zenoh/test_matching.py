@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.admin.status_document import MismatchStatus
+from rosproxy.shared.documents.status_document import MismatchStatus
 from rosproxy.zenoh.matching import MOST_COMPARISONS, MOST_MISMATCHES_OF_NAME, Comparison, compare
 from rosproxy.zenoh.protocol.liveliness import Entity, EntityKind, Qos
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.admin.status_document import (
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
+from rosproxy.shared.documents.status_document import (
     HiddenStatus,
     MismatchStatus,
     PolicyStatus,

@@ -5,9 +5,9 @@ import json
 
 import pytest
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import Credentials
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import Credentials
 from rosproxy.zenoh.router_configs import (
     FILES_OF_ROUTER,
     MAX_SESSIONS,

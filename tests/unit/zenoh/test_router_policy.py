@@ -5,14 +5,14 @@ from collections.abc import Sequence
 import pytest
 
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.access.layers import PolicyLayer, PolicyMode
-from rosproxy.access.rules import RuleKind, parse_rules
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.output.problems import Problems
+from rosproxy.shared.policy.layers import PolicyLayer, PolicyMode
+from rosproxy.shared.policy.rules import RuleKind, parse_rules
+from rosproxy.shared.ports import PortRange
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
 from rosproxy.zenoh import router_policy
-from rosproxy.zenoh.policy.access_control import access_control
+from rosproxy.zenoh.access_control import access_control
 from rosproxy.zenoh.router_policy import InsideName, RouterPolicy
 
 FIRST = "172.18.0.3"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from rosproxy.settings import Settings
+from rosproxy.shared.settings import Settings
 from rosproxy.zenoh import site_links
 from rosproxy.zenoh.link_files import LinkFiles, read_link_files
 from rosproxy.zenoh.site_links import SiteLinks

@@ -7,8 +7,7 @@ import pytest
 from msgspec.structs import replace
 from prometheus_client import CollectorRegistry, generate_latest
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.admin.status_document import (
+from rosproxy.shared.documents.status_document import (
     NamedTypeStatus,
     ZenohApartStatus,
     ZenohCertificateStatus,
@@ -16,6 +15,7 @@ from rosproxy.admin.status_document import (
     ZenohQosStatus,
     ZenohSessionStatus,
 )
+from rosproxy.shared.policy.rules import RuleKind
 from rosproxy.zenoh.protocol.liveliness import graph_of
 from rosproxy.zenoh.protocol.report import Report, RouterReport, RouterSession, SessionConnection
 from rosproxy.zenoh.router_policy import InsideName

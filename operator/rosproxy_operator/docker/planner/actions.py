@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import msgspec
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
-from rosproxy.telemetry.text import clean, listed
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.output.text import clean, listed
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.proxy_spec.place import Place
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec
 

@@ -8,8 +8,8 @@ gets no name that a container has. A proxy loses its name if a container gets th
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from rosproxy.net.addresses import is_address
-from rosproxy.telemetry.text import listed
+from rosproxy.shared.addresses import is_address
+from rosproxy.shared.output.text import listed
 from rosproxy_operator.common.problem import Fault, Problem
 from rosproxy_operator.docker.planner.labels.alias_bounds import (
     alias_refusal,

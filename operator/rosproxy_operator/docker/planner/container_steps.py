@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 from msgspec.structs import replace
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.docker.option_values import NOWHERE
 from rosproxy_operator.docker.planner.actions import (
     Action,

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterable, Iterator
 
-from rosproxy.settings import MOST_ZENOH_PORTS
+from rosproxy.shared.settings import MOST_ZENOH_PORTS
 from rosproxy_operator.common.problem import (
     OPTION_IGNORED,
     Problem,

@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from rosproxy.settings import MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
+from rosproxy.shared.settings import MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
 from rosproxy_operator.common.problem import (
     TOO_MANY,
     Fault,

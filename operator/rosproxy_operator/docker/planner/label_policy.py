@@ -10,9 +10,9 @@ from collections.abc import Collection, Iterable, Mapping
 
 from msgspec import structs
 
-from rosproxy.access.layers import LONGEST_LAYER_NAME, MOST_LAYERS, PolicyLayer
-from rosproxy.access.rules import MOST_RULES, format_rules
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.policy.layers import LONGEST_LAYER_NAME, MOST_LAYERS, PolicyLayer
+from rosproxy.shared.policy.rules import MOST_RULES, format_rules
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.problem import (
     TOO_MANY,
     Problem,

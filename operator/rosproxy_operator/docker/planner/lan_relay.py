@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 
 from msgspec.structs import replace
 
-from rosproxy.net.addresses import HostPort, is_address
+from rosproxy.shared.addresses import HostPort, is_address
 from rosproxy_operator.common.problem import (
     NO_LAN_ADDRESS,
     Problem,

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network
 
-from rosproxy.access.rules import Rule
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.rules import Rule
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.proxy_spec.place import Place
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec, Wishes
 

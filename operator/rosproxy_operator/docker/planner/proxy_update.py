@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from ipaddress import IPv4Network
 from typing import Any
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.net.addresses import is_address, is_inside, is_loopback
+from rosproxy.shared.addresses import is_address, is_inside, is_loopback
+from rosproxy.shared.policy.layers import PolicyLayer
 from rosproxy_operator.docker.planner.label_policy import RecentLayers, label_layers
 from rosproxy_operator.docker.planner.model import (
     STARTED,

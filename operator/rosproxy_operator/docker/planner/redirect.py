@@ -26,8 +26,8 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.docker.planner.actions import Action, CreateRedirect, Remove, Run
 from rosproxy_operator.docker.planner.labels.readers import MASTER_URI
 from rosproxy_operator.docker.planner.model import (

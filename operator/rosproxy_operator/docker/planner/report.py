@@ -7,8 +7,8 @@ a terminal.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from rosproxy.telemetry.tables import besides_first, table
-from rosproxy.telemetry.text import clean, listed, plural, shorten, wrap
+from rosproxy.shared.output.tables import besides_first, table
+from rosproxy.shared.output.text import clean, listed, plural, shorten, wrap
 from rosproxy_operator.common.problem import with_fix
 
 Status = Mapping[str, Any]

@@ -9,12 +9,12 @@ from typing import Any
 
 from msgspec.structs import asdict, replace
 
-from rosproxy.leases.domain_ports import LAST_DOMAIN
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.setting_kinds import SettingError, hash_token, parse_range
-from rosproxy.settings import MOST_ZENOH_PORTS
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.domain_ports import LAST_DOMAIN
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import SettingError, hash_token, parse_range
+from rosproxy.shared.settings import MOST_ZENOH_PORTS
+from rosproxy.shared.uris import parse_slave_uri
 from rosproxy_operator.common.policy import POLICY_WAIT_S, as_variable
 from rosproxy_operator.common.port_ranges import local_ports
 from rosproxy_operator.common.problem import Fault

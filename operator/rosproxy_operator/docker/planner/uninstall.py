@@ -16,7 +16,7 @@ removal then stops with a problem.
 
 from collections.abc import Iterator
 
-from rosproxy.telemetry.text import listed
+from rosproxy.shared.output.text import listed
 from rosproxy_operator.common.problem import (
     STUCK,
     Problem,

@@ -18,8 +18,8 @@ from dataclasses import replace
 from itertools import count
 from string import Template
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import ZENOH_PORT
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.setting_kinds import ZENOH_PORT
 from rosproxy_operator.common.zenoh import OVERRIDE, client_override
 from rosproxy_operator.docker.planner.model import Container, Member, RedirectContainer
 from rosproxy_operator.proxy_spec.place import ZENOH

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import msgspec
 
-from rosproxy.leases.ports import STAND_IN_PORTS, PortRange
+from rosproxy.shared.ports import STAND_IN_PORTS, PortRange
 from rosproxy_operator.common.port_ranges import (
     FormerRange,
     PortsExhausted,

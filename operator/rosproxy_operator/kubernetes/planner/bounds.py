@@ -17,10 +17,10 @@ from itertools import islice
 
 from msgspec.structs import replace
 
-from rosproxy.net.addresses import HostPort, is_address, parse_address
-from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.setting_kinds import read_peer, read_site_link
-from rosproxy.zenoh.policy.name_sets import check_layers
+from rosproxy.shared.addresses import HostPort, is_address, parse_address
+from rosproxy.shared.setting_kinds import read_peer, read_site_link
+from rosproxy.shared.uris import parse_slave_uri, slave_uri
+from rosproxy.shared.zenoh_rules.name_sets import check_layers
 from rosproxy_operator.common.port_ranges import within
 from rosproxy_operator.common.problem import NOT_ALLOWED, Fault
 from rosproxy_operator.kubernetes.resources.checks import quoted

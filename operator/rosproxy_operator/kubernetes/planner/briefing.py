@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import msgspec
 
-from rosproxy.access.layers import PolicyLayer
+from rosproxy.shared.policy.layers import PolicyLayer
 from rosproxy_operator.common.proxy_status import Leases
 from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
 from rosproxy_operator.kubernetes.planner.manifests import policy_of

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import msgspec
 
-from rosproxy.telemetry.text import listed
+from rosproxy.shared.output.text import listed
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.planner.pods.selection import (
     ambiguity_warning,

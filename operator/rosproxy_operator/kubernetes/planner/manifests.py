@@ -6,10 +6,10 @@ from typing import Any
 
 import msgspec
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.leases.domain_ports import first_unicast_port
-from rosproxy.leases.ports import STAND_IN_PORTS, PortRange
-from rosproxy.net.addresses import HostPort, is_address
+from rosproxy.shared.addresses import HostPort, is_address
+from rosproxy.shared.domain_ports import first_unicast_port
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.ports import STAND_IN_PORTS, PortRange
 from rosproxy_operator.common.policy import POLICY_WAIT_S, as_variable
 from rosproxy_operator.common.port_ranges import LOCAL_PORTS, first_fitting, local_ports
 from rosproxy_operator.common.zenoh import LINK_DIRECTORY, LINK_FILES, link_settings

@@ -7,7 +7,7 @@ of the two says so.
 
 from collections.abc import Iterator, Mapping
 
-from rosproxy.telemetry.text import listed
+from rosproxy.shared.output.text import listed
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.planner.cluster_view import View, group_by_key
 from rosproxy_operator.kubernetes.resources.cluster import ZenohReport

@@ -4,20 +4,20 @@ from itertools import islice
 
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import (
+from rosproxy.shared.documents.status_document import (
     ProblemStatus,
     ProxyStatus,
     ZenohLinkStatus,
     ZenohStatus,
 )
-from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
-from rosproxy.telemetry.problems import (
+from rosproxy.shared.output.problems import (
     DENIED,
     MOST_PROBLEMS,
     WOULD_BE_DENIED,
     refusal_subject,
 )
-from rosproxy.telemetry.text import clean
+from rosproxy.shared.output.text import clean
+from rosproxy.shared.settings import MOST_ZENOH_HUBS, MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.proxy_status import (
     inside_addresses,

@@ -18,10 +18,10 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.tasks import Tasks
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_document import ProxyStatus
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 from rosproxy_operator.kubernetes.planner.briefing import Briefing

@@ -13,7 +13,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from rosproxy.telemetry.text import clean
+from rosproxy.shared.output.text import clean
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.resources.checks import submap, text_at

@@ -2,10 +2,10 @@
 
 import re
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import is_loopback
-from rosproxy.setting_kinds import SettingError, parse_host, parse_range
-from rosproxy.telemetry.text import shorten
+from rosproxy.shared.addresses import is_loopback
+from rosproxy.shared.output.text import shorten
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import SettingError, parse_host, parse_range
 from rosproxy_operator.kubernetes.resources.model import Json
 
 _SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?(\.[a-z0-9]([-a-z0-9]*[a-z0-9])?)*")

@@ -5,8 +5,8 @@ from enum import Enum
 
 import msgspec
 
-from rosproxy.admin.status_document import RangeProbeStatus
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.documents.status_document import RangeProbeStatus
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,

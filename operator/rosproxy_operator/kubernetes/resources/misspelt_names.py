@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import Literal, NamedTuple
 
-from rosproxy.telemetry.text import clean, shorten
+from rosproxy.shared.output.text import clean, shorten
 from rosproxy_operator.common.spelling import LEAST_SIMILARITY, nearest, unknown_name
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.checks import texts_at

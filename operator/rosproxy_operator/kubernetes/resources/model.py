@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import msgspec
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.access.rules import Rule
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import Rule
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.problem import (
     INVALID,
     Problem,

@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping
 from functools import lru_cache
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort, parse_host_port
+from rosproxy.shared.addresses import HostPort, parse_host_port
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.ros2 import relay_secret
 from rosproxy_operator.kubernetes.resources.model import Name
 

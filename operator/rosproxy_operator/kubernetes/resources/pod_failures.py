@@ -6,7 +6,7 @@ Reasons and texts are from Kubernetes 1.36. Paths without a repository are in k8
 import re
 from datetime import datetime
 
-from rosproxy.telemetry.text import clean
+from rosproxy.shared.output.text import clean
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.resources.checks import int_at, submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.cluster import PodFailure

@@ -11,16 +11,16 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-from rosproxy.access.layers import PolicyLayer, PolicyMode
-from rosproxy.access.rules import Rule, RuleAction, RuleKind, parse_rule
-from rosproxy.leases.domain_ports import LAST_DOMAIN
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
-from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.setting_kinds import read_topic_limit
-from rosproxy.settings import LEAST_PORTS_PER_DOMAIN, MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
-from rosproxy.zenoh.policy.key_expressions import check_limits
-from rosproxy.zenoh.policy.name_sets import check_layers
+from rosproxy.shared.addresses import HostPort, is_address, is_loopback, parse_address
+from rosproxy.shared.domain_ports import LAST_DOMAIN
+from rosproxy.shared.policy.layers import PolicyLayer, PolicyMode
+from rosproxy.shared.policy.rules import Rule, RuleAction, RuleKind, parse_rule
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import read_topic_limit
+from rosproxy.shared.settings import LEAST_PORTS_PER_DOMAIN, MOST_ZENOH_LIMITS, MOST_ZENOH_LINKS
+from rosproxy.shared.uris import parse_slave_uri, slave_uri
+from rosproxy.shared.zenoh_rules.key_expressions import check_limits
+from rosproxy.shared.zenoh_rules.name_sets import check_layers
 from rosproxy_operator.common.policy import excess_reason
 from rosproxy_operator.common.ros2 import LEAST_PORTS, MOST_PEERS, read_peer_name
 from rosproxy_operator.common.zenoh import read_link_name, read_router_name

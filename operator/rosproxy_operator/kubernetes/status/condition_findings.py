@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error, ok, warning
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, error, ok, warning
 from rosproxy_operator.kubernetes.resources.checks import int_at, submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import INJECT

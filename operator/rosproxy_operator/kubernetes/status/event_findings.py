@@ -10,8 +10,8 @@ from datetime import datetime
 
 import msgspec
 
-from rosproxy.admin.doctor_finding import DoctorFinding, note, warning
-from rosproxy.telemetry.text import brief, duration, quoted
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, note, warning
+from rosproxy.shared.output.text import brief, duration, quoted
 from rosproxy_operator.kubernetes.resources.checks import int_at, submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import KIND

@@ -5,8 +5,8 @@ The text of a finding must not change while the problem lasts: each new text is 
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from rosproxy.admin.setup_rules import RANGE
-from rosproxy.telemetry.text import clean
+from rosproxy.shared.documents.setup_rules import RANGE
+from rosproxy.shared.output.text import clean
 from rosproxy_operator.common.problem import (
     CONFLICT,
     LAN_RELAY_STUCK,

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import msgspec
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error
-from rosproxy.telemetry.text import listed
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, error
+from rosproxy.shared.output.text import listed
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.status.operator_options import option_values

@@ -5,8 +5,8 @@ ready, the proxies reach the master, and outside receives nothing. So the proxy 
 from outside (`range_probe`).
 """
 
-from rosproxy.admin.status_document import RangeProbeStatus
-from rosproxy.fixes import FIXES
+from rosproxy.shared.documents.status_document import RangeProbeStatus
+from rosproxy.shared.fixes import FIXES
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.resources.cluster import RosProxyOnNode
 

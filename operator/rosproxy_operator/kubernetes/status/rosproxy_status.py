@@ -6,8 +6,8 @@ from typing import TypeGuard
 
 import msgspec
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.telemetry.text import brief, plural, shorten
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.output.text import brief, plural, shorten
 from rosproxy_operator.common.problem import CONFLICT, EXHAUSTED, Fault, bounded
 from rosproxy_operator.common.zenoh import OVERRIDE, client_override, tcp_endpoint
 from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
-from rosproxy.telemetry.text import clean, listed, plural
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, error, note, ok, warning
+from rosproxy.shared.output.text import clean, listed, plural
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import INJECT

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from msgspec.structs import replace
 
-from rosproxy.net.addresses import is_address, plain_address
+from rosproxy.shared.addresses import is_address, plain_address
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.api.api_client import (
     ApiError,

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 from aiohttp import web
 
-from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort, subnet
-from rosproxy.net.tasks import Tasks
+from rosproxy.shared.addresses import HostPort, subnet
+from rosproxy.shared.connections import sockets
+from rosproxy.shared.tasks import Tasks
 
 MOST_CONNECTIONS = 512
 """Connections at most: 140 MB. The operator has 512 MiB by default (the chart's values)."""

@@ -14,10 +14,10 @@ from collections.abc import AsyncIterator
 import kopf
 from aiohttp import web
 
-from rosproxy.net.addresses import HostPort, plain_address
-from rosproxy.net.bodies import TooLong, read_bounded
-from rosproxy.net.bounded_server import IDLE_TIMEOUT_S
-from rosproxy.net.budget import Budget, Charge, OverBudget
+from rosproxy.shared.addresses import HostPort, plain_address
+from rosproxy.shared.connections.budget import Budget, Charge, OverBudget
+from rosproxy.shared.http.bodies import TooLong, read_bounded
+from rosproxy.shared.http.bounded_server import IDLE_TIMEOUT_S
 from rosproxy_operator.kubernetes.planner.pods.wiring import UNWIRED
 from rosproxy_operator.kubernetes.status.events import stamp
 from rosproxy_operator.kubernetes.webhook import certificates

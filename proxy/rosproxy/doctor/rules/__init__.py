@@ -1,9 +1,9 @@
 """The rules of ``rosproxy doctor``: pure functions from gathered facts to findings."""
 
-from rosproxy.admin.doctor_finding import DoctorFinding, warning
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.doctor.rules import node, pair, participant, zenoh
 from rosproxy.doctor.rules import proxy as proxy_rules
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, warning
 
 
 def diagnose(facts: DoctorFacts) -> list[DoctorFinding]:

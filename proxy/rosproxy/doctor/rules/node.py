@@ -6,15 +6,22 @@ from ipaddress import ip_network
 
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
-from rosproxy.admin.setup_rules import LOOPBACK_MEANING
-from rosproxy.admin.status_document import EndpointStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.proxy import local_master
-from rosproxy.fixes import how_to
-from rosproxy.net.addresses import HostPort, is_inside, is_loopback, parse_host_port
-from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
-from rosproxy.telemetry.text import plural, quoted
+from rosproxy.shared.addresses import HostPort, is_inside, is_loopback, parse_host_port
+from rosproxy.shared.documents.doctor_finding import (
+    DoctorFinding,
+    Severity,
+    error,
+    note,
+    ok,
+    warning,
+)
+from rosproxy.shared.documents.setup_rules import LOOPBACK_MEANING
+from rosproxy.shared.documents.status_document import EndpointStatus
+from rosproxy.shared.fixes import how_to
+from rosproxy.shared.output.text import plural, quoted
+from rosproxy.shared.uris import parse_service_uri, parse_slave_uri
 
 INSIDE = "inside node"
 OUTSIDE = "node"

@@ -6,13 +6,13 @@ The findings say which pairs of publisher and subscriber are not connected, and 
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 
-from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok
 from rosproxy.doctor.facts import MOST_PAIRS, Attempt, DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.node import CLEANUP
 from rosproxy.doctor.rules.proxy import local_master
-from rosproxy.fixes import how_to
-from rosproxy.net.addresses import is_loopback, parse_host_port
-from rosproxy.telemetry.text import listed, quoted, size
+from rosproxy.shared.addresses import is_loopback, parse_host_port
+from rosproxy.shared.documents.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok
+from rosproxy.shared.fixes import how_to
+from rosproxy.shared.output.text import listed, quoted, size
 
 PAIR = "pair"
 """The name of the check in all findings of this module, except those with UNKNOWN_NAME."""

@@ -7,13 +7,20 @@ participants inside that the proxy does not hear, and the names in the user's qu
 from collections.abc import Iterator
 from itertools import islice, product
 
-from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok, warning
-from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
-from rosproxy.fixes import how_to
-from rosproxy.net.addresses import parse_host_port
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, participant_label
-from rosproxy.telemetry.text import listed, plural
+from rosproxy.shared.addresses import parse_host_port
+from rosproxy.shared.documents.doctor_finding import (
+    UNKNOWN_NAME,
+    DoctorFinding,
+    error,
+    note,
+    ok,
+    warning,
+)
+from rosproxy.shared.documents.status_document import DomainStatus, ParticipantStatus
+from rosproxy.shared.fixes import how_to
+from rosproxy.shared.output.text import listed, plural
 
 MOST_PAIRS = 5000
 """Pairs of participants with the topic in question that the doctor reports at most."""

@@ -3,8 +3,17 @@
 from collections.abc import Iterator
 from urllib.parse import urlsplit
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
-from rosproxy.admin.setup_rules import (
+from rosproxy.doctor.facts import DoctorFacts, MasterFacts, ReachOutcome
+from rosproxy.shared.addresses import is_loopback, parse_host_port
+from rosproxy.shared.documents.doctor_finding import (
+    DoctorFinding,
+    Severity,
+    error,
+    note,
+    ok,
+    warning,
+)
+from rosproxy.shared.documents.setup_rules import (
     HOST,
     RANGE,
     advertised_host,
@@ -12,11 +21,9 @@ from rosproxy.admin.setup_rules import (
     is_all_here,
     published_range,
 )
-from rosproxy.admin.status_bounds import left_out
-from rosproxy.doctor.facts import DoctorFacts, MasterFacts, ReachOutcome
-from rosproxy.fixes import how_to
-from rosproxy.net.addresses import is_loopback, parse_host_port
-from rosproxy.telemetry.text import duration, quoted
+from rosproxy.shared.documents.status_bounds import left_out
+from rosproxy.shared.fixes import how_to
+from rosproxy.shared.output.text import duration, quoted
 
 
 def _other_uri() -> str:

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator
 
-from rosproxy.admin.doctor_finding import (
+from rosproxy.doctor.facts import DoctorFacts
+from rosproxy.shared.documents.doctor_finding import (
     UNKNOWN_NAME,
     DoctorFinding,
     Severity,
@@ -11,10 +12,9 @@ from rosproxy.admin.doctor_finding import (
     ok,
     warning,
 )
-from rosproxy.admin.status_document import ZenohStatus
-from rosproxy.doctor.facts import DoctorFacts
-from rosproxy.fixes import how_to
-from rosproxy.telemetry.text import listed, plural
+from rosproxy.shared.documents.status_document import ZenohStatus
+from rosproxy.shared.fixes import how_to
+from rosproxy.shared.output.text import listed, plural
 from rosproxy.zenoh.findings import (
     ROUTERS,
     faults,

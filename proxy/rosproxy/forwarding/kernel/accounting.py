@@ -4,9 +4,9 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from rosproxy.forwarding.fast_ports import LeaseHolder, LeaseHolders
 from rosproxy.forwarding.kernel.conntrack import OpenConnections
 from rosproxy.forwarding.kernel.nft import Counters, Counts
-from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
 
 SILENCE_WINDOW_S = 2.0
 """Shortest window, in seconds, in which a node must send bytes (`UnansweredPorts`)."""

@@ -18,7 +18,7 @@ import msgspec
 
 from rosproxy.forwarding.kernel.decisions import Forwards
 from rosproxy.forwarding.kernel.nft import Elements, Json, Surroundings, Table, pairs
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 
 NEW_PER_SECOND = 200
 NEW_BURST = 2000

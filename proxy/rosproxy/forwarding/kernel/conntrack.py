@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 import msgspec
 
 from rosproxy.forwarding.kernel.connection_table import Marks
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 
 MOST_PEERS = 256
 """Addresses of peers of a port that have separate counts; OTHERS counts all further connections."""

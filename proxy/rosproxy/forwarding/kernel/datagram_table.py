@@ -18,7 +18,7 @@ from string import Template
 
 from rosproxy.forwarding.kernel.decisions import Forwards
 from rosproxy.forwarding.kernel.nft import Surroundings, Table, checked
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 
 # Packets from this machine to itself arrive by loopback and already have a route, which a rule here
 # can't change. The proxy's socket at the same port receives these packets.

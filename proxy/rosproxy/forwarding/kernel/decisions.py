@@ -9,8 +9,8 @@ from collections.abc import Collection, Iterable, Mapping
 
 import msgspec
 
-from rosproxy.leases.fast_ports import LeaseHolder
-from rosproxy.net.addresses import HostPort, Route, is_loopback
+from rosproxy.forwarding.fast_ports import LeaseHolder
+from rosproxy.shared.addresses import HostPort, Route, is_loopback
 
 Forwards = Mapping[int, HostPort]
 """The address and port of the target for each forwarded port."""

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import msgspec
 
 from rosproxy.forwarding.kernel.decisions import Changes, Forwards
-from rosproxy.net.addresses import HostPort, Network, is_address, parse_address
+from rosproxy.shared.addresses import HostPort, Network, is_address, parse_address
 
 Json = Any
 Near = Sequence[Network]

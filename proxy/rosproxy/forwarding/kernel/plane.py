@@ -1,8 +1,8 @@
 """The kernel plane: the interface for the other packages of the proxy.
 
-The kernel forwards the *fast port* of an endpoint (`rosproxy.leases.fast_ports`) directly to the
-TCPROS port of the node. For ROS 2, the kernel forwards a port mapping directly to a locator of the
-participant. `decisions` chooses the target, `syncer` keeps the kernel's `table` up to date, and
+The kernel forwards the *fast port* of an endpoint (`rosproxy.forwarding.fast_ports`) directly to
+the TCPROS port of the node. For ROS 2, the kernel forwards a port mapping directly to a locator of
+the participant. `decisions` chooses the target, `syncer` keeps the kernel's `table` up to date, and
 `accounting` counts. The plane only makes traffic faster: if the kernel does not forward, the socket
 at the same port receives the bytes, and the proxy relays.
 
@@ -16,6 +16,8 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from rosproxy.forwarding import fast_ports
+from rosproxy.forwarding.fast_ports import LeaseHolder, LeaseHolders
 from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.decisions import Forwards
@@ -23,12 +25,10 @@ from rosproxy.forwarding.kernel.nft import Counts, Near
 from rosproxy.forwarding.kernel.preflight import find_obstacle
 from rosproxy.forwarding.kernel.syncer import SUBJECT, Clock, ForwardSyncer, IsDenied
 from rosproxy.forwarding.kernel.table import KernelTable
-from rosproxy.leases import fast_ports
-from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
-from rosproxy.net.tasks import Tasks
-from rosproxy.settings import Settings
+from rosproxy.shared.output.problems import Problems
+from rosproxy.shared.settings import Settings
+from rosproxy.shared.tasks import Tasks
 from rosproxy.telemetry.metrics import Traffic
-from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
 

@@ -4,11 +4,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from rosproxy.fixes import how_to
 from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.nft import NftError, dropping_chains
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
-from rosproxy.setting_kinds import DataPlane
+from rosproxy.shared.fixes import how_to
+from rosproxy.shared.setting_kinds import DataPlane
 
 _INTERFACES = Path("/sys/class/net")
 _LEGACY_TABLES = Path("/proc/net/ip_tables_names")

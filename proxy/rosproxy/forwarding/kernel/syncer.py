@@ -17,6 +17,8 @@ import itertools
 import logging
 from collections.abc import Callable, Collection
 
+from rosproxy.forwarding import fast_ports
+from rosproxy.forwarding.fast_ports import LeaseHolder, LeaseHolders
 from rosproxy.forwarding.kernel import decisions
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.conntrack import Survey
@@ -25,11 +27,9 @@ from rosproxy.forwarding.kernel.nft import Counters, Near, NftError, Surrounding
 from rosproxy.forwarding.kernel.preflight import read_forwarding
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import ToolError
-from rosproxy.leases import fast_ports
-from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
-from rosproxy.net.addresses import HostPort, Route, is_loopback
-from rosproxy.net.interfaces import route_towards
-from rosproxy.telemetry.problems import Problems
+from rosproxy.shared.addresses import HostPort, Route, is_loopback
+from rosproxy.shared.machine.interfaces import route_towards
+from rosproxy.shared.output.problems import Problems
 
 log = logging.getLogger(__name__)
 

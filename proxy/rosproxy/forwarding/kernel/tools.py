@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-from rosproxy.fixes import how_to
+from rosproxy.shared.fixes import how_to
 
 IMAGE_FOLDER = Path("/usr/libexec/rosproxy")
 """The folder of the programs in the image; searched before the PATH."""

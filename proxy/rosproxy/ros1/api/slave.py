@@ -13,14 +13,12 @@ from collections.abc import Awaitable
 from functools import partial
 from typing import TypeVar
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import LongReply
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import MANY_VALUES, Context
 from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.protocol.master_methods import MASTER_ONLY
 from rosproxy.ros1.protocol.name_lengths import too_long_to_ask
-from rosproxy.ros1.protocol.uris import parse_inside_path
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import multicall, passing
 from rosproxy.ros1.registry.endpoint import Endpoint
@@ -31,6 +29,8 @@ from rosproxy.ros1.servers.tcpros_server import InsideNodes, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
 from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.uris import parse_inside_path
 
 log = logging.getLogger(__name__)
 

@@ -21,10 +21,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.registry.node_health import ProbeResult
+from rosproxy.shared.addresses import HostPort
 
 LONGEST_ANSWER_BYTES = 4096
 """Most bytes of the header, and of the body, of an answer. An answer of rospy has 400 bytes."""

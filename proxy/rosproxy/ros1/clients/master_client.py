@@ -21,8 +21,6 @@ from urllib.parse import urlsplit
 import aiohttp
 import msgspec
 
-from rosproxy.net.addresses import HostPort, is_address
-from rosproxy.net.bodies import BadResponse
 from rosproxy.net.http_client import (
     LONG_BODY_BYTES,
     MOST_BODY_BYTES,
@@ -31,15 +29,17 @@ from rosproxy.net.http_client import (
     LongBody,
     LongReply,
 )
-from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, read_state
 from rosproxy.ros1.registry.node_health import ProbeResult
+from rosproxy.shared.addresses import HostPort, is_address
+from rosproxy.shared.http.bodies import BadResponse
+from rosproxy.shared.machine.resolver import NODES, resolve
+from rosproxy.shared.output.problems import LONGEST_TEXT
+from rosproxy.shared.output.text import brief
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import LONGEST_TEXT
-from rosproxy.telemetry.text import brief
 
 CALLER_ID = "/rosproxy"
 """The node name of the proxy in its own calls."""

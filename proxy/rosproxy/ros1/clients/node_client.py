@@ -19,8 +19,6 @@ from collections.abc import Mapping
 
 import msgspec
 
-from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master_client import (
     CALLER_ID,
     MasterClient,
@@ -33,6 +31,8 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.limits import SHORT_REPLY
 from rosproxy.ros1.registry.graph import ROSOUT, NodeInfo, read_types
 from rosproxy.ros1.registry.node_health import ProbeResult
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.connections import sockets
 
 log = logging.getLogger(__name__)
 

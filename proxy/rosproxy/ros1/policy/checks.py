@@ -11,9 +11,7 @@ from dataclasses import replace
 from itertools import islice
 
 from rosproxy.access.access_policy import OFFER_KINDS, PARAMETER_KINDS, AccessPolicy
-from rosproxy.access.layers import Verdict, strictest
 from rosproxy.access.rule_index import MOST_CALLER_COMPARISONS
-from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
 from rosproxy.ros1.clients.master_client import MasterClient, MasterError, Unreachable
 from rosproxy.ros1.policy.denial import Denial, denied, no_provider, no_publisher, with_fix
@@ -27,7 +25,6 @@ from rosproxy.ros1.protocol.master_methods import (
     prefix,
     resolve_name,
 )
-from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Value
@@ -42,6 +39,9 @@ from rosproxy.ros1.rewriting.master_calls import (
     Passing,
     Request,
 )
+from rosproxy.shared.policy.layers import Verdict, strictest
+from rosproxy.shared.policy.rules import RuleKind
+from rosproxy.shared.uris import parse_service_uri
 
 MASTER = "/master"
 """The caller_id of the master's calls to nodes (rosmaster/registrations.py)."""

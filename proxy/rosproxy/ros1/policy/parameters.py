@@ -2,9 +2,9 @@
 
 import msgspec
 
-from rosproxy.access.rules import RuleKind
 from rosproxy.ros1.protocol.master_methods import resolve_name
 from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.shared.policy.rules import RuleKind
 
 _ROOT_NAMESPACE = "/"
 _NAME_INDEX_OF_READS = {"getParam": 1, "hasParam": 1, "searchParam": 1, "subscribeParam": 2}

@@ -11,13 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.access.rules import RuleKind
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import service_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.registry import Registry
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.rules import RuleKind
+from rosproxy.shared.uris import service_uri
 
 ASK_AGAIN_S = 5.0
 """Seconds between two questions for the same service. roscpp looks up an awaited service fifty

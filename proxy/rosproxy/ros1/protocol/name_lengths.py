@@ -9,8 +9,8 @@ the slave API, and in TCPROS headers. All other long texts pass unchanged.
 from collections.abc import Iterable, Mapping
 
 from rosproxy.ros1.protocol.master_methods import method_spec
-from rosproxy.ros1.protocol.uris import LONGEST_URI
 from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.shared.uris import LONGEST_URI
 
 LONGEST_NAME = 1024
 """Characters of the name of a node, topic, service, parameter or type. Names of large systems with

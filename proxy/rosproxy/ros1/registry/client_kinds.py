@@ -10,8 +10,8 @@ serves the same nodes as before.
 from collections.abc import Collection, Sequence
 from enum import Enum
 
-from rosproxy.fixes import how_to_in_a_sentence
-from rosproxy.net.addresses import Network, is_inside
+from rosproxy.shared.addresses import Network, is_inside
+from rosproxy.shared.fixes import how_to_in_a_sentence
 
 
 class ClientKind(Enum):

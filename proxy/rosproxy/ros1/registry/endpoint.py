@@ -4,11 +4,11 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind, prefix
-from rosproxy.ros1.protocol.uris import InsidePath, parse_slave_uri, path_of
 from rosproxy.ros1.registry.node_health import Health, ProbeResult
-from rosproxy.telemetry.text import listed
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.output.text import listed
+from rosproxy.shared.uris import InsidePath, parse_slave_uri, path_of
 
 MOST_REGISTRATIONS = 10_000
 """The highest number of registrations of an endpoint. ``rosbag record -a`` on a system of a

@@ -8,11 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
-from rosproxy.fixes import how_to_in_a_sentence
-from rosproxy.leases.ports import PortPool, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_service_uri, service_uri
 from rosproxy.ros1.registry.endpoint import (
     LONGEST_REGISTRATION,
     Endpoint,
@@ -20,6 +16,10 @@ from rosproxy.ros1.registry.endpoint import (
     NodeLocation,
     Registration,
 )
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.fixes import how_to_in_a_sentence
+from rosproxy.shared.ports import PortPool, PortRange
+from rosproxy.shared.uris import parse_service_uri, service_uri
 
 MOST_ADMISSIONS = 16
 """Remembered pairs of host:port and source for an endpoint. A node gives one host, from a single

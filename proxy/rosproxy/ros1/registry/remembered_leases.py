@@ -4,7 +4,7 @@ A slave URI at the master only tells the port of the lease (``http://HOST:PORT/`
 libraries cannot read a URI with a path: roslisp calls such a URI malformed, and ROS.NET takes all
 that follows the colon for the port. So the proxy keeps the rest at the parameter server, as
 roslaunch does with data that outlast roslaunch. The value is a text with a line for each lease: the
-advertised port, the node's own address in the form of `rosproxy.ros1.protocol.uris.inside_path`,
+advertised port, the node's own address in the form of `rosproxy.shared.uris.inside_path`,
 and the TCPROS ports of services, which nodes do not tell:
 
     50000 /172.30.0.11:38191/ 41234
@@ -21,10 +21,10 @@ from itertools import islice
 
 import msgspec
 
-from rosproxy.leases.ports import PortMap
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.uris import InsidePath, inside_path, parse_inside_path
 from rosproxy.ros1.registry.endpoint import MOST_SERVICE_PORTS, Endpoint
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortMap
+from rosproxy.shared.uris import InsidePath, inside_path, parse_inside_path
 
 _NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9]")
 _LINE = re.compile(r"(\d{1,5}) (/\S{1,4096}/)((?: \d{1,5})*)")

@@ -24,16 +24,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from hashlib import blake2b
 
-from rosproxy.leases.ports import STAND_IN_PORTS
-from rosproxy.net.addresses import HostPort, is_address, is_loopback
-from rosproxy.ros1.protocol.uris import (
+from rosproxy.shared.addresses import HostPort, is_address, is_loopback
+from rosproxy.shared.ports import STAND_IN_PORTS
+from rosproxy.shared.settings import Settings
+from rosproxy.shared.uris import (
     LONGEST_URI,
     parse_service_uri,
     parse_slave_uri,
     service_uri,
     slave_uri,
 )
-from rosproxy.settings import Settings
 
 MOST_STAND_INS = 1024
 """The highest number of stand-ins."""

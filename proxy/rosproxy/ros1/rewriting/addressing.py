@@ -9,9 +9,12 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from rosproxy.leases.ports import PortMap
-from rosproxy.net.addresses import HostPort, Network, is_inside
-from rosproxy.ros1.protocol.uris import (
+from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.registry import Registry
+from rosproxy.ros1.registry.stand_ins import StandIns
+from rosproxy.shared.addresses import HostPort, Network, is_inside
+from rosproxy.shared.ports import PortMap
+from rosproxy.shared.uris import (
     parse_inside_path,
     parse_service_uri,
     parse_slave_uri,
@@ -19,9 +22,6 @@ from rosproxy.ros1.protocol.uris import (
     slave_uri,
     with_caller_address,
 )
-from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.registry import Registry
-from rosproxy.ros1.registry.stand_ins import StandIns
 
 
 class Caller(msgspec.Struct, frozen=True):

@@ -17,7 +17,6 @@ from msgspec.structs import replace
 
 from rosproxy.ros1.protocol.master_methods import Reply
 from rosproxy.ros1.protocol.status_triples import replace_value
-from rosproxy.ros1.protocol.uris import parse_service_uri, with_caller_address
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.multicall import insert_items
 from rosproxy.ros1.protocol.xmlrpc.values import Edit, Value
@@ -34,6 +33,7 @@ from rosproxy.ros1.rewriting.master_calls import (
     Request,
     read_reply,
 )
+from rosproxy.shared.uris import parse_service_uri, with_caller_address
 
 ResultFilter = Callable[[CallResult, Caller], Sequence[Edit]]
 """The edits of a result that hide or add parts for a caller; empty if there are none.

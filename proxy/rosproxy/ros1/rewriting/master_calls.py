@@ -22,7 +22,6 @@ from rosproxy.ros1.protocol.master_methods import (
     resolve_name,
 )
 from rosproxy.ros1.protocol.status_triples import ros_triple
-from rosproxy.ros1.protocol.uris import with_caller_address
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Value
@@ -30,6 +29,7 @@ from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL, inner_calls, inner_items
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting.addressing import Caller
+from rosproxy.shared.uris import with_caller_address
 
 
 class LocalAnswer(msgspec.Struct, frozen=True):

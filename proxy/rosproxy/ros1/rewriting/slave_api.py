@@ -13,15 +13,15 @@ from functools import partial
 
 import msgspec
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.status_triples import replace_in_message, replace_value, ros_triple
-from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.protocol.xmlrpc.values import Edit, Value
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.uris import parse_slave_uri
 
 _URI_REPLIES = frozenset({"getUri", "getMasterUri"})
 _REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}

@@ -9,10 +9,10 @@ import binascii
 
 import msgspec
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.values import Edit, Value
+from rosproxy.shared.addresses import HostPort
 
 PROTOCOL = "UDPROS"
 

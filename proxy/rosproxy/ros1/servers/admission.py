@@ -11,7 +11,7 @@ takes back the registrations of the latter (`_make_room`). So neither dead URIs 
 former proxies keep a port from a live node.
 
 Log messages begin with the source address. So a source that makes up names is a single subject, and
-the log bounds the lines of a subject (`rosproxy.telemetry.logs`).
+the log bounds the lines of a subject (`rosproxy.shared.output.logs`).
 
 The proxy probes a new node at once, to report at once if the node is unreachable. If a node
 registers again, its port listens again, even if the node counted as dead.
@@ -23,11 +23,8 @@ import logging
 from typing import Protocol
 
 from rosproxy.binding import PORTS
-from rosproxy.net.addresses import HostPort, is_loopback
-from rosproxy.net.resolver import resolve
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.leases import Leases
-from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, with_caller_address
 from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.node_health import ProbeResult
@@ -40,6 +37,9 @@ from rosproxy.ros1.rewriting.master_calls import (
     Passing,
     refusal,
 )
+from rosproxy.shared.addresses import HostPort, is_loopback
+from rosproxy.shared.machine.resolver import resolve
+from rosproxy.shared.uris import parse_service_uri, parse_slave_uri, with_caller_address
 
 log = logging.getLogger(__name__)
 

@@ -21,11 +21,11 @@ import logging
 from collections import Counter
 from collections.abc import Iterable
 
-from rosproxy.net.addresses import is_loopback
-from rosproxy.net.interfaces import is_own
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry import client_kinds
 from rosproxy.ros1.registry.client_kinds import ClientKind
+from rosproxy.shared.addresses import is_loopback
+from rosproxy.shared.machine.interfaces import is_own
 
 log = logging.getLogger(__name__)
 

@@ -16,9 +16,6 @@ from typing import Protocol
 
 from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
-from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort, is_loopback
-from rosproxy.net.budget import Charge, OverBudget
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.policy.denial import Denial
@@ -27,6 +24,9 @@ from rosproxy.ros1.protocol.name_lengths import too_long_to_connect
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import ROSOUT
+from rosproxy.shared.addresses import HostPort, is_loopback
+from rosproxy.shared.connections import sockets
+from rosproxy.shared.connections.budget import Charge, OverBudget
 from rosproxy.telemetry.metrics import Traffic
 
 log = logging.getLogger(__name__)

@@ -20,9 +20,6 @@ from typing import TypeVar
 
 from aiohttp import ClientError
 
-from rosproxy.net.addresses import parse_host_port
-from rosproxy.net.bodies import TooLong, is_plain, read_bounded
-from rosproxy.net.budget import Charge, OverBudget
 from rosproxy.net.http_client import LongReply
 from rosproxy.net.http_server import (
     BadBody,
@@ -32,7 +29,6 @@ from rosproxy.net.http_server import (
     HttpServer,
     text_reply,
 )
-from rosproxy.net.sockets import end_if_stalled, hang_up, peek
 from rosproxy.net.time_limits import TimeLimit, TimeLimits
 from rosproxy.ros1.clients.master_client import LOOP_HEADER, Unreachable
 from rosproxy.ros1.context import MANY_VALUES, Context
@@ -41,7 +37,11 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.limits import Limits
 from rosproxy.ros1.servers.long_calls import LongCall, LongCalls
-from rosproxy.settings import MEBIBYTE
+from rosproxy.shared.addresses import parse_host_port
+from rosproxy.shared.connections.budget import Charge, OverBudget
+from rosproxy.shared.connections.sockets import end_if_stalled, hang_up, peek
+from rosproxy.shared.http.bodies import TooLong, is_plain, read_bounded
+from rosproxy.shared.settings import MEBIBYTE
 from rosproxy.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)

@@ -11,16 +11,16 @@ import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort, is_inside, is_loopback
-from rosproxy.net.interfaces import is_own
-from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.policy.denial import Denial
-from rosproxy.ros1.protocol.uris import parse_service_uri, path_of
 from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.registry.stand_ins import StandIn
+from rosproxy.shared.addresses import HostPort, is_inside, is_loopback
+from rosproxy.shared.connections import sockets
+from rosproxy.shared.machine.interfaces import is_own
+from rosproxy.shared.machine.resolver import NODES, resolve
+from rosproxy.shared.uris import parse_service_uri, path_of
 
 log = logging.getLogger(__name__)
 

@@ -26,12 +26,8 @@ from functools import partial
 from typing import Any
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.uris import parse_service_uri, slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry import stand_ins
 from rosproxy.ros1.registry.client_kinds import ClientKind
@@ -44,6 +40,10 @@ from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, coun
 from rosproxy.ros1.stand_ins.outside_nodes import RETRY_TIMEOUT_S, Outside, OutsideNode
 from rosproxy.ros1.stand_ins.publisher_lookup import PublisherLookup
 from rosproxy.ros1.stand_ins.udpros_relays import UdprosRelays
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.connections import sockets
+from rosproxy.shared.connections.sockets import Acceptor
+from rosproxy.shared.uris import parse_service_uri, slave_uri
 
 log = logging.getLogger(__name__)
 

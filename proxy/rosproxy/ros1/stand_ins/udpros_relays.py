@@ -34,9 +34,6 @@ from hashlib import blake2b
 import msgspec
 
 from rosproxy.forwarding.datagrams import DatagramRelay, bind
-from rosproxy.leases.ports import STAND_IN_PORTS
-from rosproxy.net.addresses import HostPort, subnet
-from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
@@ -47,6 +44,9 @@ from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.rewriting.udpros_offers import read_offers, redirect_offer
 from rosproxy.ros1.stand_ins.outside_nodes import Outside
+from rosproxy.shared.addresses import HostPort, subnet
+from rosproxy.shared.machine.resolver import NODES, resolve
+from rosproxy.shared.ports import STAND_IN_PORTS
 
 log = logging.getLogger(__name__)
 

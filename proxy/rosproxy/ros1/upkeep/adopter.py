@@ -16,13 +16,9 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from rosproxy.fixes import how_to_in_a_sentence
-from rosproxy.net.addresses import HostPort, is_inside
-from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.leases import Leases
-from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.rewriting.addressing import Caller
@@ -32,6 +28,10 @@ from rosproxy.ros1.upkeep.decisions.adoption import Container, DirectNode
 from rosproxy.ros1.upkeep.decisions.registration import is_known_as
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.verifier import Verifier
+from rosproxy.shared.addresses import HostPort, is_inside
+from rosproxy.shared.fixes import how_to_in_a_sentence
+from rosproxy.shared.machine.resolver import resolve
+from rosproxy.shared.uris import parse_slave_uri
 
 log = logging.getLogger(__name__)
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.leases import Leases
@@ -29,6 +28,7 @@ from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import Resubscriber
 from rosproxy.ros1.upkeep.verifier import Verifier
+from rosproxy.shared.addresses import HostPort
 
 log = logging.getLogger(__name__)
 

@@ -10,13 +10,13 @@ import asyncio
 import logging
 from urllib.parse import urlsplit
 
-from rosproxy.fixes import how_to_in_a_sentence
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
+from rosproxy.shared.fixes import how_to_in_a_sentence
 
 log = logging.getLogger(__name__)
 

@@ -18,7 +18,6 @@ import logging
 from dataclasses import dataclass, field
 
 from rosproxy.access.access_policy import OFFER_KINDS
-from rosproxy.admin.requests import EnforcementCounts
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
@@ -29,6 +28,7 @@ from rosproxy.ros1.servers.tcpros_server import UNREGISTERED, TcprosServer
 from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
+from rosproxy.shared.documents.requests import EnforcementCounts
 
 log = logging.getLogger(__name__)
 

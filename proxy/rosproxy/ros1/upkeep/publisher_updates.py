@@ -14,15 +14,15 @@ import asyncio
 import logging
 from collections.abc import Iterable, Sequence
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.decisions import registration as decisions
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.uris import parse_slave_uri
 
 log = logging.getLogger(__name__)
 

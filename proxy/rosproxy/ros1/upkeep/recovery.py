@@ -29,8 +29,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.net.addresses import is_inside
-from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.leases import Leases
@@ -43,6 +41,8 @@ from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import Resubscriber
 from rosproxy.ros1.upkeep.verifier import Verifier
+from rosproxy.shared.addresses import is_inside
+from rosproxy.shared.machine.resolver import resolve
 
 log = logging.getLogger(__name__)
 

@@ -22,12 +22,12 @@ from dataclasses import replace
 from rosproxy.ros1.clients.master_client import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_slave_uri, service_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.upkeep.decisions import registration as decisions
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
+from rosproxy.shared.uris import parse_slave_uri, service_uri
 
 log = logging.getLogger(__name__)
 

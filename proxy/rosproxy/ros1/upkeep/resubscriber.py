@@ -23,12 +23,9 @@ from itertools import islice
 from random import randrange
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.net.resolver import NODES, resolve
-from rosproxy.net.tasks import in_turns
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.registry.stand_ins import StandIn
@@ -39,6 +36,9 @@ from rosproxy.ros1.upkeep.decisions.registration import one_publisher_per_topic
 from rosproxy.ros1.upkeep.decisions.resubscription import BusRow, TopicSubscription
 from rosproxy.ros1.upkeep.publisher_updates import MOST_PARALLEL_CALLS, PublisherUpdates
 from rosproxy.ros1.upkeep.registrar import Registrar
+from rosproxy.shared.machine.resolver import NODES, resolve
+from rosproxy.shared.tasks import in_turns
+from rosproxy.shared.uris import parse_slave_uri
 
 log = logging.getLogger(__name__)
 

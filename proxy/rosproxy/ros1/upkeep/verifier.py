@@ -17,13 +17,13 @@ confirmed by a service.
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.clients.node_client import NodeClient
-from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import ROSOUT, NodeInfo
 from rosproxy.ros1.upkeep.decisions import recovery_claims
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.uris import parse_service_uri
 
 
 @dataclass(frozen=True, slots=True)

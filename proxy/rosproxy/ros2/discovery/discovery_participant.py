@@ -12,11 +12,11 @@ names, and that has not come.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.announcement import READER_ENDPOINTS, announcement, dispose_message
 from rosproxy.ros2.protocol.reliable import MOST_ASKED, Heartbeat, acknack, heartbeats
 from rosproxy.ros2.protocol.rtps import samples
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
+from rosproxy.shared.addresses import HostPort
 
 LEASE_DURATION_S = 12.0
 """Seconds after the last announcement until others forget the discovery participant. The duration

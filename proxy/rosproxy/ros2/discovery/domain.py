@@ -48,7 +48,6 @@ from itertools import islice
 
 from msgspec.structs import replace
 
-from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.announcements.to_inside import AnnouncementsToInside, ForInside
 from rosproxy.ros2.discovery.announcements.to_outside import AnnouncementsToOutside, ForOutside
 from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
@@ -103,6 +102,7 @@ from rosproxy.ros2.rewriting.discovery import (
 from rosproxy.ros2.sources.address_proofs import AddressProofs, is_question_of_proxy
 from rosproxy.ros2.sources.claimed_addresses import claim_fault
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing, cost
+from rosproxy.shared.ports import PortPool
 
 MOST_ENDED_PER_CALL = 64
 """Participants of a side that `Domain.expire` ends in one call."""

@@ -9,7 +9,6 @@ not pass on an announcement of these participants between the sides.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announcements.to_inside import ForInside
 from rosproxy.ros2.discovery.announcements.to_outside import ForOutside
 from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
@@ -25,6 +24,7 @@ from rosproxy.ros2.registry.participants import InsideParticipant, OutsidePartic
 from rosproxy.ros2.rewriting.announced_participant import first_metatraffic
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
 from rosproxy.ros2.sources.address_proofs import AddressProofs
+from rosproxy.shared.addresses import HostPort
 
 
 @dataclass(slots=True)

@@ -28,7 +28,6 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Final
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announcements.to_inside import AnnouncementsToInside
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
 from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
@@ -37,6 +36,7 @@ from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.rtps import RtpsError
 from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant
 from rosproxy.ros2.rewriting.discovery import read_discovery, rewritten
+from rosproxy.shared.addresses import HostPort
 
 SEPARATION_S = 0.4
 """Seconds in which a dispose message arrives and takes effect on both sides."""

@@ -22,8 +22,6 @@ from functools import partial
 
 from rosproxy.forwarding import datagrams
 from rosproxy.forwarding.datagrams import DATAGRAMS_PER_TURN, LARGEST_DATAGRAM
-from rosproxy.leases.domain_ports import multicast_port
-from rosproxy.net.addresses import HostPort, plain_address
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.lan_relay.sources import SOURCE_BURST_UNITS, SOURCE_UNITS_PER_SECOND, LanSources
 from rosproxy.ros2.protocol.relay_envelope import LIST_MAGIC, listed_addresses, wrapped
@@ -33,6 +31,8 @@ from rosproxy.ros2.rewriting.discovery import read_discovery
 from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
 from rosproxy.ros2.sources.rates import DiscoveryRates
+from rosproxy.shared.addresses import HostPort, plain_address
+from rosproxy.shared.domain_ports import multicast_port
 
 log = logging.getLogger(__name__)
 

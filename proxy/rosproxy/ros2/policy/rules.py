@@ -1,11 +1,10 @@
-"""Which rule of the policy applies to a reader or writer of DDS (`rosproxy.access.rules`).
+"""Which rule of the policy applies to a reader or writer of DDS (`rosproxy.shared.policy.rules`).
 
 The rules name topics and services as seen from inside. A service has two topics in DDS, for
 requests and for replies. Each topic has readers and writers. So the kind of rule follows from the
 name of the topic, and from the direction of the data.
 """
 
-from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.protocol.ros_names import (
     GRAPH_TOPIC,
     is_of_requests,
@@ -13,6 +12,7 @@ from rosproxy.ros2.protocol.ros_names import (
     ros_name,
 )
 from rosproxy.ros2.registry.participants import EndpointKind
+from rosproxy.shared.policy.rules import RuleKind
 
 
 def rule_about(kind: EndpointKind, dds_topic: str, is_inside: bool) -> tuple[RuleKind, str] | None:

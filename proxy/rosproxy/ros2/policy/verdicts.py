@@ -8,11 +8,11 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
-from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.domain_settings import Judge
 from rosproxy.ros2.policy.rules import rule_about
 from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import Announcement
+from rosproxy.shared.policy.rules import RuleKind
 
 MOST_VERDICTS = 1024
 """The highest number of remembered verdicts of a participant; a participant has some hundreds. A

@@ -12,7 +12,6 @@ from collections.abc import Collection, Container, Iterable, Iterator, Mapping, 
 from dataclasses import dataclass, field
 from typing import NamedTuple, Self
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import (
     MOST_PER_ADDRESS,
     MOST_WAITING,
@@ -25,6 +24,7 @@ from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.announced_participant import first_metatraffic
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 from rosproxy.ros2.sources.address_proofs import AddressProofs
+from rosproxy.shared.addresses import HostPort
 
 ANSWER_TIMEOUT_S = 5.0
 """Seconds that a participant has to name its former ports."""

@@ -12,14 +12,14 @@ the port. Meanwhile the kernel goes on forwarding.
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from rosproxy.leases.ports import PortPool
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.ports.mappings import PortMappings
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortPool
 
 
 @dataclass(eq=False, slots=True)
 class ForwardedPort:
-    """A port and its locator, as `rosproxy.leases.fast_ports.LeaseHolder`.
+    """A port and its locator, as `rosproxy.forwarding.fast_ports.LeaseHolder`.
 
     ``is_down`` stays False, because nothing reports whether a locator answers. ``fast_peers`` stays
     empty, because datagrams have no connections.
@@ -56,7 +56,7 @@ class ForwardedPort:
 
 
 class KernelPorts:
-    """The ports that the kernel may forward, as `rosproxy.leases.fast_ports.LeaseHolders`.
+    """The ports that the kernel may forward, as `rosproxy.forwarding.fast_ports.LeaseHolders`.
 
     ``domains`` are the port mappings of each domain. ``pool`` has the ports of all domains.
     """

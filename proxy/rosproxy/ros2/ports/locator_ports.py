@@ -25,10 +25,10 @@ from functools import partial
 from hashlib import blake2b
 from itertools import chain
 
-from rosproxy.leases.ports import PortPool, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import destination, of_built_in_writer
 from rosproxy.ros2.registry.participants import TrafficKind
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortPool, PortRange
 
 MOST_NAMED = 8
 """Participants that may be named at one port. If more are named, the names count for nothing. A

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import MOST_MAPPINGS, DomainSettings, Refused
 from rosproxy.ros2.ports.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import (
@@ -21,6 +20,7 @@ from rosproxy.ros2.registry.participants import (
 )
 from rosproxy.ros2.rewriting.discovery import Announcement
 from rosproxy.ros2.sources.address_proofs import AddressProofs
+from rosproxy.shared.addresses import HostPort
 
 PART_FOR_PROVEN = 4
 """If at most 1/PART_FOR_PROVEN of the range is free, only participants that have answered get

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 
-from rosproxy.leases.ports import STAND_IN_PORTS
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import MOST_MAPPINGS, DomainSettings, Refused
 from rosproxy.ros2.ports.locator_ports import order_for
 from rosproxy.ros2.registry.participants import OutsideParticipant, PortMapping, TrafficKind
 from rosproxy.ros2.sources.claimed_addresses import is_proxy_port
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import STAND_IN_PORTS
 
 MOST_PORTS_TRIED = 32
 """The highest number of ports that are tried for a locator outside."""

@@ -65,12 +65,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b, pbkdf2_hmac
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.announcement import PORT_STORE_ENDPOINTS, announcement, dispose_message
 from rosproxy.ros2.protocol.reliable import acknowledged, heartbeat
 from rosproxy.ros2.protocol.rtps import HEADER_BYTES, NO_VENDOR, PREFIX_BYTES
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
 
 COUNTS_EACH_SECOND = 4
 """Heartbeat counts per second of Unix time (`PortStore._heartbeat_datagrams`)."""

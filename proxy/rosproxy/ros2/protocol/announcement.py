@@ -8,10 +8,10 @@ import struct
 from collections.abc import Iterable
 from functools import lru_cache
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import NO_VENDOR, SENTINEL, VERSION, SubmessageId, message_header
+from rosproxy.shared.addresses import HostPort
 
 _SPDP_READER = 0x000100C7
 _SPDP_WRITER = 0x000100C2

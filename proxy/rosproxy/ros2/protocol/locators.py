@@ -11,9 +11,9 @@ from ipaddress import IPv4Address, IPv6Address
 
 import msgspec
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.parameters import Parameter, ParameterList
 from rosproxy.ros2.protocol.rtps import Overwrite
+from rosproxy.shared.addresses import HostPort
 
 LOCATOR_BYTES = 24
 """Bytes of a locator."""

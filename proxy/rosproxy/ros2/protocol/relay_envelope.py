@@ -13,8 +13,8 @@ from collections.abc import Iterable, Iterator
 from ipaddress import IPv6Address, ip_address
 from itertools import islice
 
-from rosproxy.net.addresses import plain_address
 from rosproxy.ros2.protocol.rtps import RtpsError
+from rosproxy.shared.addresses import plain_address
 
 LIST_MAGIC = b"ADDR"
 MOST_LISTED = 256

@@ -5,7 +5,7 @@ DDS calls the topic ``/chatter`` ``rt/chatter``. A service has two topics, ``rq/
 namespace, ``dds_``.
 """
 
-from rosproxy.net.addresses import cached
+from rosproxy.shared.addresses import cached
 
 GRAPH_TOPIC = "ros_discovery_info"
 """The topic on which participants publish their nodes. Without this topic, `ros2 node list` is

@@ -12,12 +12,12 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.qos import EndpointQos
 from rosproxy.ros2.protocol.ros_names import GRAPH_TOPIC
 from rosproxy.ros2.protocol.rtps import CYCLONE_DDS, FAST_DDS, NO_VENDOR, RTI
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.rules import RuleKind
 
 VENDORS = {
     NO_VENDOR: "rosproxy",

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 
-from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.ros2.protocol.locators import LocatorKind, read_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.qos import read_qos
@@ -16,6 +15,7 @@ from rosproxy.ros2.registry.participants import (
     ParticipantTraits,
 )
 from rosproxy.ros2.rewriting.discovery import Announcement
+from rosproxy.shared.addresses import HostPort, is_loopback
 
 LONGEST_LEASE_DURATION_S = 300.0
 """Upper bound in seconds for the lease duration that a participant announces."""

@@ -19,7 +19,6 @@ from enum import IntEnum
 
 import msgspec
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import read_locator, replaced
 from rosproxy.ros2.protocol.parameters import (
     OLD_LOCATORS,
@@ -50,6 +49,7 @@ from rosproxy.ros2.protocol.rtps import (
     submessages,
 )
 from rosproxy.ros2.registry.participants import EndpointKind
+from rosproxy.shared.addresses import HostPort
 
 UNICAST = (
     Pid.UNICAST_LOCATOR,

@@ -35,9 +35,6 @@ from functools import partial
 from rosproxy.forwarding import datagrams
 from rosproxy.forwarding.buffer_sizes import UDP_RECEIVE_BUFFER_BYTES
 from rosproxy.forwarding.datagrams import LARGEST_DATAGRAM
-from rosproxy.leases.ports import PortPool
-from rosproxy.net.addresses import HostPort, plain_address
-from rosproxy.net.tasks import in_turns
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import (
     NEXT_PORTS,
@@ -54,6 +51,9 @@ from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
 from rosproxy.ros2.servers.receive_buffers import ReceiveBuffers
 from rosproxy.ros2.sources.selected import SelectedAddresses
+from rosproxy.shared.addresses import HostPort, plain_address
+from rosproxy.shared.ports import PortPool
+from rosproxy.shared.tasks import in_turns
 
 log = logging.getLogger(__name__)
 

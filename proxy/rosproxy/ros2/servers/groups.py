@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from rosproxy.forwarding.datagrams import enlarge_receive_buffer
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.interfaces import interface_index
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.machine.interfaces import interface_index
 
 GROUP = "239.255.0.1"
 """The IPv4 group for announcements (DDSI-RTPS 2.5, 9.6.2.4.1)."""

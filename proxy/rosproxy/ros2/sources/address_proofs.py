@@ -17,7 +17,6 @@ from hashlib import blake2b
 from itertools import islice
 from typing import Any
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.announcement import WRITER_ENDPOINTS, announcement
 from rosproxy.ros2.protocol.reliable import heartbeat, heartbeats
@@ -33,6 +32,7 @@ from rosproxy.ros2.protocol.rtps import (
 )
 from rosproxy.ros2.registry.participants import ParticipantTable
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, DiscoveryMessage
+from rosproxy.shared.addresses import HostPort
 
 LEASE_DURATION_S = 12.0
 """Seconds for which a participant remembers the participant in a question. Cyclone DDS announces

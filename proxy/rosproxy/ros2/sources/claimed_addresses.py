@@ -7,8 +7,8 @@ inside, to the machine of the proxy, or to the proxy's own ports.
 
 from collections.abc import Container
 
-from rosproxy.net.addresses import HostPort, as_ip, is_ipv6_link_local, is_loopback
 from rosproxy.ros2.domain_settings import DomainSettings
+from rosproxy.shared.addresses import HostPort, as_ip, is_ipv6_link_local, is_loopback
 
 _BROADCAST = "255.255.255.255"
 

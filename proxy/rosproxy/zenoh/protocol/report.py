@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from rosproxy.net.addresses import HostPort, parse_authority, plain_address
+from rosproxy.shared.addresses import HostPort, parse_authority, plain_address
 
 LONGEST_REPORT = 16 * 1024 * 1024
 """Bytes of a line. A report with the most sessions and the most tokens has some 10 MB."""

@@ -6,7 +6,7 @@ from typing import Any
 
 from msgspec import structs
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.labels.members import find_members, read_labels

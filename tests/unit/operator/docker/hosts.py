@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Sequence
 from typing import TypeVar
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.docker.planner.actions import Action, CreateSandbox, Start
 from rosproxy_operator.docker.planner.model import STARTED
 from rosproxy_operator.docker.planner.plan import DockerPlan

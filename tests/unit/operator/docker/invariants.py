@@ -2,8 +2,8 @@
 
 from msgspec import structs
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.port_ranges import overlap
 from rosproxy_operator.docker.planner.actions import Create, CreateLanRelay, CreateSandbox
 from rosproxy_operator.docker.planner.desired import proxy_spec

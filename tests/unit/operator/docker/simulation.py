@@ -4,8 +4,8 @@ import itertools
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,

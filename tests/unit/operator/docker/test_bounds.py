@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from rosproxy.setting_kinds import SlaveControl
+from rosproxy.shared.setting_kinds import SlaveControl
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.option_values import read_host_pattern
 from rosproxy_operator.docker.planner.actions import Connect, Create, CreateSandbox

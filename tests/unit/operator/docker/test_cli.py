@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from rosproxy.access.layers import PolicyMode
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyMode
 from rosproxy_operator.cli import main
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker import host_status

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from msgspec import structs
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.master_resolver import MasterResolver
 from rosproxy_operator.common.operator_metrics import DockerMetrics

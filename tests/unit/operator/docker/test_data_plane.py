@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from msgspec import structs
 
-from rosproxy.setting_kinds import DataPlane
+from rosproxy.shared.setting_kinds import DataPlane
 from rosproxy_operator.docker.planner.actions import Action, Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Container, Proxy, Sandbox
 from rosproxy_operator.docker.planner.plan import DockerPlan

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from msgspec import structs
 
-from rosproxy.setting_kinds import Direction
+from rosproxy.shared.setting_kinds import Direction
 from rosproxy_operator.docker.planner.actions import Create
 from rosproxy_operator.docker.planner.model import Container, Network
 from rosproxy_operator.docker.planner.specs import container_config, proxy_fingerprint

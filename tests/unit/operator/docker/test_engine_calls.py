@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import hash_token
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.setting_kinds import hash_token
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.engine_json import uplink_secret

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from rosproxy.net.tasks import Tasks
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.docker.errors import EngineError, PortTaken
 from rosproxy_operator.docker.executor import Executor
 from rosproxy_operator.docker.planner.actions import Action, Connect, CreateNetwork, Remove, Start

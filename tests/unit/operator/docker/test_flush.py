@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from msgspec import structs
 
-from rosproxy.admin.doctor_finding import Severity
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.documents.doctor_finding import Severity
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.doctor import host_findings
 from rosproxy_operator.docker.engine_json import check_inspection, read_making

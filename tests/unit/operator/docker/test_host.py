@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.docker import host
 
 TCP = """\

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from rosproxy.admin.status_document import (
+from rosproxy.shared.documents.status_document import (
     DomainStatus,
     ParticipantStatus,
     ProxyStatus,
@@ -14,7 +14,7 @@ from rosproxy.admin.status_document import (
     ZenohSessionStatus,
     ZenohStatus,
 )
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.problem import Problem, with_fix
 from rosproxy_operator.docker.host_document import (
     NODES_STARTING_S,

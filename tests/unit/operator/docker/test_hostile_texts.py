@@ -8,7 +8,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.telemetry.logs import JsonLines, TextLines
+from rosproxy.shared.output.logs import JsonLines, TextLines
 from rosproxy_operator.docker.engine_json import check_inspection, read_container
 from rosproxy_operator.docker.host_document import host_document
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 from msgspec import structs
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.access.rules import MOST_RULES, Rule, parse_rules
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import MOST_RULES, Rule, parse_rules
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.docker.planner.actions import Create
 from rosproxy_operator.docker.planner.label_policy import (

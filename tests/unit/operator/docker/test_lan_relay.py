@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from msgspec import structs
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.docker.engine_json import read_making
 from rosproxy_operator.docker.planner.actions import (
     Action,

@@ -4,7 +4,7 @@ from contextlib import ExitStack, closing
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.docker.operator_sign import MOST_ENDPOINTS_ASKED, operators, publish_sign
 
 ENGINE = "unix:///test.sock"

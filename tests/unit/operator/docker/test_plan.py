@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from msgspec import structs
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.port_ranges import Move
 from rosproxy_operator.common.problem import ends_again
 from rosproxy_operator.docker.planner.actions import (

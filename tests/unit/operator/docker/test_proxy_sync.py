@@ -7,17 +7,17 @@ from typing import Any
 
 import pytest
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.access.rules import parse_rules
-from rosproxy.admin.status_document import (
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_document import (
     DomainStatus,
     LocatorStatus,
     ParticipantStatus,
     ProxyStatus,
 )
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.tasks import Tasks
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.docker import proxy_sync

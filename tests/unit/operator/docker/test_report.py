@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.telemetry.text import width
+from rosproxy.shared.output.text import width
 from rosproxy_operator.docker import host_status
 from rosproxy_operator.docker.host_status import HostStatus
 from rosproxy_operator.docker.planner.actions import (

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_document import ProxyStatus
 from rosproxy_operator.common.operator_metrics import DockerMetrics
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.docker import controller, host_status

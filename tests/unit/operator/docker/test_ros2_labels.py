@@ -6,7 +6,7 @@ from ipaddress import IPv4Network
 
 import pytest
 
-from rosproxy.access.rules import parse_rules
+from rosproxy.shared.policy.rules import parse_rules
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.ros2_variables import ROS2_VARIABLES
 from rosproxy_operator.docker.option_values import read_host_pattern

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.master_resolver import MasterResolver
 from rosproxy_operator.docker import snapshot
 from rosproxy_operator.docker.engine_client import DockerClient

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from rosproxy.access.rules import parse_rules
-from rosproxy.leases.ports import PortRange
-from rosproxy.setting_kinds import hash_token
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import hash_token
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.specs import (

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.access.rules import parse_rules
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.docker.engine_json import check_inspection, read_container, read_making
 from rosproxy_operator.docker.planner.actions import (
     Action,

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.access.rules import parse_rules
-from rosproxy.settings import MOST_ZENOH_LINKS
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.settings import MOST_ZENOH_LINKS
 from rosproxy_operator.cli import main
 from rosproxy_operator.docker.engine_json import read_making
 from rosproxy_operator.docker.planner.actions import Create

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from rosproxy.admin.status_document import RangeProbeStatus
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.documents.status_document import RangeProbeStatus
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.kubernetes.resources.cluster import (
     PodFailure,
     ProxyPod,

@@ -6,7 +6,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateProxy, Emit, PatchStatus
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite

@@ -8,7 +8,7 @@ import pytest
 from aiohttp import web
 from msgspec.structs import replace
 
-from rosproxy.net.tasks import Tasks
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.apply import ClusterApplier

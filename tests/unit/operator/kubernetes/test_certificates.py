@@ -15,7 +15,7 @@ import pytest
 from cryptography import x509
 
 from examples.demo.fake_http import free_ports
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api, ApiError

@@ -3,9 +3,9 @@
 import pytest
 from click.testing import CliRunner, Result
 
-from rosproxy.access.layers import PolicyMode
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.layers import PolicyMode
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator import cli
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.resources.pod_defaults import PodDefaults
@@ -167,7 +167,7 @@ def test_a_wrong_word_is_one_line() -> None:
 def test_no_cluster_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
     default_location = "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION"
     monkeypatch.setattr(default_location, f"{tmp_path}/none")
-    monkeypatch.setattr("rosproxy.telemetry.logs.set_up", lambda *_: None)
+    monkeypatch.setattr("rosproxy.shared.output.logs.set_up", lambda *_: None)
     monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
     result = run()
     assert result.exit_code == 1

@@ -3,7 +3,7 @@
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import RangeProbeStatus
+from rosproxy.shared.documents.status_document import RangeProbeStatus
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.proxies.proxy_report import no_answer
 from rosproxy_operator.kubernetes.resources.cluster import Obstacle, PodFailure, ProxyReport

@@ -9,7 +9,7 @@ import pytest
 from aiohttp import web
 from msgspec import structs
 
-from rosproxy.setting_kinds import hash_token
+from rosproxy.shared.setting_kinds import hash_token
 from rosproxy_operator.common import control_loop
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.kubernetes import controller as module

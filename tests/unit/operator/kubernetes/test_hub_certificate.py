@@ -4,7 +4,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from msgspec.structs import replace
 
-from rosproxy.setting_kinds import read_hub_certificate
+from rosproxy.shared.setting_kinds import read_hub_certificate
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
 from rosproxy_operator.kubernetes.proxies.hub_certificate import (

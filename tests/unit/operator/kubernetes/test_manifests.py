@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.access.rules import parse_rules
-from rosproxy.leases.ports import PortRange
-from rosproxy.setting_kinds import hash_token
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import hash_token
 from rosproxy_operator.common.policy import POLICY_WAIT_S, administrators_policy
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite

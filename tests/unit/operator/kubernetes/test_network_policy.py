@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.leases.ports import STAND_IN_PORTS, PortRange
+from rosproxy.shared.ports import STAND_IN_PORTS, PortRange
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import CreatePolicy, DeletePolicy, SetPolicy
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan

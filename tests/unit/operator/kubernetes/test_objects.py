@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import RangeProbeStatus, read_status
-from rosproxy.settings import MOST_ZENOH_HUBS, MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
-from rosproxy.telemetry.problems import MOST_PROBLEMS
-from rosproxy.telemetry.text import clean
+from rosproxy.shared.documents.status_document import RangeProbeStatus, read_status
+from rosproxy.shared.output.problems import MOST_PROBLEMS
+from rosproxy.shared.output.text import clean
+from rosproxy.shared.settings import MOST_ZENOH_HUBS, MOST_ZENOH_LINKS, MOST_ZENOH_PEERS
 from rosproxy_operator.kubernetes.proxies import proxy_report as reports
 from rosproxy_operator.kubernetes.proxies.proxy_report import RECENT_S, no_answer, report
 from rosproxy_operator.kubernetes.resources import objects

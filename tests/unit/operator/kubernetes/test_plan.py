@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.planner.actions import (
     CreateProxy,

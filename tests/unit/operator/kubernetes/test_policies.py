@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.access.rules import parse_rules
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import parse_rules
 from rosproxy_operator.common.policy import administrators_policy
 from tests.unit.operator.kubernetes.objects import (
     SETTINGS,

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.access.rules import parse_rules
-from rosproxy.admin.status_document import ProxyStatus, read_status
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.tasks import Tasks
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_document import ProxyStatus, read_status
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.tasks import Tasks
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.kubernetes.planner.briefing import Briefing
 from rosproxy_operator.kubernetes.proxies import proxy_sync

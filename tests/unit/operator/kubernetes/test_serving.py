@@ -17,7 +17,7 @@ import kopf
 import pytest
 
 from examples.demo.fake_http import free_ports
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.common.operator_admin import MOST_CONNECTIONS
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.access.rules import RuleKind, format_rules, parse_rules
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.policy.rules import RuleKind, format_rules, parse_rules
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import Advertise, MasterSpec, Name, Selector
 from rosproxy_operator.kubernetes.resources.spec import invalid, rosproxy

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import RangeProbeStatus
-from rosproxy.leases.ports import PortRange
+from rosproxy.shared.documents.status_document import RangeProbeStatus
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.kubernetes.resources.cluster import (
     HelperPod,

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes import doctor_facts
 from rosproxy_operator.kubernetes.api.api_client import Api

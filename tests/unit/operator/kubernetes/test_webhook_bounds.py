@@ -13,7 +13,7 @@ import kopf
 import pytest
 
 from examples.demo.fake_http import free_ports
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.kubernetes.webhook import certificates, webhook_server
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateDirectory, CertificateRotation

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.access.rules import parse_rules
-from rosproxy.admin.status_document import (
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.status_document import (
     ProblemStatus,
     ProxyStatus,
     StatusSettings,
@@ -15,8 +15,8 @@ from rosproxy.admin.status_document import (
     ZenohSessionStatus,
     ZenohStatus,
 )
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.ports import PortRange
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import (

@@ -5,10 +5,15 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.access.rules import parse_rules
-from rosproxy.admin.status_document import ProxyStatus, StatusSettings, ZenohLinkStatus, ZenohStatus
-from rosproxy.zenoh.policy.key_expressions import check_limits
-from rosproxy.zenoh.policy.name_sets import check_layers
+from rosproxy.shared.documents.status_document import (
+    ProxyStatus,
+    StatusSettings,
+    ZenohLinkStatus,
+    ZenohStatus,
+)
+from rosproxy.shared.policy.rules import parse_rules
+from rosproxy.shared.zenoh_rules.key_expressions import check_limits
+from rosproxy.shared.zenoh_rules.name_sets import check_layers
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import DeleteProxy, Emit
 from rosproxy_operator.kubernetes.planner.bounds import bounds_violation

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 from msgspec.structs import replace
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.setting_kinds import hash_token
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.setting_kinds import hash_token
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.pods.selection import on_node, select_rosproxy, selects

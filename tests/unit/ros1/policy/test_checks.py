@@ -5,15 +5,16 @@ from typing import Any
 
 import pytest
 
-from rosproxy.access import rule_index, rules
+from rosproxy.access import rule_index
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rule_index import MOST_CALLER_COMPARISONS
-from rosproxy.access.rules import parse_rules
 from rosproxy.ros1.policy.checks import Ros1Policy
 from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.shared.output.problems import Problems
+from rosproxy.shared.policy import rules
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import parse_rules
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
 from tests.unit.builders import add_node, add_registration, make_addressing
 

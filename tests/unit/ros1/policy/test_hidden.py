@@ -6,9 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.policy.checks import topic_names
 from rosproxy.ros1.policy.denial import no_provider
 from rosproxy.ros1.policy.hidden import HiddenAnswers
@@ -18,6 +15,9 @@ from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry.endpoint import NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.rules import RuleKind
+from rosproxy.shared.ports import PortMap, PortRange
 from tests.unit.builders import make_stand_ins
 
 PORTS = PortRange(11000, 11009)

@@ -8,13 +8,13 @@ from rosproxy.ros1.protocol.name_lengths import (
     too_long_to_connect,
     too_long_to_register,
 )
-from rosproxy.ros1.protocol.uris import (
+from rosproxy.ros1.protocol.xmlrpc.document import parse_call
+from rosproxy.shared.uris import (
     LONGEST_URI,
     parse_inside_path,
     parse_service_uri,
     parse_slave_uri,
 )
-from rosproxy.ros1.protocol.xmlrpc.document import parse_call
 from tests.unit.builders import py_call
 
 REGISTRATIONS = {

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import multicall
 from rosproxy.ros1.protocol.xmlrpc.document import Value, XmlRpcError
 from rosproxy.ros1.rewriting import master_api, master_calls, slave_api
+from rosproxy.shared.addresses import HostPort
 from tests.unit.builders import (
     add_node,
     cpp_call,

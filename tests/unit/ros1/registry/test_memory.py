@@ -4,9 +4,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.uris import InsidePath, parse_inside_path
 from rosproxy.ros1.registry import remembered_leases
 from rosproxy.ros1.registry.endpoint import MOST_SERVICE_PORTS
 from rosproxy.ros1.registry.remembered_leases import (
@@ -15,6 +12,9 @@ from rosproxy.ros1.registry.remembered_leases import (
     parameter_of,
     read_leases,
 )
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortMap, PortRange
+from rosproxy.shared.uris import InsidePath, parse_inside_path
 from tests.unit.builders import add_node, make_addressing
 
 PORTS = PortMap(PortRange(45000, 45009), PortRange(30000, 30009))

@@ -5,11 +5,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master_client import read_value
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY
 from rosproxy.ros1.registry.endpoint import (
     LONGEST_REGISTRATION,
@@ -22,6 +19,9 @@ from rosproxy.ros1.registry.endpoint import (
 )
 from rosproxy.ros1.registry.node_health import Health
 from rosproxy.ros1.registry.registry import MOST_ADMISSIONS, RangeExhausted, Registry
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.uris import parse_slave_uri
 from tests.unit.builders import own_uri, py_reply
 
 PUB = Kind.PUBLISHER

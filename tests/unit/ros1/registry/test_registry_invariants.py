@@ -7,12 +7,12 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import RangeExhausted, Registry
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
+from rosproxy.shared.uris import slave_uri
 
 PORTS = PortRange(45000, 45005)
 ADDRESSES = st.sampled_from(["10.0.0.5", "10.0.0.6", "10.0.0.7"])

@@ -2,8 +2,8 @@
 
 from itertools import count
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.registry.stand_ins import MOST_TRIES, StandIn, StandIns
+from rosproxy.shared.addresses import HostPort
 from tests.unit.builders import make_stand_ins
 
 NEAR = "172.30.1.2"

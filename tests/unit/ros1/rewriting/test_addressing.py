@@ -2,10 +2,10 @@
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import NodeLocation
 from rosproxy.ros1.rewriting.addressing import Addressing
+from rosproxy.shared.addresses import HostPort
 from tests.unit.builders import PROXY, add_node, add_registration, make_addressing, make_caller
 
 LITERAL = "http://10.0.0.5:40001/"

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, service_uri, slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.remembered_leases import leases_text, read_leases
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.uris import parse_service_uri, parse_slave_uri, service_uri, slave_uri
 from tests.unit.builders import make_addressing
 
 ADDRESSES = st.sampled_from(

@@ -5,12 +5,12 @@ from typing import Any
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import MASTER_ONLY, Kind
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
 from rosproxy.ros1.rewriting import slave_api
 from rosproxy.ros1.rewriting.slave_api import CallView
+from rosproxy.shared.addresses import HostPort
 from tests.unit.builders import (
     DIALECTS,
     PROXY,

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.tcpros import encode_header
 from rosproxy.ros1.protocol.xmlrpc import document
 from rosproxy.ros1.rewriting.udpros_offers import read_offers, redirect_offer
+from rosproxy.shared.addresses import HostPort
 
 HERE = HostPort("10.0.0.1", 25000)
 

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, NodeInfo
@@ -12,6 +11,7 @@ from rosproxy.ros1.upkeep.decisions import adoption as policy
 from rosproxy.ros1.upkeep.decisions.adoption import DirectNode
 from rosproxy.ros1.upkeep.decisions.recovery_claims import confirmed_by
 from rosproxy.ros1.upkeep.decisions.registration import is_known_as
+from rosproxy.shared.addresses import HostPort
 from tests.unit.builders import add_node, make_addressing
 
 PUB = Kind.PUBLISHER

@@ -7,7 +7,7 @@ import pytest
 
 from rosproxy.ros1.clients.master_client import MasterError
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
-from rosproxy.telemetry.problems import Problems
+from rosproxy.shared.output.problems import Problems
 from tests.unit.builders import add_node, make_addressing
 
 

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry import remembered_leases
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, NodeInfo
 from rosproxy.ros1.upkeep.decisions import recovery_claims
 from rosproxy.ros1.upkeep.decisions.recovery_claims import Claim
+from rosproxy.shared.addresses import HostPort, is_inside
 from tests.unit.builders import add_node, add_registration, make_addressing
 
 PUB = Kind.PUBLISHER

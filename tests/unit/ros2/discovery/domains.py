@@ -5,8 +5,6 @@ from collections.abc import Iterable, Sequence
 from ipaddress import ip_address, ip_network
 from itertools import product
 
-from rosproxy.leases.ports import PortMap, PortPool, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import DomainSettings, Judge, LanRelayLink, Outgoing
 from rosproxy.ros2.ports.locator_ports import EVIDENCE_PERIOD_S
@@ -18,6 +16,8 @@ from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import HEADER_BYTES, source_prefix
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
 from rosproxy.ros2.sources.rates import BURST
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortMap, PortPool, PortRange
 from tests.unit.ros2.protocol.messages import data, message, parameter_list, payload, submessage
 
 INSIDE = "172.30.0.5"

@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     LAN_RELAY,

@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announcements import to_inside
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
@@ -13,6 +12,7 @@ from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import HEADER_BYTES, source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NEAR,

@@ -6,9 +6,6 @@ from itertools import chain
 
 import pytest
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.rediscovery import (
     MOST_PAIRS_PER_PART,
@@ -26,6 +23,9 @@ from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.rules import RuleKind
+from rosproxy.shared.ports import PortMap, PortRange
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NOW,

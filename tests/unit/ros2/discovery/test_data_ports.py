@@ -4,13 +4,13 @@ import struct
 
 import pytest
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import FAST_DDS, NO_VENDOR, RTI, SubmessageId, submessages
 from rosproxy.ros2.registry.participants import TrafficKind
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.rules import RuleKind
 from tests.unit.ros2.discovery.domains import (
     CYCLONE_DDS,
     INSIDE,

@@ -6,8 +6,6 @@ from math import inf
 
 import pytest
 
-from rosproxy.leases.ports import STAND_IN_PORTS
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.ports.locator_ports import order_for
@@ -15,6 +13,8 @@ from rosproxy.ros2.ports.stand_ins import MOST_SHARING
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import TrafficKind
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import STAND_IN_PORTS
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
     INSIDE,

@@ -6,8 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announcements import to_inside
 from rosproxy.ros2.discovery.announcements.to_outside import REPEAT_INTERVAL_S
 from rosproxy.ros2.discovery.domain import Domain
@@ -23,6 +21,8 @@ from rosproxy.ros2.protocol.rtps import source_prefix, source_vendor
 from rosproxy.ros2.registry.participants import ShortageKind, TrafficKind
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 from rosproxy.ros2.sources.rates import BURST, BYTES_PER_UNIT, cost
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortMap, PortRange
 from tests.unit.ros2.discovery.domains import (
     HOST,
     INSIDE,

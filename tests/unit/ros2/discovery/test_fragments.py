@@ -11,7 +11,6 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import fragments
 from rosproxy.ros2.discovery.fragments import OVERHEAD_BYTES, FragmentStores
 from rosproxy.ros2.protocol.addressing import destination
@@ -27,6 +26,7 @@ from rosproxy.ros2.rewriting.discovery import (
     read_discovery,
     rewritten,
 )
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.protocol.messages import (
     PREFIX,
     data,

@@ -7,9 +7,6 @@ from typing import NoReturn
 
 import pytest
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.announcements.to_outside import ForOutside
 from rosproxy.ros2.discovery.domain import MOST_ENDED_PER_CALL
@@ -31,6 +28,9 @@ from rosproxy.ros2.registry.participants import (
 )
 from rosproxy.ros2.rewriting import discovery
 from rosproxy.ros2.sources.rates import BURST
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.rules import RuleKind
+from rosproxy.shared.ports import PortMap, PortRange
 from tests.unit.ros2.discovery.domains import (
     HOST,
     INSIDE,

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.protocol.locators import pack_locator
@@ -12,6 +11,7 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.relay_envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import WINDOW_S, Direction, RelayProof
 from rosproxy.ros2.registry.participants import TrafficKind
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.discovery.domains import (
     HOST,
     INSIDE,

@@ -2,9 +2,6 @@
 
 import pytest
 
-from rosproxy.admin.requests import BodyError, ContainerUpdate, read_body
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announcements.to_inside import DISPOSE_MESSAGE_INTERVAL_S
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.rediscovery import LAN_RELAY_TIMEOUT_S, SEPARATION_S
@@ -12,6 +9,9 @@ from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from rosproxy.ros2.sources.rates import BURST
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.documents.requests import BodyError, ContainerUpdate, read_body
+from rosproxy.shared.ports import PortMap, PortRange
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     LAN_RELAY,

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.protocol.graph_sample import MOST_NODES, node_names
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import RtpsError
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NOW,

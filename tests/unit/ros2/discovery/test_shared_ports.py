@@ -4,7 +4,6 @@ import struct
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.addressing import MOST_UNREAD_SUBMESSAGES, may_be_discovery
@@ -12,6 +11,7 @@ from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import TrafficKind
 from rosproxy.ros2.sources.rates import BURST, BYTES_PER_UNIT
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NOW,

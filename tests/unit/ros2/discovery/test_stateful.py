@@ -12,14 +12,14 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.leases.ports import STAND_IN_PORTS
 from rosproxy.ros2.discovery import fragments
 from rosproxy.ros2.domain_settings import MOST_MAPPINGS, Outgoing
 from rosproxy.ros2.ports.stand_ins import MOST_SHARING
 from rosproxy.ros2.protocol.rtps import LAST_SEQUENCE_NUMBER, source_prefix
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from rosproxy.ros2.sources.rates import BURST, MOST_SOURCES
+from rosproxy.shared.policy.rules import RuleKind
+from rosproxy.shared.ports import STAND_IN_PORTS
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     LAN_RELAY,

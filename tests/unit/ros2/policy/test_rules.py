@@ -2,9 +2,9 @@
 
 import pytest
 
-from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.policy.rules import rule_about
 from rosproxy.ros2.registry.participants import EndpointKind
+from rosproxy.shared.policy.rules import RuleKind
 
 READER = EndpointKind.READER
 WRITER = EndpointKind.WRITER

@@ -5,8 +5,6 @@ from collections.abc import Iterable
 
 import pytest
 
-from rosproxy.access.rules import RuleKind
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.domain_settings import Outgoing
@@ -16,6 +14,8 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import SubmessageId, source_prefix, submessages
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from rosproxy.ros2.sources.rates import DiscoveryRates
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.policy.rules import RuleKind
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
     INSIDE,

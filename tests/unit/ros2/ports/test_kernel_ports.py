@@ -1,13 +1,13 @@
 """Ports that the kernel may forward: ports of user data, and ports from before the start."""
 
 from rosproxy.forwarding.kernel.decisions import HostForwarding, destination
-from rosproxy.leases.ports import PortPool
-from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.ports.former_ports import ANSWER_TIMEOUT_S
 from rosproxy.ros2.ports.kernel_ports import KernelPorts
 from rosproxy.ros2.ports.locator_ports import SETTLING_PERIOD_S
 from rosproxy.ros2.registry.participants import TrafficKind
+from rosproxy.shared.addresses import HostPort, Route
+from rosproxy.shared.ports import PortPool
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     OTHER,

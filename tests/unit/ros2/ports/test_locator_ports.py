@@ -7,8 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.leases.ports import PortPool, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.ports.locator_ports import (
     EVIDENCE_PERIOD_S,
     SETTLING_PERIOD_S,
@@ -18,6 +16,8 @@ from rosproxy.ros2.ports.locator_ports import (
     order_for,
 )
 from rosproxy.ros2.registry.participants import TrafficKind
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortPool, PortRange
 
 RANGE = PortRange(45000, 45019)
 DATA = TrafficKind.USER_DATA

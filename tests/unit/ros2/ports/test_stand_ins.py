@@ -5,8 +5,8 @@ from collections.abc import Callable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.leases.ports import STAND_IN_PORTS
 from rosproxy.ros2.ports.stand_ins import MOST_SHARING, stand_in_port
+from rosproxy.shared.ports import STAND_IN_PORTS
 
 
 @given(st.text(max_size=40))

@@ -6,8 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.ports.store import (
     COUNTS_EACH_SECOND,
     HALF_BITS,
@@ -18,6 +16,8 @@ from rosproxy.ros2.ports.store import (
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import HEADER_BYTES, source_prefix
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortRange
 from tests.unit.ros2.discovery.domains import kept_halves, kept_number
 
 RANGE = PortRange(11400, 11463)

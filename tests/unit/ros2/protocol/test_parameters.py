@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import Locator, pack_locator, read_locator, replaced
 from rosproxy.ros2.protocol.parameters import (
     ParameterList,
@@ -15,6 +14,7 @@ from rosproxy.ros2.protocol.parameters import (
     payload_parameters,
 )
 from rosproxy.ros2.protocol.rtps import MOST_PARAMETERS, RtpsError, Sample, apply, samples
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.protocol.messages import VALUES, data, message, order, parameter_list, payload
 
 BOTH = pytest.mark.parametrize("little", [True, False], ids=["little", "big"])

@@ -2,10 +2,10 @@
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.reliable import acknack, heartbeat, nack_frag
 from rosproxy.ros2.protocol.rtps import submessages
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.discovery.domains import LAN_RELAY, NOW, A, B, carried, make_domain, spdp, to
 
 OWN = bytes(range(12))

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import DdsSecurity, LocatorFault, ParticipantTraits
 from rosproxy.ros2.rewriting.announced_participant import traits
 from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.protocol.messages import VALUES, data, message, payload
 
 INSIDE = "172.30.0.5"

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import OLD_LOCATORS, Pid
 from rosproxy.ros2.protocol.rtps import RtpsError
@@ -18,6 +17,7 @@ from rosproxy.ros2.rewriting.discovery import (
     read_discovery,
     rewritten,
 )
+from rosproxy.shared.addresses import HostPort
 from tests.unit.ros2.protocol.messages import (
     data,
     fragment,

@@ -5,8 +5,6 @@ from functools import partial
 
 import pytest
 
-from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import (
     MOST_ANNOUNCED_UNPROVEN,
@@ -36,6 +34,8 @@ from rosproxy.ros2.sources.address_proofs import (
     AddressProofs,
 )
 from rosproxy.ros2.sources.rates import BURST, Standing
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.ports import PortMap, PortRange
 from tests.unit.ros2.discovery.domains import (
     HOST,
     INSIDE,

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy.zenoh.protocol.report import (
     Ends,
     Report,

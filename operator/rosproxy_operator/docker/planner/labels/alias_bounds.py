@@ -16,7 +16,7 @@ Besides, the answer of a name server changes, and each change would cut connecti
 import re
 from fnmatch import fnmatchcase
 
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.shared.uris import parse_slave_uri
 from rosproxy_operator.docker.planner.labels.readers import MOST_HOST_CHARACTERS
 from rosproxy_operator.docker.settings import PlanSettings
 

@@ -12,9 +12,9 @@ gets the part that is allowed, and a warning.
 from dataclasses import replace
 from fnmatch import fnmatchcase
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.setting_kinds import DataPlane, read_peer, read_site_link
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.setting_kinds import DataPlane, read_peer, read_site_link
+from rosproxy.shared.uris import parse_slave_uri
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.settings import PlanSettings

@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 
-from rosproxy.telemetry.text import listed
+from rosproxy.shared.output.text import listed
 from rosproxy_operator.common.problem import (
     MASTER_UNKNOWN,
     NO_ADVERTISE_HOST,

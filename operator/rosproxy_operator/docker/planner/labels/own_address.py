@@ -8,7 +8,7 @@ the proxy replaces the address. Two values do harm:
   that address, and ends before any call to a master (`ROSLaunchNode.start` in roslaunch/server.py).
 """
 
-from rosproxy.net.addresses import is_loopback
+from rosproxy.shared.addresses import is_loopback
 from rosproxy_operator.common.problem import Fault, bounded
 from rosproxy_operator.docker.planner.model import Container, HostState
 from rosproxy_operator.proxy_spec.place import Place

@@ -8,10 +8,10 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-from rosproxy.access.rules import Rule, parse_rules
-from rosproxy.net.addresses import HostPort, is_address, is_loopback
-from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.settings import MOST_ZENOH_LINKS
+from rosproxy.shared.addresses import HostPort, is_address, is_loopback
+from rosproxy.shared.policy.rules import Rule, parse_rules
+from rosproxy.shared.settings import MOST_ZENOH_LINKS
+from rosproxy.shared.uris import parse_slave_uri, slave_uri
 from rosproxy_operator.common.problem import (
     INVALID,
     MASTER_UNKNOWN,

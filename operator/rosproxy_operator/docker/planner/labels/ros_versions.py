@@ -16,8 +16,8 @@ that runs a router of zenoh states that.
 import re
 from collections.abc import Collection, Iterator
 
-from rosproxy.leases.domain_ports import LAST_DOMAIN
-from rosproxy.net.addresses import is_inside, is_loopback
+from rosproxy.shared.addresses import is_inside, is_loopback
+from rosproxy.shared.domain_ports import LAST_DOMAIN
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.common.ros2 import (
     MOST_PEERS,

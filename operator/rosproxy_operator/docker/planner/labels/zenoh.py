@@ -8,13 +8,13 @@ that router, too. The router goes on serving its own clients.
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy.access.rules import Rule
-from rosproxy.net.addresses import HostPort, is_address, is_loopback
-from rosproxy.setting_kinds import read_zenoh_peer
-from rosproxy.settings import MOST_ZENOH_PORTS
-from rosproxy.telemetry.text import listed
-from rosproxy.zenoh.policy.name_sets import check_layers
+from rosproxy.shared.addresses import HostPort, is_address, is_loopback
+from rosproxy.shared.output.text import listed
+from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.rules import Rule
+from rosproxy.shared.setting_kinds import read_zenoh_peer
+from rosproxy.shared.settings import MOST_ZENOH_PORTS
+from rosproxy.shared.zenoh_rules.name_sets import check_layers
 from rosproxy_operator.common.problem import (
     TOO_MANY,
     Fault,

@@ -5,8 +5,8 @@ The doctor reads the pods itself: no operator has to run.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error
-from rosproxy.telemetry.text import listed, plural
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, error
+from rosproxy.shared.output.text import listed, plural
 from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
 from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, wants_proxy
 from rosproxy_operator.kubernetes.planner.pods.wiring import (

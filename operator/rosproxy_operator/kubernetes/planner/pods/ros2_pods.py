@@ -9,7 +9,7 @@ image may tell the distribution.
 import re
 from collections.abc import Iterator
 
-from rosproxy.telemetry.text import clean
+from rosproxy.shared.output.text import clean
 from rosproxy_operator.common.problem import NOT_WIRED, Fault
 from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.kubernetes.planner.pods.wiring import (

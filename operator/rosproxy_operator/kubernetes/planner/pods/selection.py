@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
-from rosproxy.telemetry.text import shorten
+from rosproxy.shared.output.text import shorten
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.common.zenoh import tcp_endpoint
 from rosproxy_operator.kubernetes.planner.pods.wiring import edit_fix, recreate_fix

@@ -13,9 +13,9 @@ from typing import Any
 
 import msgspec
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.telemetry.text import clean
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.output.text import clean
+from rosproxy.shared.uris import parse_slave_uri
 from rosproxy_operator.common.problem import NOT_WIRED, Fault
 from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.common.zenoh import OVERRIDE, tcp_endpoint, with_client_override

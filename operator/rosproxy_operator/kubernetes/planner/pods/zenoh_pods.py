@@ -6,7 +6,7 @@ does not see variables that the image sets.
 
 from collections.abc import Iterator
 
-from rosproxy.telemetry.text import clean
+from rosproxy.shared.output.text import clean
 from rosproxy_operator.common.problem import NOT_WIRED, Fault
 from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, is_client, tcp_endpoint
 from rosproxy_operator.kubernetes.planner.pods.wiring import (

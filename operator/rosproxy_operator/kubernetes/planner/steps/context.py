@@ -6,9 +6,9 @@ from collections.abc import Iterator
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import hash_token
-from rosproxy.settings import MOST_ZENOH_HUBS
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.setting_kinds import hash_token
+from rosproxy.shared.settings import MOST_ZENOH_HUBS
 from rosproxy_operator.common.problem import EXHAUSTED, MASTER_UNKNOWN, NO_ADVERTISE_HOST, Fault
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
 from rosproxy_operator.kubernetes.planner.cluster_view import View

@@ -8,7 +8,7 @@ operator recreates the LAN relay. The LAN relay's only privilege is the host's n
 
 from collections.abc import Iterable, Iterator
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.shared.addresses import HostPort
 from rosproxy_operator.common.problem import NO_LAN_ADDRESS, Fault
 from rosproxy_operator.common.ros2 import LAN_RELAY_COMMAND, lan_relay_variables
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateHelper, DeleteHelper

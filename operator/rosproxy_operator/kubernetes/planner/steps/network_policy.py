@@ -28,8 +28,8 @@ outside goes through the proxy, which enforces the rules.
 from collections.abc import Collection, Iterator
 from typing import Any
 
-from rosproxy.leases.domain_ports import first_unicast_port
-from rosproxy.leases.ports import STAND_IN_PORTS, PortRange
+from rosproxy.shared.domain_ports import first_unicast_port
+from rosproxy.shared.ports import STAND_IN_PORTS, PortRange
 from rosproxy_operator.common.port_ranges import gaps
 from rosproxy_operator.kubernetes.planner import proxy_ports
 from rosproxy_operator.kubernetes.planner.actions import (

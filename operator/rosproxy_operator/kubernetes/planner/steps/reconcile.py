@@ -13,8 +13,8 @@ from collections.abc import Iterator
 
 from msgspec.structs import replace
 
-from rosproxy.net.addresses import is_address
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.shared.addresses import is_address
+from rosproxy.shared.uris import parse_slave_uri
 from rosproxy_operator.common.port_ranges import REFUSED_RANGE_KEPT_S
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import (

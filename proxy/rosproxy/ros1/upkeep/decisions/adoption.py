@@ -17,12 +17,12 @@ from collections.abc import Collection, Iterable, Mapping
 
 import msgspec
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, Graph, NodeInfo
 from rosproxy.ros1.rewriting.addressing import Addressing
 from rosproxy.ros1.upkeep.decisions.registration import is_known_as
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.uris import parse_slave_uri
 
 Container = tuple[str, Collection[str]]
 """The IP address of a container on an inside network, and the host names in lower case."""

@@ -8,9 +8,9 @@ proxy asks the node before the proxy acts.
 from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum
 
-from rosproxy.net.addresses import Network, is_address, is_inside, is_loopback
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.node_health import UNKNOWN_PIDS, ProbeResult
+from rosproxy.shared.addresses import Network, is_address, is_inside, is_loopback
 
 LONGEST_DIRECT_INTERVAL_S = 2.0
 """The longest time between probes, in seconds, of a node that registered directly."""

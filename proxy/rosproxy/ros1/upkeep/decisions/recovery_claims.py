@@ -12,13 +12,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_inside_path, slave_uri
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, Graph, NodeInfo
 from rosproxy.ros1.registry.remembered_leases import RememberedLease
 from rosproxy.ros1.rewriting.addressing import Addressing
+from rosproxy.shared.addresses import HostPort
+from rosproxy.shared.uris import parse_inside_path, slave_uri
 
 NO_MERIT = -(10**9)
 """The merit of a claim whose node has not answered: less than the merit of any other claim."""

@@ -14,9 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
-from rosproxy.net.addresses import is_loopback
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS, Kind, method_spec
-from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import (
     MOST_CALLERS,
     Endpoint,
@@ -24,6 +22,8 @@ from rosproxy.ros1.registry.endpoint import (
     Registration,
 )
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, NodeInfo
+from rosproxy.shared.addresses import is_loopback
+from rosproxy.shared.uris import parse_slave_uri
 
 MethodCall = tuple[str, list[Any]]
 """A method and its parameters, the caller_id first."""

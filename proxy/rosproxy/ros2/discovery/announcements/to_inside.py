@@ -13,7 +13,6 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from math import inf
 
-from rosproxy.net.addresses import HostPort, is_ipv6_link_local, is_loopback
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
 from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings, Outgoing, sent_to
@@ -29,6 +28,7 @@ from rosproxy.ros2.rewriting.discovery import (
     read_discovery,
     rewritten,
 )
+from rosproxy.shared.addresses import HostPort, is_ipv6_link_local, is_loopback
 
 DISPOSE_MESSAGE_INTERVAL_S = 2.0
 """Seconds from a dispose message to the next, for the same participant inside and the same

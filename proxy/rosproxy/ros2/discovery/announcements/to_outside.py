@@ -7,7 +7,6 @@ range, and removes a locator that has no port. The announcement goes to the peer
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
 from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
 from rosproxy.ros2.domain_settings import MOST_TRIED, NEXT_PORTS, DomainSettings, Outgoing
@@ -15,6 +14,7 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import InsideParticipant, TrafficKind
 from rosproxy.ros2.rewriting.announced_participant import note_endpoints
 from rosproxy.ros2.rewriting.discovery import Announcement, DiscoveryMessage, rewritten
+from rosproxy.shared.addresses import HostPort
 
 REPEAT_INTERVAL_S = 0.5
 """Seconds in which the proxy sends the same announcement to outside only once."""

@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from rosproxy.net.addresses import subnet
 from rosproxy.ros2.discovery.participants.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.domain_settings import (
     MOST_ANNOUNCED_UNPROVEN,
@@ -35,6 +34,7 @@ from rosproxy.ros2.rewriting.discovery import (
     require_rewritable,
 )
 from rosproxy.ros2.sources.address_proofs import AddressProofs
+from rosproxy.shared.addresses import subnet
 
 HIDDEN_SOURCE = (
     "this address is the gateway of the proxy's own network: the engine forwards datagrams from "

@@ -1,1 +1,0 @@
-"""Ports of the range: listen and advertised range, free ports, and fast ports."""

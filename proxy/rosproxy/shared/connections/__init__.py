@@ -1,0 +1,1 @@
+"""TCP sockets, and the bounds on what each source may hold."""

@@ -1,0 +1,1 @@
+"""HTTP for admin endpoints: the server, the rule for hosts, replies, bodies, and the client."""

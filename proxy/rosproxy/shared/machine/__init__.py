@@ -1,0 +1,1 @@
+"""Routes, interfaces, host names, and signs of the processes of this machine."""

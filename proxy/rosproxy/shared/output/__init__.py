@@ -1,0 +1,1 @@
+"""Text for logs and terminals, and the problems that a user should know."""

@@ -1,0 +1,1 @@
+"""Policy: rules, layers of rules, and what they decide. All pure."""
