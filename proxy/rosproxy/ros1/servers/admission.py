@@ -23,6 +23,7 @@ import logging
 from typing import Protocol
 
 from rosproxy.binding import PORTS
+from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.registry.client_kinds import ClientKind
@@ -50,7 +51,7 @@ FIRST_ANSWER_RETRY_S = 0.2
 """Seconds between two questions to such a node."""
 MOST_ADDRESSES = 4
 """The highest number of addresses that the proxy tries for a host name."""
-RETIRED = "rosproxy: this proxy is retired and accepts no registrations"
+RETIRED = "this proxy is retired and accepts no registrations"
 
 
 class Cleanup(Protocol):
@@ -86,13 +87,14 @@ class NodeAdmission:
     async def admit(self, call: MasterCall, caller: Caller) -> CallOutcome:
         """The endpoint of a call that registers, or the reason why there is none.
 
-        Raises Unreachable if the master is needed and does not answer.
+        Raises Unreachable if the master is needed and does not answer, and if the proxy is retired:
+        a node tries again without an answer, and so registers at the next proxy.
         """
         uri = call.registering_uri
         if uri is None:
             return Passing.NO_REGISTRATION
         if self._context.retired:
-            return refusal(RETIRED)
+            raise Unreachable(RETIRED)
         uri = with_caller_address(uri, caller.address)
         node = parse_slave_uri(uri)
         endpoint = self._context.registry.admitted(node, caller.address)
