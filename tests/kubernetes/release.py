@@ -183,8 +183,8 @@ def kill_operator() -> None:
     pod.remove(grace=0)
 
 
-def wait_operator(seconds: float = 60) -> None:
-    """Wait until all operators are ready, one leads, and the webhook answers.
+def wait_operator(seconds: float = 60, namespace: str = "default") -> None:
+    """Wait until all operators are ready, one leads, and the webhook answers for a namespace.
 
     For a second after an operator is ready, kube-proxy still leads to the former operator.
     """
@@ -194,16 +194,16 @@ def wait_operator(seconds: float = 60) -> None:
         bodies = api.objects("pods", NAMESPACE, OPERATORS)
         alive = operators()
         ready = len(bodies) == len(alive) == wanted and all(pod.ready for pod in alive)
-        return ready and operator() in alive and _webhook_answers()
+        return ready and operator() in alive and _webhook_answers(namespace)
 
     wait_until(is_serving, seconds, lambda: str(api.objects("pods", NAMESPACE, OPERATORS)))
 
 
-def _webhook_answers() -> bool:
+def _webhook_answers(namespace: str) -> bool:
     """Whether the webhook warns of a labelled pod without a RosProxy. True without a webhook."""
     if not api.get("mutatingwebhookconfigurations", "", FULL_NAME):
         return True
-    body = Namespace("default").pod_body("unused", "true")
+    body = Namespace(namespace).pod_body("unused", "true")
     return api.dry_run(body)[1] != ""
 
 

@@ -191,7 +191,7 @@ def test_upgrade_keeps_the_certificate(restored: None) -> None:
 def test_the_readmes_command_and_the_notes_example(net: Namespace, robot: Robot) -> None:
     try:
         example = release.install_as_the_readme_says(net.name, robot.master_uri)
-        release.wait_operator()
+        release.wait_operator(namespace=net.name)
         assert f"uri: {robot.master_uri}\n" in example
         kubectl("-n", net.name, "apply", "-f", "-", input=example)
         made = RosProxy(net.name, "robot")

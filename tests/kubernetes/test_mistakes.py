@@ -178,20 +178,6 @@ def _privileged(site: Site, said: str) -> None:
     run_told(site, said, r"label namespace \S+ pod-security\S+ --overwrite")
 
 
-def _made_anew(site: Site) -> None:
-    site.create_rosproxy()
-    site.create_app()
-    wait_until(lambda: site.robot.knows_proxied(site.node), START, site.rosproxy.tell)
-    site.rosproxy.remove()
-    wait_until(lambda: not site.rosproxy.body, 60, "the RosProxy is gone")
-    site.create_rosproxy()
-
-
-def _restart_unregistered(site: Site, said: str) -> None:
-    wait_until(lambda: not site.robot.uri(site.node), 30, lambda: str(site.robot.nodes()))
-    restart(site, said)
-
-
 def _two_nodes_for_a_port(site: Site) -> None:
     site.create_rosproxy(ports=1)
     nodes = [" ".join(site.talker(word, f"{site.node}_{word}")) for word in ("one", "two")]
@@ -343,12 +329,6 @@ MISTAKES: dict[str, Mistake] = {
     "RosProxy after the pod": Mistake(
         _late_rosproxy, "NotWired",
         (Cure("since the pod is older than RosProxy robot", "Run kubectl", restart),),
-    ),
-    "RosProxy deleted and created again": Mistake(
-        _made_anew, "NotWired",
-        (Cure("is older than RosProxy robot: the former RosProxy of that name was deleted",
-              "Run kubectl", _restart_unregistered),),
-        is_silent=False,  # before the RosProxy is deleted
     ),
     "two RosProxies": Mistake(
         _two, "Ambiguous",
@@ -518,6 +498,7 @@ ROS2_MISTAKES: dict[str, Mistake] = {
         _both(OF_ROS2, {"env": {"ROS_STATIC_PEERS": "192.0.2.7"}}), "NotWired",
         (Cure("variable ROS_STATIC_PEERS=192.0.2.7 of the template does not name the proxy",
               "Remove the variable from the template", _without_variables),),
+        is_silent=False,  # the proxy may discover the pod all the same
     ),
 }  # fmt: skip
 
