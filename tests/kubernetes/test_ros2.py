@@ -14,8 +14,10 @@ from tests.kubernetes import api, release
 from tests.kubernetes.cluster.control_plane import kubectl
 from tests.kubernetes.conftest import cluster
 from tests.kubernetes.measured import note
+from tests.kubernetes.mistakes import errors
 from tests.kubernetes.pods import Namespace, Pod, namespace
 from tests.kubernetes.ros2 import (
+    ADDRESS,
     Robot2,
     lan_relays,
     leased,
@@ -373,3 +375,18 @@ def test_what_a_pod_cannot_have_is_told(net: Namespace) -> None:
         pod = net.idle(on="node1", env=variables)
         wait_event(net.name, pod.name, "Pod", reason)
     assert api.get("networkpolicies", net.name, f"rosproxy-{of.name}")
+
+
+def test_a_pod_that_the_proxy_discovers_by_multicast_is_well(
+    net: Namespace, robot2: Robot2
+) -> None:
+    """The operator told an error although messages flowed: the pod network has multicast."""
+    of = rosproxy(net.name, ros=2, domain=4, peers=[ADDRESS], ports=16)
+    wait_for_service(net)
+    heard = robot2.node("jazzy", "sub", "/word", domain=4)
+    elsewhere = {"ROS_STATIC_PEERS": "192.0.2.9"}
+    node(net, "jazzy", "pub", "/word", "--word", "pod", on="node1", env=elsewhere)
+    heard.wait_for("pod", seconds=START)
+    of.wait_for("Degraded", "False")
+    assert errors(net.name) == []
+    robot2.end_all()

@@ -38,9 +38,14 @@ Unregistrations = Mapping[ProxyPlace, Unregistration]
 def recall(view: View, known: Unregistrations) -> dict[ProxyPlace, Unregistration]:
     """Return the last unregistration of each place, either ``known`` or, if later, from a status.
 
-    A watched status may be older than the operator's own state.
+    A watched status may be older than the operator's own state. The pods of a node that has left
+    the cluster are gone, so its unregistration is forgotten.
     """
-    latest = {place: last for place, last in known.items() if place.of in view.rosproxies}
+    latest = {
+        place: last
+        for place, last in known.items()
+        if place.of in view.rosproxies and place.node in view.observed.nodes
+    }
     for rosproxy in view.rosproxies.values():
         for node, at in rosproxy.unregistered_at.items():
             place = ProxyPlace(rosproxy.id, node)
@@ -76,7 +81,7 @@ def retiring_proxies(actions: Iterable[Action]) -> frozenset[str]:
 def with_unregistrations(
     view: View, rosproxy: RosProxy, known: Unregistrations, retiring: Set[str] = frozenset()
 ) -> RosProxy:
-    """Return a RosProxy with the last unregistration on each node, and the registered addresses.
+    """Return a RosProxy with the last unregistration on each node, and the addresses of its nodes.
 
     ``retiring``: the uids of the proxies that unregister ROS 1 nodes now.
     """
@@ -87,9 +92,13 @@ def with_unregistrations(
     pods = (proxy.pod for place in own for proxy in view.proxies.get(place, ()))
     staying = (pod.uid for pod in pods if not pod.deleting and pod.uid not in retiring)
     reports = (view.observed.reports.get(uid) for uid in staying)
-    answered = (report for report in reports if report and not report.retired)
-    registered = frozenset(address for report in answered for address in report.nodes)
-    return replace(rosproxy, unregistered_at=times, registered=registered)
+    answered = tuple(report for report in reports if report and not report.retired)
+    return replace(
+        rosproxy,
+        unregistered_at=times,
+        registered=frozenset(address for report in answered for address in report.nodes),
+        discovered=frozenset(address for report in answered for address in report.participants),
+    )
 
 
 def _has_nodes(view: View, rosproxy: RosProxy, proxy: ProxyPod) -> bool:

@@ -15,7 +15,6 @@ from rosproxy_operator.kubernetes.planner.actions import (
     DeleteProxy,
 )
 from rosproxy_operator.kubernetes.planner.bounds import bounds_violation
-from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.pods.wiring import PodVariables, pod_variables, wire
 from rosproxy_operator.kubernetes.planner.steps.context import TORN_DOWN_WITHIN_S
 from rosproxy_operator.kubernetes.planner.steps.lan_relay import lan_relay_pod
@@ -385,62 +384,6 @@ def test_a_copy_of_a_wired_pod_is_wired_anew():
     wiring = wire(old, PodVariables(static_peers=ADDRESS))
     assert wiring.spec is not None
     assert wiring.spec["containers"][0]["env"][0]["value"] == ADDRESS
-
-
-@pytest.mark.parametrize(
-    ("reason", "container"),
-    [
-        ("NoDds", PodContainer(variables={"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"})),
-        ("TooOld", PodContainer("docker.io/osrf/ros:humble-desktop")),
-        ("TooOld", PodContainer(variables={"ROS_DISTRO": "foxy"})),
-        ("NotWired", PodContainer(variables={"ROS_STATIC_PEERS": "192.0.2.7"})),
-        ("OtherDomain", PodContainer(variables={"ROS_DOMAIN_ID": "9"})),
-        ("Alone", PodContainer(variables={"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"})),
-        ("Alone", PodContainer(variables={"ROS_LOCALHOST_ONLY": "1"})),
-    ],
-)
-def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
-    (finding,) = ros2_findings(pod(container), of2(), ADDRESS)
-    assert (finding.reason, finding.fatal) == (reason, False)
-    assert finding.about is not None
-    assert finding.about.kind == "Pod"
-    (of_deployment,) = ros2_findings(pod(container, workload="deployment/a"), of2(), ADDRESS)
-    assert ": kubectl -n ros edit deployment/a" in of_deployment.message
-    assert list(ros2_findings(pod(container), some.rosproxy(), ADDRESS)) == []
-
-
-@pytest.mark.parametrize(
-    "container",
-    [
-        PodContainer("ros:jazzy", {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}),
-        PodContainer("registry/exhumble-thing:1", {"ROS_DISTRO": "kilted"}),
-        PodContainer(variables={"ROS_STATIC_PEERS": f"192.0.2.7;{ADDRESS}"}),
-        PodContainer(variables={"ROS_STATIC_PEERS": "rosproxy-robot.ros.svc.cluster.local"}),
-        PodContainer(variables={"ROS_DOMAIN_ID": "0"}),
-        PodContainer(variables={"ROS_DOMAIN_ID": ""}),
-    ],
-)
-def test_what_is_well_is_not_told(container: PodContainer):
-    assert list(ros2_findings(pod(container), of2(), ADDRESS)) == []
-
-
-def test_an_empty_domain_is_domain_0():
-    """The nodes were in domain 0, and the operator reported nothing."""
-    container = PodContainer(variables={"ROS_DOMAIN_ID": ""})
-    (finding,) = ros2_findings(pod(container), of2(Ros2Spec(domain=5)), ADDRESS)
-    assert finding.reason == "OtherDomain"
-    assert "ROS_DOMAIN_ID=(empty, so 0) is not domain 5 of RosProxy" in finding.message
-    assert finding.message.endswith(". Or change spec.domain: kubectl -n ros edit rosproxy robot")
-
-
-def test_a_pod_that_no_webhook_has_seen_is_told():
-    (finding,) = ros2_findings(pod(static_peers=""), of2(), ADDRESS)
-    assert finding.reason == "NotWired"
-    assert finding.message.endswith(
-        ". Run kubectl -n ros delete pod talker, and create the pod again"
-    )
-    (finding,) = ros2_findings(pod(static_peers="10.96.9.9"), of2(), ADDRESS)
-    assert "the proxy is at 10.96.1.1 now" in finding.message
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,13 @@ def test_other_ports_leave_older_pods_unregistered() -> None:
     assert told(first, "NotWired")
 
 
+def test_the_unregistrations_of_a_node_that_has_left_are_forgotten() -> None:
+    first = look(seen(running(), proxy(), of=rosproxy(master=OTHER_MASTER)), stamp=THEN)
+    assert first.state.unregistered
+    left = look(observed(rosproxy(), node("two")), first.state)
+    assert not left.state.unregistered
+
+
 def test_a_second_plan_of_the_same_deletion_keeps_the_time() -> None:
     """Otherwise pods would be told that start while the proxy unregisters its nodes."""
     changed = seen(running(), proxy(), of=rosproxy(master=OTHER_MASTER))

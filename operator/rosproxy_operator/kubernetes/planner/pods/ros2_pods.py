@@ -4,10 +4,15 @@ The webhook sets ROS_STATIC_PEERS to the address of the RosProxy's Service, whic
 on the pod's own node. A pod in which this variable has no effect gets an Event. The operator does
 not see variables that the image sets. Unless the template sets ROS_DISTRO, only the name of the
 image may tell the distribution.
+
+Some pod networks have multicast. There the proxy discovers pods without ROS_STATIC_PEERS. So if
+this variable has an effect in no container of a pod, and the proxy has discovered participants at
+the address of the pod all the same, nothing is wrong.
 """
 
 import re
 from collections.abc import Iterator
+from itertools import chain
 
 from rosproxy.shared.output.text import clean
 from rosproxy_operator.common.problem import NOT_WIRED, Fault
@@ -46,63 +51,44 @@ def ros2_findings(
     """
     if rosproxy.spec.ros2 is None:
         return
-    problems = dict.fromkeys(
-        p for c in pod.containers for p in _problems(c, pod, rosproxy, address)
+    faults = [fault for c in pod.containers for fault in _other_faults(c, pod, rosproxy)]
+    undiscovered = [
+        (*_peers_faults(c, pod, rosproxy, address, webhook), *_faults_of_peers(c, pod))
+        for c in pod.containers
+    ]
+    uses_peers = any(
+        not found and (pod.static_peers or has_peers(container))
+        for container, found in zip(pod.containers, undiscovered, strict=True)
     )
-    if (fault := _peers_problem(pod, rosproxy, address, webhook)) and not any(
-        r == NOT_WIRED for r, _ in problems
-    ):
-        problems[NOT_WIRED, fault] = None
-    for reason, fault in problems:
+    if uses_peers or not rosproxy.discovered & {pod.ip, *pod.ips}:
+        faults += chain.from_iterable(undiscovered)
+    for reason, fault in dict.fromkeys(faults):
         yield pod_finding(pod, rosproxy, reason, fault, fatal=False)
 
 
-def _peers_problem(
-    pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState
-) -> Fault | None:
-    """The fault of the ROS_STATIC_PEERS that the webhook sets; None if there is no fault."""
-    if pod.static_peers and pod.static_peers != address:
-        return Fault(
-            f"was wired to {clean(pod.static_peers)[:200]} (ROS_STATIC_PEERS), but the proxy is at "
-            f"{address} now",
-            f"Run {recreate_command(pod)}",
-        )
-    if pod.static_peers or any(map(has_peers, pod.containers)):
-        return None
-    return missing_variable("ROS_STATIC_PEERS", pod, rosproxy, webhook)
-
-
-def _problems(
-    container: PodContainer, pod: Pod, rosproxy: RosProxy, address: str
+def _peers_faults(
+    container: PodContainer, pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState
 ) -> Iterator[tuple[str, Fault]]:
-    """Yield the reason and the fault, for each fault of a container."""
+    """Yield the reason and the fault, if ROS_STATIC_PEERS of a container is missing or wrong."""
+    if not (pod.static_peers or any(map(has_peers, pod.containers))):
+        yield NOT_WIRED, missing_variable("ROS_STATIC_PEERS", pod, rosproxy, webhook)
+        return
+    peers = container.variables.get("ROS_STATIC_PEERS", pod.static_peers or VALUE_AT_RUNTIME)
+    if peers == VALUE_AT_RUNTIME or _names_service(peers, rosproxy, address):
+        return
+    if peers == pod.static_peers:
+        text = f"was wired to {_shown(peers)} (ROS_STATIC_PEERS), but the proxy is at {address} now"
+        yield NOT_WIRED, Fault(text, f"Run {recreate_command(pod)}")
+        return
+    text = f"variable ROS_STATIC_PEERS={_shown(peers)} of the template does not name the proxy"
+    fix = f"Remove the variable from the template, or add {address} to the variable"
+    yield NOT_WIRED, Fault(text, edit_fix(fix, pod))
+
+
+def _faults_of_peers(container: PodContainer, pod: Pod) -> Iterator[tuple[str, Fault]]:
+    """Yield the reason and the fault, for each fault that makes ROS_STATIC_PEERS ineffective."""
     get = container.variables.get
     removal = edit_fix("Remove the variable from the template", pod)
-    rmw = get("RMW_IMPLEMENTATION", "")
-    if not is_dds(rmw):
-        text = (
-            f"variable RMW_IMPLEMENTATION={_shown(rmw)} is not DDS, and a proxy forwards DDS only"
-        )
-        fix = edit_fix("Set rmw_fastrtps_cpp or rmw_cyclonedds_cpp in the template", pod)
-        yield "NoDds", Fault(text, f"{fix}. Or use a RosProxy with spec.ros: zenoh")
-    peers = get("ROS_STATIC_PEERS")
-    if (
-        peers is not None
-        and peers != VALUE_AT_RUNTIME
-        and not _names_service(peers, rosproxy, address)
-    ):
-        text = f"variable ROS_STATIC_PEERS={_shown(peers)} of the template does not name the proxy"
-        fix = f"Remove the variable from the template, or add {address} to the variable"
-        yield NOT_WIRED, Fault(text, edit_fix(fix, pod))
-    domain = get("ROS_DOMAIN_ID")
-    number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
-    # rcl treats an empty variable as unset (rcl, domain_id.c), and the webhook keeps the variable.
-    if domain not in (None, VALUE_AT_RUNTIME) and (str(domain).strip() or "0") != str(number):
-        value = _shown(str(domain)) or "(empty, so 0)"
-        name = rosproxy.id.name
-        text = f"variable ROS_DOMAIN_ID={value} is not domain {number} of RosProxy {name}"
-        edit = f"kubectl -n {rosproxy.id.namespace} edit rosproxy {name}"
-        yield "OtherDomain", Fault(text, f"{removal}. Or change spec.domain: {edit}")
     distro = _OLD.search(get("ROS_DISTRO", "").lower()) or _OLD.search(container.image.lower())
     if distro:
         text = f"has ROS 2 {distro[1].capitalize()}, which does not support ROS_STATIC_PEERS"
@@ -115,6 +101,30 @@ def _problems(
     if get("ROS_LOCALHOST_ONLY") == "1":
         text = "variable ROS_LOCALHOST_ONLY=1 keeps the participants of the pod from being"
         yield "Alone", Fault(f"{text} discovered", removal)
+
+
+def _other_faults(
+    container: PodContainer, pod: Pod, rosproxy: RosProxy
+) -> Iterator[tuple[str, Fault]]:
+    """Yield the reason and the fault, if a container uses another protocol or another domain."""
+    get = container.variables.get
+    rmw = get("RMW_IMPLEMENTATION", "")
+    if not is_dds(rmw):
+        text = (
+            f"variable RMW_IMPLEMENTATION={_shown(rmw)} is not DDS, and a proxy forwards DDS only"
+        )
+        fix = edit_fix("Set rmw_fastrtps_cpp or rmw_cyclonedds_cpp in the template", pod)
+        yield "NoDds", Fault(text, f"{fix}. Or use a RosProxy with spec.ros: zenoh")
+    domain = get("ROS_DOMAIN_ID")
+    number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
+    # rcl treats an empty variable as unset (rcl, domain_id.c), and the webhook keeps the variable.
+    if domain not in (None, VALUE_AT_RUNTIME) and (str(domain).strip() or "0") != str(number):
+        value = _shown(str(domain)) or "(empty, so 0)"
+        name = rosproxy.id.name
+        text = f"variable ROS_DOMAIN_ID={value} is not domain {number} of RosProxy {name}"
+        removal = edit_fix("Remove the variable from the template", pod)
+        edit = f"kubectl -n {rosproxy.id.namespace} edit rosproxy {name}"
+        yield "OtherDomain", Fault(text, f"{removal}. Or change spec.domain: {edit}")
 
 
 def _names_service(peers: str, rosproxy: RosProxy, address: str) -> bool:

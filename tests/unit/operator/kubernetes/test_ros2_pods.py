@@ -1,0 +1,124 @@
+"""Tests: what the operator tells of pods whose ROS 2 nodes the proxy can't discover."""
+
+import pytest
+from msgspec.structs import replace
+
+from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
+from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
+from rosproxy_operator.kubernetes.resources.model import Pod, PodContainer, Ros2Spec
+from tests.unit.operator.kubernetes import objects as some
+from tests.unit.operator.kubernetes.objects import look, observed, proxy, service, told
+from tests.unit.operator.kubernetes.test_ros2 import ADDRESS, of2, pod
+
+UNSET = PodContainer()
+WIRED = PodContainer(variables={"ROS_STATIC_PEERS": ADDRESS})
+ELSEWHERE = PodContainer(variables={"ROS_STATIC_PEERS": "192.0.2.7"})
+
+
+@pytest.mark.parametrize(
+    ("reason", "container"),
+    [
+        ("NoDds", PodContainer(variables={"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"})),
+        ("TooOld", PodContainer("docker.io/osrf/ros:humble-desktop")),
+        ("TooOld", PodContainer(variables={"ROS_DISTRO": "foxy"})),
+        ("NotWired", PodContainer(variables={"ROS_STATIC_PEERS": "192.0.2.7"})),
+        ("OtherDomain", PodContainer(variables={"ROS_DOMAIN_ID": "9"})),
+        ("Alone", PodContainer(variables={"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"})),
+        ("Alone", PodContainer(variables={"ROS_LOCALHOST_ONLY": "1"})),
+    ],
+)
+def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
+    (finding,) = ros2_findings(pod(container), of2(), ADDRESS)
+    assert (finding.reason, finding.fatal) == (reason, False)
+    assert finding.about is not None
+    assert finding.about.kind == "Pod"
+    (of_deployment,) = ros2_findings(pod(container, workload="deployment/a"), of2(), ADDRESS)
+    assert ": kubectl -n ros edit deployment/a" in of_deployment.message
+    assert list(ros2_findings(pod(container), some.rosproxy(), ADDRESS)) == []
+
+
+@pytest.mark.parametrize(
+    "container",
+    [
+        PodContainer("ros:jazzy", {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}),
+        PodContainer("registry/exhumble-thing:1", {"ROS_DISTRO": "kilted"}),
+        PodContainer(variables={"ROS_STATIC_PEERS": f"192.0.2.7;{ADDRESS}"}),
+        PodContainer(variables={"ROS_STATIC_PEERS": "rosproxy-robot.ros.svc.cluster.local"}),
+        PodContainer(variables={"ROS_DOMAIN_ID": "0"}),
+        PodContainer(variables={"ROS_DOMAIN_ID": ""}),
+    ],
+)
+def test_what_is_well_is_not_told(container: PodContainer):
+    assert list(ros2_findings(pod(container), of2(), ADDRESS)) == []
+
+
+def test_an_empty_domain_is_domain_0():
+    """The nodes were in domain 0, and the operator reported nothing."""
+    container = PodContainer(variables={"ROS_DOMAIN_ID": ""})
+    (finding,) = ros2_findings(pod(container), of2(Ros2Spec(domain=5)), ADDRESS)
+    assert finding.reason == "OtherDomain"
+    assert "ROS_DOMAIN_ID=(empty, so 0) is not domain 5 of RosProxy" in finding.message
+    assert finding.message.endswith(". Or change spec.domain: kubectl -n ros edit rosproxy robot")
+
+
+def test_a_pod_that_no_webhook_has_seen_is_told():
+    (finding,) = ros2_findings(pod(UNSET, static_peers=""), of2(), ADDRESS)
+    assert finding.reason == "NotWired"
+    assert finding.message.endswith(
+        ". Run kubectl -n ros delete pod talker, and create the pod again"
+    )
+
+
+def test_a_pod_that_was_wired_to_a_former_address_is_restarted():
+    """The operator advised to remove the variable from the template, which does not have it."""
+    former = "10.96.9.9"
+    container = PodContainer(variables={"ROS_STATIC_PEERS": former})
+    (finding,) = ros2_findings(pod(container, static_peers=former), of2(), ADDRESS)
+    assert f"was wired to {former} (ROS_STATIC_PEERS)" in finding.message
+    assert f"the proxy is at {ADDRESS} now. Run kubectl -n ros delete pod" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("containers", "static_peers"),
+    [
+        ((ELSEWHERE,), ""),
+        ((ELSEWHERE, UNSET), ""),
+        ((UNSET,), ""),
+        ((UNSET, UNSET), "10.96.9.9"),
+        ((PodContainer("ros:humble", WIRED.variables),), ADDRESS),
+    ],
+)
+def test_a_pod_that_the_proxy_discovers_by_multicast_is_well(
+    containers: tuple[PodContainer, ...], static_peers: str
+):
+    """Messages flowed, but the doctor told an error."""
+    silent = pod(*containers, static_peers=static_peers)
+    assert ros2_findings_of(silent, "")
+    assert not ros2_findings_of(silent, silent.ip)
+
+
+def test_another_container_does_not_prove_multicast():
+    found = pod(WIRED, ELSEWHERE)
+    assert ros2_findings_of(found, found.ip) == ["NotWired"]
+
+
+def test_another_domain_is_told_of_a_discovered_pod():
+    found = pod(PodContainer(variables={**WIRED.variables, "ROS_DOMAIN_ID": "9"}))
+    assert ros2_findings_of(found, found.ip) == ["OtherDomain"]
+
+
+def ros2_findings_of(of: Pod, discovered: str) -> list[str]:
+    """Return the reasons, if the proxy has discovered a participant at an address."""
+    rosproxy = replace(of2(), discovered=frozenset({discovered}))
+    return [finding.reason for finding in ros2_findings(of, rosproxy, ADDRESS)]
+
+
+def test_a_plan_knows_the_participants_of_the_proxies():
+    of = of2()
+    proxy_pod = proxy(of)
+    found = pod(ELSEWHERE, static_peers="")
+    silent = observed(of, service(of), found, proxy_pod)
+    assert told(look(silent), "NotWired")
+    report = ProxyReport(True, True, participants={found.ip: ("01",)})
+    heard = replace(silent, reports={proxy_pod.pod.uid: report})
+    assert not told(look(heard), "NotWired")
