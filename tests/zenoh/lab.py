@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -176,6 +177,12 @@ class Lab:
         assert proxy is not None
         (child,) = Path(f"/proc/{proxy.pid}/task/{proxy.pid}/children").read_text().split()
         return int(child)
+
+    def peak_memory(self) -> int:
+        """The most memory in bytes that the process of the routers has used."""
+        status = Path(f"/proc/{self.router_process()}/status").read_text()
+        (kibibytes,) = re.findall(r"^VmHWM:\s+(\d+) kB$", status, re.MULTILINE)
+        return int(kibibytes) * 1024
 
     def start(self, role: str, argv: list[str], environment: Mapping[str, str]) -> Process:
         """Start a program on a machine."""

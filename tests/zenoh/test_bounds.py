@@ -52,6 +52,19 @@ def test_messages_that_may_not_be_dropped_hold_up_no_other_container(
     assert lab.zenoh().restarts == 0
 
 
+def test_a_message_of_a_container_does_not_fill_the_memory(lab: Lab) -> None:
+    """With zenoh's bound of 1 GiB, one message took more memory than most proxies may have."""
+    lab.start_proxy(with_robot=False)
+    for role in PORTS:
+        lab.redirect(role)
+    images = lab.node(VERSION, "c2", "count", "images")
+    lab.node(VERSION, "c1", "blast", "images", NODE_BYTES="900000000,1000")
+    images.wait_for_count("^got 1000$", 3, timeout=60)
+    assert "got 900000000" not in images.output()
+    assert lab.peak_memory() < 400_000_000
+    assert lab.zenoh().restarts == 0
+
+
 def test_sessions_of_a_container_leave_files_for_other_containers(lab: Lab) -> None:
     """The routers share the open files of a process."""
     lab.start_router(VERSION)

@@ -11,8 +11,8 @@ routers of other sites that connect to the proxy have one more router of this ki
 Links to other sites have a router of their own, which dials the hub (`rosproxy.zenoh.link_router`).
 
 The values come from rmw_zenohd (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_ROUTER_CONFIG.json5).
-Exceptions are the addresses, the bounds of sessions, the queue for declarations, and the delay for
-scouting, which is off.
+Exceptions are the addresses, the bounds of sessions and messages, the queue for declarations, and
+the delay for scouting, which is off.
 """
 
 import base64
@@ -40,6 +40,11 @@ FILES_OF_ROUTER = 6
 LEAST_FILES_FOR_SESSIONS = 4
 """Open files for the sessions of each router, with which a router is of use."""
 MAX_SESSIONS = "transport/unicast/max_sessions"
+MAX_MESSAGE_BYTES = 128 * 2**20
+"""A router keeps the fragments of a message in memory until the message is complete, and drops a
+longer message. zenoh's default of 1 GiB is more than the memory of most containers. So one message
+could end the routers of all containers.
+"""
 KEEP_ALIVES = 4
 """Packets within the lease on a link without messages."""
 LEASE = MappingProxyType(
@@ -62,6 +67,7 @@ _COMMON: dict[str, Any] = {
     "scouting/gossip/target": {"router": ["router", "peer"], "peer": ["router"]},
     "scouting/gossip/autoconnect": {"router": [], "peer": ["router", "peer"]},
     "timestamping/enabled": True,
+    "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
     "transport/link/tx/keep_alive": 2,
     "transport/link/tx/lease": 60_000,
     # Buffers of 64 KiB. All routers share the threads of one process. With two, the default of

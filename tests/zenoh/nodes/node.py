@@ -7,6 +7,7 @@ NODE_TOKENS, NODE_LETTER: see `crowd`. NODE_BYTES: see `blast`. For `offer` and 
 names of nodes as TOPIC, see `matrix.py`.
 """
 
+import itertools
 import os
 import socket
 import sys
@@ -52,10 +53,13 @@ def publish(session: Any, key: str) -> None:
 
 
 def blast(session: Any, key: str) -> None:
-    """Publish messages of NODE_BYTES at full rate, as rmw_zenoh does with reliable and keep_all."""
+    """Publish messages at full rate, as rmw_zenoh does with reliable and keep_all.
+
+    NODE_BYTES has the sizes in turn, separated by commas.
+    """
     publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
-    content = bytes(int(os.environ["NODE_BYTES"]))
-    while True:
+    contents = [bytes(int(size)) for size in os.environ["NODE_BYTES"].split(",")]
+    for content in itertools.cycle(contents):
         publisher.put(content)
 
 
