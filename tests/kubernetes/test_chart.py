@@ -13,6 +13,7 @@ from tests.docker.engine import wait_until
 from tests.kubernetes import api, release
 from tests.kubernetes.api import Json
 from tests.kubernetes.cluster.control_plane import kubectl
+from tests.kubernetes.cluster.layout import NODES
 from tests.kubernetes.pods import Namespace, namespace
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import NOWHERE, RosProxy, rosproxy
@@ -224,6 +225,30 @@ def test_deleted_certificate_is_made_anew(net: Namespace, restored: None) -> Non
     assert certificate() != before
     rosproxy(net.name, master=NOWHERE)
     wait_until(lambda: bool(net.idle().environment.get("ROS_MASTER_URI")), 60, "a wired pod")
+
+
+def test_operators_in_the_networks_of_their_nodes(
+    net: Namespace, robot: Robot, restored: None
+) -> None:
+    level = "pod-security.kubernetes.io/enforce"
+    nodes = {node.address for node in NODES}
+    blocks = [{"ipBlock": {"cidr": f"{address}/32"}} for address in sorted(nodes)]
+    kubectl("label", "--overwrite", "namespace", release.NAMESPACE, f"{level}=privileged")
+    try:
+        release.upgrade(hostNetwork=True, proxy={"networkPolicy": {"metricsFrom": blocks}})
+        release.wait_operator(namespace=net.name)
+        assert {pod.ip for pod in release.operators()} == nodes
+        made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+        wait_for_service(net)
+        net.node("rospy", "pub", "--topic", "/host", "--word", "inside", on="node1")
+        listener = robot.node("listener_host", "rospy", "sub", "--topic", "/host")
+        listener.wait_for("inside", seconds=START)
+        made.wait_for("MasterReachable")
+        made.wait_for("Degraded", "False")
+    finally:
+        release.upgrade()
+        release.wait_operator()
+        kubectl("label", "--overwrite", "namespace", release.NAMESPACE, f"{level}=restricted")
 
 
 def test_rights_in_named_namespaces(net: Namespace, restored: None) -> None:
