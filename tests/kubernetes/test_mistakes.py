@@ -40,7 +40,7 @@ from tests.kubernetes.pods import INJECT, Namespace
 from tests.kubernetes.robot import Robot, robot_with_master
 from tests.kubernetes.ros2 import ADDRESS, Robot2, robot_with_ros2
 from tests.kubernetes.rosproxies import rosproxy
-from tests.kubernetes.traffic import START
+from tests.kubernetes.traffic import START, wait_for_service
 
 OF_ROS2 = {"ros": 2, "peers": [ADDRESS], "ports": 16}
 WITHOUT_MULTICAST = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -198,6 +198,19 @@ def _name_of_the_node(site: Site) -> None:
     site.create_rosproxy(advertise="Hostname")
     site.create_app()
     wait_until(lambda: bool(site.robot.uri(site.node)), START, site.rosproxy.tell)
+
+
+def _other_domain(former: dict[str, Any]) -> Step:
+    """Change the domain of a RosProxy to 4, while the pod is in another domain."""
+
+    def make(site: Site) -> None:
+        site.create_rosproxy(**OF_ROS2, **former)
+        wait_for_service(site.net)
+        site.create_app()
+        wait_until(site.is_well, 90, site.rosproxy.tell)
+        site.rosproxy.change(domain=4)
+
+    return make
 
 
 def _taint(site: Site) -> None:
@@ -491,6 +504,15 @@ ROS2_MISTAKES: dict[str, Mistake] = {
               "Remove the variable from the template", _without_variables),),
         domain=3,
     ),
+    **{
+        f"domain {former.get('domain')} of a RosProxy changes": Mistake(
+            _other_domain(former), "OtherDomain",
+            (Cure(f"was wired to domain {former.get('domain', 0)}, but RosProxy robot has domain 4 "
+                  "now", "Run kubectl", restart),),
+            domain=4,
+        )
+        for former in ({"domain": 3}, {})
+    },
     "localhost only": Mistake(
         _both(OF_ROS2, {"env": {"ROS_LOCALHOST_ONLY": "1"}}), "Alone",
         (Cure("variable ROS_LOCALHOST_ONLY=1 keeps the participants of the pod from being",

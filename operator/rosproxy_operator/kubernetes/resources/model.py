@@ -261,8 +261,8 @@ class Pod(msgspec.Struct, frozen=True):
     ``wired_master_uri`` is the ROS_MASTER_URI that the webhook has set, empty for none.
     ``own_masters`` are the other values of ROS_MASTER_URI, which the pod's template sets. A value
     that is no plain text, for example from a ConfigMap, is `VALUE_AT_RUNTIME`. ``static_peers`` is
-    the ROS_STATIC_PEERS that the webhook has set, empty for none. ``router_endpoint`` is the
-    endpoint in the ZENOH_CONFIG_OVERRIDE that the webhook has set, empty for none.
+    the ROS_STATIC_PEERS that the webhook has set, ``wired_domain`` the ROS_DOMAIN_ID, and
+    ``router_endpoint`` the endpoint in the ZENOH_CONFIG_OVERRIDE, each empty for none.
 
     ``controller`` is the kind of the pod's controller, for example ReplicaSet. ``workload`` is the
     object for `kubectl rollout restart`, for example "deployment/talker". ``created`` is the
@@ -285,6 +285,7 @@ class Pod(msgspec.Struct, frozen=True):
     ips: tuple[str, ...] = ()
     udp_ports: frozenset[int] = frozenset()
     static_peers: str = ""
+    wired_domain: str = ""
     router_endpoint: str = ""
     containers: tuple[PodContainer, ...] = ()
     controller: str = ""

@@ -39,6 +39,9 @@ ALLOW_FROM = "rosproxy.io/allow-from"
 STATIC_PEERS = "rosproxy.io/static-peers"
 """Annotation of users' pods: the ROS_STATIC_PEERS that the webhook has set."""
 
+DOMAIN = "rosproxy.io/domain"
+"""Annotation of users' pods: the ROS_DOMAIN_ID that the webhook has set."""
+
 ROUTER_ENDPOINT = "rosproxy.io/router-endpoint"
 """Annotation of users' pods: the endpoint of the router in the ZENOH_CONFIG_OVERRIDE that the
 webhook has set."""

@@ -111,6 +111,7 @@ def pod(obj: Json) -> Pod:
         own_masters=tuple(uri for uri in masters if not wired or uri != wired),
         wired_master_uri=wired,
         static_peers=_short(text_at(submap(meta, "annotations"), names.STATIC_PEERS)),
+        wired_domain=_short(text_at(submap(meta, "annotations"), names.DOMAIN)),
         router_endpoint=_short(text_at(submap(meta, "annotations"), names.ROUTER_ENDPOINT)),
         containers=tuple(map(_container, submaps(spec, "containers")[:MOST_CONTAINERS])),
         ips=tuple(filter(None, (text_at(pod_ip, "ip") for pod_ip in submaps(status, "podIPs")))),

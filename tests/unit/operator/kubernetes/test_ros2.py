@@ -369,7 +369,7 @@ def test_what_the_webhook_sets():
     peers = {"name": "ROS_STATIC_PEERS", "value": ADDRESS}
     domain = {"name": "ROS_DOMAIN_ID", "value": "5"}
     assert wiring.spec["containers"][0]["env"] == [domain, peers][::-1]
-    assert wiring.annotations == {names.STATIC_PEERS: ADDRESS}
+    assert wiring.annotations == {names.STATIC_PEERS: ADDRESS, names.DOMAIN: "5"}
     own = ({"name": "ROS_STATIC_PEERS", "value": "a"}, {"name": "ROS_DOMAIN_ID", "value": "4"})
     assert wire(admitted(*own), to).spec is None
     both = wire(admitted(), pod_variables(some.rosproxy(ros2=Ros2Spec()), ADDRESS))
@@ -379,11 +379,20 @@ def test_what_the_webhook_sets():
 
 
 def test_a_copy_of_a_wired_pod_is_wired_anew():
-    old = admitted({"name": "ROS_STATIC_PEERS", "value": "10.96.9.9"})
-    old["metadata"]["annotations"] = {names.STATIC_PEERS: "10.96.9.9"}
-    wiring = wire(old, PodVariables(static_peers=ADDRESS))
+    former = {"ROS_STATIC_PEERS": "10.96.9.9", "ROS_DOMAIN_ID": "3"}
+    old = admitted(*({"name": name, "value": value} for name, value in former.items()))
+    old["metadata"]["annotations"] = {names.STATIC_PEERS: "10.96.9.9", names.DOMAIN: "3"}
+    wiring = wire(old, PodVariables(static_peers=ADDRESS, domain=5))
     assert wiring.spec is not None
-    assert wiring.spec["containers"][0]["env"][0]["value"] == ADDRESS
+    assert [v["value"] for v in wiring.spec["containers"][0]["env"]] == [ADDRESS, "5"]
+    assert wiring.annotations[names.DOMAIN] == "5"
+
+
+def test_the_domain_of_a_template_is_not_the_webhooks():
+    """After a change of spec.domain, the pod would be recreated in vain."""
+    own = admitted({"name": "ROS_DOMAIN_ID", "value": "5"})
+    wiring = wire(own, PodVariables(static_peers=ADDRESS, domain=5))
+    assert wiring.annotations == {names.STATIC_PEERS: ADDRESS}
 
 
 @pytest.mark.parametrize(

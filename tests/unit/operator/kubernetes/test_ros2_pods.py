@@ -4,6 +4,8 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
+from rosproxy_operator.kubernetes.planner.pods.wiring import needs_recreation
+from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
 from rosproxy_operator.kubernetes.resources.model import Pod, PodContainer, Ros2Spec
 from tests.unit.operator.kubernetes import objects as some
@@ -12,6 +14,7 @@ from tests.unit.operator.kubernetes.test_ros2 import ADDRESS, of2, pod
 
 UNSET = PodContainer()
 WIRED = PodContainer(variables={"ROS_STATIC_PEERS": ADDRESS})
+WIRED_TO_3 = PodContainer(variables={**WIRED.variables, "ROS_DOMAIN_ID": "3"})
 ELSEWHERE = PodContainer(variables={"ROS_STATIC_PEERS": "192.0.2.7"})
 
 
@@ -59,6 +62,37 @@ def test_an_empty_domain_is_domain_0():
     assert finding.reason == "OtherDomain"
     assert "ROS_DOMAIN_ID=(empty, so 0) is not domain 5 of RosProxy" in finding.message
     assert finding.message.endswith(". Or change spec.domain: kubectl -n ros edit rosproxy robot")
+
+
+@pytest.mark.parametrize(("container", "wired_domain"), [(WIRED, ""), (WIRED_TO_3, "3")])
+def test_a_pod_that_was_wired_to_a_former_domain_is_restarted(
+    container: PodContainer, wired_domain: str
+):
+    """The operator advised to edit the template, or told nothing if there was no domain before."""
+    of = of2(Ros2Spec(domain=5))
+    former = pod(container, wired_domain=wired_domain, labels={names.INJECT: "true"})
+    (finding,) = ros2_findings(former, of, ADDRESS)
+    assert finding.reason == "OtherDomain"
+    assert finding.message == (
+        f"was wired to domain {wired_domain or 0}, but RosProxy robot has domain 5 now. "
+        "Run kubectl -n ros delete pod talker, and create the pod again"
+    )
+    assert needs_recreation(former, of, ADDRESS)
+
+
+def test_the_image_may_set_the_domain():
+    found = pod(WIRED, labels={names.INJECT: "true"})
+    of = replace(of2(Ros2Spec(domain=5)), discovered=frozenset({found.ip}))
+    assert list(ros2_findings(found, of, ADDRESS)) == []
+    assert not needs_recreation(found, of, ADDRESS)
+
+
+def test_the_domain_of_a_template_is_no_reason_to_recreate_the_pod():
+    found = pod(WIRED_TO_3, labels={names.INJECT: "true"})
+    of = of2(Ros2Spec(domain=5))
+    (finding,) = ros2_findings(found, of, ADDRESS)
+    assert "Remove the variable from the template" in finding.message
+    assert not needs_recreation(found, of, ADDRESS)
 
 
 def test_a_pod_that_no_webhook_has_seen_is_told():

@@ -21,6 +21,7 @@ from rosproxy_operator.kubernetes.planner.pods.wiring import (
     UNKNOWN_WEBHOOK,
     edit_fix,
     has_peers,
+    is_of_former_domain,
     is_of_service,
     missing_variable,
     recreate_command,
@@ -117,10 +118,17 @@ def _other_faults(
         yield "NoDds", Fault(text, f"{fix}. Or use a RosProxy with spec.ros: zenoh")
     domain = get("ROS_DOMAIN_ID")
     number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
+    name = rosproxy.id.name
+    if is_of_former_domain(container, pod, rosproxy):
+        text = (
+            f"was wired to domain {_shown(domain or '0')}, but RosProxy {name} has domain {number} "
+            "now"
+        )
+        yield "OtherDomain", Fault(text, f"Run {recreate_command(pod)}")
+        return
     # rcl treats an empty variable as unset (rcl, domain_id.c), and the webhook keeps the variable.
     if domain not in (None, VALUE_AT_RUNTIME) and (str(domain).strip() or "0") != str(number):
         value = _shown(str(domain)) or "(empty, so 0)"
-        name = rosproxy.id.name
         text = f"variable ROS_DOMAIN_ID={value} is not domain {number} of RosProxy {name}"
         removal = edit_fix("Remove the variable from the template", pod)
         edit = f"kubectl -n {rosproxy.id.namespace} edit rosproxy {name}"

@@ -7,7 +7,7 @@ webhook uses `wire`. The planner finds pods that do not use their proxy: `wiring
 `ros2_pods` for DDS, `zenoh_pods` for rmw_zenoh.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from datetime import datetime, timedelta
 from typing import Any
 
@@ -33,6 +33,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
+    DOMAIN,
     INJECT,
     MASTER_PORT,
     MASTER_URI,
@@ -138,21 +139,17 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
     replaced = _replaced_uri(spec, wanted) or annotations.get(REPLACED_URI, "")
     new_annotations = {
         annotation: value
-        for annotation, variable, value in _address_variables(wanted)
-        if any(
-            _value(c, variable) == value for kind in _CONTAINER_FIELDS for c in wired.get(kind, ())
-        )
+        for annotation, variable, value in _wired_variables(wanted)
+        if any(_value(c, variable) == value for c in _containers(wired))
     }
     if wanted.router:
         endpoint = tcp_endpoint(wanted.router)
-        if any(
-            endpoint in _value(c, OVERRIDE)
-            for kind in _CONTAINER_FIELDS
-            for c in wired.get(kind, ())
-        ):
+        if any(endpoint in _value(c, OVERRIDE) for c in _containers(wired)):
             new_annotations[ROUTER_ENDPOINT] = endpoint
     if replaced and MASTER_URI in new_annotations:
         new_annotations[REPLACED_URI] = replaced
+    if DOMAIN not in annotations and all(map(_has_domain, _containers(spec))):
+        new_annotations.pop(DOMAIN, None)  # all values are the template's
     return Wiring({**spec, **wired} if changed else None, new_annotations)
 
 
@@ -171,11 +168,11 @@ def wiring_finding(
 def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
     """Whether a pod does not use its proxy, and the webhook would wire a recreated pod.
 
-    True if ROS_MASTER_URI, ROS_STATIC_PEERS or the endpoint in ZENOH_CONFIG_OVERRIDE is missing or
-    outdated, or if the ROS 1 nodes of the pod may be unregistered for good. A variable that the
-    template sets does not count, except a ROS_MASTER_URI that names the real master of the
-    RosProxy, and a ZENOH_CONFIG_OVERRIDE that the webhook can extend. False for a pod without the
-    label.
+    True if ROS_MASTER_URI, ROS_STATIC_PEERS, ROS_DOMAIN_ID or the endpoint in ZENOH_CONFIG_OVERRIDE
+    is missing or outdated, or if the ROS 1 nodes of the pod may be unregistered for good. A
+    variable that the template sets does not count, except a ROS_MASTER_URI that names the real
+    master of the RosProxy, and a ZENOH_CONFIG_OVERRIDE that the webhook can extend. False for a pod
+    without the label.
     """
     masters = _masters_of(rosproxy)
     lacks_master = (
@@ -196,7 +193,23 @@ def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
         and peers <= {pod.static_peers}
         and pod.static_peers != cluster_ip
     )
-    return INJECT in pod.labels and (lacks_master or lacks_peers or lacks_router)
+    lacks_domain = any(is_of_former_domain(c, pod, rosproxy) for c in pod.containers)
+    return INJECT in pod.labels and (lacks_master or lacks_peers or lacks_domain or lacks_router)
+
+
+def is_of_former_domain(container: PodContainer, pod: Pod, rosproxy: RosProxy) -> bool:
+    """Whether a container was wired before the domain of the RosProxy changed.
+
+    Without ROS_DOMAIN_ID, the RosProxy had no domain then. But the image may set the variable.
+    """
+    ros2 = rosproxy.spec.ros2
+    if ros2 is None:
+        return False
+    own = container.variables.get("ROS_DOMAIN_ID")
+    if own is None:
+        is_discovered = rosproxy.discovered & {pod.ip, *pod.ips}
+        return bool(pod.static_peers and ros2.domain and not is_discovered)
+    return own == pod.wired_domain != str(ros2.number) and own != ""
 
 
 def wired_override(variables: Mapping[str, str], router: HostPort, former: str) -> str:
@@ -406,17 +419,29 @@ def _names_master(uri: str, masters: Collection[HostPort]) -> bool:
 
 def _replaced_uri(spec: Json, wanted: PodVariables) -> str:
     """The first ROS_MASTER_URI of a template that the webhook replaces; empty without one."""
-    containers = (container for kind in _CONTAINER_FIELDS for container in submaps(spec, kind))
-    own = (v for c in containers for v in submaps(c, "env") if v.get("name") == MASTER_VARIABLE)
+    own = (
+        v for c in _containers(spec) for v in submaps(c, "env") if v.get("name") == MASTER_VARIABLE
+    )
     values = (text_at(variable, "value") for variable in own)
     return next((value for value in values if _names_master(value, wanted.masters)), "")
 
 
-def _address_variables(wanted: PodVariables) -> list[tuple[str, str, str]]:
-    """The annotation, the variable and the value of each address for a pod."""
+def _containers(spec: Json) -> Iterator[Json]:
+    """Yield the containers and init containers of a pod."""
+    yield from (container for kind in _CONTAINER_FIELDS for container in submaps(spec, kind))
+
+
+def _has_domain(container: Json) -> bool:
+    return any(v.get("name") == "ROS_DOMAIN_ID" for v in submaps(container, "env"))
+
+
+def _wired_variables(wanted: PodVariables) -> list[tuple[str, str, str]]:
+    """The annotation, the variable and the value of each variable that an annotation records."""
+    domain = "" if wanted.domain is None else str(wanted.domain)
     variables = (
         (MASTER_URI, MASTER_VARIABLE, wanted.uri),
         (STATIC_PEERS, "ROS_STATIC_PEERS", wanted.static_peers),
+        (DOMAIN, "ROS_DOMAIN_ID", domain),
     )
     return [v for v in variables if v[2]]
 
@@ -426,7 +451,7 @@ def _wired(container: Json, wanted: PodVariables, annotations: Mapping[str, str]
     variables = list(submaps(container, "env"))
     names = {text_at(v, "name") for v in variables}
     added: list[Json] = []
-    for annotation, name, value in _address_variables(wanted):
+    for annotation, name, value in _wired_variables(wanted):
         former = annotations.get(annotation)
         masters = wanted.masters if name == MASTER_VARIABLE else frozenset[HostPort]()
         for index, variable in enumerate(variables):
@@ -439,8 +464,6 @@ def _wired(container: Json, wanted: PodVariables, annotations: Mapping[str, str]
     if wanted.uri and not names & {"ROS_IP", "ROS_HOSTNAME"}:
         source = {"fieldRef": {"apiVersion": "v1", "fieldPath": "status.podIP"}}
         added.append({"name": "ROS_IP", "valueFrom": source})
-    if wanted.domain is not None and "ROS_DOMAIN_ID" not in names:
-        added.append({"name": "ROS_DOMAIN_ID", "value": str(wanted.domain)})
     env = [*added, *variables]
     if wanted.router:
         env = _with_router(container, env, wanted.router, annotations.get(ROUTER_ENDPOINT, ""))
