@@ -143,6 +143,9 @@ def test_a_cluster_that_is_well_or_empty_or_without_an_operator() -> None:
     assert sound.severity is Severity.OK
     assert "there is no RosProxy" in cluster_findings([])[0].text
     assert "no running pod is selected" in cluster_findings([rosproxy(nodes=0)])[0].text
+    idle = condition("Ready", "True", "no pod is selected. Give pods the labels")
+    (finding,) = cluster_findings([rosproxy(nodes=0, conditions=[idle])])
+    assert (finding.text, finding.fix) == ("no pod is selected", "Give pods the labels")
     assert (
         "check that the operator runs" in cluster_findings([rosproxy(observedGeneration=1)])[0].fix
     )

@@ -224,7 +224,9 @@ def _status(
     master, _ = master_of(rosproxy, context.observed)
     uri = master.uri if master else ""
     addresses = Addresses(context.cluster_ip(rosproxy), uri, outside_address(context, rosproxy))
-    return status_of(rosproxy, states, problems, addresses, stamp)
+    selected = context.view.selected_pods.get(rosproxy.id, ())
+    unscheduled = [pod for pod in selected if not pod.node]
+    return status_of(rosproxy, states, problems, addresses, stamp, unscheduled)
 
 
 def stand_by(

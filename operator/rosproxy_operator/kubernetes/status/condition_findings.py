@@ -5,7 +5,6 @@ from collections.abc import Collection, Iterator
 from rosproxy.shared.documents.doctor_finding import DoctorFinding, error, ok, warning
 from rosproxy_operator.kubernetes.resources.checks import int_at, submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
-from rosproxy_operator.kubernetes.resources.names import INJECT
 from rosproxy_operator.kubernetes.status.fixes import fix_for
 from rosproxy_operator.kubernetes.status.operator_findings import (
     UNKNOWN,
@@ -79,6 +78,5 @@ def _findings_of(rosproxy: Json, operators: Operators) -> Iterator[DoctorFinding
         text = f"proxies {text_at(status, 'proxies')} ready, {int_at(status, 'rosNodes')} ROS nodes"
         yield ok("rosproxy", subject, text)
     else:
-        text = "no running pod is selected"
-        fix = f"add the label {INJECT}={metadata['name']} to the template of your pods"
-        yield warning("rosproxy", subject, text, fix)
+        text, _, fix = text_at(conditions.get("Ready", {}), "message").partition(". ")
+        yield warning("rosproxy", subject, text or "no running pod is selected", fix)

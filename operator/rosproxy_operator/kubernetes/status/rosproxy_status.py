@@ -22,6 +22,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     InvalidRosProxy,
     Json,
+    Pod,
     RosProxy,
     ZenohSpec,
 )
@@ -68,6 +69,8 @@ _MOST_BY_NODE_CHARACTERS = 400
 # As for the reason of a metav1.Condition in k8s.io/apimachinery, pkg/apis/meta/v1/types.go.
 _REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
 _NO_PODS = "NoPods"
+MOST_DESCRIBED_PODS = 3
+"""Most pods that a command in a condition names."""
 _KEEPS_PODS_OUT = ("Ambiguous", "HostNetwork", "NodeLeftOut", "NotWired")
 """Reasons of findings about pods that get no proxy."""
 _NO_PROXY = "no proxy runs, so this is not known"
@@ -103,6 +106,7 @@ def status_of(
     problems: tuple[ClusterFinding, ...],
     addresses: Addresses,
     stamp: str,
+    unscheduled: Sequence[Pod] = (),
 ) -> Json:
     """The status of a RosProxy, with the fields of the CRD.
 
@@ -110,7 +114,8 @@ def status_of(
     status. So a start of the operator changes no status.
 
     ``problems`` are all findings about the RosProxy, with the findings about pods. ``stamp`` is the
-    time for conditions that change, in RFC 3339.
+    time for conditions that change, in RFC 3339. ``unscheduled`` are the selected pods without a
+    node.
     """
     former = rosproxy.status
     lines = _lines(rosproxy, states)
@@ -122,7 +127,7 @@ def status_of(
     served = [plural(ros_nodes, "ROS node")] if spec.ros1 or spec.zenoh else []
     if spec.ros2:
         served.append(f"{plural(participant_count, 'participant')} of domain {spec.ros2.number}")
-    ready = _ready(rosproxy, wanted, problems, " and ".join(served))
+    ready = _ready(rosproxy, wanted, problems, " and ".join(served), unscheduled)
     judged = (
         ready,
         *([_allocated(wanted, problems)] if not spec.zenoh else []),
@@ -419,11 +424,17 @@ def _ready(
     wanted: Sequence[RosProxyOnNode],
     problems: Sequence[ClusterFinding],
     served: str,
+    unscheduled: Sequence[Pod],
 ) -> Condition:
     if not wanted:
         cause = next((p for p in problems if p.reason in _KEEPS_PODS_OUT), None)
         if cause is not None:
             return Condition(READY, "True", _NO_PODS, f"no pod has a proxy. {_one_line(cause)}")
+        if unscheduled:
+            names = " ".join(sorted(pod.id.name for pod in unscheduled)[:MOST_DESCRIBED_PODS])
+            text = f"no selected pod runs on a node yet ({plural(len(unscheduled), 'pod')})"
+            command = f"kubectl -n {rosproxy.id.namespace} describe pod {names}"
+            return Condition(READY, "True", _NO_PODS, f"{text}. Read the Events: {command}")
         fix = "Give pods the labels that spec.podSelector requires"
         if rosproxy.spec.pod_selector is None:
             # Not "true": with several RosProxies this value is ambiguous.

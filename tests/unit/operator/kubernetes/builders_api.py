@@ -174,7 +174,8 @@ def status(
     problems = (*findings(resource, states, given.get("failures", {})), *more)
     stamp = given.get("stamp", STAMP)
     addresses = Addresses(given.get("cluster_ip", CLUSTER_IP), ROBOT, given.get("outside"))
-    return status_of(resource, states, problems, addresses, stamp)
+    waiting = given.get("unscheduled", ())
+    return status_of(resource, states, problems, addresses, stamp, waiting)
 
 
 def condition(rosproxy_status: Json, type: str) -> Any:

@@ -161,6 +161,18 @@ def test_the_wide_output_tells_the_first_problem_of_a_rosproxy_that_is_ready():
     assert rosproxy_status["message"] == "pod robots/astray: has no variable"
 
 
+def test_selected_pods_without_a_node_are_no_reason_for_a_label():
+    """The status and the doctor advised to add the label, which the pods had."""
+    waiting = [pod(f"talker-{number}", node="") for number in range(5)]
+    rosproxy_status = status(unscheduled=waiting)
+
+    assert judged(rosproxy_status, "Ready") == ("True", "NoPods")
+    assert message(rosproxy_status) == (
+        "no selected pod runs on a node yet (5 pods). Read the Events: kubectl -n robots describe "
+        "pod talker-0 talker-1 talker-2"
+    )
+
+
 def test_no_pod_is_selected():
     rosproxy_status = status()
 
