@@ -29,6 +29,25 @@ def test_tokens_of_a_container_do_not_end_the_routers(lab: Lab) -> None:
     assert lab.zenoh().restarts == 0
 
 
+def test_a_program_does_not_answer_for_the_routers(lab: Lab) -> None:
+    """zenoh asks only a queryable that says that it has all answers, from any machine."""
+    lab.start_router(VERSION)
+    lab.start_proxy()
+    for role in PORTS:
+        lab.redirect(role)
+    lab.wait_for_link()
+    subscriber = lab.node(VERSION, "c2", "sub")
+    lab.node(VERSION, "c1", "pub")
+    outside = lab.node(VERSION, "out", "usurp")
+    inside = lab.node(VERSION, "c1", "usurp")
+    for usurper in (outside, inside):
+        usurper.wait_for_count("^asked", 20, timeout=30, since=usurper.mark())
+    status = lab.zenoh()
+    assert (status.restarts, status.links[0].up) == (0, True)
+    assert "f00" not in {session.zid for session in status.sessions}
+    subscriber.wait_for_count("^got hello ", 20, timeout=30, since=subscriber.mark())
+
+
 @pytest.mark.parametrize("hangs", [False, True])
 def test_messages_that_may_not_be_dropped_hold_up_no_other_container(
     lab: Lab, *, hangs: bool

@@ -1,13 +1,14 @@
 """A replacement for a node of rmw_zenoh: session, keys and liveliness tokens.
 
 `python node.py KIND NAME TOPIC`, where KIND is pub, blast, shout, sub, count, clock, latch, late,
-serve, call, probe, graph, crowd, hoard, mute, offer or use. Prints a line for each event, and runs
-until killed. NODE_TYPE: another type, as in keys. NODE_PERIOD_S: the time between two messages.
-NODE_TOKENS, NODE_LETTER: see `crowd`. NODE_BYTES: see `blast`. For `offer` and `use`, which gets
-names of nodes as TOPIC, see `matrix.py`.
+serve, usurp, call, probe, graph, crowd, hoard, mute, offer or use. Prints a line for each event,
+and runs until killed. NODE_TYPE: another type, as in keys. NODE_PERIOD_S: the time between two
+messages. NODE_TOKENS, NODE_LETTER: see `crowd`. NODE_BYTES: see `blast`. For `offer` and `use`,
+which gets names of nodes as TOPIC, see `matrix.py`.
 """
 
 import itertools
+import json
 import os
 import socket
 import sys
@@ -93,6 +94,20 @@ def serve(session: Any, key: str, name: str) -> Any:
     return session.declare_queryable(key, lambda query: query.reply(key, f"answer of {name}"))
 
 
+def usurp(session: Any, _: str, __: str) -> Any:
+    """Answer for the routers: with nonsense, and with a session that the router does not have."""
+
+    def answer(query: Any) -> None:
+        say("asked", query.key_expr)
+        zid = str(query.key_expr).split("/")[1]
+        link = {"src": "tcp/192.0.2.1:7448", "dst": "tcp/192.0.2.9:1"}
+        invented = {"peer": "f00", "whatami": "router", "links": [link]}
+        described = {"zid": zid, "sessions": [invented], "locators": []}
+        query.reply(query.key_expr, json.dumps(described))
+
+    return session.declare_queryable("@/**", answer, complete=True)
+
+
 def crowd(session: Any, _: str, name: str) -> list[Any]:
     """Declare NODE_TOKENS tokens of topics, whose names end in NODE_LETTER, 800 times."""
     start = f"@ros2_lv/0/{session.info.zid()}/0"
@@ -175,6 +190,7 @@ DECLARES = {
     "count": count,
     "clock": clock,
     "serve": serve,
+    "usurp": usurp,
     "graph": watch_graph,
     "crowd": crowd,
     "latch": latch,
