@@ -303,8 +303,20 @@ class ZenohState(Collector):
         yield from (links, hubs, sessions, full, nodes, files)
 
     def _sessions_of(self, routers: Sequence[RouterReport]) -> Iterator[_PlacedSession]:
-        """The sessions with programs other than the routers themselves."""
+        """The sessions with programs other than the routers themselves.
+
+        A container can take the zenoh ID of a router, and rules for its address hold all the same.
+        So at a port for containers, a session is with a router only if that router reports it, too.
+        """
         own = {router.zid for router in routers}
+        ends_of_own = [
+            ends
+            for router in routers
+            for session in router.sessions
+            if session.peer in own
+            for ends in all_ends_of(session)
+        ]
+        between = {Ends(ends.remote, ends.local) for ends in ends_of_own} & {*ends_of_own}
         for_outside = [] if self._settings.zenoh_listen is None else [None]
         for_links = [None] if self._settings.has_site_links else []
         ports = [*self._settings.zenoh_ports.ports(), *for_outside, *for_links, None]
@@ -312,7 +324,8 @@ class ZenohState(Collector):
         for index, (port, router) in enumerate(zip(ports, routers, strict=False)):
             for session in router.sessions:
                 ends = ends_of(session)
-                if ends and session.peer not in own:
+                is_own = session.peer in own and (port is None or ends in between)
+                if ends and not is_own:
                     yield _PlacedSession(port, session, ends, index == at_link)
 
     def _full(self, routers: Sequence[RouterReport]) -> Iterator[ZenohFullStatus]:

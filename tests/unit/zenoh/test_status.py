@@ -121,6 +121,16 @@ def test_sessions_at_the_port_for_outside_are_outside() -> None:
     ]
 
 
+def test_a_container_with_the_zenoh_id_of_a_router_is_no_router() -> None:
+    """The rules of the container did not hold at the port of another container."""
+    state = make_state(FakeProcess())
+    borrowed = session("01", "client", "172.18.0.2:7449", "172.18.0.3:50009")
+    routers = (REPORT.routers[0], RouterReport("02", (borrowed,)), HUB)
+    state.take(Report(routers), None)
+    assert (7449, "172.18.0.3") in state.container_sessions
+    assert not [port for port, address in state.container_sessions if address == "127.0.0.1"]
+
+
 def test_sessions_have_both_addresses_and_their_router() -> None:
     status = make_state(FakeProcess()).status()
     assert status.sessions == (
