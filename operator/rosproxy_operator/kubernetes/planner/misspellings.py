@@ -10,7 +10,7 @@ from heapq import nsmallest
 
 from rosproxy_operator.common.problem import UNKNOWN_NAME, Fault
 from rosproxy_operator.kubernetes.planner.cluster_view import View, group_by_key
-from rosproxy_operator.kubernetes.planner.pods.wiring import edit_fix
+from rosproxy_operator.kubernetes.planner.pods.pod_fixes import edit_fix
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Name,

@@ -29,12 +29,12 @@ from rosproxy_operator.kubernetes.planner.misspellings import (
     misspellings,
     misspelt_pod_findings,
 )
+from rosproxy_operator.kubernetes.planner.pods.ros1_pods import ros1_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.pods.unselected import (
     unselected_findings,
     unselected_waits,
 )
-from rosproxy_operator.kubernetes.planner.pods.wiring import wiring_finding
 from rosproxy_operator.kubernetes.planner.pods.zenoh_pods import zenoh_findings
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
@@ -292,7 +292,7 @@ def _problems(
         *(f for f in (*shared, *context.ranges.findings) if f.of == rosproxy.id),
         *filter(
             None,
-            (wiring_finding(p, rosproxy, address, webhook) for p in pods if rosproxy.spec.ros1),
+            (ros1_finding(p, rosproxy, address, webhook) for p in pods if rosproxy.spec.ros1),
         ),
         *(f for pod in pods for f in ros2_findings(pod, rosproxy, address, webhook)),
         *(f for pod in pods for f in zenoh_findings(pod, rosproxy, address, webhook)),

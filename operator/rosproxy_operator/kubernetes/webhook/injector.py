@@ -28,12 +28,7 @@ from rosproxy_operator.kubernetes.api.api_client import (
 )
 from rosproxy_operator.kubernetes.planner.bounds import Consents, bounds_violation
 from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, why_not_selected
-from rosproxy_operator.kubernetes.planner.pods.wiring import (
-    UNWIRED,
-    Wiring,
-    pod_variables,
-    wire,
-)
+from rosproxy_operator.kubernetes.planner.pods.wiring import UNWIRED, Wiring, pod_variables, wire
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import service_id

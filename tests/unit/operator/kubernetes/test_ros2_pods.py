@@ -3,8 +3,8 @@
 import pytest
 from msgspec.structs import replace
 
+from rosproxy_operator.kubernetes.planner.pods.recreation import needs_recreation
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
-from rosproxy_operator.kubernetes.planner.pods.wiring import needs_recreation
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
 from rosproxy_operator.kubernetes.resources.model import Pod, PodContainer, Ros2Spec

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from rosproxy.shared.addresses import HostPort
+from rosproxy_operator.kubernetes.planner.pods.recreation import needs_recreation
+from rosproxy_operator.kubernetes.planner.pods.ros1_pods import ros1_finding
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
     MIRROR_ANNOTATION,
     PodVariables,
     Wiring,
-    needs_recreation,
     pod_variables,
     wire,
-    wiring_finding,
 )
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.cluster import WebhookState
@@ -158,11 +158,11 @@ def test_the_own_masters_uri_is_replaced_and_any_other_stays(master, uri, names_
     assert env_of(wiring) == [IP, {"name": "A", "value": "b"}, MASTER if names_it else own(uri)]
     notes = {ANNOTATION: URI, "rosproxy.io/replaced-master-uri": uri}
     assert wiring.annotations == (notes if names_it else {})
-    finding = wiring_finding(objects.pod(applied(obj, wiring)), of, CLUSTER_IP)
+    finding = ros1_finding(objects.pod(applied(obj, wiring)), of, CLUSTER_IP)
     assert bool(finding) == (not names_it and "$" not in uri)
     unwired = objects.pod({**obj, "metadata": {"labels": {INJECT: "true"}}})
     assert needs_recreation(unwired, of, CLUSTER_IP) == names_it
-    finding = wiring_finding(unwired, of, CLUSTER_IP)
+    finding = ros1_finding(unwired, of, CLUSTER_IP)
     assert finding is None or ("Remove the variable" in finding.message) == (not names_it)
 
 
@@ -303,7 +303,7 @@ def test_a_wired_pod_is_wired():
     stored = objects.pod(applied(obj, wire(obj, TO)))
 
     assert stored.wired_master_uri == URI
-    assert wiring_finding(stored, rosproxy(), CLUSTER_IP) is None
+    assert ros1_finding(stored, rosproxy(), CLUSTER_IP) is None
 
 
 @pytest.mark.parametrize(
@@ -320,7 +320,7 @@ def test_a_wired_pod_is_wired():
     ],
 )
 def test_a_pod_that_sets_its_proxy_itself_is_wired(master):
-    assert wiring_finding(pod(own_masters=(master,)), rosproxy(), CLUSTER_IP) is None
+    assert ros1_finding(pod(own_masters=(master,)), rosproxy(), CLUSTER_IP) is None
 
 
 @pytest.mark.parametrize(
@@ -336,7 +336,7 @@ def test_a_pod_that_sets_its_proxy_itself_is_wired(master):
     ],
 )
 def test_a_pod_that_goes_around_its_proxy_is_told(master):
-    finding = wiring_finding(
+    finding = ros1_finding(
         pod(own_masters=(URI, master), wired_master_uri=URI), rosproxy(), CLUSTER_IP
     )
 
@@ -367,7 +367,7 @@ def test_a_pod_that_goes_around_its_proxy_is_told(master):
 )
 def test_a_pod_that_is_not_wired_is_told_what_to_do(unwired, said):
     of = replace(rosproxy(), created="2026-01-02T00:00:00Z")
-    finding = wiring_finding(unwired, of, CLUSTER_IP)
+    finding = ros1_finding(unwired, of, CLUSTER_IP)
 
     assert finding is not None
     assert said in finding.message
@@ -384,7 +384,7 @@ def test_a_pod_that_no_operator_wired_though_one_was_ready_needs_another_fix(cre
     """The advice was to create the pod anew, which fails again while port 9443 is closed."""
     of = replace(rosproxy(), created="2026-01-02T00:00:00Z")
     webhook = WebhookState(since="2026-01-03T00:00:00Z")
-    finding = wiring_finding(pod(created=created), of, CLUSTER_IP, webhook)
+    finding = ros1_finding(pod(created=created), of, CLUSTER_IP, webhook)
 
     assert finding is not None
     assert said in finding.message
@@ -394,9 +394,9 @@ def test_a_pod_that_is_older_than_the_service_is_told_so():
     """A RosProxy that was refused at first gets its Service late. The text blamed the webhook."""
     of = replace(rosproxy(), created="2026-01-02T00:00:00Z")
     webhook = WebhookState(since="2026-01-01T00:00:00Z", service_since="2026-01-05T00:00:00Z")
-    old = wiring_finding(pod(created="2026-01-05T00:00:00Z"), of, CLUSTER_IP, webhook)
-    new = wiring_finding(pod(created="2026-01-05T00:00:59Z"), of, CLUSTER_IP, webhook)
-    newer = wiring_finding(pod(created="2026-01-05T00:01:00Z"), of, CLUSTER_IP, webhook)
+    old = ros1_finding(pod(created="2026-01-05T00:00:00Z"), of, CLUSTER_IP, webhook)
+    new = ros1_finding(pod(created="2026-01-05T00:00:59Z"), of, CLUSTER_IP, webhook)
+    newer = ros1_finding(pod(created="2026-01-05T00:01:00Z"), of, CLUSTER_IP, webhook)
 
     assert old is not None
     assert new is not None
@@ -408,7 +408,7 @@ def test_a_pod_that_is_older_than_the_service_is_told_so():
 
 def test_without_the_webhook_the_template_sets_the_variable():
     unwired = pod(workload="deployment/talker")
-    finding = wiring_finding(unwired, rosproxy(), CLUSTER_IP, WebhookState(served=False))
+    finding = ros1_finding(unwired, rosproxy(), CLUSTER_IP, WebhookState(served=False))
 
     assert finding is not None
     assert "(webhook.enabled=false). Set ROS_MASTER_URI in the template: kubectl" in finding.message

@@ -27,11 +27,8 @@ from rosproxy_operator.kubernetes.planner.actions import (
     Emit,
 )
 from rosproxy_operator.kubernetes.planner.bounds import bounds_violation
-from rosproxy_operator.kubernetes.planner.pods.wiring import (
-    needs_recreation,
-    pod_variables,
-    wire,
-)
+from rosproxy_operator.kubernetes.planner.pods.recreation import needs_recreation
+from rosproxy_operator.kubernetes.planner.pods.wiring import pod_variables, wire
 from rosproxy_operator.kubernetes.planner.pods.zenoh_pods import zenoh_findings
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
 from rosproxy_operator.kubernetes.planner.zenoh_hubs import APART_REPORTED_S

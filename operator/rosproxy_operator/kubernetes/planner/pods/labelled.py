@@ -8,13 +8,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from rosproxy.shared.documents.doctor_finding import DoctorFinding, error
 from rosproxy.shared.output.text import listed, plural
 from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
+from rosproxy_operator.kubernetes.planner.pods.pod_fixes import edit_fix, recreate_command
+from rosproxy_operator.kubernetes.planner.pods.recreation import needs_recreation
 from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, wants_proxy
-from rosproxy_operator.kubernetes.planner.pods.wiring import (
-    edit_fix,
-    needs_recreation,
-    recreate_command,
-    should_be_wired,
-)
+from rosproxy_operator.kubernetes.planner.pods.unwired import should_be_wired
 from rosproxy_operator.kubernetes.resources.model import Name, Pod, RosProxy
 from rosproxy_operator.kubernetes.resources.names import INJECT
 

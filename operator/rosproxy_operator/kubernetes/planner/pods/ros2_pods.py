@@ -17,15 +17,13 @@ from itertools import chain
 from rosproxy.shared.output.text import clean
 from rosproxy_operator.common.problem import NOT_WIRED, Fault
 from rosproxy_operator.common.ros2 import is_dds
-from rosproxy_operator.kubernetes.planner.pods.wiring import (
+from rosproxy_operator.kubernetes.planner.pods.pod_fixes import edit_fix, recreate_command
+from rosproxy_operator.kubernetes.planner.pods.unwired import (
     UNKNOWN_WEBHOOK,
-    edit_fix,
-    has_peers,
     is_of_former_domain,
-    is_of_service,
     missing_variable,
-    recreate_command,
 )
+from rosproxy_operator.kubernetes.planner.pods.wiring import has_peers, is_of_service
 from rosproxy_operator.kubernetes.resources.cluster import WebhookState
 from rosproxy_operator.kubernetes.resources.model import (
     VALUE_AT_RUNTIME,

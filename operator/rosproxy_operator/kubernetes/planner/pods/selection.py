@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from rosproxy.shared.output.text import shorten
 from rosproxy_operator.common.problem import Fault
 from rosproxy_operator.common.zenoh import tcp_endpoint
-from rosproxy_operator.kubernetes.planner.pods.wiring import edit_fix, recreate_fix
+from rosproxy_operator.kubernetes.planner.pods.pod_fixes import edit_fix, recreate_fix
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     ClusterNode,

@@ -1,41 +1,32 @@
-"""Wires pods to the proxy at admission, and finds pods that are not wired.
+"""Wires pods to the proxy at admission.
 
 The containers of a wired pod have ROS_MASTER_URI and ROS_IP, or ROS_STATIC_PEERS for DDS, or
 ZENOH_CONFIG_OVERRIDE for rmw_zenoh. ROS_MASTER_URI, ROS_STATIC_PEERS and the endpoint in
 ZENOH_CONFIG_OVERRIDE name the RosProxy's Service, which leads to the proxy on the same node. The
-webhook uses `wire`. The planner finds pods that do not use their proxy: `wiring_finding` for ROS 1,
-`ros2_pods` for DDS, `zenoh_pods` for rmw_zenoh.
+webhook uses `wire`. The planner finds pods that do not use their proxy: `ros1_pods`, `ros2_pods`
+(DDS) and `zenoh_pods`.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from datetime import datetime, timedelta
 from typing import Any
 
 import msgspec
 
 from rosproxy.shared.addresses import HostPort
-from rosproxy.shared.output.text import clean
 from rosproxy.shared.uris import parse_slave_uri
-from rosproxy_operator.common.problem import NOT_WIRED, Fault
 from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.common.zenoh import OVERRIDE, tcp_endpoint, with_client_override
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
-from rosproxy_operator.kubernetes.resources.cluster import WebhookState
 from rosproxy_operator.kubernetes.resources.model import (
     REFERENCE,
-    VALUE_AT_RUNTIME,
-    ClusterFinding,
     Json,
     Name,
-    Pod,
     PodContainer,
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
     DOMAIN,
-    INJECT,
-    MASTER_PORT,
     MASTER_URI,
     REPLACED_URI,
     ROUTER_ENDPOINT,
@@ -45,16 +36,9 @@ from rosproxy_operator.kubernetes.resources.names import (
     service_id,
 )
 from rosproxy_operator.kubernetes.resources.objects import MASTER_VARIABLE
-from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 MIRROR_ANNOTATION = "kubernetes.io/config.mirror"
 """Annotation of the mirror pod of a static pod. A change of a mirror pod changes no container."""
-WEBHOOK_READY_AFTER = timedelta(minutes=1)
-"""Time after which the webhook is sure to wire the pods of a new RosProxy.
-
-The time starts when the RosProxy exists and the webhook is ready.
-"""
-UNKNOWN_WEBHOOK = WebhookState()
 UNWIRED = "rosproxy: this pod was not wired to a proxy: "
 """The start of each warning at admission."""
 _CONTAINER_FIELDS = ("initContainers", "containers")
@@ -97,7 +81,7 @@ def pod_variables(rosproxy: RosProxy, cluster_ip: str) -> PodVariables:
         master_uri(cluster_ip) if rosproxy.spec.ros1 else "",
         cluster_ip if ros2 else "",
         ros2.domain if ros2 else None,
-        _masters_of(rosproxy) if rosproxy.spec.ros1 else frozenset(),
+        masters_of(rosproxy) if rosproxy.spec.ros1 else frozenset(),
         router_of(cluster_ip) if rosproxy.spec.zenoh else None,
     )
 
@@ -153,65 +137,6 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
     return Wiring({**spec, **wired} if changed else None, new_annotations)
 
 
-def wiring_finding(
-    pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState = UNKNOWN_WEBHOOK
-) -> ClusterFinding | None:
-    """Return a finding (reason NotWired) if the ROS 1 nodes of a selected pod do not use its proxy.
-
-    Also if the pod has to be recreated: the ROS nodes may not be registered any more. Else None.
-    ``cluster_ip`` is the address of the RosProxy's Service.
-    """
-    fault = _why_not_wired(pod, rosproxy, cluster_ip, webhook)
-    return pod_finding(pod, rosproxy, NOT_WIRED, fault, fatal=False) if fault else None
-
-
-def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
-    """Whether a pod does not use its proxy, and the webhook would wire a recreated pod.
-
-    True if ROS_MASTER_URI, ROS_STATIC_PEERS, ROS_DOMAIN_ID or the endpoint in ZENOH_CONFIG_OVERRIDE
-    is missing or outdated, or if the ROS 1 nodes of the pod may be unregistered for good. A
-    variable that the template sets does not count, except a ROS_MASTER_URI that names the real
-    master of the RosProxy, and a ZENOH_CONFIG_OVERRIDE that the webhook can extend. False for a pod
-    without the label.
-    """
-    masters = _masters_of(rosproxy)
-    lacks_master = (
-        rosproxy.spec.ros1
-        and all(_names_master(uri, masters) for uri in pod.own_masters)
-        and (pod.wired_master_uri != master_uri(cluster_ip) or bool(_why_lost(pod, rosproxy)))
-    )
-    # A container without the endpoint in a wired pod comes from a later webhook.
-    router = router_of(cluster_ip)
-    lacks_router = (
-        rosproxy.spec.zenoh is not None
-        and pod.router_endpoint != tcp_endpoint(router)
-        and any(wired_override(c.variables, router, pod.router_endpoint) for c in pod.containers)
-    )
-    peers = {c.variables["ROS_STATIC_PEERS"] for c in pod.containers if has_peers(c)}
-    lacks_peers = (
-        rosproxy.spec.ros2 is not None
-        and peers <= {pod.static_peers}
-        and pod.static_peers != cluster_ip
-    )
-    lacks_domain = any(is_of_former_domain(c, pod, rosproxy) for c in pod.containers)
-    return INJECT in pod.labels and (lacks_master or lacks_peers or lacks_domain or lacks_router)
-
-
-def is_of_former_domain(container: PodContainer, pod: Pod, rosproxy: RosProxy) -> bool:
-    """Whether a container was wired before the domain of the RosProxy changed.
-
-    Without ROS_DOMAIN_ID, the RosProxy had no domain then. But the image may set the variable.
-    """
-    ros2 = rosproxy.spec.ros2
-    if ros2 is None:
-        return False
-    own = container.variables.get("ROS_DOMAIN_ID")
-    if own is None:
-        is_discovered = rosproxy.discovered & {pod.ip, *pod.ips}
-        return bool(pod.static_peers and ros2.domain and not is_discovered)
-    return own == pod.wired_domain != str(ros2.number) and own != ""
-
-
 def wired_override(variables: Mapping[str, str], router: HostPort, former: str) -> str:
     """Return the ZENOH_CONFIG_OVERRIDE with which a container uses a router.
 
@@ -239,152 +164,6 @@ def has_peers(container: PodContainer) -> bool:
     return "ROS_STATIC_PEERS" in container.variables
 
 
-def recreate_command(pod: Pod) -> str:
-    """The kubectl command that recreates a pod."""
-    if pod.workload:
-        return f"kubectl -n {pod.id.namespace} rollout restart {pod.workload}"
-    command = f"kubectl -n {pod.id.namespace} delete pod {pod.id.name}"
-    return command if pod.controller else f"{command}, and create the pod again"
-
-
-def recreate_fix(pod: Pod) -> str:
-    """The fix that recreates a pod. A pod at admission has no uid, and may have no name."""
-    return f"run {recreate_command(pod)}" if pod.uid or pod.workload else "create the pod again"
-
-
-def edit_fix(change: str, pod: Pod) -> str:
-    """The fix that makes a ``change`` in the template of a pod, with the kubectl command."""
-    if pod.workload:
-        return f"{change}: kubectl -n {pod.id.namespace} edit {pod.workload}"
-    return f"{change}, then {recreate_fix(pod)}"
-
-
-def _why_lost(pod: Pod, rosproxy: RosProxy) -> str:
-    """Return why the ROS 1 nodes of a wired pod may be unregistered for good; empty if they aren't.
-
-    The proxy unregisters the nodes when the RosProxy is deleted, and when the operator moves the
-    proxy or no longer needs the proxy (`unregistrations`). ROS 1 nodes don't register again by
-    themselves. A container that was started later has new nodes, which register at their start. If
-    a proxy has nodes at the address of the pod, the nodes of the pod are registered.
-    """
-    if not pod.running_since or rosproxy.registered & {pod.ip, *pod.ips}:
-        return ""
-    # The times are RFC 3339 in UTC with whole seconds, so texts sort like times.
-    if pod.running_since < rosproxy.created:
-        return (
-            f"is older than RosProxy {rosproxy.id.name}: the former RosProxy of that name was "
-            "deleted, and the ROS nodes of the pod may have been unregistered at the master"
-        )
-    at = rosproxy.unregistered_at.get(pod.node, "")
-    if pod.running_since < at:
-        return (
-            f"was started before {at}, when the proxy on node {pod.node} unregistered ROS nodes "
-            f"after a change of RosProxy {rosproxy.id.name} or of the selected pods. The ROS nodes "
-            "of this pod may have been unregistered for good"
-        )
-    return ""
-
-
-def _younger_object(pod: Pod, rosproxy: RosProxy, service_since: str) -> str:
-    """The object that an unwired pod lacked at its creation; empty if both objects existed.
-
-    A pod of the same second as the object lacked the object, too: otherwise the webhook would have
-    wired the pod. The operator creates the Service, so the Service is younger than the RosProxy.
-    """
-    if pod.created and pod.created < rosproxy.created:
-        return f"RosProxy {rosproxy.id.name}"
-    if pod.created and pod.created <= service_since:
-        return f"Service {service_id(rosproxy.id).name} of the RosProxy"
-    return ""
-
-
-def should_be_wired(
-    pod: Pod, rosproxy: RosProxy, ready_since: str, service_since: str = ""
-) -> bool:
-    """Whether the webhook should have wired a pod when the pod was created.
-
-    The pod must be at least `WEBHOOK_READY_AFTER` younger than the RosProxy, than the time
-    ``ready_since`` at which the webhook became ready, and than the Service of the RosProxy
-    (``service_since``; empty if unknown). False if another time is not known.
-    """
-    if not (pod.created and rosproxy.created and ready_since):
-        return False
-    others = filter(None, (rosproxy.created, ready_since, service_since))
-    latest = max(datetime.fromisoformat(time) for time in others)
-    return datetime.fromisoformat(pod.created) - latest >= WEBHOOK_READY_AFTER
-
-
-def _why_not_wired(
-    pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState
-) -> Fault | None:
-    """Return why the ROS 1 nodes of a pod do not use the proxy, and the fix; else None."""
-    masters = _masters_of(rosproxy)
-    bypassing = [
-        uri for uri in pod.own_masters if not _leads_to_proxy(uri, rosproxy.id, cluster_ip)
-    ]
-    foreign = [uri for uri in bypassing if not _names_master(uri, masters)]
-    if foreign:
-        return Fault(
-            f"variable ROS_MASTER_URI={clean(foreign[0])[:200]} of the template does not lead to "
-            "the proxy, so the nodes bypass the proxy",
-            edit_fix("Remove the variable from the template", pod),
-        )
-    if pod.wired_master_uri and pod.wired_master_uri != master_uri(cluster_ip):
-        return Fault(
-            f"was wired to {clean(pod.wired_master_uri)[:200]}, but the proxy is at "
-            f"{master_uri(cluster_ip)} now",
-            f"Run {recreate_command(pod)}",
-        )
-    if lost := _why_lost(pod, rosproxy):
-        return Fault(lost, f"Run {recreate_command(pod)}")
-    if not bypassing and (pod.wired_master_uri or pod.own_masters):
-        return None
-    return missing_variable("ROS_MASTER_URI", pod, rosproxy, webhook)
-
-
-def missing_variable(variable: str, pod: Pod, rosproxy: RosProxy, webhook: WebhookState) -> Fault:
-    """The fault of a pod without the variable: the reason and the fix."""
-    text = f"has no variable {variable} with the address of the proxy"
-    if INJECT not in pod.labels:
-        label = f"{INJECT}={rosproxy.id.name}"
-        fix = edit_fix(f"Add the label {label} to the template", pod)
-        return Fault(f"{text}, since the pod has no label {INJECT}", fix)
-    restart = f"Run {recreate_command(pod)}"
-    if not webhook.served:
-        fix = edit_fix(f"Set {variable} in the template", pod)
-        reason = "the operator serves no webhook (webhook.enabled=false)"
-        return Fault(f"{text}, since {reason}", fix)
-    if pod.wired_master_uri or pod.static_peers or pod.router_endpoint:
-        changed = f"spec.ros of RosProxy {rosproxy.id.name} has changed"
-        return Fault(f"{text}, since {changed} after the pod was created", restart)
-    if younger := _younger_object(pod, rosproxy, webhook.service_since):
-        return Fault(f"{text}, since the pod is older than {younger}", restart)
-    reason = (
-        "no operator answered the API server at the webhook port (chart value webhook.port) when "
-        "the pod was created"
-    )
-    if should_be_wired(pod, rosproxy, webhook.since, webhook.service_since):
-        return Fault(
-            f"{text}, since {reason}, although an operator was ready",
-            "Allow connections from the API server to the webhook port of the operator's pods "
-            f"(NetworkPolicy, firewall). {restart}",
-        )
-    return Fault(f"{text}, since {reason}", restart)
-
-
-def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:
-    """Whether a ROS_MASTER_URI leads to a RosProxy's Service, by address or by name.
-
-    The operator can't see a value that is only known at run time, and accepts that value.
-    """
-    if uri == VALUE_AT_RUNTIME:
-        return True
-    master = parse_slave_uri(uri.strip())
-    if master is None or master.port != MASTER_PORT:
-        return False
-    return is_of_service(master.host, rosproxy_id, cluster_ip)
-
-
 def is_of_service(host: str, rosproxy_id: Name, cluster_ip: str) -> bool:
     """Whether a host is the address or a name of a RosProxy's Service."""
     service = service_id(rosproxy_id)
@@ -393,7 +172,7 @@ def is_of_service(host: str, rosproxy_id: Name, cluster_ip: str) -> bool:
     return host in (cluster_ip.lower(), service.name, name) or f"{host}.".startswith(f"{name}.svc.")
 
 
-def _masters_of(rosproxy: RosProxy) -> frozenset[HostPort]:
+def masters_of(rosproxy: RosProxy) -> frozenset[HostPort]:
     """The hosts and ports by which pods may name the real master of a RosProxy, in lower case."""
     master = rosproxy.spec.master
     service = rosproxy.spec.master.service
@@ -408,7 +187,7 @@ def _masters_of(rosproxy: RosProxy) -> frozenset[HostPort]:
     return frozenset(HostPort(host, master.service_port) for host in hosts)
 
 
-def _names_master(uri: str, masters: Collection[HostPort]) -> bool:
+def names_master(uri: str, masters: Collection[HostPort]) -> bool:
     """Whether a ROS_MASTER_URI names one of these masters, in upper or lower case."""
     plain = uri.strip().lower()
     named = parse_slave_uri(plain)
@@ -423,7 +202,7 @@ def _replaced_uri(spec: Json, wanted: PodVariables) -> str:
         v for c in _containers(spec) for v in submaps(c, "env") if v.get("name") == MASTER_VARIABLE
     )
     values = (text_at(variable, "value") for variable in own)
-    return next((value for value in values if _names_master(value, wanted.masters)), "")
+    return next((value for value in values if names_master(value, wanted.masters)), "")
 
 
 def _containers(spec: Json) -> Iterator[Json]:
@@ -457,7 +236,7 @@ def _wired(container: Json, wanted: PodVariables, annotations: Mapping[str, str]
         for index, variable in enumerate(variables):
             own = text_at(variable, "value")
             is_ours = bool(former) and own == former
-            if variable.get("name") == name and (is_ours or _names_master(own, masters)):
+            if variable.get("name") == name and (is_ours or names_master(own, masters)):
                 variables[index] = {**variable, "value": value}
         if name not in names:
             added.append({"name": name, "value": value})

@@ -9,15 +9,9 @@ from collections.abc import Iterator
 from rosproxy.shared.output.text import clean
 from rosproxy_operator.common.problem import NOT_WIRED, Fault
 from rosproxy_operator.common.zenoh import OVERRIDE, connect_endpoints, is_client, tcp_endpoint
-from rosproxy_operator.kubernetes.planner.pods.wiring import (
-    UNKNOWN_WEBHOOK,
-    edit_fix,
-    is_of_service,
-    missing_variable,
-    recreate_command,
-    uses_dds,
-    wired_override,
-)
+from rosproxy_operator.kubernetes.planner.pods.pod_fixes import edit_fix, recreate_command
+from rosproxy_operator.kubernetes.planner.pods.unwired import UNKNOWN_WEBHOOK, missing_variable
+from rosproxy_operator.kubernetes.planner.pods.wiring import is_of_service, uses_dds, wired_override
 from rosproxy_operator.kubernetes.resources.cluster import WebhookState
 from rosproxy_operator.kubernetes.resources.model import (
     REFERENCE,

@@ -12,8 +12,8 @@ deleted. The first evictions follow without a pause. Then the pauses grow, up to
 from collections.abc import Iterator
 
 from rosproxy_operator.kubernetes.planner.actions import Action, EvictPod
+from rosproxy_operator.kubernetes.planner.pods.recreation import needs_recreation
 from rosproxy_operator.kubernetes.planner.pods.selection import selects
-from rosproxy_operator.kubernetes.planner.pods.wiring import needs_recreation
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext
 from rosproxy_operator.kubernetes.resources.model import Pod, RosProxy
