@@ -119,8 +119,8 @@ class DoctorFacts:
     ) -> WebhookFacts:
         """Return the webhook's configurations, and how many endpoints of each Service are ready.
 
-        ``unreached`` has the pods that no webhook wired (`labelled.unreached`). Without such pods,
-        a trial tells whether the API server reaches the operators.
+        ``unreached`` has the pods that no webhook wired (`labelled.unreached`). A trial tells
+        whether the API server reaches the operators now.
         """
         api = self._api
         listed = self._ask("webhook", lambda: api.list_fresh(WEBHOOKS, ""))
@@ -134,7 +134,7 @@ class DoctorFacts:
             self._ask("webhook", partial(self._count_ready, service, ready))
         trials: dict[str, Trial] = {}
         for configuration in ours:
-            if ready.get(service_of(configuration)) and not unreached:
+            if ready.get(service_of(configuration)):
                 trial = self._ask("webhook", partial(self._trial, configuration, rosproxies))
                 trials |= {text_at(configuration["metadata"], "name"): trial} if trial else {}
         return WebhookFacts(ours, ready=ready, unreached=unreached, trials=trials)

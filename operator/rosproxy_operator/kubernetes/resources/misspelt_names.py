@@ -42,7 +42,7 @@ _NAMES_OF_OPERATOR = frozenset(
     {
         *(names.PROXY_OF, names.NODE, names.PORT_RANGE, names.FINGERPRINT),
         *(names.MASTER_URI, names.REPLACED_URI, names.STATIC_PEERS),
-        *(names.DOMAIN, names.ROUTER_ENDPOINT),
+        *(names.DOMAIN, names.ROUTER_ENDPOINT, names.NOT_WIRED_BECAUSE),
     }
 )
 """Names that the operator sets. Users may copy such names, since some are in users' pods."""

@@ -264,8 +264,12 @@ class Pod(msgspec.Struct, frozen=True):
     the ROS_STATIC_PEERS that the webhook has set, ``wired_domain`` the ROS_DOMAIN_ID, and
     ``router_endpoint`` the endpoint in the ZENOH_CONFIG_OVERRIDE, each empty for none.
 
+    ``replaced_master_uri`` is the ROS_MASTER_URI of the template that the webhook has replaced.
+    ``not_wired_because`` is why the webhook has set no variable. ``labelled_later``: the pod got
+    the label of the webhook after the creation.
+
     ``controller`` is the kind of the pod's controller, for example ReplicaSet. ``workload`` is the
-    object for `kubectl rollout restart`, for example "deployment/talker". ``created`` is the
+    object with the template, for example "deployment/talker" or "job/survey". ``created`` is the
     creation time, as the API server writes the time. ``running_since`` is the earliest start of a
     running container with ``wired_master_uri``, in the same form, empty if no such container runs.
     ``misspelt`` has the texts of `misspelt_names`.
@@ -287,6 +291,9 @@ class Pod(msgspec.Struct, frozen=True):
     static_peers: str = ""
     wired_domain: str = ""
     router_endpoint: str = ""
+    replaced_master_uri: str = ""
+    not_wired_because: str = ""
+    labelled_later: bool = False
     containers: tuple[PodContainer, ...] = ()
     controller: str = ""
     workload: str = ""

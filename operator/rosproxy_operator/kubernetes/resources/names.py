@@ -42,6 +42,9 @@ STATIC_PEERS = "rosproxy.io/static-peers"
 DOMAIN = "rosproxy.io/domain"
 """Annotation of users' pods: the ROS_DOMAIN_ID that the webhook has set."""
 
+NOT_WIRED_BECAUSE = "rosproxy.io/not-wired-because"
+"""Annotation of users' pods: why the webhook has set no variable."""
+
 ROUTER_ENDPOINT = "rosproxy.io/router-endpoint"
 """Annotation of users' pods: the endpoint of the router in the ZENOH_CONFIG_OVERRIDE that the
 webhook has set."""

@@ -95,7 +95,8 @@ def pod(obj: Json) -> Pod:
     meta = submap(obj, "metadata")
     spec = submap(obj, "spec")
     status = submap(obj, "status")
-    wired = _short(text_at(submap(meta, "annotations"), names.MASTER_URI))
+    notes = texts_at(meta, "annotations")
+    wired = _short(notes.get(names.MASTER_URI, ""))
     masters = islice(map(_short, _masters(spec)), MOST_CONTAINERS)
     return Pod(
         id=name_of(meta),
@@ -110,9 +111,12 @@ def pod(obj: Json) -> Pod:
         deleting=is_deleted(meta),
         own_masters=tuple(uri for uri in masters if not wired or uri != wired),
         wired_master_uri=wired,
-        static_peers=_short(text_at(submap(meta, "annotations"), names.STATIC_PEERS)),
-        wired_domain=_short(text_at(submap(meta, "annotations"), names.DOMAIN)),
-        router_endpoint=_short(text_at(submap(meta, "annotations"), names.ROUTER_ENDPOINT)),
+        replaced_master_uri=_short(notes.get(names.REPLACED_URI, "")),
+        static_peers=_short(notes.get(names.STATIC_PEERS, "")),
+        wired_domain=_short(notes.get(names.DOMAIN, "")),
+        router_endpoint=_short(notes.get(names.ROUTER_ENDPOINT, "")),
+        not_wired_because=_short(notes.get(names.NOT_WIRED_BECAUSE, "")),
+        labelled_later=_is_labelled_later(meta),
         containers=tuple(map(_container, submaps(spec, "containers")[:MOST_CONTAINERS])),
         ips=tuple(filter(None, (text_at(pod_ip, "ip") for pod_ip in submaps(status, "podIPs")))),
         controller=text_at(_controller(meta), "kind"),
@@ -343,15 +347,26 @@ def _controller(meta: Json) -> Json:
     return next((owner for owner in owners if owner.get("controller") is True), {})
 
 
+def _is_labelled_later(meta: Json) -> bool:
+    """Whether a pod got the label of the webhook after the creation.
+
+    The creator of a pod has set fields of the spec. False without ``managedFields``.
+    """
+    owned = [submap(entry, "fieldsV1") for entry in submaps(meta, "managedFields")]
+    label = f"f:{names.INJECT}"
+    setters = [fields for fields in owned if label in submap(fields, "f:metadata", "f:labels")]
+    return bool(setters) and not any("f:spec" in fields for fields in setters)
+
+
 def _workload(meta: Json) -> str:
-    """Return the object for `kubectl rollout restart` that replaces a pod, empty for none.
+    """Return the object that has the template of a pod, empty for none.
 
     A Deployment names each ReplicaSet NAME-HASH. The pods of the ReplicaSet have the hash as label.
     """
     controller = _controller(meta)
     kind = text_at(controller, "kind")
     name = _short(text_at(controller, "name"))
-    if kind in _RESTARTABLE_KINDS:
+    if kind in (*_RESTARTABLE_KINDS, "Job"):
         return f"{kind.lower()}/{name}"
     suffix = f"-{texts_at(meta, 'labels').get(_TEMPLATE_HASH, '')}"
     is_of_deployment = kind == "ReplicaSet" and len(suffix) > 1 and name.endswith(suffix)

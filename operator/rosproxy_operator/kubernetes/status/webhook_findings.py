@@ -118,12 +118,13 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
     elif not ready:
         text = f"the Service {service} of the webhook has no ready endpoint, so no pod is wired"
         yield error(_CHECK, subject, text, f"{describe_operators(service.namespace)}; {_REWIRE}")
-    elif not lacks_ca and facts.unreached:
-        yield _cut_off(subject, service, _text_of_pods(facts.unreached))
     elif not lacks_ca:
         trial = facts.trials.get(text_at(metadata, "name"))
         if trial is not None and not trial.is_wired:
             yield _cut_off(subject, service, _text_of_trial(trial))
+            return
+        if trial is None and facts.unreached:
+            yield _cut_off(subject, service, _text_of_pods(facts.unreached))
             return
         text = f"{plural(ready, 'operator')} ready to wire pods"
         tried = f", and wired a pod of a dry run in namespace {trial.namespace}" if trial else ""

@@ -28,7 +28,7 @@ from rosproxy_operator.kubernetes.api.api_client import (
 )
 from rosproxy_operator.kubernetes.planner.bounds import Consents, bounds_violation
 from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, why_not_selected
-from rosproxy_operator.kubernetes.planner.pods.wiring import UNWIRED, Wiring, pod_variables, wire
+from rosproxy_operator.kubernetes.planner.pods.wiring import Wiring, left_alone, pod_variables, wire
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import service_id
@@ -92,7 +92,7 @@ class Injector:
             text = f"the operator failed: {error!r}"
         self._metrics.admissions.labels("failed").inc()
         log.warning("pod not wired: %s", text)
-        return Wiring(warnings=(UNWIRED + text,))
+        return left_alone(text)
 
     async def _wiring_by(self, body: Json, dry_run: bool, deadline: float) -> tuple[Wiring, float]:
         """The wiring of a pod, and the seconds to hold the pod.
@@ -133,10 +133,12 @@ class Injector:
             address, hold = self._address(rosproxy, dry_run)
             return wire(body, pod_variables(rosproxy, address), rosproxy.spec.host_aliases), hold
         if rosproxy is not None:
-            return Wiring(warnings=(UNWIRED + rosproxy.message,)), 0.0
+            return left_alone(rosproxy.text, rosproxy.message), 0.0
         fault = why_not_selected(pod, usable)
+        if not fault:
+            return Wiring(), 0.0
         reasons = [f"RosProxy {r.id.name}: {with_fix(r.text, r.fix)}" for r in unusable.values()]
-        return Wiring(warnings=(". ".join([f"{UNWIRED}{fault}", *reasons]),) if fault else ()), 0.0
+        return left_alone(fault.text, ". ".join([str(fault), *reasons])), 0.0
 
     def _address(self, rosproxy: RosProxy, dry_run: bool) -> tuple[str, float]:
         """The cluster IP of a RosProxy's Service, and the seconds until all nodes know the Service.

@@ -273,10 +273,11 @@ def test_a_pod_that_lacks_something_is_no_proxy(path):
         ("ReplicaSet", "talker", {"pod-template-hash": "5d4c9"}, ""),
         ("StatefulSet", "arm", {}, "statefulset/arm"),
         ("DaemonSet", "arm", {}, "daemonset/arm"),
-        ("Job", "arm", {}, ""),
+        ("Job", "arm", {}, "job/arm"),
+        ("CustomSet", "arm", {}, ""),
     ],
 )
-def test_what_restarts_a_pod(kind, name, labels, workload):
+def test_what_has_the_template_of_a_pod(kind, name, labels, workload):
     obj = pod_obj()
     owner = {"kind": kind, "name": name, "controller": True}
     obj["metadata"] |= {"labels": labels, "ownerReferences": [owner]}

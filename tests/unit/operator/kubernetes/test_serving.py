@@ -313,7 +313,8 @@ async def test_a_pod_is_admitted_whatever_the_api_server_says(
     running.server.refuse("GET", "rosproxies", status, "no")
     answer = await running.admit(pod_obj("talker", INJECT))
     assert answer["warnings"][0].startswith("rosproxy: this pod was not wired to a proxy: ")
-    assert "patch" not in answer
+    patch = json.loads(base64.b64decode(answer["patch"]))
+    assert {step["path"].split("/")[1] for step in patch} == {"metadata"}
 
 
 async def test_an_api_server_that_is_just_starting_is_asked_again(running: Running) -> None:

@@ -26,6 +26,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Name,
     Ros2Spec,
 )
+from rosproxy_operator.kubernetes.resources.names import NOT_WIRED_BECAUSE
 from tests.unit.operator.kubernetes.builders_api import CLUSTER_IP, NAMESPACE, URI, pod, rosproxy
 
 TO = PodVariables(URI)
@@ -111,7 +112,8 @@ def test_a_container_keeps_what_it_sets_itself(own, set_too):
 def test_a_pod_that_sets_all_itself_stays_as_it_is():
     own = [{"name": "ROS_MASTER_URI", "value": "http://robot:11311"}, {"name": "ROS_IP"}]
 
-    assert wire(admitted(container(*own)), TO) == Wiring()
+    wiring = wire(admitted(container(*own)), TO)
+    assert (wiring.spec, wiring.warnings) == (None, ())
 
 
 def own(uri: str) -> dict[str, str]:
@@ -157,7 +159,8 @@ def test_the_own_masters_uri_is_replaced_and_any_other_stays(master, uri, names_
 
     assert env_of(wiring) == [IP, {"name": "A", "value": "b"}, MASTER if names_it else own(uri)]
     notes = {ANNOTATION: URI, "rosproxy.io/replaced-master-uri": uri}
-    assert wiring.annotations == (notes if names_it else {})
+    unchanged = {NOT_WIRED_BECAUSE: "the template sets ROS_MASTER_URI"}
+    assert wiring.annotations == (notes if names_it else unchanged)
     finding = ros1_finding(objects.pod(applied(obj, wiring)), of, CLUSTER_IP)
     assert bool(finding) == (not names_it and "$" not in uri)
     unwired = objects.pod({**obj, "metadata": {"labels": {INJECT: "true"}}})
@@ -411,4 +414,7 @@ def test_without_the_webhook_the_template_sets_the_variable():
     finding = ros1_finding(unwired, rosproxy(), CLUSTER_IP, WebhookState(served=False))
 
     assert finding is not None
-    assert "(webhook.enabled=false). Set ROS_MASTER_URI in the template: kubectl" in finding.message
+    assert (
+        "(webhook.enabled=false). Set ROS_MASTER_URI=http://rosproxy-arm:11311, and ROS_IP from "
+        "status.podIP, in the template: kubectl"
+    ) in finding.message

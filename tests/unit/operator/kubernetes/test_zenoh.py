@@ -433,7 +433,7 @@ def test_a_pod_that_was_wired_for_another_version_is_told(rosproxy: RosProxy, wi
     )
     plan = look(observed(rosproxy, service(rosproxy), former))
     (text,) = told(plan, "NotWired")
-    assert "since spec.ros of RosProxy robot has changed after the pod was created" in text
+    assert "since the pod was created for another spec.ros, or for another RosProxy" in text
     assert text.endswith("Run kubectl -n ros rollout restart deployment/a")
 
 

@@ -1,7 +1,7 @@
 """Which pods the webhook would wire if they were created again."""
 
 from rosproxy_operator.common.zenoh import tcp_endpoint
-from rosproxy_operator.kubernetes.planner.pods.ros1_pods import why_lost
+from rosproxy_operator.kubernetes.planner.pods.ros1_pods import names_former_master, why_lost
 from rosproxy_operator.kubernetes.planner.pods.unwired import is_of_former_domain
 from rosproxy_operator.kubernetes.planner.pods.wiring import (
     has_peers,
@@ -33,6 +33,7 @@ def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
     lacks_master = (
         rosproxy.spec.ros1
         and all(names_master(uri, masters) for uri in pod.own_masters)
+        and not names_former_master(pod, rosproxy)
         and (pod.wired_master_uri != master_uri(cluster_ip) or bool(why_lost(pod, rosproxy)))
     )
     # A container without the endpoint in a wired pod comes from a later webhook.

@@ -52,13 +52,31 @@ def _why_not_wired(
         return Fault(
             f"was wired to {clean(pod.wired_master_uri)[:200]}, but the proxy is at "
             f"{master_uri(cluster_ip)} now",
-            f"Run {recreate_command(pod)}",
+            _recreation(pod, rosproxy),
         )
     if lost := why_lost(pod, rosproxy):
-        return Fault(lost, f"Run {recreate_command(pod)}")
+        return Fault(lost, _recreation(pod, rosproxy))
     if not bypassing and (pod.wired_master_uri or pod.own_masters):
         return None
     return missing_variable("ROS_MASTER_URI", pod, rosproxy, webhook)
+
+
+def names_former_master(pod: Pod, rosproxy: RosProxy) -> bool:
+    """Whether the template names a master that the RosProxy had before.
+
+    The webhook keeps such a value, since the value may be another master on purpose. So the nodes
+    of a new pod would bypass the proxy.
+    """
+    replaced = pod.replaced_master_uri
+    return bool(replaced) and not names_master(replaced, masters_of(rosproxy))
+
+
+def _recreation(pod: Pod, rosproxy: RosProxy) -> str:
+    """The fix that makes the nodes of a new pod use the proxy."""
+    if names_former_master(pod, rosproxy):
+        former = f"ROS_MASTER_URI={clean(pod.replaced_master_uri)[:200]}"
+        return edit_fix(f"Remove {former} from the template, which is not spec.master", pod)
+    return f"Run {recreate_command(pod)}"
 
 
 def why_lost(pod: Pod, rosproxy: RosProxy) -> str:

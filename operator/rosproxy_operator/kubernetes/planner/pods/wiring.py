@@ -14,6 +14,7 @@ import msgspec
 
 from rosproxy.shared.addresses import HostPort
 from rosproxy.shared.uris import parse_slave_uri
+from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.common.zenoh import OVERRIDE, tcp_endpoint, with_client_override
 from rosproxy_operator.kubernetes.resources import objects
@@ -28,6 +29,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.names import (
     DOMAIN,
     MASTER_URI,
+    NOT_WIRED_BECAUSE,
     REPLACED_URI,
     ROUTER_ENDPOINT,
     STATIC_PEERS,
@@ -41,6 +43,8 @@ MIRROR_ANNOTATION = "kubernetes.io/config.mirror"
 """Annotation of the mirror pod of a static pod. A change of a mirror pod changes no container."""
 UNWIRED = "rosproxy: this pod was not wired to a proxy: "
 """The start of each warning at admission."""
+MOST_REASON_CHARACTERS = 500
+"""Characters of a reason in an annotation."""
 _CONTAINER_FIELDS = ("initContainers", "containers")
 
 
@@ -86,6 +90,12 @@ def pod_variables(rosproxy: RosProxy, cluster_ip: str) -> PodVariables:
     )
 
 
+def left_alone(reason: str, warning: str = "") -> Wiring:
+    """The answer about a pod that stays as it is. The warning is the reason, or longer."""
+    kept = bounded(reason, MOST_REASON_CHARACTERS)
+    return Wiring(None, {NOT_WIRED_BECAUSE: kept}, (UNWIRED + (warning or reason),))
+
+
 def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> Wiring:
     """Return the wiring of a pod at admission, with ``host_aliases`` added to the pod's aliases.
 
@@ -105,11 +115,9 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
     """
     annotations = texts_at(pod, "metadata", "annotations")
     if MIRROR_ANNOTATION in annotations:
-        warning = (
-            f"{UNWIRED}the pod is a static pod, made from a file on its node. Set {wanted.name} "
-            "in that file, or run an ordinary pod"
-        )
-        return Wiring(warnings=(warning,))
+        text = "the pod is a static pod, made from a file on its node"
+        fix = f"Set {wanted.name} in that file, or run an ordinary pod"
+        return Wiring(warnings=(f"{UNWIRED}{text}. {fix}",))
     spec = submap(pod, "spec")
     wired: dict[str, Any] = {
         kind: [_wired(container, wanted, annotations) for container in submaps(spec, kind)]
@@ -132,6 +140,8 @@ def wire(pod: Json, wanted: PodVariables, host_aliases: Iterable[Json] = ()) -> 
             new_annotations[ROUTER_ENDPOINT] = endpoint
     if replaced and MASTER_URI in new_annotations:
         new_annotations[REPLACED_URI] = replaced
+    if wanted.uri and MASTER_URI not in new_annotations:
+        new_annotations[NOT_WIRED_BECAUSE] = "the template sets ROS_MASTER_URI"
     if DOMAIN not in annotations and all(map(_has_domain, _containers(spec))):
         new_annotations.pop(DOMAIN, None)  # all values are the template's
     return Wiring({**spec, **wired} if changed else None, new_annotations)
