@@ -507,8 +507,7 @@ ROS2_MISTAKES: dict[str, Mistake] = {
     **{
         f"domain {former.get('domain')} of a RosProxy changes": Mistake(
             _other_domain(former), "OtherDomain",
-            (Cure(f"was wired to domain {former.get('domain', 0)}, but RosProxy robot has domain 4 "
-                  "now", "Run kubectl", restart),),
+            (Cure("but RosProxy robot has domain 4 now", "Run kubectl", restart),),
             domain=4,
         )
         for former in ({"domain": 3}, {})

@@ -190,7 +190,10 @@ def _wanted(
             f"node {place.node} does not match spec.nodeSelector, so selected pods there have no "
             f"proxy: {abbreviated(str(pod.id) for pod in pods)}"
         )
-        fix = "Widen spec.nodeSelector, or set the same nodeSelector in the pods"
+        fix = (
+            "Widen spec.nodeSelector (default: the chart's value proxy.pod.nodeSelector), or set "
+            "the same nodeSelector in the pods"
+        )
         findings.append(finding(rosproxy, "NodeLeftOut", Fault(text, fix)))
     return wanted, findings
 

@@ -81,7 +81,7 @@ def retiring_proxies(actions: Iterable[Action]) -> frozenset[str]:
 def with_unregistrations(
     view: View, rosproxy: RosProxy, known: Unregistrations, retiring: Set[str] = frozenset()
 ) -> RosProxy:
-    """Return a RosProxy with the last unregistration on each node, and the addresses of its nodes.
+    """Return a RosProxy with the last unregistrations, and with what its proxies know of pods.
 
     ``retiring``: the uids of the proxies that unregister ROS 1 nodes now.
     """
@@ -89,13 +89,15 @@ def with_unregistrations(
     nodes = (*rosproxy.former_ranges, *(p.node for p in own))
     places = {node: ProxyPlace(rosproxy.id, node) for node in nodes}
     times = {node: known[place].at for node, place in places.items() if place in known}
-    pods = (proxy.pod for place in own for proxy in view.proxies.get(place, ()))
-    staying = (pod.uid for pod in pods if not pod.deleting and pod.uid not in retiring)
-    reports = (view.observed.reports.get(uid) for uid in staying)
-    answered = tuple(report for report in reports if report and not report.retired)
+    proxies = (proxy for place in own for proxy in view.proxies.get(place, ()))
+    staying = [p for p in proxies if not p.pod.deleting and p.pod.uid not in retiring]
+    reports = [(p.node, view.observed.reports.get(p.pod.uid)) for p in staying]
+    silent = frozenset(node for node, report in reports if not (report and report.answered))
+    answered = tuple(report for _, report in reports if report and not report.retired)
     return replace(
         rosproxy,
         unregistered_at=times,
+        silent=silent,
         registered=frozenset(address for report in answered for address in report.nodes),
         discovered=frozenset(address for report in answered for address in report.participants),
     )

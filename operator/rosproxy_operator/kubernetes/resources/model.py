@@ -201,8 +201,8 @@ class RosProxy(msgspec.Struct, frozen=True):
     evicts unwired pods. ``created`` is the creation time, as the API server writes the time.
     ``unregistered_at`` is, by node name, the time at which a proxy last unregistered the ROS 1
     nodes of running pods, in the same form. ``registered`` are the addresses at which its proxies
-    have ROS 1 nodes, ``discovered`` those at which they have ROS 2 participants. ``misspelt`` has
-    the texts of `misspelt_names`.
+    have ROS 1 nodes, ``discovered`` those at which they have ROS 2 participants. On the nodes
+    ``silent``, a proxy has not answered. ``misspelt`` has the texts of `misspelt_names`.
     """
 
     id: Name
@@ -216,6 +216,7 @@ class RosProxy(msgspec.Struct, frozen=True):
     remakes: bool = False
     created: str = ""
     unregistered_at: Mapping[str, str] = {}
+    silent: frozenset[str] = frozenset()
     registered: frozenset[str] = frozenset()
     discovered: frozenset[str] = frozenset()
     misspelt: tuple[str, ...] = ()

@@ -39,7 +39,7 @@ ALLOW_FROM = "rosproxy.io/allow-from"
 STATIC_PEERS = "rosproxy.io/static-peers"
 """Annotation of users' pods: the ROS_STATIC_PEERS that the webhook has set."""
 
-DOMAIN = "rosproxy.io/domain"
+DOMAIN = "rosproxy.io/wired-domain"
 """Annotation of users' pods: the ROS_DOMAIN_ID that the webhook has set."""
 
 NOT_WIRED_BECAUSE = "rosproxy.io/not-wired-because"

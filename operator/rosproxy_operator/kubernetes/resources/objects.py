@@ -30,6 +30,7 @@ from rosproxy_operator.kubernetes.resources.cluster import (
 )
 from rosproxy_operator.kubernetes.resources.misspelt_names import misspelt_names
 from rosproxy_operator.kubernetes.resources.model import (
+    REFERENCE,
     VALUE_AT_RUNTIME,
     ClusterNode,
     Json,
@@ -275,12 +276,20 @@ def _container(obj: Json) -> PodContainer:
 def ros2_variables(container: Json) -> dict[str, str]:
     """Return the ROS 2 variables that a container itself sets, with values of any length."""
     return {
-        name: VALUE_AT_RUNTIME
-        if variable.get("valueFrom") is not None
-        else text_at(variable, "value")
+        name: _value_of(variable)
         for variable in submaps(container, "env")
         if (name := text_at(variable, "name")) in ROS2_VARIABLES
     }
+
+
+def _value_of(variable: Json) -> str:
+    """Return the value of a variable, or `VALUE_AT_RUNTIME`.
+
+    The caller decides about a reference in the value of ZENOH_CONFIG_OVERRIDE.
+    """
+    value = text_at(variable, "value")
+    is_reference = REFERENCE in value and variable.get("name") != OVERRIDE
+    return VALUE_AT_RUNTIME if is_reference or variable.get("valueFrom") is not None else value
 
 
 def _kept_labels(meta: Json) -> dict[str, str]:

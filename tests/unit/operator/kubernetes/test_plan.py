@@ -16,7 +16,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.resources import names
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
     InvalidRosProxy,
@@ -372,7 +372,11 @@ def test_a_pod_of_a_former_rosproxy_gets_a_finding() -> None:
     of = replace(rosproxy(), created="2026-01-01T00:00:10Z")
     deployment = "deployment/talker"
     former = pod(running_since="2026-01-01T00:00:09Z", workload=deployment)
-    plan = look(complete(pods=(former,), rosproxies=(of,)))
+    seen = complete(pods=(former,), rosproxies=(of,))
+    # The nodes of the pod may be registered, as long as the proxy does not answer.
+    assert not told(look(seen), "NotWired")
+    assert not told(look(replace(seen, reports={proxy().pod.uid: ProxyReport(False)})), "NotWired")
+    plan = look(replace(seen, reports={proxy().pod.uid: ProxyReport(True)}))
     (text,) = told(plan, "NotWired")
     assert "is older than RosProxy robot" in text
     assert text.endswith(". Run kubectl -n ros rollout restart deployment/talker")

@@ -10,7 +10,7 @@ from rosproxy_operator.kubernetes.planner.actions import Emit, EvictPod
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names, objects
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyReport
 from rosproxy_operator.kubernetes.resources.model import MasterSpec, Pod, PodContainer, Ros2Spec
 from rosproxy_operator.kubernetes.resources.names import master_uri
 from rosproxy_operator.kubernetes.resources.spec import rosproxy as read
@@ -61,8 +61,10 @@ def test_a_pod_of_a_former_rosproxy_is_evicted() -> None:
     seen = cluster(of_set(wired_master_uri=WIRED, running_since="2026-01-01T00:00:00Z"))
     (of,) = seen.rosproxies
     assert evicted(look(seen)) == []
-    of = replace(of, created="2026-01-01T00:00:01Z")
-    assert evicted(look(replace(seen, rosproxies=(of,)))) == ["a"]
+    younger = replace(seen, rosproxies=(replace(of, created="2026-01-01T00:00:01Z"),))
+    assert evicted(look(younger)) == []  # the proxy has not answered
+    answered = {uid: ProxyReport(True) for uid in (p.pod.uid for p in seen.proxies)}
+    assert evicted(look(replace(younger, reports=answered))) == ["a"]
 
 
 @pytest.mark.parametrize(

@@ -49,5 +49,9 @@ def needs_recreation(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
         and peers <= {pod.static_peers}
         and pod.static_peers != cluster_ip
     )
-    lacks_domain = any(is_of_former_domain(c, pod, rosproxy) for c in pod.containers)
+    # Without the variable, the image may set the domain.
+    lacks_domain = any(
+        "ROS_DOMAIN_ID" in c.variables and is_of_former_domain(c, pod, rosproxy)
+        for c in pod.containers
+    )
     return INJECT in pod.labels and (lacks_master or lacks_peers or lacks_domain or lacks_router)

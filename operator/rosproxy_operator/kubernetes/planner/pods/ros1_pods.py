@@ -85,9 +85,11 @@ def why_lost(pod: Pod, rosproxy: RosProxy) -> str:
     The proxy unregisters the nodes when the RosProxy is deleted, and when the operator moves the
     proxy or no longer needs the proxy (`unregistrations`). ROS 1 nodes don't register again by
     themselves. A container that was started later has new nodes, which register at their start. If
-    a proxy has nodes at the address of the pod, the nodes of the pod are registered.
+    a proxy has nodes at the address of the pod, the nodes of the pod are registered. That is
+    unknown while the proxy does not answer.
     """
-    if not pod.running_since or rosproxy.registered & {pod.ip, *pod.ips}:
+    is_registered = bool(rosproxy.registered & {pod.ip, *pod.ips})
+    if not pod.running_since or is_registered or pod.node in rosproxy.silent:
         return ""
     # The times are RFC 3339 in UTC with whole seconds, so texts sort like times.
     if pod.running_since < rosproxy.created:

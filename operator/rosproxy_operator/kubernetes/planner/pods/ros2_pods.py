@@ -88,8 +88,7 @@ def _faults_of_peers(container: PodContainer, pod: Pod) -> Iterator[tuple[str, F
     """Yield the reason and the fault, for each fault that makes ROS_STATIC_PEERS ineffective."""
     get = container.variables.get
     removal = edit_fix("Remove the variable from the template", pod)
-    distro = _OLD.search(get("ROS_DISTRO", "").lower()) or _OLD.search(container.image.lower())
-    if distro:
+    if distro := _OLD.search((get("ROS_DISTRO") or container.image).lower()):
         text = f"has ROS 2 {distro[1].capitalize()}, which does not support ROS_STATIC_PEERS"
         fix = edit_fix("Use an image with Iron or a later distribution in the template", pod)
         yield "TooOld", Fault(text, fix)
@@ -118,10 +117,8 @@ def _other_faults(
     number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
     name = rosproxy.id.name
     if is_of_former_domain(container, pod, rosproxy):
-        text = (
-            f"was wired to domain {_shown(domain or '0')}, but RosProxy {name} has domain {number} "
-            "now"
-        )
+        was = f"was wired to domain {_shown(domain)}" if domain else "was wired without a domain"
+        text = f"{was}, but RosProxy {name} has domain {number} now"
         yield "OtherDomain", Fault(text, f"Run {recreate_command(pod)}")
         return
     # rcl treats an empty variable as unset (rcl, domain_id.c), and the webhook keeps the variable.

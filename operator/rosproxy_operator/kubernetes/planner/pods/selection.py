@@ -69,7 +69,10 @@ def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | Clus
         text = (
             "is on the node's own network (hostNetwork), where ROS nodes need no proxy and get none"
         )
-        fix = edit_fix(f"Remove hostNetwork or the label {INJECT} from the template", pod)
+        change = f"Remove hostNetwork or the label {INJECT} from the template"
+        if INJECT not in pod.labels:
+            change = f"Remove hostNetwork from the template, or add the label {INJECT}=false"
+        fix = edit_fix(change, pod)
         return pod_finding(pod, rosproxy, "HostNetwork", Fault(text, fix))
     return rosproxy
 
