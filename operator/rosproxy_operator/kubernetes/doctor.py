@@ -84,7 +84,7 @@ def _rosproxy_findings(
     """The findings about RosProxies, and about labelled pods in namespaces without a RosProxy."""
     with_rosproxy = namespaces_of(rosproxies)
     yield from cluster_findings(rosproxies, operators)
-    yield from missing_rosproxy_findings(pods, with_rosproxy)
+    yield from missing_rosproxy_findings(pods, with_rosproxy, operators)
     yield from misspelt_findings(pods, with_rosproxy)
 
 

@@ -17,6 +17,8 @@ OPERATOR_SELECTOR = "app.kubernetes.io/component=operator,app.kubernetes.io/part
 """Label selector of the pods of operators."""
 _CHECK = "operator"
 _OPTION = "--namespace"
+MANAGE = "add the namespace to the chart's value namespaces and run helm upgrade"
+"""The fix for a namespace that no operator manages."""
 
 
 class Operators(msgspec.Struct, frozen=True):
@@ -71,18 +73,20 @@ def operator_findings(operators: Operators) -> Iterator[DoctorFinding]:
 
 def unmanaged_finding(rosproxy: Name, operators: Operators) -> DoctorFinding | None:
     """The error about a RosProxy in a namespace that no operator manages, else None."""
+    text = why_unmanaged(rosproxy.namespace, operators)
+    fix = f"{MANAGE}, or create the RosProxy in a namespace of the value"
+    return error(_CHECK, f"rosproxy {rosproxy}", text, fix) if text else None
+
+
+def why_unmanaged(namespace: str, operators: Operators) -> str:
+    """Why no operator looks after a namespace; empty if an operator does, or if that is unknown."""
     managed = operators.namespaces
-    if not managed or rosproxy.namespace in managed:
-        return None
-    text = (
-        f"no operator manages the namespace {rosproxy.namespace} (option {_OPTION} of the "
-        f"operator: {listed(sorted(managed))})"
+    if not managed or namespace in managed:
+        return ""
+    return (
+        f"no operator manages the namespace {namespace} (option {_OPTION} of the operator: "
+        f"{listed(sorted(managed))})"
     )
-    fix = (
-        "add the namespace to the chart's value namespaces and run helm upgrade, or create the "
-        "RosProxy in a namespace of the value"
-    )
-    return error(_CHECK, f"rosproxy {rosproxy}", text, fix)
 
 
 def unnoticed_finding(rosproxy: Name, operators: Operators) -> DoctorFinding:

@@ -173,11 +173,18 @@ async def test_labelled_pods_in_a_namespace_without_a_rosproxy(server: ApiServer
         server.put("pods", pod_obj(name, {"rosproxy.io/inject": "true"}), NAMESPACE)
     server.put("pods", pod_obj("off", {"rosproxy.io/inject": "false"}), NAMESPACE)
     pods = await in_thread(DoctorFacts(api, ()).labelled_pods)
-    (finding,) = missing_rosproxy_findings(pods, frozenset({"other"}))
+    (finding,) = missing_rosproxy_findings(pods, frozenset({"other"}), Operators())
     assert (finding.severity, finding.subject) == (Severity.ERROR, f"namespace {NAMESPACE}")
     assert "2 pods with the label rosproxy.io/inject (listener, talker)" in finding.text
     assert "create a RosProxy in the namespace, then run kubectl -n robots delete" in finding.fix
-    assert list(missing_rosproxy_findings(pods, frozenset({NAMESPACE}))) == []
+    assert list(missing_rosproxy_findings(pods, frozenset({NAMESPACE}), Operators())) == []
+    elsewhere = Operators((operator_obj("--namespace=a"),))
+    (finding,) = missing_rosproxy_findings(pods, frozenset({"other"}), elsewhere)
+    assert finding.text.startswith(f"no operator manages the namespace {NAMESPACE} (option ")
+    assert "and the namespace has no RosProxy, but 2 pods" in finding.text
+    assert finding.fix.startswith(
+        "add the namespace to the chart's value namespaces and run helm upgrade, create a RosProxy"
+    )
 
 
 async def test_misspelt_labels_in_a_namespace_without_a_rosproxy(
@@ -199,7 +206,7 @@ async def test_misspelt_labels_in_a_namespace_without_a_rosproxy(
         f"correct the name in the template: kubectl -n {NAMESPACE} edit statefulset/robots"
     )
     assert misspelt_findings(pods, frozenset({NAMESPACE})) == []
-    assert list(missing_rosproxy_findings(pods, frozenset())) == []
+    assert list(missing_rosproxy_findings(pods, frozenset(), Operators())) == []
 
 
 CERT_MANAGER = {"cert-manager.io/inject-ca-from": "a/b"}

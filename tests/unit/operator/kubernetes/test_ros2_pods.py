@@ -5,9 +5,14 @@ from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.pods.recreation import needs_recreation
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
-from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
-from rosproxy_operator.kubernetes.resources.model import Pod, PodContainer, Ros2Spec
+from rosproxy_operator.kubernetes.resources.model import (
+    VALUE_AT_RUNTIME,
+    Pod,
+    PodContainer,
+    Ros2Spec,
+)
 from tests.unit.operator.kubernetes import objects as some
 from tests.unit.operator.kubernetes.objects import look, observed, proxy, service, told
 from tests.unit.operator.kubernetes.test_ros2 import ADDRESS, of2, pod
@@ -48,11 +53,23 @@ def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
         PodContainer(variables={"ROS_STATIC_PEERS": f"192.0.2.7;{ADDRESS}"}),
         PodContainer(variables={"ROS_STATIC_PEERS": "rosproxy-robot.ros.svc.cluster.local"}),
         PodContainer(variables={"ROS_DOMAIN_ID": "0"}),
+        PodContainer("humble/nav:1", {"ROS_DISTRO": "jazzy"}),
         PodContainer(variables={"ROS_DOMAIN_ID": ""}),
     ],
 )
 def test_what_is_well_is_not_told(container: PodContainer):
     assert list(ros2_findings(pod(container), of2(), ADDRESS)) == []
+
+
+def test_a_reference_to_another_variable_is_unknown():
+    """ROS_DOMAIN_ID=$(FLEET_DOMAIN) was told as another domain."""
+    env = [
+        {"name": "ROS_DOMAIN_ID", "value": "$(FLEET_DOMAIN)"},
+        {"name": "ROS_STATIC_PEERS", "value": "$(ROSPROXY_ROBOT_SERVICE_HOST)"},
+    ]
+    found = objects.pod({"spec": {"containers": [{"env": env}]}})
+    assert {*found.containers[0].variables.values()} == {VALUE_AT_RUNTIME}
+    assert list(ros2_findings(found, of2(Ros2Spec(domain=5)), ADDRESS)) == []
 
 
 def test_an_empty_domain_is_domain_0():

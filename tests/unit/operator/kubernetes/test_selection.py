@@ -143,6 +143,12 @@ def test_a_pod_in_its_nodes_own_network_is_left_out():
     assert isinstance(finding, ClusterFinding)
     assert (finding.reason, finding.of) == ("HostNetwork", Name("robots", "arm"))
     assert finding.message.endswith("from the template: kubectl -n robots edit deployment/a")
+    of = rosproxy("arm", Selector({"app": "x"}))
+    by_selector = select_rosproxy(pod(labels={"app": "x"}, host_network=True), [of])
+    assert isinstance(by_selector, ClusterFinding)
+    assert by_selector.fix.startswith(
+        f"Remove hostNetwork from the template, or add the label {INJECT}=false, then "
+    )
 
 
 def test_a_pod_that_is_not_labelled_needs_no_warning():

@@ -14,6 +14,11 @@ from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy,
 from rosproxy_operator.kubernetes.planner.pods.unwired import should_be_wired
 from rosproxy_operator.kubernetes.resources.model import Name, Pod, RosProxy
 from rosproxy_operator.kubernetes.resources.names import INJECT
+from rosproxy_operator.kubernetes.status.operator_findings import (
+    MANAGE,
+    Operators,
+    why_unmanaged,
+)
 
 MOST_COMMANDS = 5
 """Most commands in a fix."""
@@ -22,7 +27,7 @@ MOST_MISSPELT_FINDINGS = 10
 
 
 def missing_rosproxy_findings(
-    pods: Iterable[Pod], with_rosproxy: frozenset[str]
+    pods: Iterable[Pod], with_rosproxy: frozenset[str], operators: Operators
 ) -> Iterator[DoctorFinding]:
     """Yield an error for each namespace that has labelled pods, but no RosProxy.
 
@@ -37,6 +42,9 @@ def missing_rosproxy_findings(
         )
         restarts = sorted({recreate_command(pod) for pod in group})[:MOST_COMMANDS]
         fix = f"create a RosProxy in the namespace, then run {'; '.join(restarts)}"
+        if unmanaged := why_unmanaged(namespace, operators):
+            text = f"{unmanaged}, and {text}"
+            fix = f"{MANAGE}, {fix}"
         yield error("pods", f"namespace {namespace}", text, fix)
 
 
