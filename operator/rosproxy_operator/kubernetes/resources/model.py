@@ -272,7 +272,7 @@ class Pod(msgspec.Struct, frozen=True):
     ``controller`` is the kind of the pod's controller, for example ReplicaSet. ``workload`` is the
     object with the template, for example "deployment/talker" or "job/survey". ``created`` is the
     creation time, as the API server writes the time. ``running_since`` is the earliest start of a
-    running container with ``wired_master_uri``, in the same form, empty if no such container runs.
+    running container with a ROS_MASTER_URI, in the same form, empty if no such container runs.
     ``misspelt`` has the texts of `misspelt_names`.
     """
 

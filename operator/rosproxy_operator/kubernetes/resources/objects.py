@@ -123,7 +123,7 @@ def pod(obj: Json) -> Pod:
         controller=text_at(_controller(meta), "kind"),
         workload=_workload(meta),
         created=text_at(meta, "creationTimestamp"),
-        running_since=_running_since(obj, wired) if wired else "",
+        running_since=_running_since(obj),
         misspelt=misspelt_names(meta, "pods"),
     )
 
@@ -326,8 +326,8 @@ def _masters(spec: Json) -> Iterator[str]:
                 yield VALUE_AT_RUNTIME if is_indirect else value
 
 
-def _running_since(obj: Json, wired: str) -> str:
-    """Return the earliest start of a running container with this ROS_MASTER_URI; empty for none.
+def _running_since(obj: Json) -> str:
+    """Return the earliest start of a running container with a ROS_MASTER_URI; empty for none.
 
     A container that has restarted has new ROS nodes, also in an old pod. A container that does not
     run has no ROS nodes.
@@ -339,7 +339,7 @@ def _running_since(obj: Json, wired: str) -> str:
         for kind in ("initContainers", "containers")
         for container in submaps(spec, kind)
         for variable in submaps(container, "env")
-        if variable.get("name") == MASTER_VARIABLE and _short(text_at(variable, "value")) == wired
+        if variable.get("name") == MASTER_VARIABLE and text_at(variable, "value")
     }
     starts = (
         text_at(submap(container, "state", "running"), "startedAt")

@@ -93,3 +93,11 @@ def test_fixes_for_the_pod_of_a_job():
 def test_whether_a_pod_got_the_label_after_its_creation(setters: list[Any], later: bool):
     meta = {"name": "a", "managedFields": [{"fieldsV1": fields} for fields in setters]}
     assert objects.pod({"metadata": meta}).labelled_later == later
+
+
+def test_a_pod_that_names_the_proxy_by_hand_is_told_that_its_nodes_are_unregistered():
+    of = rosproxy(created="2026-01-01T00:00:09Z")
+    old = pod(own_masters=("http://rosproxy-arm:11311",), running_since="2026-01-01T00:00:00Z")
+    finding = ros1_finding(old, of, CLUSTER_IP)
+    assert finding is not None
+    assert "is older than RosProxy arm" in finding.text

@@ -54,7 +54,8 @@ def _why_not_wired(
             f"{master_uri(cluster_ip)} now",
             _recreation(pod, rosproxy),
         )
-    if lost := why_lost(pod, rosproxy):
+    uses_proxy = bool(pod.wired_master_uri) or not bypassing
+    if uses_proxy and (lost := why_lost(pod, rosproxy)):
         return Fault(lost, _recreation(pod, rosproxy))
     if not bypassing and (pod.wired_master_uri or pod.own_masters):
         return None
