@@ -125,7 +125,7 @@ _BY_ROSPROXY = (
 )
 _NAMESPACES: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(_BY_ROSPROXY, lambda key: key.of.namespace),
-    "unselected": lambda pod: pod.namespace,
+    **dict.fromkeys(("unselected", "undiscovered"), lambda pod: pod.namespace),
     "apart": lambda pair: pair[0].of.namespace,
 }
 """By field of `ClusterState`: a function that returns the namespace of a key."""

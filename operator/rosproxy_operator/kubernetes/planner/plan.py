@@ -31,6 +31,10 @@ from rosproxy_operator.kubernetes.planner.misspellings import (
 )
 from rosproxy_operator.kubernetes.planner.pods.ros1_pods import ros1_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
+from rosproxy_operator.kubernetes.planner.pods.undiscovered import (
+    undiscovered_findings,
+    undiscovered_waits,
+)
 from rosproxy_operator.kubernetes.planner.pods.unselected import (
     unselected_findings,
     unselected_waits,
@@ -199,6 +203,7 @@ def _pod_findings(
     return (
         *cluster_view.findings,
         *unselected_findings(cluster_view, state.unselected, now),
+        *undiscovered_findings(cluster_view, state.undiscovered, now),
         *misspelt_pod_findings(cluster_view),
     )
 
@@ -209,6 +214,7 @@ def _waits(context: ClusterContext, departed: departures.Departures) -> Iterator
     yield from context.retries.pauses()
     yield from departures.next_checks(departed, context.now)
     yield from unselected_waits(context.state.unselected, context.now)
+    yield from undiscovered_waits(context.state.undiscovered, context.now)
     waits = (due_in(since, context.now) for since in context.state.apart.values())
     yield from (seconds for seconds in waits if seconds > 0)
 

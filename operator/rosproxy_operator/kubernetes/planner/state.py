@@ -24,6 +24,7 @@ from rosproxy_operator.common.port_ranges import (
 from rosproxy_operator.common.problem import CONFLICT, Fault
 from rosproxy_operator.kubernetes.planner.cluster_view import View, has_ports, place_of, serves
 from rosproxy_operator.kubernetes.planner.former_ports import FormerPorts, remember
+from rosproxy_operator.kubernetes.planner.pods.undiscovered import undiscovered
 from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
 from rosproxy_operator.kubernetes.planner.unregistrations import Unregistration, recall
 from rosproxy_operator.kubernetes.planner.zenoh_hubs import Apart, hubs_apart
@@ -61,6 +62,7 @@ class ClusterState(msgspec.Struct, frozen=True):
     - ``former``: see `former_ports`.
     - ``unregistered``: see `unregistrations`.
     - ``unselected``: the time since when no RosProxy selects a labelled pod.
+    - ``undiscovered``: see `undiscovered_findings`.
     - ``apart``: see `zenoh_hubs.hubs_apart`.
     """
 
@@ -80,6 +82,7 @@ class ClusterState(msgspec.Struct, frozen=True):
     former: Mapping[ProxyPlace, FormerPorts] = {}
     unregistered: Mapping[ProxyPlace, Unregistration] = {}
     unselected: Mapping[Name, float] = {}
+    undiscovered: Mapping[Name, float] = {}
     apart: Apart = {}
 
 
@@ -110,6 +113,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
         moved=_recent(view, state.moved, now - MOVE_REPORTED_S),
         tried=_recent(view, state.tried, now - TRIED_RANGE_REPORTED_S),
         unselected={p.id: state.unselected.get(p.id, now) for p in view.observed.unselected_pods},
+        undiscovered={p.id: state.undiscovered.get(p.id, now) for p, _, _ in undiscovered(view)},
         apart=hubs_apart(view, state.apart, now),
     )
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import Any
 
+from rosproxy_operator.common import ros2_variables
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.zenoh import OVERRIDE
 from rosproxy_operator.kubernetes.resources import names
@@ -43,18 +44,9 @@ from rosproxy_operator.kubernetes.resources.pod_failures import pod_failure
 MASTER_VARIABLE = "ROS_MASTER_URI"
 ROS_VARIABLE = "ROSPROXY_ROS"
 """Variable of a proxy with the versions of ROS that the proxy serves."""
-ROS2_VARIABLES = frozenset(
-    {
-        "ROS_STATIC_PEERS",
-        "ROS_DOMAIN_ID",
-        "ROS_DISTRO",
-        "ROS_LOCALHOST_ONLY",
-        "ROS_AUTOMATIC_DISCOVERY_RANGE",
-        "RMW_IMPLEMENTATION",
-        OVERRIDE,
-    }
-)
+ROS2_VARIABLES = ros2_variables.ROS2_VARIABLES | {"ROS_DISTRO", OVERRIDE}
 """Variables from which the operator tells what does not work with ROS 2 in a pod."""
+_WHOLE = (OVERRIDE, "CYCLONEDDS_URI")
 MOST_LABELS = 128
 """Labels that are kept of a pod, first the labels of rosproxy.io.
 
@@ -269,11 +261,11 @@ def _is_ready(status: Json) -> bool:
 
 def _container(obj: Json) -> PodContainer:
     """Return a container: the image, and the ROS 2 variables that the container itself sets."""
-    variables = {name: _short(value) for name, value in ros2_variables(obj).items()}
+    variables = {name: _short(value) for name, value in variables_of(obj).items()}
     return PodContainer(_short(text_at(obj, "image")), variables)
 
 
-def ros2_variables(container: Json) -> dict[str, str]:
+def variables_of(container: Json) -> dict[str, str]:
     """Return the ROS 2 variables that a container itself sets, with values of any length."""
     return {
         name: _value_of(variable)
@@ -285,10 +277,10 @@ def ros2_variables(container: Json) -> dict[str, str]:
 def _value_of(variable: Json) -> str:
     """Return the value of a variable, or `VALUE_AT_RUNTIME`.
 
-    The caller decides about a reference in the value of ZENOH_CONFIG_OVERRIDE.
+    The callers decide about references in the values of `_WHOLE`.
     """
     value = text_at(variable, "value")
-    is_reference = REFERENCE in value and variable.get("name") != OVERRIDE
+    is_reference = REFERENCE in value and variable.get("name") not in _WHOLE
     return VALUE_AT_RUNTIME if is_reference or variable.get("valueFrom") is not None else value
 
 

@@ -261,7 +261,7 @@ def _wired(container: Json, wanted: PodVariables, annotations: Mapping[str, str]
 
 def _with_router(container: Json, env: list[Json], router: HostPort, former: str) -> list[Json]:
     """Return the variables of a container with ZENOH_CONFIG_OVERRIDE for a router."""
-    value = wired_override(objects.ros2_variables(container), router, former)
+    value = wired_override(objects.variables_of(container), router, former)
     if not value:
         return env
     others = [variable for variable in env if variable.get("name") != OVERRIDE]
