@@ -105,7 +105,7 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
     if members:
         text = f"{plural(len(members), 'container')} with a proxy"
         yield ok("host", "host", text)
-    elif not problems:
+    elif not problems and not status["containers"]:
         fix = "docker run --label rosproxy.enable=true ..."
         yield warning("host", "host", "no container is labelled, so no container has a proxy", fix)
 

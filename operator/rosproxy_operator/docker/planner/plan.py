@@ -33,6 +33,7 @@ from rosproxy_operator.docker.planner.labels.members import LabelReading, find_m
 from rosproxy_operator.docker.planner.labels.zenoh import with_bounded_containers
 from rosproxy_operator.docker.planner.lan_relay import missing_lan_relay, with_lan_relay
 from rosproxy_operator.docker.planner.model import (
+    THIS_HOST,
     Desired,
     HostState,
     LanRelayContainer,
@@ -238,7 +239,10 @@ def _groups(
             yield Group(wanted.place, (action,))
     all_actions = [action for actions in actions_by_place.values() for action in actions or ()]
     joins = (isinstance(a, Connect) and a.network == uplink for a in all_actions)
-    is_needed = any(joins) or any(isinstance(action, CreateSandbox) for action in all_actions)
+    # By the uplink's gateway, the operator finds the address of this host.
+    is_needed = observed.masters.get(THIS_HOST) == "" or any(
+        (*joins, *(isinstance(action, CreateSandbox) for action in all_actions))
+    )
     if is_needed and uplink not in {network.name for network in observed.networks}:
         yield Group(None, (CreateNetwork(uplink),))
     for wanted in desired:
@@ -280,7 +284,8 @@ def _container_problems(observed: HostState, live: Collection[Place]) -> Iterato
             fault = ends_again("the engine restarts it", f"docker logs {name}")
             yield Problem(f"{kind} {name}", *fault, fatal=reason is STUCK, reason=reason)
     for host in sorted(host for host, address in observed.masters.items() if not address):
-        yield Problem(f"master {host}", *unresolved_master(host), reason=MASTER_UNKNOWN)
+        fault = unresolved_master(host, observed)
+        yield Problem(f"master {host}", *fault, reason=MASTER_UNKNOWN)
 
 
 def _seconds_to_changes(

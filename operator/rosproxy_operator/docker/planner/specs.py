@@ -32,7 +32,7 @@ from rosproxy_operator.docker.planner.actions import (
     CreateRedirect,
     CreateSandbox,
 )
-from rosproxy_operator.docker.planner.model import STARTED_LABEL
+from rosproxy_operator.docker.planner.model import STARTED, STARTED_LABEL, THIS_HOST, HostState
 from rosproxy_operator.docker.planner.zenoh_redirect import FIRST_PORT
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.proxy_spec.environment import environment
@@ -180,17 +180,27 @@ def _identity(place: Place) -> str:
     return f"{name} {place.advertise_host}"
 
 
-def unresolved_master(host: str) -> Fault:
+def unresolved_master(host: str, observed: HostState) -> Fault:
     """Say that the operator can't resolve the host name of a master.
 
-    An address in place of the name is no fix: nodes with an address in ROS_MASTER_URI bypass the
-    proxy.
+    A container that does not run has no address. Its name in /etc/hosts would hide its next
+    address.
     """
+    text = f"the operator can't resolve the host name {host}"
+    if host == THIS_HOST:
+        return Fault(f"{text} before the network of the proxies exists", "Wait for the operator")
+    for container in observed.containers:
+        names = {container.name, *(name for a in container.attachments for name in a.names)}
+        if host.lower() in {name.lower() for name in names} and container.state not in STARTED:
+            return Fault(
+                f"{text}: the container {container.name} is {container.state}",
+                f"Start the container: docker start {container.name}",
+            )
     return Fault(
-        f"the operator can't resolve the host name {host}",
+        text,
         f"Add the line 'ADDRESS {host}' to /etc/hosts of this host; if the operator runs in a "
         f"container, start that container with docker run --add-host {host}:ADDRESS (Compose: "
-        "extra_hosts). Do not replace the name by an address",
+        "extra_hosts)",
     )
 
 

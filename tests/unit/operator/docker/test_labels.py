@@ -391,7 +391,7 @@ def test_a_network_that_it_is_not_on() -> None:
 @pytest.mark.parametrize(
     ("networks", "mode", "told"),
     [
-        (("bridge",), "bridge", "is only on the default bridge network, where no names resolve"),
+        (("bridge",), "bridge", "is only on the default bridge network, which the proxy does not"),
         ((), "default", "is only on the default bridge network"),
         (("host",), "host", "is on the host's own network, where nodes need no proxy"),
         (("none",), "none", "is on no network"),

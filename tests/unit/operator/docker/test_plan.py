@@ -22,7 +22,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.model import HostState, Network, Proxy
+from rosproxy_operator.docker.planner.model import THIS_HOST, Container, HostState, Network, Proxy
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     proxy_fingerprint,
@@ -114,6 +114,26 @@ def test_the_first_container_on_a_host() -> None:
     assert list(plan.actions) == [CreateNetwork("0-rosproxy"), *FIRST]
     assert [group.place for group in plan.groups] == [None, PLACE]
     assert (plan.problems, plan.again_in) == ((), None)
+
+
+def labelled(master: str) -> Container:
+    return container(labels={"rosproxy.enable": "true", "rosproxy.master-uri": master})
+
+
+def test_a_master_on_this_host_needs_the_network_of_the_proxies_first() -> None:
+    """On a fresh host, no proxy was made: the address of the host is known by that network."""
+    talker = labelled(f"http://{THIS_HOST}:11311")
+    settings = replace(SETTINGS, advertise_host="")
+    plan = look(observed(talker, networks=[APP], masters={THIS_HOST: ""}), settings=settings)
+    assert list(plan.actions) == [CreateNetwork("0-rosproxy")]
+    assert all("/etc/hosts" not in text for text in texts(plan))
+
+
+def test_a_master_in_a_stopped_container_is_no_matter_of_etc_hosts() -> None:
+    talker = labelled("http://roscore:11311")
+    roscore = container("roscore", {}, state="exited")
+    (text, *_) = texts(look(observed(talker, roscore, masters={"roscore": ""})))
+    assert "the container roscore is exited. Start the container: docker start roscore" in text
 
 
 def test_another_secret_makes_the_process_anew_in_its_sandbox() -> None:

@@ -176,7 +176,7 @@ def _why_no_host(place: Place, observed: HostState) -> tuple[Fault, str]:
     if isinstance(place.graph, Master):
         host = place.graph.host
         if observed.masters.get(host.lower()) == "":
-            text, fix = unresolved_master(host)
+            text, fix = unresolved_master(host, observed)
             return Fault(f"no address of the master: {text}", fix), MASTER_UNKNOWN
         towards = f" towards the {place.graph}"
     fault = Fault(

@@ -23,7 +23,7 @@ from rosproxy_operator.common.ros2 import MOST_PEERS
 from rosproxy_operator.common.zenoh import read_link_name
 from rosproxy_operator.docker.option_values import MOST_PORTS
 from rosproxy_operator.docker.planner.labels import bounds
-from rosproxy_operator.docker.planner.model import Container, HostState, Network
+from rosproxy_operator.docker.planner.model import THIS_HOST, Container, HostState, Network
 from rosproxy_operator.docker.planner.network_owner import NoOwner, by_reference, find_network_owner
 from rosproxy_operator.docker.planner.specs import is_proxy_name, proxy_name
 from rosproxy_operator.docker.settings import PlanSettings
@@ -294,8 +294,12 @@ def _why_no_network(owner: Container) -> Fault:
         return Fault("is on no network", f"Start the container on a user-defined network: {anew}")
     live = f"docker network create ros; docker network connect ros {owner.name}"
     if "bridge" in owner.networks or owner.network_mode in ("bridge", "default"):
-        where = "is only on the default bridge network, where no names resolve"
-        return Fault(where, f"Attach the container to another network: {live}")
+        # Nodes of ROS 2 use only the networks that they had at their start.
+        return Fault(
+            "is only on the default bridge network, which the proxy does not join",
+            f"Attach the container to another network: {live}; docker restart {owner.name}; docker "
+            f"network disconnect bridge {owner.name}. With Compose, remove network_mode",
+        )
     return Fault("is on no network", f"Attach the container to a network: {live}")
 
 
@@ -408,9 +412,10 @@ def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:
     host = host_port.host.lower()
     if is_loopback(host):
         raise UnusableLabel(
-            f"{source} means the container itself, where no master runs",
-            f"Give the name of the master's host, or set ROS_MASTER_URI=http://{ALIAS}:"
-            f"{host_port.port} and give the master in the label {MASTER_URI}",
+            f"{source} means the container itself, and a proxy reaches no master there",
+            f"Give the master in the label {MASTER_URI}, and set ROS_MASTER_URI=http://{ALIAS}:"
+            f"{host_port.port}. A master on this host is http://{THIS_HOST}:{host_port.port}. If "
+            "the master runs in this container, move roscore to a container of its own",
         )
     if _names_proxy(host, proxies):
         raise UnusableLabel(
