@@ -49,6 +49,11 @@ class Attempt(msgspec.Struct, frozen=True):
         """Whether the attempt was made, and got no proper answer."""
         return self.reach not in (ReachOutcome.ANSWERED, ReachOutcome.UNTRIED)
 
+    @property
+    def why(self) -> str:
+        """The reason in brackets, after a space; empty without a reason."""
+        return f" ({self.reason})" if self.reason else ""
+
 
 class MasterFacts(msgspec.Struct, frozen=True):
     """The facts about the master.

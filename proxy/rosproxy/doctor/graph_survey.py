@@ -14,7 +14,6 @@ from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-import aiohttp
 from msgspec.structs import replace
 
 from rosproxy.doctor.facts import (
@@ -369,11 +368,12 @@ async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
     except (Unreachable, MasterError) as error:
         if isinstance(error, Unreachable) and error.refused:
             return Attempt(ReachOutcome.REFUSED), None
-        # The failure of the connection (`_failures_of`).
-        if isinstance(error.__cause__, aiohttp.ClientOSError | TimeoutError):
-            return Attempt(ReachOutcome.SILENT), None
         # Without the name of the node or master at the beginning: the finding names the object.
         reason = str(error).partition("\n")[0].partition(": ")[2][:LONGEST_REASON]
+        cause = error.__cause__
+        # A program that ends the connection is there. Otherwise there may be no machine, or no way.
+        if isinstance(cause, OSError) and not isinstance(cause, ConnectionError):
+            return Attempt(ReachOutcome.SILENT, reason), None
         return Attempt(ReachOutcome.STRANGER, reason or "the answer can't be read"), None
 
 

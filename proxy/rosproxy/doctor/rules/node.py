@@ -230,13 +230,19 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     elif reach is ReachOutcome.UNRESOLVABLE:
         yield _unresolvable(facts, node, slave)
     elif reach is ReachOutcome.SILENT:
-        text = f"no answer at {node.uri}: the node hangs, or its machine is off or cut off"
-        fix = f"test from here: nc -vz {quoted(slave.host)} {slave.port}; if the node is gone, "
-        fix += CLEANUP
+        text = (
+            f"no answer at {node.uri}{node.attempt.why}: the node hangs, its machine is off or cut "
+            "off, a firewall is in the way, or the address is of a network that is not reached "
+            "from here"
+        )
+        fix = (
+            f"test from here: nc -vz {quoted(slave.host)} {slave.port}; where the node runs, set "
+            "ROS_IP to an address that is reached from here, and restart the node; only if the "
+            f"node is gone, {CLEANUP}"
+        )
         yield error(OUTSIDE, node.name, text, fix)
     elif node.attempt.failed:
-        reason = f" ({node.attempt.reason})" if node.attempt.reason else ""
-        text = f"registered as {node.uri}, but gone: {reach.value}{reason}"
+        text = f"registered as {node.uri}, but gone: {reach.value}{node.attempt.why}"
         yield error(STALE, node.name, text, CLEANUP)
     elif _past_the_proxy(facts, node):
         text = (

@@ -109,7 +109,7 @@ def _unanswered(master: MasterFacts) -> tuple[str, str]:
                 how_to("master", uri=quoted(f"http://{split_uri.netloc}/")),
             )
         case ReachOutcome.STRANGER:
-            text = f"{uri}: the program that answers is no ROS master ({master.attempt.reason})"
+            text = f"{uri}: the program that answers is no ROS master{master.attempt.why}"
             return text, _other_uri()
         case ReachOutcome.REFUSED if is_loopback(host):
             text = f"{uri} refuses connections. In a container, {host} is the container itself"
@@ -120,7 +120,7 @@ def _unanswered(master: MasterFacts) -> tuple[str, str]:
             return text, f"start roscore on {quoted(host)}: roscore -p {port}; or {_other_uri()}"
     text = "the machine is off or cut off, a firewall drops the packets, or the address is wrong"
     fix = f"test from here: nc -vz {quoted(host)} {port}; test on {quoted(host)}: rosnode list"
-    return f"{uri} does not answer: {text}", fix
+    return f"{uri} does not answer{master.attempt.why}: {text}", fix
 
 
 def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
