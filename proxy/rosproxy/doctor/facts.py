@@ -105,14 +105,14 @@ def slave_report(
     ``topics``: all other topics are left out; None: no topic is left out.
 
     A row of ``getBusInfo`` is ``[id, peer, direction, transport, topic, connected, ...]``. Booleans
-    of XML-RPC arrive as text.
+    of XML-RPC arrive as text. The rows of rosjava end after the topic.
     """
 
     def is_wanted(topic: str) -> bool:
         return topics is None or topic in topics
 
-    rows = [row for row in _items(bus) if isinstance(row, list) and len(row) > 5]
-    rows = [row for row in rows if row[5] not in (0, "0") and is_wanted(str(row[4]))]
+    rows = [row for row in _items(bus) if isinstance(row, list) and len(row) > 4]
+    rows = [row for row in rows if row[5:6] not in ([0], ["0"]) and is_wanted(str(row[4]))]
     counted = read_bus_stats(stats)
     links = {(str(row[2]), str(row[4]), str(row[1])): row[0] for row in rows}
     counts = {

@@ -172,6 +172,13 @@ FIXES = {
         "start the operator with --ros2-lan and this host's address on the LAN",
         "set spec.multicast: true",
     ),
+    "relay proof": Fix(
+        "give the proxy and its LAN relay the same secret (--ros2-lan-relay-secret of the proxy, "
+        "--secret of the LAN relay), and set the clocks of both machines",
+        "run docker restart with the name of the LAN relay's container; the operator gives both "
+        "the same secret",
+        "delete the pod of the LAN relay; the operator gives it and the proxy the same secret",
+    ),
     "hidden source": Fix(
         "rootless Docker: set DOCKERD_ROOTLESS_ROOTLESSKIT_PORT_DRIVER=slirp4netns for the service "
         "of the engine; Docker Desktop: use an engine on Linux; Docker before 23.0: run conntrack "

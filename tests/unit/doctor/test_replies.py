@@ -34,6 +34,12 @@ def test_words() -> None:
     assert slave_report(None, "x", 3) == SlaveReport()
 
 
+def test_a_row_of_rosjava_does_not_say_whether_it_is_connected() -> None:
+    """The doctor reported its publishers as not connected, although messages flowed."""
+    report = slave_report([], [], [["1", "/c", "o", "TCPROS", "/t"]])
+    assert report.peers == {("o", "/t", "/c")}
+
+
 def test_a_row_that_is_not_connected_is_not_counted() -> None:
     """Nodes may write the boolean as a number or a text."""
     rows = [

@@ -194,6 +194,22 @@ def test_an_engine_that_hides_who_sends_is_an_error() -> None:
     assert told["refused", "refused: hidden source"][0] is Severity.ERROR
 
 
+def test_a_lan_relay_with_another_secret_is_an_error() -> None:
+    """The doctor found nothing wrong, and no participant outside was heard."""
+    wrong = ProblemStatus(10.0, "refused: relay proof", "from 172.30.0.1: another secret")
+    severity, text = diagnose_domain(BOTH, problems=(wrong,))["refused", "refused: relay proof"]
+    assert severity is Severity.ERROR
+    assert "give the proxy and its LAN relay the same secret" in text
+
+
+def test_the_name_of_a_node_is_known() -> None:
+    """The doctor said that no participant had a topic or service of this name."""
+    inside = replace(INSIDE, nodes=("/talker",))
+    told = diagnose_domain(replace(BOTH, inside=(inside,)), "/talker")
+    assert told["node", "/talker"][0] is Severity.OK
+    assert not any(severity is Severity.ERROR for severity, _ in told.values())
+
+
 def test_nothing_is_heard_of_zenoh() -> None:
     told = diagnose_domain(DomainStatus(peers=("10.0.0.9",)))["inside", "domain 0"][1]
     assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp does not use DDS" in told

@@ -37,7 +37,8 @@ OTHER_DOMAIN = "domain"
 OWN_MACHINE = "range"
 """The check for a participant on a network inside that announces itself only on its own machine."""
 HIDDEN = "refused: hidden source"
-"""The subject of the only refusal that is an error."""
+RELAY_PROOF = "refused: relay proof"
+"""With these refusals, no participant outside is heard. So they are errors."""
 _REFUSED = {
     "refused: no locator": (
         "where the participant runs: for (tcp) unset FASTDDS_BUILTIN_TRANSPORTS; for (loopback) "
@@ -48,6 +49,7 @@ _REFUSED = {
         "if participants at this address shall meet participants inside, {peer}"
     ),
     HIDDEN: "{hidden source}",
+    RELAY_PROOF: "{relay proof}",
     "refused: participants": (
         "to see the participants, {status}; docs/reference/limits.md lists the bounds"
     ),
@@ -68,7 +70,7 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
             for finding in _heard(heard, domains, known)
         ]
     findings += [
-        (error if problem.subject == HIDDEN else warning)(
+        (error if problem.subject in (HIDDEN, RELAY_PROOF) else warning)(
             "refused", problem.subject, problem.text, _refused_fix(problem.subject)
         )
         for problem in facts.proxy.problems
@@ -80,7 +82,7 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
 
 
 def _refused_fix(subject: str) -> str:
-    keys = ("peer", "hidden source", "status")
+    keys = ("peer", "hidden source", "relay proof", "status")
     return _REFUSED[subject].format_map({key: how_to(key) for key in keys})
 
 
@@ -98,7 +100,9 @@ def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
         text = "no participant inside has been heard"
         fix = (
             f"{how_to('participants inside')}, and set "
-            f"ROS_DOMAIN_ID={domain.domain} and ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET. If the "
+            f"ROS_DOMAIN_ID={domain.domain} and ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET. Unset "
+            "ROS_LOCALHOST_ONLY, ROS_DISCOVERY_SERVER, and what names other interfaces "
+            "(CYCLONEDDS_URI, DDS profiles). If the "
             "network has no multicast, set ROS_STATIC_PEERS to the proxy's address there. "
             "RMW_IMPLEMENTATION=rmw_zenoh_cpp does not use DDS: "
             f"{how_to('rmw_zenoh')}"
@@ -171,8 +175,9 @@ def _heard(
 def _name_in_domains(name: str, domains: tuple[DomainStatus, ...]) -> Iterator[DoctorFinding]:
     """The findings about a topic or service: participants, and whether the two sides match."""
     participants = [p for domain in domains for side in _sides(domain) for p in side]
-    if not any(name in (*p.publishes, *p.subscribes, *p.services) for p in participants):
-        text = "no participant has a topic or service of this name"
+    named = [(*p.publishes, *p.subscribes, *p.services, *p.nodes) for p in participants]
+    if not any(name in names for names in named):
+        text = "no participant has a topic, service or node of this name"
         yield error(
             UNKNOWN_NAME, name, text, f"compare with the names in the status: {how_to('status')}"
         )
@@ -185,13 +190,7 @@ def _name_in_domain(domain: DomainStatus, name: str) -> Iterator[DoctorFinding]:
     publishers = [p for p in participants if name in p[0].publishes]
     subscribers = [p for p in participants if name in p[0].subscribes]
     for participant, is_inside in participants:
-        if name in participant.services:
-            yield ok(
-                "service",
-                name,
-                f"served by participant {participant.guid_prefix} "
-                f"{participant_label(participant, is_inside)}",
-            )
+        yield from _of_participant(participant, is_inside, name)
     for own_side, other_side, lacks in (
         (publishers, subscribers, "subscribes to"),
         (subscribers, publishers, "publishes"),
@@ -214,6 +213,17 @@ def _name_in_domain(domain: DomainStatus, name: str) -> Iterator[DoctorFinding]:
                 f"the subscription {guids[1]} {participant_label(peer, to_inside)} match"
             )
             yield ok("topic", name, text)
+
+
+def _of_participant(
+    participant: ParticipantStatus, is_inside: bool, name: str
+) -> Iterator[DoctorFinding]:
+    """The findings that a participant has a service or a node of this name."""
+    shown = f"participant {participant.guid_prefix} {participant_label(participant, is_inside)}"
+    if name in participant.services:
+        yield ok("service", name, f"served by {shown}")
+    if name in participant.nodes:
+        yield ok("node", name, f"a node of {shown}")
 
 
 def _sides(domain: DomainStatus) -> tuple[tuple[ParticipantStatus, ...], ...]:
