@@ -20,7 +20,7 @@ from rosproxy.ros1.registry.graph import read_types
 from rosproxy.ros2.registry.matching import in_turn
 from rosproxy.shared.addresses import HostPort
 from rosproxy.shared.documents.requests import RangeProbe
-from rosproxy.shared.documents.status_document import EndpointStatus, ProxyStatus
+from rosproxy.shared.documents.status_document import EndpointStatus, HiddenStatus, ProxyStatus
 from rosproxy.shared.uris import parse_slave_uri
 
 MOST_PAIRS = 5000
@@ -317,6 +317,12 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     def system(self) -> SystemState:
         """The state of the master; empty if the master gave no answer."""
         return self.graph or SystemState()
+
+    @cached_property
+    def hidden(self) -> dict[str, HiddenStatus]:
+        """What the policy hides from outside, by topic or service: the first entry of each name."""
+        hidden = self.proxy.policy.hidden if self.proxy.policy else ()
+        return {entry.name: entry for entry in reversed(hidden)}
 
     @cached_property
     def scope(self) -> Scope:

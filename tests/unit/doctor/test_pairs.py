@@ -103,6 +103,21 @@ def test_a_name_that_nobody_knows() -> None:
     assert "/listener" in finding.text
 
 
+@pytest.mark.parametrize("known", [False, True])
+def test_a_name_that_the_policy_hides_has_another_cause(known: bool) -> None:
+    """The doctor advised to check remappings, and to restart nodes outside."""
+    hidden = {"kind": "publish", "name": "/camera/image", "node": "/camera"}
+    hidden["reason"] = "policy, deny publish /camera/*"
+    status = {**make_status(make_node()), "policy": {"hidden": [hidden]}}
+    listeners = {"/camera/image": ["/listener"]} if known else {}
+    facts = make_facts(
+        status=status, graph=SystemState({}, listeners, {}), names=("/camera/image",)
+    )
+    findings = list(pair_rules.check(facts))
+    assert [(f.severity, f.check) for f in findings] == [(Severity.WARNING, "policy")]
+    assert "by the policy: policy, deny publish /camera/* (publish, /camera)" in findings[0].text
+
+
 def test_a_name_without_its_namespace() -> None:
     graph = SystemState({"/robot1/scan": ["/talker"]}, {}, {})
     assert "similar names: /robot1/scan" in only(check(["/scan"], graph=graph)).text

@@ -9,8 +9,10 @@ from rosproxy.shared.documents.doctor_finding import Severity, failed
 from rosproxy.shared.documents.requests import PortProbe, RangeProbe
 from rosproxy.shared.documents.status_document import (
     DomainStatus,
+    HiddenStatus,
     MismatchStatus,
     ParticipantStatus,
+    PolicyStatus,
     PortsStatus,
     ProblemStatus,
     ProxyStatus,
@@ -27,11 +29,17 @@ def diagnose_domain(
     heard: tuple[HeardParticipant, ...] = (),
     problems: tuple[ProblemStatus, ...] = (),
     uptime: float = 60.0,
+    policy: PolicyStatus | None = None,
 ) -> dict[tuple[str, str], tuple[Severity, str]]:
     settings = StatusSettings(ros=("2",))
     ports = PortsStatus("11400-11431", "11400-11431", free=32)
     status = ProxyStatus(
-        settings=settings, ports=ports, domains=(domain,), problems=problems, uptime=uptime
+        settings=settings,
+        ports=ports,
+        domains=(domain,),
+        problems=problems,
+        uptime=uptime,
+        policy=policy,
     )
     facts = DoctorFacts(
         admin="http://127.0.0.1:11312",
@@ -146,6 +154,17 @@ def test_who_serves_a_service() -> None:
     severity, text = diagnose_domain(BOTH, "/add")["service", "/add"]
     assert severity is Severity.OK
     assert "served by participant 01.0f.aa at 172.30.0.5" in text
+
+
+def test_a_topic_that_the_policy_hides_does_not_match() -> None:
+    hidden = HiddenStatus("publish", "/t", "01.0f.aa", "policy, deny publish /t")
+    inside, outside = replace(INSIDE, publishes=("/t",)), replace(OUTSIDE, subscribes=("/t",))
+    domain = DomainStatus(peers=("10.0.0.9",), inside=(inside,), outside=(outside,))
+    told = diagnose_domain(domain, "/t", policy=PolicyStatus(hidden=(hidden,)))
+    assert ("topic", "/t") not in told
+    severity, text = told["policy", "/t"]
+    assert severity is Severity.WARNING
+    assert "deny publish /t" in text
 
 
 def test_a_name_that_nobody_has() -> None:

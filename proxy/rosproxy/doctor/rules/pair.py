@@ -8,6 +8,7 @@ from difflib import get_close_matches
 
 from rosproxy.doctor.facts import MOST_PAIRS, Attempt, DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.node import CLEANUP
+from rosproxy.doctor.rules.policy import hidden_finding
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.shared.addresses import is_loopback, parse_host_port
 from rosproxy.shared.documents.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok
@@ -35,7 +36,10 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         yield note(PAIR, ", ".join(facts.names), text)
         return
     scope = facts.scope
-    yield from (_unknown(facts, name) for name in scope.unknown)
+    yield from (
+        hidden_finding(facts.hidden[name]) if name in facts.hidden else _unknown(facts, name)
+        for name in scope.unknown
+    )
     yield from _one_sided_topics(facts)
     if scope.has_more_pairs:
         text = f"only {MOST_PAIRS} pairs are checked: these topics have more"
@@ -91,7 +95,8 @@ def _one_sided_topics(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         by_ending.setdefault(_ending(topic), []).append(topic)
     for topic in topics[:MOST_ONE_SIDED]:
         alike = [other for other in by_ending[_ending(topic)] if other != topic]
-        yield _one_sided_topic(facts, topic, alike)
+        hidden = facts.hidden.get(topic)
+        yield hidden_finding(hidden) if hidden else _one_sided_topic(facts, topic, alike)
     if len(topics) > MOST_ONE_SIDED:
         text = f"{len(topics) - MOST_ONE_SIDED} more topics have no publisher or no subscriber"
         yield note(PAIR, ", ".join(facts.names), text, "run the doctor with the name of a topic")

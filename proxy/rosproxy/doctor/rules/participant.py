@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from itertools import islice, product
 
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
+from rosproxy.doctor.rules.policy import hidden_finding
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, participant_label
 from rosproxy.shared.addresses import parse_host_port
 from rosproxy.shared.documents.doctor_finding import (
@@ -77,7 +78,15 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
         if domains and problem.subject in _REFUSED and problem.age < RECENT_S
     ]
     if domains and not facts.proxy.settings.for_ros1:
-        findings += [finding for name in facts.names for finding in _name_in_domains(name, domains)]
+        findings += [
+            finding
+            for name in facts.names
+            for finding in (
+                [hidden_finding(facts.hidden[name])]
+                if name in facts.hidden
+                else _name_in_domains(name, domains)
+            )
+        ]
     return findings
 
 
