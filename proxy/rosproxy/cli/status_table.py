@@ -120,9 +120,11 @@ def _ports(status: document.ProxyStatus) -> str:
 
 
 def _reached(probe: document.RangeProbeStatus | None) -> str:
-    """Whether outside reaches the range; empty if unknown."""
+    """Whether outside reaches the range; empty if unknown. Only the master tries from outside."""
     if probe is None or probe.reached is None:
         return ""
+    if probe.reached and probe.from_master != "ok":
+        return ", reached from this host"
     return ", reached from outside" if probe.reached else ", NOT reached from outside"
 
 

@@ -43,11 +43,17 @@ def test_head_names_offset_and_blocked_ports_and_the_published_master() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reached", "end"),
-    [(True, "reached from outside"), (False, "NOT reached from outside"), (None, "100 free")],
+    ("reached", "by_master", "end"),
+    [
+        (True, "ok", "reached from outside"),
+        (True, "unknown", "reached from this host"),
+        (False, "missed", "NOT reached from outside"),
+        (None, "unknown", "100 free"),
+    ],
 )
-def test_head_tells_whether_outside_gets_in(reached, end) -> None:
-    status = {**make_status(), "range_probe": {"reached": reached}}
+def test_head_tells_whether_outside_gets_in(reached, by_master, end) -> None:
+    """The try of the proxy itself was told as one from outside, as with ROS 2."""
+    status = {**make_status(), "range_probe": {"reached": reached, "from_master": by_master}}
     assert shown(status, 120).split("\n")[2].endswith(f", {end}")
 
 

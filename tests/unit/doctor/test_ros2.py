@@ -158,7 +158,8 @@ def test_who_serves_a_service() -> None:
 
 def test_a_topic_that_the_policy_hides_does_not_match() -> None:
     hidden = HiddenStatus("publish", "/t", "01.0f.aa", "policy, deny publish /t")
-    inside, outside = replace(INSIDE, publishes=("/t",)), replace(OUTSIDE, subscribes=("/t",))
+    inside = replace(INSIDE, publishes=("/t",))
+    outside = replace(OUTSIDE, subscribes=("/t",))
     domain = DomainStatus(peers=("10.0.0.9",), inside=(inside,), outside=(outside,))
     told = diagnose_domain(domain, "/t", policy=PolicyStatus(hidden=(hidden,)))
     assert ("topic", "/t") not in told
