@@ -62,10 +62,29 @@ ROS2_VARIABLES = frozenset(
 
 
 def discovery_obstacle(variables: Mapping[str, str]) -> Fault | None:
-    """Return which variable may prevent discovery, and the fix; None without such a variable."""
-    for name, (prevents_discovery, cause) in _DISCOVERY_OBSTACLES.items():
-        value = variables.get(name, "")
-        if value and prevents_discovery(value):
-            shown = f"variable {name}={brief(value, MOST_VALUE_CHARACTERS)}"
-            return Fault(f"{shown}. {cause.text}", cause.fix)
-    return None
+    """Return which variable may prevent discovery, and the fix; None without such a variable.
+
+    Of several, the text has the surest with its cause, and the names of the others.
+    """
+    found = [
+        name
+        for name, (prevents_discovery, _) in _DISCOVERY_OBSTACLES.items()
+        if (value := variables.get(name, ""))
+        and prevents_discovery(value)
+        and not name.startswith(_of_another_rmw(variables))
+    ]
+    if not found:
+        return None
+    first, *others = found
+    cause = _DISCOVERY_OBSTACLES[first][1]
+    more = f". Or the cause is {' or '.join(others)}" if others else ""
+    shown = f"variable {first}={brief(variables[first], MOST_VALUE_CHARACTERS)}"
+    return Fault(f"{shown}. {cause.text}{more}", cause.fix)
+
+
+def _of_another_rmw(variables: Mapping[str, str]) -> tuple[str, ...]:
+    """The beginnings of variables that the RMW of a container does not read."""
+    rmw = variables.get("RMW_IMPLEMENTATION", "")
+    if "fastrtps" in rmw:
+        return ("CYCLONEDDS_",)
+    return ("FASTDDS_", "FASTRTPS_", "ROS_DISCOVERY_SERVER") if "cyclonedds" in rmw else ()

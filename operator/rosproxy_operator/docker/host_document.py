@@ -240,11 +240,15 @@ def _undiscovered(
         addresses = _addresses(container, observed).values()
         obstacle = discovery_obstacle(container.variables)
         if obstacle and settled and not participants_by_address(status).keys() & {*addresses}:
-            text = "the proxy has discovered no participant of this container. Possible cause: "
+            text = (
+                "the proxy has discovered no participant of this container. Possible cause, if a "
+                f"participant runs: {obstacle.text}"
+            )
             yield Problem(
                 f"container {container.name}",
-                f"{text}{obstacle.text}",
+                text,
                 obstacle.fix,
+                fatal=False,
                 reason=NOT_WIRED,
             )
 
@@ -269,6 +273,7 @@ def _unconnected(
                 f"{SESSION_FILE}={brief(file, MOST_VALUE_CHARACTERS)}. The file may name other "
                 "endpoints than tcp/localhost:7447",
                 "Unset the variable, or change the file",
+                fatal=False,
                 reason=NOT_WIRED,
             )
 

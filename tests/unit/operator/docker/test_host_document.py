@@ -121,6 +121,15 @@ def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) 
     assert (silence.text in told) is is_told
 
 
+def test_only_variables_of_the_rmw_in_use_are_named() -> None:
+    of_cyclone = {"CYCLONEDDS_URI": "file:///cyclone.xml"}
+    of_fast = {"FASTRTPS_DEFAULT_PROFILES_FILE": "/profile.xml"}
+    assert not told_of_talker({**of_cyclone, "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"})
+    assert not told_of_talker({**of_fast, "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"})
+    (text,) = told_of_talker({**of_cyclone, **of_fast})
+    assert "Or the cause is FASTRTPS_DEFAULT_PROFILES_FILE" in text
+
+
 @pytest.mark.parametrize(
     ("variables", "fix"),
     [
@@ -138,7 +147,7 @@ def test_a_variable_is_named_where_no_participant_is_heard(
 ) -> None:
     (text,) = told_of_talker(variables)
     ((name, value),) = variables.items()
-    assert f"Possible cause: variable {name}={value}. " in text
+    assert f"Possible cause, if a participant runs: variable {name}={value}. " in text
     assert fix in text
     assert not told_of_talker(variables, inside=[TALKER.address]), "all is well"
     assert not told_of_talker(variables, age=1.0), "the container has just started"

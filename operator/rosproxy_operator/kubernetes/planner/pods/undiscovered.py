@@ -50,12 +50,10 @@ def undiscovered_findings(
     for pod, rosproxy, fault in undiscovered(view):
         if now - since.get(pod.id, now) >= UNDISCOVERED_FOR_S:
             text = (
-                f"the proxy has discovered no participant of the pod. Possible cause: {fault.text}"
+                "the proxy has discovered no participant of the pod. Possible cause, if one runs: "
             )
-            fix = edit_fix(f"{fault.fix}. Edit the template", pod)
-            yield pod_finding(
-                pod, rosproxy, "NotDiscovered", Fault(text + fault.text, fix), fatal=False
-            )
+            described = Fault(text + fault.text, edit_fix(f"{fault.fix}. Edit the template", pod))
+            yield pod_finding(pod, rosproxy, "NotDiscovered", described, fatal=False)
 
 
 def undiscovered_waits(since: Mapping[Name, float], now: float) -> Iterator[float]:
