@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.shared.addresses import HostPort
-from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.layers import PolicyLayer, PolicyMode
 from rosproxy.shared.policy.rules import parse_rules
 from rosproxy.shared.ports import PortRange
 from rosproxy_operator.docker.engine_json import check_inspection, read_container, read_making
@@ -274,6 +274,17 @@ def test_with_rules_no_node_connects_past_them(
         members, told = read(made, settings=used)
         assert bool(members) == is_served
         assert is_served or "connects the nodes to" in told[0]
+
+
+def test_rules_that_only_report_keep_no_container_out() -> None:
+    """A container that worked lost its proxy when the administrator tried rules."""
+    (rules,) = ADMINISTRATOR
+    audit = replace(SETTINGS, policy=(PolicyLayer(rules.name, rules.rules, PolicyMode.AUDIT),))
+    members, _ = read(node(override=ROBOT), settings=audit)
+    assert members
+    members, (text, *_) = read(node(override=ROBOT), settings=replace(audit, policy=ADMINISTRATOR))
+    assert not members
+    assert text.startswith("has to obey the operator's --policy, and variable")
 
 
 def test_with_rules_no_router_runs_in_the_container() -> None:

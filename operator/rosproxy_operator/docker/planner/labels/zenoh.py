@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from rosproxy.shared.addresses import HostPort, is_address, is_loopback
 from rosproxy.shared.output.text import listed
-from rosproxy.shared.policy.layers import PolicyLayer
+from rosproxy.shared.policy.layers import PolicyLayer, PolicyMode
 from rosproxy.shared.policy.rules import Rule
 from rosproxy.shared.setting_kinds import read_zenoh_peer
 from rosproxy.shared.settings import MOST_ZENOH_PORTS
@@ -99,7 +99,7 @@ def zenoh_member(
         redirect=readers.redirect(labels),
     )
     owner = readers.network_owner(container, observed)
-    if rules or settings.policy:
+    if rules or any(layer.mode is PolicyMode.ENFORCE for layer in settings.policy):
         _refuse_detours(container, bool(rules), _has_router(owner, observed))
     own = [*_routers_of_variable(member, observed)]
     allowed = [r for r in (*_routers_of_label(labels), *own) if _is_allowed(r, settings)]
@@ -239,10 +239,11 @@ def _refuse_detours(container: Container, has_own_rules: bool, has_router: bool)
     Before the redirect is in place, a node reaches an address outside directly. If the variable
     names a port of the proxy, the administrator's rules apply there, and the label's rules do not.
     """
+    policy = "has a policy" if has_own_rules else "has to obey the operator's --policy"
     if has_router:
         raise UnusableLabel(
-            "has a policy, and a router runs in the container or in its network. Nodes at that "
-            "router bypass the policy",
+            f"{policy}, and a router runs in the container or in its network. Nodes at that router "
+            "bypass the policy",
             "Remove the router, or the rules",
         )
     proxies = () if has_own_rules else _PROXIES
@@ -250,8 +251,8 @@ def _refuse_detours(container: Container, has_own_rules: bool, has_router: bool)
         is_of_proxy = protocol == "tcp" and address.host in proxies
         if not is_loopback(address.host) and not is_of_proxy:
             raise UnusableLabel(
-                f"has a policy, and variable {OVERRIDE} connects the nodes to "
-                f"{quoted(str(address))}, past the policy",
+                f"{policy}, and variable {OVERRIDE} connects the nodes to {quoted(str(address))}, "
+                "past the policy",
                 "Remove connect/endpoints from the variable, and name routers outside in the label "
                 f"{PEERS}",
             )
