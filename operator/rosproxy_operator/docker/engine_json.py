@@ -11,6 +11,7 @@ from typing import Any, TypedDict
 
 import msgspec
 
+from rosproxy.shared.uris import parse_slave_uri
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.ros2_variables import ROS2_VARIABLES
 from rosproxy_operator.common.zenoh import OVERRIDE, SESSION_FILE, runs_router
@@ -56,6 +57,7 @@ class _Binding(TypedDict, total=False):
 
 class _HostConfig(TypedDict, total=False):
     PortBindings: dict[str, list[_Binding] | None] | None
+    ExtraHosts: list[str] | None
     # Other containers may have any values here: the operator only compares these fields with the
     # values of its own containers.
     NetworkMode: Any
@@ -211,6 +213,7 @@ def read_container(
             for key, endpoint in endpoints(row).items()
         ),
         master_uri=variables.get("ROS_MASTER_URI", ""),
+        master_entry=_hosts_entry(inspected, variables.get("ROS_MASTER_URI", "")),
         variables={name: text for name, text in variables.items() if name in _VARIABLES},
         host_ports=_requested_ports(inspected, "tcp") | _public_ports(row, "tcp"),
         udp_ports=_requested_ports(inspected, "udp") | _public_ports(row, "udp"),
@@ -219,6 +222,20 @@ def read_container(
         exit_code=dig(inspected, "State", "ExitCode") or 0,
         is_zenoh_router=runs_router(read_making(inspected).command),
     )
+
+
+def _hosts_entry(inspected: Json | None, master_uri: str) -> str:
+    """Return what the engine writes into /etc/hosts for the host of a ROS_MASTER_URI.
+
+    This is an address or ``host-gateway``; empty without an entry. The separator of an entry is a
+    colon or, since Docker 25, an equals sign (moby: opts/hosts.go).
+    """
+    target = parse_slave_uri(master_uri.strip())
+    for entry in dig(inspected, "HostConfig", "ExtraHosts") or ():
+        name, _, address = entry.replace("=", ":", 1).partition(":")
+        if target and name.lower() == target.host.lower():
+            return str(bounded(address, MOST_TEXT_CHARACTERS))
+    return ""
 
 
 def read_network(row: Json) -> Network:

@@ -48,6 +48,8 @@ class Container:
     Attributes:
         network_mode: ``bridge``, ``host``, ``none``, ``container:ID`` or the name of a network.
         master_uri: The variable ROS_MASTER_URI; empty without.
+        master_entry: The address that /etc/hosts of the container has for the host of
+            ``master_uri`` (``--add-host``), or ``host-gateway``; empty without an entry.
         host_ports: TCP ports of the host that the container publishes now, or after a start.
         hostname: The host name of the container itself.
         variables: The variables that the operator needs: the ROS version, settings of ROS 2,
@@ -67,6 +69,7 @@ class Container:
     network_mode: str = ""
     attachments: tuple[Attachment, ...] = ()
     master_uri: str = ""
+    master_entry: str = ""
     host_ports: frozenset[int] = frozenset()
     hostname: str = ""
     variables: Mapping[str, str] = field(default_factory=dict)

@@ -241,6 +241,22 @@ def test_who_is_not_redirected_is_told(
     assert not any(member.redirected for member in members)
 
 
+@pytest.mark.parametrize(
+    ("entry", "redirected"), [(ADDRESS, [f"{ADDRESS}:11311"]), ("host-gateway", []), ("", [])]
+)
+def test_a_container_may_know_the_master_by_its_hosts_file(
+    entry: str, redirected: list[str]
+) -> None:
+    """The alias of the proxy had no effect, and nothing was told."""
+    talker = replace(node(env="http://robot:11311"), master_entry=entry)
+    members, problems = read_members(observed(talker, masters={"robot": ADDRESS}))
+    (member,) = members
+    assert [*map(str, member.redirected)] == redirected
+    told = [p.message for p in problems if "leads past the proxy: /etc/hosts" in p.message]
+    assert bool(told) == (entry == "host-gateway")
+    assert all("Remove robot from extra_hosts of the service" in text for text in told)
+
+
 def test_a_label_can_not_widen() -> None:
     _, problems = read_members(observed(node(redirect="true")), OFF)
     assert any("rosproxy.redirect=true is ignored" in problem.message for problem in problems)

@@ -76,6 +76,23 @@ def test_names() -> None:
     assert container(Names=None).name == "45afed2aea6c"
 
 
+@pytest.mark.parametrize(
+    ("entries", "entry"),
+    [
+        (["other:192.0.2.1", "Robot:192.0.2.7"], "192.0.2.7"),
+        (["robot=192.0.2.7"], "192.0.2.7"),
+        (["robot:2001:db8::7"], "2001:db8::7"),
+        (["robot:host-gateway"], "host-gateway"),
+        (["robot2:192.0.2.7", "robot"], ""),
+        (None, ""),
+    ],
+)
+def test_the_hosts_file_of_a_container(entries: list[str] | None, entry: str) -> None:
+    config = {"Env": ["ROS_MASTER_URI=http://robot:11311"]}
+    inspected = {"Config": config, "HostConfig": {"ExtraHosts": entries}}
+    assert read_container(captured.created(), inspected).master_entry == entry
+
+
 def test_variables() -> None:
     assert environment(captured.inspected())["ROSPROXY_ADMIN_TOKEN"] == "a=b"
     assert environment({"Config": {"Env": None}}) == environment(None) == {}

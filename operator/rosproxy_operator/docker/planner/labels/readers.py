@@ -343,6 +343,10 @@ def proxy_alias(container: Container, place: Place) -> tuple[str, Fault | None]:
     if target is None:
         return "", Fault(f"{variable} is not of the form http://HOST:11311", fix)
     host = target.host.lower()
+    if container.master_entry:
+        text = f"{variable} leads past the proxy: /etc/hosts of the container has {host}"
+        remove = f"Remove {host} from extra_hosts of the service (docker run: --add-host)"
+        return "", Fault(text, f"{remove}. Or {fix[0].lower()}{fix[1:]}")
     if not is_address(host) and host in (ALIAS, real.host, proxy_name(place)):
         if target.port == real.port:
             return host, None
@@ -357,19 +361,20 @@ def proxy_alias(container: Container, place: Place) -> tuple[str, Fault | None]:
 def master_by_address(container: Container, place: Place) -> HostPort | None:
     """Return the address in a container's ROS_MASTER_URI that a redirect may lead to the proxy.
 
-    If a label gives the master by name, any address is accepted: the name may resolve to another
-    address by now. Otherwise the address has to be the master's. None for a wrong port, a name,
-    loopback and IPv6.
+    The container may have the address in /etc/hosts. If a label gives the master by name, any
+    address is accepted: the name may resolve to another address by now. Otherwise the address has
+    to be the master's. None for a wrong port, a name, loopback and IPv6.
     """
     target = parse_slave_uri(container.master_uri)
     real = place.master
-    if target is None or target.port != real.port or ":" in target.host:
+    if target is None or target.port != real.port:
         return None
-    if not is_address(target.host) or is_loopback(target.host):
+    host = container.master_entry or target.host
+    if not is_address(host) or is_loopback(host) or ":" in host:
         return None
-    if is_address(real.host) and target.host != real.host:
+    if is_address(real.host) and host != real.host:
         return None
-    return HostPort(target.host, target.port)
+    return HostPort(host, target.port)
 
 
 def _wrong_master(host: str, place: Place, variable: str, fix: str) -> Fault:
