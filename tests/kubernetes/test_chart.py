@@ -27,7 +27,7 @@ SECRET = "rosproxy-operator-webhook"
 @pytest.fixture(scope="module")
 def namespaces(_release: None) -> Iterator[None]:
     """The namespaces that the combinations name."""
-    with namespace("robots"), namespace("arms"):
+    with namespace("robots"), namespace("arms"), namespace("monitoring"):
         yield
 
 
