@@ -12,7 +12,7 @@ from tests.docker.inside import ENABLE, Inside
 from tests.docker.nodes import node_command
 from tests.docker.robot import Robot
 
-ADVICE = re.compile(r"[Ss]et ROS_MASTER_URI=(\S+)(?: and the label (\S+=\S+))?$")
+ADVICE = re.compile(r"[Ss]et ROS_MASTER_URI=(\S+)(?: and the label (\S+=\S+))?(?:; or wait|$)")
 
 
 def told(controller: Controller, name: str) -> str:
