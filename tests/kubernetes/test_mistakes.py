@@ -43,8 +43,6 @@ from tests.kubernetes.rosproxies import rosproxy
 from tests.kubernetes.traffic import START, wait_for_service
 
 OF_ROS2 = {"ros": 2, "peers": [ADDRESS], "ports": 16}
-WITHOUT_MULTICAST = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-"""Variables of a pod that a proxy discovers by ROS_STATIC_PEERS only."""
 
 
 def _both(spec: dict[str, Any], template: dict[str, Any]) -> Step:
@@ -512,15 +510,15 @@ ROS2_MISTAKES: dict[str, Mistake] = {
         )
         for former in ({"domain": 3}, {})
     },
-    "localhost only": Mistake(
-        _both(OF_ROS2, {"env": {"ROS_LOCALHOST_ONLY": "1"}}), "Alone",
-        (Cure("variable ROS_LOCALHOST_ONLY=1 keeps the participants of the pod from being",
-              "Remove the variable from the template", _without_variables),),
+    "no discovery": Mistake(
+        _both(OF_ROS2, {"env": {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}}), "NotDiscovered",
+        (Cure("variable ROS_AUTOMATIC_DISCOVERY_RANGE=OFF. The nodes discover only nodes on their",
+              "Unset the variable, or set SUBNET. Edit the template", _without_variables),),
     ),
-    "peers in the template": Mistake(
-        _both(OF_ROS2, {"env": {"ROS_STATIC_PEERS": "192.0.2.7", **WITHOUT_MULTICAST}}), "NotWired",
-        (Cure("variable ROS_STATIC_PEERS=192.0.2.7 of the template does not name the proxy",
-              "Remove the variable from the template", _without_variables),),
+    "discovery server": Mistake(
+        _both(OF_ROS2, {"env": {"ROS_DISCOVERY_SERVER": "192.0.2.7:11811"}}), "NotDiscovered",
+        (Cure("variable ROS_DISCOVERY_SERVER=192.0.2.7:11811. The nodes announce themselves only",
+              "Unset the variable. Edit the template", _without_variables),),
     ),
 }  # fmt: skip
 

@@ -25,7 +25,7 @@ from tests.kubernetes.ros2 import (
     ports_are_kept,
     robot_with_ros2,
 )
-from tests.kubernetes.rosproxies import Proxy, RosProxy, rosproxy, wait_event
+from tests.kubernetes.rosproxies import Proxy, RosProxy, events, rosproxy, wait_event
 from tests.kubernetes.test_doctor import doctor
 from tests.kubernetes.traffic import wait_for_service
 
@@ -365,28 +365,32 @@ def test_what_a_pod_cannot_have_is_told(net: Namespace) -> None:
     of = rosproxy(net.name, ros=2, domain=3, peers=["10.88.0.51"])
     wait_for_service(net)
 
-    for reason, variables in {
+    unable = {
         "NoDds": {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"},
         "TooOld": {"ROS_DISTRO": "humble"},
         "NotWired": {"ROS_STATIC_PEERS": "192.0.2.9"},
         "OtherDomain": {"ROS_DOMAIN_ID": "4"},
-        "Alone": {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"},
-    }.items():
-        pod = net.idle(on="node1", env=variables)
-        wait_event(net.name, pod.name, "Pod", reason)
+        "NotDiscovered": {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"},
+    }
+    pods = {reason: net.idle(on="node1", env=variables) for reason, variables in unable.items()}
+    for reason, pod in pods.items():
+        wait_event(net.name, pod.name, "Pod", reason, seconds=90)
     assert api.get("networkpolicies", net.name, f"rosproxy-{of.name}")
 
 
-def test_a_pod_that_the_proxy_discovers_by_multicast_is_well(
+def test_a_pod_that_the_proxy_discovers_without_static_peers_is_well(
     net: Namespace, robot2: Robot2
 ) -> None:
-    """The operator told an error although messages flowed: the pod network has multicast."""
+    """The operator told an error although messages flowed: the proxy announces itself to pods."""
     of = rosproxy(net.name, ros=2, domain=4, peers=[ADDRESS], ports=16)
     wait_for_service(net)
     heard = robot2.node("jazzy", "sub", "/word", domain=4)
-    elsewhere = {"ROS_STATIC_PEERS": "192.0.2.9"}
-    node(net, "jazzy", "pub", "/word", "--word", "pod", on="node1", env=elsewhere)
+    elsewhere = {"ROS_STATIC_PEERS": "192.0.2.9", "ROS_LOCALHOST_ONLY": "1"}
+    pod = node(net, "jazzy", "pub", "/word", "--word", "pod", on="node1", env=elsewhere)
     heard.wait_for("pod", seconds=START)
     of.wait_for("Degraded", "False")
     assert errors(net.name) == []
+    assert not {event.reason for event in events(net.name, pod.name, "Pod")} & {
+        "NotWired", "NotDiscovered"
+    }  # fmt: skip
     robot2.end_all()

@@ -32,6 +32,7 @@ from rosproxy_operator.kubernetes.planner.misspellings import (
 from rosproxy_operator.kubernetes.planner.pods.ros1_pods import ros1_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.pods.undiscovered import (
+    is_undiscovered,
     undiscovered_findings,
     undiscovered_waits,
 )
@@ -75,11 +76,17 @@ from rosproxy_operator.kubernetes.planner.unregistrations import (
     with_unregistrations,
 )
 from rosproxy_operator.kubernetes.planner.zenoh_hubs import apart_findings, due_in
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Obstacle, RosProxyOnNode
+from rosproxy_operator.kubernetes.resources.cluster import (
+    ClusterSnapshot,
+    Obstacle,
+    RosProxyOnNode,
+    WebhookState,
+)
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     InvalidRosProxy,
     Json,
+    Pod,
     ProxyPlace,
     RosProxy,
 )
@@ -300,12 +307,23 @@ def _problems(
             None,
             (ros1_finding(p, rosproxy, address, webhook) for p in pods if rosproxy.spec.ros1),
         ),
-        *(f for pod in pods for f in ros2_findings(pod, rosproxy, address, webhook)),
+        *_ros2_findings(context, rosproxy, pods, webhook),
         *(f for pod in pods for f in zenoh_findings(pod, rosproxy, address, webhook)),
         *lan_relay_findings(context, rosproxy),
         *apart_findings(context.state.apart, rosproxy, context.now),
         *misspellings(context.view, rosproxy),
     )
+
+
+def _ros2_findings(
+    context: ClusterContext, rosproxy: RosProxy, pods: Iterable[Pod], webhook: WebhookState
+) -> Iterator[ClusterFinding]:
+    address = context.cluster_ip(rosproxy)
+    for pod in pods:
+        lacks_participants = is_undiscovered(pod, context.state.undiscovered, context.now)
+        yield from ros2_findings(
+            pod, rosproxy, address, webhook, is_undiscovered=lacks_participants
+        )
 
 
 def _patch(

@@ -62,7 +62,7 @@ class ClusterState(msgspec.Struct, frozen=True):
     - ``former``: see `former_ports`.
     - ``unregistered``: see `unregistrations`.
     - ``unselected``: the time since when no RosProxy selects a labelled pod.
-    - ``undiscovered``: see `undiscovered_findings`.
+    - ``undiscovered``: the time since when a running pod has no participants.
     - ``apart``: see `zenoh_hubs.hubs_apart`.
     """
 
@@ -113,7 +113,10 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
         moved=_recent(view, state.moved, now - MOVE_REPORTED_S),
         tried=_recent(view, state.tried, now - TRIED_RANGE_REPORTED_S),
         unselected={p.id: state.unselected.get(p.id, now) for p in view.observed.unselected_pods},
-        undiscovered={p.id: state.undiscovered.get(p.id, now) for p, _, _ in undiscovered(view)},
+        undiscovered={
+            pod.id: state.undiscovered.get(pod.id, now)
+            for pod, _ in undiscovered(view, state.undiscovered)
+        },
         apart=hubs_apart(view, state.apart, now),
     )
 

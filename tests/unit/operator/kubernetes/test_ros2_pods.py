@@ -5,6 +5,8 @@ from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.pods.recreation import needs_recreation
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
+from rosproxy_operator.kubernetes.planner.pods.undiscovered import UNDISCOVERED_FOR_S
+from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
 from rosproxy_operator.kubernetes.resources.model import (
@@ -31,8 +33,6 @@ ELSEWHERE = PodContainer(variables={"ROS_STATIC_PEERS": "192.0.2.7"})
         ("TooOld", PodContainer(variables={"ROS_DISTRO": "foxy"})),
         ("NotWired", PodContainer(variables={"ROS_STATIC_PEERS": "192.0.2.7"})),
         ("OtherDomain", PodContainer(variables={"ROS_DOMAIN_ID": "9"})),
-        ("Alone", PodContainer(variables={"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"})),
-        ("Alone", PodContainer(variables={"ROS_LOCALHOST_ONLY": "1"})),
     ],
 )
 def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
@@ -141,37 +141,47 @@ def test_a_pod_that_was_wired_to_a_former_address_is_restarted():
         ((PodContainer("ros:humble", WIRED.variables),), ADDRESS),
     ],
 )
-def test_a_pod_that_the_proxy_discovers_by_multicast_is_well(
+def test_a_pod_that_the_proxy_discovers_without_static_peers_is_well(
     containers: tuple[PodContainer, ...], static_peers: str
 ):
     """Messages flowed, but the doctor told an error."""
-    silent = pod(*containers, static_peers=static_peers)
-    assert ros2_findings_of(silent, "")
-    assert not ros2_findings_of(silent, silent.ip)
+    found = pod(*containers, static_peers=static_peers)
+    assert ros2_findings_of(found, is_undiscovered=True)
+    assert not ros2_findings_of(found, is_undiscovered=False)
 
 
-def test_another_container_does_not_prove_multicast():
+def test_the_participants_may_be_of_another_container():
     found = pod(WIRED, ELSEWHERE)
-    assert ros2_findings_of(found, found.ip) == ["NotWired"]
+    assert ros2_findings_of(found, is_undiscovered=False) == ["NotWired"]
 
 
 def test_another_domain_is_told_of_a_discovered_pod():
     found = pod(PodContainer(variables={**WIRED.variables, "ROS_DOMAIN_ID": "9"}))
-    assert ros2_findings_of(found, found.ip) == ["OtherDomain"]
+    assert ros2_findings_of(found, is_undiscovered=False) == ["OtherDomain"]
 
 
-def ros2_findings_of(of: Pod, discovered: str) -> list[str]:
-    """Return the reasons, if the proxy has discovered a participant at an address."""
-    rosproxy = replace(of2(), discovered=frozenset({discovered}))
-    return [finding.reason for finding in ros2_findings(of, rosproxy, ADDRESS)]
+def ros2_findings_of(of: Pod, *, is_undiscovered: bool) -> list[str]:
+    found = ros2_findings(of, of2(), ADDRESS, is_undiscovered=is_undiscovered)
+    return [finding.reason for finding in found]
 
 
 def test_a_plan_knows_the_participants_of_the_proxies():
     of = of2()
     proxy_pod = proxy(of)
     found = pod(ELSEWHERE, static_peers="")
-    silent = observed(of, service(of), found, proxy_pod)
-    assert told(look(silent), "NotWired")
-    report = ProxyReport(True, True, participants={found.ip: ("01",)})
-    heard = replace(silent, reports={proxy_pod.pod.uid: report})
-    assert not told(look(heard), "NotWired")
+    begun = ClusterState(begun=True)
+
+    def after_a_while(first: ProxyReport, second: ProxyReport) -> list[str]:
+        early = observed(of, service(of), found, proxy_pod, reports={proxy_pod.pod.uid: first})
+        plan = look(early, begun, 100.0)
+        assert not told(plan, "NotWired")
+        late = replace(early, reports={proxy_pod.pod.uid: second})
+        return told(look(late, plan.state, 100.0 + UNDISCOVERED_FOR_S), "NotWired")
+
+    without = ProxyReport(True, True)
+    silent = ProxyReport(False)
+    heard = ProxyReport(True, True, participants={found.ip: ("01",)})
+    assert after_a_while(without, without)
+    assert after_a_while(without, silent)
+    assert not after_a_while(without, heard)
+    assert not after_a_while(silent, without)

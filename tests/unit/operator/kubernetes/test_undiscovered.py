@@ -39,6 +39,16 @@ def test_a_variable_that_may_prevent_discovery_is_told_after_a_while():
     assert text.endswith("Unset the variable. Edit the template: kubectl -n ros edit deployment/a")
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("ROS_LOCALHOST_ONLY", "1"), ("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF"),
+     ("ROS_DISCOVERY_SERVER", "localhost")],
+)  # fmt: skip
+def test_the_variables_of_ros2_are_told(name: str, value: str):
+    (text,) = reported({name: value}, ProxyReport(True))
+    assert f"variable {name}={value}" in text
+
+
 def test_the_next_look_is_in_time():
     plan = look(seen(SERVER, ProxyReport(True), "Running"), ClusterState(begun=True), 100.0)
     assert plan.next_look_in is not None

@@ -28,8 +28,10 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.bounds import bounds_violation
 from rosproxy_operator.kubernetes.planner.pods.recreation import needs_recreation
+from rosproxy_operator.kubernetes.planner.pods.undiscovered import UNDISCOVERED_FOR_S
 from rosproxy_operator.kubernetes.planner.pods.wiring import pod_variables, wire
 from rosproxy_operator.kubernetes.planner.pods.zenoh_pods import zenoh_findings
+from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
 from rosproxy_operator.kubernetes.planner.zenoh_hubs import APART_REPORTED_S
 from rosproxy_operator.kubernetes.proxies.proxy_report import report
@@ -431,7 +433,8 @@ def test_a_pod_that_was_wired_for_another_version_is_told(rosproxy: RosProxy, wi
     former = pod(
         labels=labels, containers=(PodContainer("ros:1"),), workload="deployment/a", **wired
     )
-    plan = look(observed(rosproxy, service(rosproxy), former))
+    state = ClusterState(undiscovered={former.id: 0.0})
+    plan = look(observed(rosproxy, service(rosproxy), former), state, UNDISCOVERED_FOR_S)
     (text,) = told(plan, "NotWired")
     assert "since the pod was created for another spec.ros, or for another RosProxy" in text
     assert text.endswith("Run kubectl -n ros rollout restart deployment/a")

@@ -5,9 +5,9 @@ on the pod's own node. A pod in which this variable has no effect gets an Event.
 not see variables that the image sets. Unless the template sets ROS_DISTRO, only the name of the
 image may tell the distribution.
 
-Some pod networks have multicast. There the proxy discovers pods without ROS_STATIC_PEERS. So if
-this variable has an effect in no container of a pod, and the proxy has discovered participants at
-the address of the pod all the same, nothing is wrong.
+The proxy also announces itself to the address of each pod, and some pod networks have multicast. So
+the proxy may discover a pod without ROS_STATIC_PEERS. If this variable has an effect in no
+container of a pod, that is a fault only if the proxy discovers no participant of the pod.
 """
 
 import re
@@ -37,30 +37,34 @@ from rosproxy_operator.kubernetes.status.findings import pod_finding
 BEFORE_IRON = ("ardent", "bouncy", "crystal", "dashing", "eloquent", "foxy", "galactic", "humble")
 """Distributions without ROS_STATIC_PEERS (rmw_dds_common reads this variable since Iron)."""
 _OLD = re.compile(rf"(?<![a-z0-9])({'|'.join(BEFORE_IRON)})(?![a-z0-9])")
-_RANGES_WITHOUT_PEERS = ("OFF", "SYSTEM_DEFAULT")
-"""Values of ROS_AUTOMATIC_DISCOVERY_RANGE with which ROS 2 does not use static peers."""
 
 
 def ros2_findings(
-    pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState = UNKNOWN_WEBHOOK
+    pod: Pod,
+    rosproxy: RosProxy,
+    address: str,
+    webhook: WebhookState = UNKNOWN_WEBHOOK,
+    *,
+    is_undiscovered: bool = True,
 ) -> Iterator[ClusterFinding]:
     """Yield findings about a pod; none if the RosProxy has no ROS 2.
 
-    ``address`` is the address of the RosProxy's Service.
+    ``address`` is the address of the RosProxy's Service. ``is_undiscovered``: see
+    `undiscovered.is_undiscovered`.
     """
     if rosproxy.spec.ros2 is None:
         return
     faults = [fault for c in pod.containers for fault in _other_faults(c, pod, rosproxy)]
-    undiscovered = [
-        (*_peers_faults(c, pod, rosproxy, address, webhook), *_faults_of_peers(c, pod))
+    without_effect = [
+        (*_peers_faults(c, pod, rosproxy, address, webhook), *_age_faults(c, pod))
         for c in pod.containers
     ]
     uses_peers = any(
         not found and (pod.static_peers or has_peers(container))
-        for container, found in zip(pod.containers, undiscovered, strict=True)
+        for container, found in zip(pod.containers, without_effect, strict=True)
     )
-    if uses_peers or not rosproxy.discovered & {pod.ip, *pod.ips}:
-        faults += chain.from_iterable(undiscovered)
+    if uses_peers or is_undiscovered:
+        faults += chain.from_iterable(without_effect)
     for reason, fault in dict.fromkeys(faults):
         yield pod_finding(pod, rosproxy, reason, fault, fatal=False)
 
@@ -84,21 +88,13 @@ def _peers_faults(
     yield NOT_WIRED, Fault(text, edit_fix(fix, pod))
 
 
-def _faults_of_peers(container: PodContainer, pod: Pod) -> Iterator[tuple[str, Fault]]:
-    """Yield the reason and the fault, for each fault that makes ROS_STATIC_PEERS ineffective."""
-    get = container.variables.get
-    removal = edit_fix("Remove the variable from the template", pod)
-    if distro := _OLD.search((get("ROS_DISTRO") or container.image).lower()):
+def _age_faults(container: PodContainer, pod: Pod) -> Iterator[tuple[str, Fault]]:
+    """Yield the reason and the fault, if ROS 2 is older than ROS_STATIC_PEERS."""
+    name = container.variables.get("ROS_DISTRO") or container.image
+    if distro := _OLD.search(name.lower()):
         text = f"has ROS 2 {distro[1].capitalize()}, which does not support ROS_STATIC_PEERS"
         fix = edit_fix("Use an image with Iron or a later distribution in the template", pod)
         yield "TooOld", Fault(text, fix)
-    reach = get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
-    if reach.upper() in _RANGES_WITHOUT_PEERS:
-        text = f"variable ROS_AUTOMATIC_DISCOVERY_RANGE={_shown(reach)} makes ROS 2 ignore static"
-        yield "Alone", Fault(f"{text} peers, such as the proxy", removal)
-    if get("ROS_LOCALHOST_ONLY") == "1":
-        text = "variable ROS_LOCALHOST_ONLY=1 keeps the participants of the pod from being"
-        yield "Alone", Fault(f"{text} discovered", removal)
 
 
 def _other_faults(
