@@ -101,6 +101,8 @@ def test_50_messages_a_second_and_calls_go_on_without_a_loss(lab: Lab) -> None:
     ]
     for reader in readers.values():
         reader.wait_for_count("^got hello ", 50)
+    for caller in callers:
+        caller.wait_for_count("^reply ", 50)
     wait_until("all ports are given", lambda: lab.domain().ports_used == 9, 90)
     wait_until("all kept", lambda: all(participant.kept for participant in lab.domain().inside), 90)
 

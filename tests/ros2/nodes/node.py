@@ -8,6 +8,7 @@ import argparse
 import sys
 import threading
 import time
+from functools import partial
 
 import rclpy
 from rclpy.action import ActionClient, ActionServer
@@ -35,10 +36,12 @@ from test_msgs.action import Fibonacci
 FEEDBACK_PAUSE = 0.2
 # A server drops a response if the server has not discovered the client's reader after a tenth of a
 # second (rmw_fastrtps, `check_for_subscription`). The client may already know the server. So on a
-# busy machine the result of the first goal may be lost, also without a proxy. Clients ask again.
+# busy machine the first reply and the result of the first goal may be lost, also without a proxy.
+# Clients ask again.
 ORDER = 8
 """Order of the goals. The sequence has ORDER + 1 numbers, the first feedback has three."""
 GOAL_PATIENCE = 15.0
+CALL_PATIENCE = 5.0
 
 
 def say(*words: object) -> None:
@@ -113,26 +116,33 @@ def serve(node: Node, options: argparse.Namespace) -> None:
 
 
 def call(node: Node, options: argparse.Namespace) -> None:
+    """Call a service again and again. In turn, the first call is repeated until a reply arrives."""
     client = node.create_client(Trigger, options.topic)
-    number = answered = 0
+    number = 0
+    answered = set[int]()
+    first_asked = -CALL_PATIENCE
 
     def ask() -> None:
-        nonlocal number
-        if not client.service_is_ready() or (options.in_turn and answered < number):
+        nonlocal number, first_asked
+        now = time.monotonic()
+        is_lost = not answered and now - first_asked >= CALL_PATIENCE
+        waits = options.in_turn and len(answered) < number and not is_lost
+        if waits or not client.service_is_ready():
             return
-        asked = number
-        started = time.monotonic()
+        if options.in_turn and not answered:
+            number = 0
+            first_asked = now
+        client.call_async(Trigger.Request()).add_done_callback(partial(done, number, now))
         number += 1
         if number == options.count:
             timer.cancel()
 
-        def done(future: object) -> None:
-            nonlocal answered
-            answered += 1
-            took = time.monotonic() - started
-            say("reply", asked, future.result().message, f"{took * 1000:.1f}", "ms")
-
-        client.call_async(Trigger.Request()).add_done_callback(done)
+    def done(asked: int, started: float, future: object) -> None:
+        if asked in answered:
+            return
+        answered.add(asked)
+        took = time.monotonic() - started
+        say("reply", asked, future.result().message, f"{took * 1000:.1f}", "ms")
 
     timer = node.create_timer(options.period, ask)
 
