@@ -56,6 +56,21 @@ def test_the_label_alone_is_enough(
             robot.end(name)
 
 
+def test_a_name_in_the_hosts_file_of_the_container(
+    controller: Controller, near: Inside, robot: Robot
+) -> None:
+    """The file wins over the alias of the proxy, so the nodes used the real master."""
+    network = near.network()
+    entry = ("--add-host", f"{robot.name}:{robot.address}")
+    node = near.node(
+        network, "rospy", "pub", "--topic", "/out", "--word", "inside",
+        uri=f"http://{robot.name}:11311", options=entry,
+    )  # fmt: skip
+    wait_until(lambda: robot.knows_proxied(node.node), 60, node.log.read)
+    assert node.resolve(robot.name) == {robot.address}
+    redirected(node, network)
+
+
 def test_it_is_told_and_leaves_no_more_than_a_record(
     controller: Controller, near: Inside, robot: Robot
 ) -> None:
