@@ -8,6 +8,7 @@ releases the Lease object. The peering of kopf has no locks, as its documentatio
 
 import asyncio
 import logging
+import os
 import random
 import socket
 import time
@@ -56,7 +57,7 @@ class LeaderElection:
         self._api = api
         self._lease = lease
         self._metrics = metrics
-        self._candidate = Candidate(f"{socket.gethostname()}_{uuid.uuid4()}")
+        self._candidate = Candidate(f"{_own_name()}_{uuid.uuid4()}")
         self._leaving = False
         self._lock = asyncio.Lock()
         self._shown = (-1, "")  # no term has this number, so `_show` reports the first state
@@ -174,6 +175,11 @@ class LeaderElection:
         else:
             log.info("this operator stands by: %s leads", holder or "no operator")
         changed()
+
+
+def _own_name() -> str:
+    """Return the name of this operator's pod. Without the chart's variable, that of the host."""
+    return os.environ.get("POD_NAME") or socket.gethostname()
 
 
 def lease_record(obj: Json) -> LeaseRecord:

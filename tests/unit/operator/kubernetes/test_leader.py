@@ -80,6 +80,15 @@ async def test_one_of_two_leads(candidates: Candidates, server: ApiServer) -> No
     assert spec["leaseDurationSeconds"] == leadership.LEASE_DURATION_S
 
 
+async def test_the_lease_names_the_pod(
+    candidates: Candidates, server: ApiServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a host network, the host name is that of the node."""
+    monkeypatch.setenv("POD_NAME", "rosproxy-operator-5d9f-x2k")
+    await until(candidates.join().leads)
+    assert server.get(*KEY)["spec"]["holderIdentity"].startswith("rosproxy-operator-5d9f-x2k_")
+
+
 async def test_another_one_leads_when_it_is_killed(
     candidates: Candidates, server: ApiServer, now: list[float]
 ) -> None:
