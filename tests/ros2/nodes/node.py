@@ -8,6 +8,7 @@ import argparse
 import sys
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 
 import rclpy
@@ -27,6 +28,7 @@ from rclpy.qos import (
     qos_policy_name_from_kind,
 )
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
@@ -207,27 +209,49 @@ def hold(node: Node, options: argparse.Namespace) -> None:
     say("ready")
 
 
-def tune(node: Node, options: argparse.Namespace) -> None:
-    client = node.kept = AsyncParameterClient(node, options.of)
-
-    def listed(future: object) -> None:
-        say("listed", *sorted(future.result().result.names))
-        asked = [Parameter("speed", Parameter.Type.INTEGER, 7)]
-        client.set_parameters(asked).add_done_callback(was_set)
-
-    def was_set(future: object) -> None:
-        say("set", *(result.successful for result in future.result().results))
-        client.get_parameters(["speed"]).add_done_callback(got)
-
-    def got(future: object) -> None:
-        say("parameter", *(value.integer_value for value in future.result().values))
+def until_answered(
+    node: Node,
+    period: float,
+    is_ready: Callable[[], bool],
+    send: Callable[[], Future],
+    answered: Callable[[object], None],
+) -> None:
+    """Send a request again and again until a reply arrives."""
+    sent_at = -CALL_PATIENCE
 
     def ask() -> None:
-        if client.services_are_ready():
-            timer.cancel()
-            client.list_parameters().add_done_callback(listed)
+        nonlocal sent_at
+        now = time.monotonic()
+        if is_ready() and now - sent_at >= CALL_PATIENCE:
+            sent_at = now
+            send().add_done_callback(done)
 
-    timer = node.create_timer(options.period, ask)
+    def done(future: Future) -> None:
+        if not timer.is_canceled():
+            timer.cancel()
+            answered(future.result())
+
+    timer = node.create_timer(period, ask)
+
+
+def tune(node: Node, options: argparse.Namespace) -> None:
+    client = node.kept = AsyncParameterClient(node, options.of)
+    speed = [Parameter("speed", Parameter.Type.INTEGER, 7)]
+
+    ask = partial(until_answered, node, options.period, client.services_are_ready)
+
+    def listed(reply: object) -> None:
+        say("listed", *sorted(reply.result.names))
+        ask(partial(client.set_parameters, speed), was_set)
+
+    def was_set(reply: object) -> None:
+        say("set", *(result.successful for result in reply.results))
+        ask(partial(client.get_parameters, ["speed"]), got)
+
+    def got(reply: object) -> None:
+        say("parameter", *(value.integer_value for value in reply.values))
+
+    ask(client.list_parameters, listed)
 
 
 def list_names(node: Node, options: argparse.Namespace) -> None:
