@@ -5,12 +5,13 @@ measures the ports of a participant instead: all links to the participant share 
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from msgspec.structs import replace
 
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.doctor.rules.participant import check
+from rosproxy.doctor.rules.policy import hidden_finding
 from rosproxy.page.measures import FLOW_PERIOD_S, Measures
 from rosproxy.page.page_document import (
     BROKEN,
@@ -69,7 +70,8 @@ def graph(
                 node = _node(domain, participant, side is domain.inside, problem)
                 node = replace(node, label=labels[participant.guid_prefix])
                 nodes[_key(domain, participant.guid_prefix)] = node
-        links += _measured(domain, _links(domain, problems), measures, now, epoch)
+        made = _links(domain, problems, _hidden(status))
+        links += _measured(domain, made, measures, now, epoch)
     return nodes, links
 
 
@@ -263,19 +265,38 @@ def _mismatches(domain: DomainStatus) -> dict[Key, DomainProblem]:
     return mismatches
 
 
-def _links(domain: DomainStatus, problems: dict[str, DomainProblem]) -> Iterator[PageLink]:
-    """The links of a domain."""
+def _hidden(status: ProxyStatus) -> dict[tuple[str, str, str], DomainProblem]:
+    """What the policy hides from outside, by kind, name and the GUID prefix of the participant."""
+    hidden = {}
+    for entry in status.policy.hidden if status.policy else ():
+        finding = hidden_finding(entry)
+        problem = DomainProblem(finding.check, entry.name, finding.text, finding.fix, grave=False)
+        hidden[entry.kind, entry.name, entry.node] = problem
+    return hidden
+
+
+def _links(
+    domain: DomainStatus,
+    problems: Mapping[str, DomainProblem],
+    hidden: Mapping[tuple[str, str, str], DomainProblem],
+) -> Iterator[PageLink]:
+    """The links of a domain. ``problems`` by GUID prefix, ``hidden`` as `_hidden` returns it."""
     mismatches = _mismatches(domain)
     for writers, readers in ((domain.inside, domain.outside), (domain.outside, domain.inside)):
         is_passed = writers is domain.outside or domain.direction == "both"
         for topic, writer, reader in _crossing(writers, readers):
             key = ("topic", topic, writer.guid_prefix, reader.guid_prefix)
+            denial = hidden.get(("publish", topic, writer.guid_prefix)) or hidden.get(
+                ("subscribe", topic, reader.guid_prefix)
+            )
             problem = _worst(
                 problems.get(writer.guid_prefix),
                 problems.get(reader.guid_prefix),
+                denial,
                 mismatches.get(key),
             )
-            yield _topic_link(domain, topic, (writer, reader), problem, is_passed)
+            link = _topic_link(domain, topic, (writer, reader), problem, is_passed)
+            yield replace(link, carried="", port=None) if denial else link
     for participant in domain.inside:
         for service in participant.services:
             yield _marked(
@@ -285,7 +306,10 @@ def _links(domain: DomainStatus, problems: dict[str, DomainProblem]) -> Iterator
                     _key(domain, participant.guid_prefix),
                     quiet=is_quiet_ros2_service(service),
                 ),
-                problems.get(participant.guid_prefix),
+                _worst(
+                    problems.get(participant.guid_prefix),
+                    hidden.get(("serve", service, participant.guid_prefix)),
+                ),
             )
     # A service has a link to a client only if client and server do not match.
     for (kind, name, server, client), problem in mismatches.items():

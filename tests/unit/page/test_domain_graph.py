@@ -10,9 +10,11 @@ from rosproxy.page.graph_document import graph_document
 from rosproxy.page.measures import Measures
 from rosproxy.shared.documents.status_document import (
     DomainStatus,
+    HiddenStatus,
     LocatorStatus,
     MismatchStatus,
     ParticipantStatus,
+    PolicyStatus,
     ProxyStatus,
     StatusSettings,
 )
@@ -205,6 +207,33 @@ def test_a_service_that_does_not_match_is_broken_between_its_ends() -> None:
         assert not document["findings"]
     alone = made(mismatches=(MismatchStatus("service", "/add", "type", "A", "B", *asks),))
     assert [f["subject"] for f in alone["findings"]] == ["service /add"]
+
+
+@pytest.mark.parametrize("is_inwards", [True, False])
+def test_a_hidden_topic_is_not_ok(is_inwards: bool) -> None:
+    kind = "subscribe" if is_inwards else "publish"
+    hidden = HiddenStatus(kind, "/chatter", "01.0f.aa", "rule deny subscribe /chatter")
+    ends = [INSIDE, OUTSIDE]
+    if not is_inwards:
+        ends = [replace(p, publishes=p.subscribes, subscribes=p.publishes) for p in ends]
+    status = status_with(inside=(ends[0],), outside=(ends[1],))
+    status = replace(status, policy=PolicyStatus(hidden=(hidden,)))
+    links = graph_document(status, None, Measures(), (), 0.0, 900.0)["links"]
+    (link,) = (link for link in links.values() if link["name"] == "/chatter")
+    assert link["state"] == "warning"
+    assert link["text"].startswith("hidden from outside by the policy: rule deny subscribe")
+    assert link["fix"] == "if outside may use the name, change this rule"
+    assert not {"carried", "port", "rate"} & link.keys()
+    assert [link["state"] for link in links.values() if link["name"] == "/rosout"] == ["ok"]
+
+
+def test_a_hidden_service_is_not_ok() -> None:
+    server = replace(INSIDE, services=("/add", "/sum"))
+    hidden = HiddenStatus("serve", "/add", "01.0f.aa", "rule deny serve /add")
+    status = replace(status_with(inside=(server,)), policy=PolicyStatus(hidden=(hidden,)))
+    links = graph_document(status, None, Measures(), (), 0.0, 900.0)["links"]
+    assert links["service /add 0 01.0f.aa "]["state"] == "warning"
+    assert links["service /sum 0 01.0f.aa "]["state"] == "ok"
 
 
 def test_a_mismatch_counts_more_than_a_warning_about_a_participant() -> None:
