@@ -9,7 +9,7 @@ proxy (``docker exec``), unless the proxy has just been started.
 import asyncio
 from collections.abc import Iterator, Sequence
 
-from rosproxy.doctor.rules.participant import OTHER_DOMAIN, OWN_MACHINE
+from rosproxy.doctor.rules.participant import OTHER_DOMAIN, OWN_MACHINE, UNSELECTED
 from rosproxy.shared.documents.doctor_finding import DoctorFinding, error, note, ok, warning
 from rosproxy.shared.output.text import plural
 from rosproxy_operator.common.proxy_client import Json
@@ -71,9 +71,9 @@ def _participant_of(finding: DoctorFinding) -> str:
     """Return the GUID prefix of a participant that another proxy of this host may serve, or empty.
 
     The doctor of a proxy knows no other proxy. So the doctor warns that such a participant is in
-    another domain, or announces itself on its own machine only.
+    another domain, announces itself on its own machine only, or is not selected.
     """
-    is_about_participant = finding.check in (OTHER_DOMAIN, OWN_MACHINE)
+    is_about_participant = finding.check in (OTHER_DOMAIN, OWN_MACHINE, UNSELECTED)
     return finding.subject.rpartition(" ")[2] if is_about_participant else ""
 
 

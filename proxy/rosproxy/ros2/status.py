@@ -221,6 +221,7 @@ class Ros2State(Collector):
                 self._outside(p, most)
                 for p, most in self._shares(domain.outside.by_prefix.values())
             ),
+            unselected=tuple(sorted(server.unselected)),
         )
 
     def _shares(self, participants: Iterable[_Participant]) -> Iterator[tuple[_Participant, int]]:

@@ -95,6 +95,11 @@ FIXES = {
         "label the container rosproxy.enable=true. The container must use the master of this proxy",
         "label the pod rosproxy.io/inject=true. The pod must use the master of this proxy",
     ),
+    "selected participant": Fix(
+        "select the address (POST /containers of the admin endpoint)",
+        _LABELLED.format(nodes="the node"),
+        _INJECTED.format(nodes="the node"),
+    ),
     "nodes inside": Fix(
         "start {nodes} with ROS_MASTER_URI=http://PROXY:{port} (PROXY: the proxy's address inside)",
         _LABELLED,

@@ -178,6 +178,9 @@ async def test_an_unselected_source_has_an_allowance_of_discovery(
         insider.sendto(spdp(B, INSIDE, port), well_known)
         await until(lambda: held, "an announcement is held")
     assert held[INSIDE].keys() == {B}
+    assert [*server.unselected] == [INSIDE]
+    server.select([INSIDE])
+    assert not server.unselected
 
 
 async def test_participants_that_have_waited_are_admitted_in_turn() -> None:

@@ -192,6 +192,17 @@ def test_who_is_on_a_network_inside_and_not_heard() -> None:
     assert "--ros2-domain 5" in text
 
 
+def test_an_unlabelled_container_is_not_told_to_change_its_discovery_range() -> None:
+    stranger = HeardParticipant(0, "01.0f.cc", "172.30.0.6", "Fast DDS")
+    domain = replace(BOTH, unselected=("172.30.0.6",))
+    told = diagnose_domain(domain, heard=(stranger,))
+    assert ("range", "01.0f.cc") not in told
+    severity, text = told["selected", "01.0f.cc"]
+    assert severity is Severity.WARNING
+    assert "the operator has not selected this address" in text
+    assert "select the address" in text
+
+
 def test_a_proxy_that_has_just_started_may_know_them_and_not_tell() -> None:
     unknown = HeardParticipant(0, "01.0f.cc", "172.30.0.6", "Fast DDS")
     assert not any(

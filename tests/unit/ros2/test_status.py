@@ -51,6 +51,7 @@ class Served:
 
     domain: Domain
     lost: int = 0
+    unselected: tuple[str, ...] = ()
     buffers: ReceiveBuffers = field(default_factory=ReceiveBuffers)
 
 

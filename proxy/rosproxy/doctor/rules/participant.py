@@ -37,6 +37,8 @@ OTHER_DOMAIN = "domain"
 """The check for a participant on a network inside that is in another domain."""
 OWN_MACHINE = "range"
 """The check for a participant on a network inside that announces itself only on its own machine."""
+UNSELECTED = "selected"
+"""The check for a participant at an address inside that the operator has not selected."""
 HIDDEN = "refused: hidden source"
 RELAY_PROOF = "refused: relay proof"
 """With these refusals, no participant outside is heard. So they are errors."""
@@ -163,17 +165,22 @@ def _heard(
 
     ``known``: the GUID prefixes of the participants that the proxy has heard.
     """
-    served = [domain.domain for domain in domains]
+    served = {domain.domain: domain for domain in domains}
     label = f"participant at {participant.address} ({participant.vendor}, inside)"
     if participant.domain not in served:
         text = f"{label}: is in domain {participant.domain}, but this proxy serves "
         text += f"{'domain' if len(served) == 1 else 'domains'} {listed(map(str, served))}"
         fix = (
-            f"set ROS_DOMAIN_ID={served[0]} for the participant, or "
+            f"set ROS_DOMAIN_ID={domains[0].domain} for the participant, or "
             f"{how_to('domain', domain=participant.domain)}"
         )
         yield warning(OTHER_DOMAIN, participant.guid_prefix, text, fix)
-    elif participant.guid_prefix not in known:
+    elif participant.guid_prefix in known:
+        return
+    elif participant.address in served[participant.domain].unselected:
+        text = f"{label}: is not served, since the operator has not selected this address"
+        yield warning(UNSELECTED, participant.guid_prefix, text, how_to("selected participant"))
+    else:
         text = f"{label}: answers the doctor, but does not announce itself to the network: its "
         text += "discovery range is its own machine. So the proxy does not hear the participant"
         fix = "where the participant runs: set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET and unset "

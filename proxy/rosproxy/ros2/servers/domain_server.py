@@ -199,6 +199,11 @@ class DomainServer:
         self._release()
         self._announce_to((self._selected.selected or frozenset()) - before)
 
+    @property
+    def unselected(self) -> Collection[str]:
+        """The addresses inside that have announced participants, but are not selected."""
+        return self._selected.held_announcements.keys()
+
     def note_former(self, former: Mapping[bytes, Sequence[int]]) -> None:
         """Note the ports that participants had at a proxy with another address."""
         self.domain.former_ports.note_recorded(former, self.domain.inside.by_prefix)

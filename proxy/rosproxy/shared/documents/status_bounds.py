@@ -192,6 +192,7 @@ def _visit_tables(status: ProxyStatus, visit: VisitTable) -> ProxyStatus:
             peers=lambda _: "peers",
             inside=lambda participant: participant.address,
             outside=lambda participant: participant.address,
+            unselected=lambda address: address,
             mismatches=_owners_of_mismatches(domain),
         )
         for domain in status.domains

@@ -355,7 +355,8 @@ class DomainStatus(msgspec.Struct, frozen=True):
     did not accept. ``overflowed``: datagrams that the kernel dropped because a receive buffer of
     the proxy was full; ``overflowed_recently`` counts the last minute. ``receive_buffer``: the size
     of these buffers in bytes. ``data_plane`` is for user data. ``not_compared``: pairs of a reader
-    and a writer that the proxy has not compared.
+    and a writer that the proxy has not compared. ``unselected``: addresses inside that have
+    announced participants, but that the operator has not selected.
     """
 
     domain: Count = 0
@@ -373,6 +374,7 @@ class DomainStatus(msgspec.Struct, frozen=True):
     data_plane: DataPlaneStatus | None = None
     inside: tuple[ParticipantStatus, ...] = ()
     outside: tuple[ParticipantStatus, ...] = ()
+    unselected: Names = ()
     mismatches: tuple[MismatchStatus, ...] = ()
     mismatches_left_out: Count = 0
     not_compared: Count = 0
