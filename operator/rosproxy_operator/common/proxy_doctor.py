@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rosproxy.shared.documents.doctor_finding import UNKNOWN_NAME, DoctorFinding, Severity, warning
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity, warning
 from rosproxy.shared.output.text import brief
 
 MOST_FINDINGS = 500
@@ -35,33 +35,6 @@ def read_findings(proxy: str, output: bytes) -> list[DoctorFinding]:
             "be of another release"
         )
         return [warning("proxy", proxy, text)]
-
-
-def without_names_of_others(
-    findings_by_proxy: Sequence[Sequence[DoctorFinding]], names: Sequence[str]
-) -> list[DoctorFinding]:
-    """Return the findings of all proxies, without "unknown name" for names that any proxy knows.
-
-    Each proxy knows only its own graph: a topic of ROS 1 is in no domain of ROS 2.
-    """
-    known = {name for findings in findings_by_proxy for name in _known(findings, names)}
-    return [
-        finding
-        for findings in findings_by_proxy
-        for finding in findings
-        if finding.check != UNKNOWN_NAME or not known & _words(finding)
-    ]
-
-
-def _known(findings: Sequence[DoctorFinding], names: Sequence[str]) -> set[str]:
-    """Return the ``names`` that are subjects of a proxy's findings, except unknown names."""
-    reported = {word for f in findings if f.check != UNKNOWN_NAME for word in _words(f)}
-    return reported & {*names}
-
-
-def _words(finding: DoctorFinding) -> set[str]:
-    """Return the words of the subject, such as ``proxy a: /topic from /talker to /listener``."""
-    return {*finding.subject.split()}
 
 
 def _finding(proxy: str, row: Mapping[str, Any]) -> DoctorFinding:

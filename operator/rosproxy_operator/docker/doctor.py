@@ -10,10 +10,17 @@ import asyncio
 from collections.abc import Iterator, Sequence
 
 from rosproxy.doctor.rules.participant import OTHER_DOMAIN, OWN_MACHINE, UNSELECTED
-from rosproxy.shared.documents.doctor_finding import DoctorFinding, error, note, ok, warning
+from rosproxy.shared.documents.doctor_finding import (
+    DoctorFinding,
+    error,
+    note,
+    ok,
+    warning,
+    without_known_names,
+)
 from rosproxy.shared.output.text import plural
 from rosproxy_operator.common.proxy_client import Json
-from rosproxy_operator.common.proxy_doctor import command, read_findings, without_names_of_others
+from rosproxy_operator.common.proxy_doctor import command, read_findings
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
@@ -53,7 +60,7 @@ async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding
     running = [proxy for proxy in status["proxies"] if proxy["state"] == "running"]
     # A silent proxy without a problem has just been started.
     asked = [p["name"] for p in running if p["reachable"] or f"proxy {p['name']}" in subjects]
-    findings = without_names_of_others(await asyncio.gather(*map(ask, asked)), names)
+    findings = without_known_names(await asyncio.gather(*map(ask, asked)), names)
     if any(map(_participant_of, findings)):
         # A proxy may have begun to serve a participant while the doctors ran.
         served = served_participants(status) | served_participants(await host.now())

@@ -16,12 +16,8 @@ from kubernetes.client.exceptions import ApiException
 from kubernetes.stream import stream
 from websocket import WebSocketException
 
-from rosproxy.shared.documents.doctor_finding import DoctorFinding, warning
-from rosproxy_operator.common.proxy_doctor import (
-    command,
-    read_findings,
-    without_names_of_others,
-)
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, warning, without_known_names
+from rosproxy_operator.common.proxy_doctor import command, read_findings
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.kubeconfig import configuration
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
@@ -75,7 +71,7 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
     proxies = running_proxies(own_pods)
     with ThreadPoolExecutor(MOST_DOCTORS) as threads:
         answers = threads.map(lambda pod: [*_ask(pod["metadata"], names)], proxies)
-        return [*findings, *without_names_of_others([*answers], names)]
+        return [*findings, *without_known_names([*answers], names)]
 
 
 def _rosproxy_findings(

@@ -3,9 +3,9 @@
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
+from rosproxy.doctor.facts import DoctorFacts, HeardParticipant, SystemState
 from rosproxy.doctor.rules import diagnose
-from rosproxy.shared.documents.doctor_finding import Severity, failed
+from rosproxy.shared.documents.doctor_finding import UNKNOWN_NAME, Severity, failed
 from rosproxy.shared.documents.requests import PortProbe, RangeProbe
 from rosproxy.shared.documents.status_document import (
     DomainStatus,
@@ -17,6 +17,8 @@ from rosproxy.shared.documents.status_document import (
     ProblemStatus,
     ProxyStatus,
     StatusSettings,
+    ZenohNodeStatus,
+    ZenohStatus,
 )
 
 INSIDE = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
@@ -253,3 +255,38 @@ def test_a_proxy_that_has_just_started_misses_no_participant_yet() -> None:
     assert severity is Severity.INFO
     assert "just started" in text
     assert diagnose_domain(domain)["inside", "domain 0"][0] is Severity.WARNING
+
+
+ALL_STACKS = ProxyStatus(
+    settings=StatusSettings(ros=("1", "2", "zenoh")),
+    domains=(BOTH,),
+    zenoh=ZenohStatus(nodes=(ZenohNodeStatus("/arm", 0, "172.18.0.3", ("/joints",)),)),
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "check"),
+    [("/scan", "pair"), ("/chatter", "topic"), ("/joints", "topic"), ("/arm", "node")],
+)
+def test_a_proxy_for_all_versions_finds_a_name_in_any(name: str, check: str) -> None:
+    """A topic of ROS 2 alone was told as a name that the master does not know."""
+    graph = SystemState(publishers={"/scan": ["/lidar"]})
+    told = diagnose(DoctorFacts(status=ALL_STACKS, graph=graph, names=(name,)))
+    checks = {finding.check for finding in told if finding.subject == name}
+    assert check in checks
+    assert UNKNOWN_NAME not in checks
+
+
+def test_a_name_in_none_of_all_versions_is_told_of_each() -> None:
+    facts = DoctorFacts(status=ALL_STACKS, graph=SystemState(), names=("/chater",))
+    told = [finding.text for finding in diagnose(facts) if finding.check == UNKNOWN_NAME]
+    assert [text.split(" ")[1] for text in told] == ["master", "participant", "node"]
+
+
+def test_a_hidden_name_is_told_once() -> None:
+    hidden = HiddenStatus("publish", "/chatter", "01.0f.aa", "a rule")
+    status = replace(ALL_STACKS, policy=PolicyStatus(hidden=(hidden,)))
+    told = diagnose(DoctorFacts(status=status, graph=SystemState(), names=("/chatter",)))
+    assert [finding.text for finding in told if finding.check == "policy"] == [
+        "hidden from outside by the policy: a rule (publish, 01.0f.aa)"
+    ]

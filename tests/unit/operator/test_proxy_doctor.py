@@ -9,15 +9,13 @@ from hypothesis import strategies as st
 
 from rosproxy.doctor.presentation import as_json
 from rosproxy.shared.documents.doctor_finding import (
-    UNKNOWN_NAME,
     DoctorFinding,
     Severity,
     error,
-    note,
     ok,
     warning,
 )
-from rosproxy_operator.common.proxy_doctor import read_findings, without_names_of_others
+from rosproxy_operator.common.proxy_doctor import read_findings
 from rosproxy_operator.docker import doctor as docker_doctor
 from rosproxy_operator.docker.doctor import host_findings
 from rosproxy_operator.docker.host_status import HostStatus
@@ -149,23 +147,6 @@ def test_a_cluster_that_is_well_or_empty_or_without_an_operator() -> None:
     assert (
         "check that the operator runs" in cluster_findings([rosproxy(observedGeneration=1)])[0].fix
     )
-
-
-def test_a_name_that_one_proxy_knows_is_unknown_to_none() -> None:
-    unknown = error(UNKNOWN_NAME, "proxy b: /scan", "no participant has it")
-    connected = ok("pair", "proxy a: /scan from /lidar to /nav", "connected")
-    other = warning("node", "proxy b: /scanner", "is slow")
-    found = without_names_of_others([[connected], [unknown, other]], ["/scan"])
-    assert found == [connected, other]
-    lonely = note("topic", "proxy a: /scan", "no participant subscribes to /scan")
-    assert unknown not in without_names_of_others([[unknown], [lonely]], ["/scan"])
-
-
-def test_a_name_that_no_proxy_knows_is_told_by_each() -> None:
-    unknown = [error(UNKNOWN_NAME, f"proxy {name}: /scan", "no one has it") for name in "ab"]
-    about_another = ok("pair", "proxy a: /map from /slam to /nav", "connected")
-    found = without_names_of_others([[unknown[0], about_another], [unknown[1]]], ["/scan", "/map"])
-    assert found == [unknown[0], about_another, unknown[1]]
 
 
 @pytest.mark.parametrize("is_new", [False, True])

@@ -3,15 +3,18 @@
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.doctor.rules import node, pair, participant, zenoh
 from rosproxy.doctor.rules import proxy as proxy_rules
-from rosproxy.shared.documents.doctor_finding import DoctorFinding, warning
+from rosproxy.shared.documents.doctor_finding import DoctorFinding, warning, without_known_names
 
 
 def diagnose(facts: DoctorFacts) -> list[DoctorFinding]:
     """All findings: about the proxy, the nodes, and the names in the user's question."""
-    domains = [*participant.check(facts), *zenoh.check(facts)]
-    if not facts.proxy.settings.for_ros1:
-        return [*proxy_rules.alive(facts), *proxy_rules.setup(facts), *domains]
-    return [*proxy_rules.check(facts), *node.check(facts), *pair.check(facts), *domains]
+    if facts.proxy.settings.for_ros1:
+        first = [*proxy_rules.check(facts), *node.check(facts), *pair.check(facts)]
+    else:
+        first = [*proxy_rules.alive(facts), *proxy_rules.setup(facts)]
+    by_stack = (first, participant.check(facts), [*zenoh.check(facts)])
+    # ROS 1 and ROS 2 both report a name that the policy hides.
+    return [*dict.fromkeys(without_known_names(by_stack, facts.names))]
 
 
 def diagnose_running(facts: DoctorFacts) -> list[DoctorFinding]:

@@ -79,7 +79,7 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
         for problem in facts.proxy.problems
         if domains and problem.subject in _REFUSED and problem.age < RECENT_S
     ]
-    if domains and not facts.proxy.settings.for_ros1:
+    if domains:
         findings += [
             finding
             for name in facts.names

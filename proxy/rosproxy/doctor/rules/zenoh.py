@@ -48,12 +48,11 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     yield from mismatches
     yield from incomplete(zenoh)
     graph = Graph(zenoh if facts.names else ZenohStatus(), facts.proxy.policy)
-    is_alone = not facts.proxy.settings.for_ros1 and not facts.proxy.domains
     for name in facts.names:
         about_name = [*_about(zenoh, name)]
         yield from about_name
         yield from (f for f in troubles(graph, name) if f not in (*lasting, *mismatches))
-        if not about_name and is_alone:
+        if not about_name:
             text = "no node has this name, and no node has a topic or service of this name"
             fix = f"compare with the names in the status: {how_to('status')}"
             yield error(UNKNOWN_NAME, name, text, fix)

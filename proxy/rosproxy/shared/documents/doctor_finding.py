@@ -43,3 +43,33 @@ error = partial(DoctorFinding, Severity.ERROR)
 def failed(findings: Sequence[DoctorFinding]) -> bool:
     """Whether there is an ERROR among the findings."""
     return any(finding.severity is Severity.ERROR for finding in findings)
+
+
+def without_known_names(
+    by_source: Sequence[Sequence[DoctorFinding]], names: Sequence[str]
+) -> list[DoctorFinding]:
+    """All findings, without "unknown name" for names that any source knows.
+
+    ``by_source``: the findings of each source, such as a proxy or a version of ROS. Each source
+    knows only its own graph: a topic of ROS 1 is in no domain of ROS 2. ``names``: the names in the
+    user's question.
+    """
+    reported = {
+        word
+        for findings in by_source
+        for finding in findings
+        if finding.check != UNKNOWN_NAME
+        for word in _words(finding)
+    }
+    known = reported & {*names}
+    return [
+        finding
+        for findings in by_source
+        for finding in findings
+        if finding.check != UNKNOWN_NAME or not known & _words(finding)
+    ]
+
+
+def _words(finding: DoctorFinding) -> set[str]:
+    """The words of the subject, such as ``proxy a: /topic from /talker to /listener``."""
+    return {*finding.subject.split()}
