@@ -32,8 +32,8 @@ _OPEN_HOSTPORTS = (
     "hostPorts in the node's firewall and in NetworkPolicies"
 )
 _KERNEL_BY_LABEL = (
-    "start the operator with --allow-data-plane kernel, and add the label "
-    "rosproxy.data-plane=kernel to a container of this proxy"
+    "start the operator with --allow-data-plane kernel (and with this option for every other data "
+    "plane in labels), and add the label rosproxy.data-plane=kernel to a container of this proxy"
 )
 _KERNEL_BY_FIELD = "set spec.dataPlane: Kernel. The chart's allow.dataPlanes must list Kernel"
 _LABELLED = "start {nodes} in a container with the label rosproxy.enable=true"

@@ -224,7 +224,8 @@ def _obstacle(claim: _Claim, place: Place, fix: str) -> Fault:
         return Fault(
             f"labels may not give a proxy that name on network {claim.network}: {claim.refusal}. "
             "So the nodes bypass the proxy",
-            f"Start the operator with --allow-alias {claim.alias}, or set {fix}",
+            f"Start the operator with --allow-alias {claim.alias} (and with this option for every "
+            f"other name that a proxy may have), or set {fix}",
         )
     holders = [f"container {name}" for name in claim.containers]
     rivals = {*claim.holders, claim.owner or place} - {place}

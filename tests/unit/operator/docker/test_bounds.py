@@ -187,7 +187,8 @@ def test_a_data_plane_that_is_not_allowed() -> None:
     assert member.wishes == {}
     assert told == (
         "label rosproxy.data-plane=kernel is ignored: the operator does not allow this value in "
-        "labels. To allow this value, start the operator with --allow-data-plane kernel"
+        "labels. To allow this value, start the operator with --allow-data-plane kernel "
+        "--allow-data-plane auto --allow-data-plane copy --allow-data-plane splice"
     )
     assert asked(replace(SETTINGS, allow_data_plane=("kernel",)), data_plane="kernel")[1] == ""
 

@@ -61,9 +61,11 @@ def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[Fau
         request = replace(request, ports=limit)
     wishes = dict(request.wishes)
     plane = wishes.get("data_plane", settings.data_plane)
-    if plane not in allowed_planes(settings):
+    allowed = allowed_planes(settings)
+    if plane not in allowed:
         text = f"label rosproxy.data-plane={plane} is ignored: the operator does not allow this "
-        fix = f"To allow this value, start the operator with --allow-data-plane {plane}"
+        options = " ".join(f"--allow-data-plane {p}" for p in (plane, *sorted(allowed)))
+        fix = f"To allow this value, start the operator with {options}"
         warnings.append(Fault(f"{text}value in labels", fix))
         del wishes["data_plane"]
     if wishes.get("slave_control") == "any" and settings.slave_control == "master":
