@@ -72,6 +72,28 @@ def test_a_reference_to_another_variable_is_unknown():
     assert list(ros2_findings(found, of2(Ros2Spec(domain=5)), ADDRESS)) == []
 
 
+@pytest.mark.parametrize(
+    ("container", "is_undiscovered", "reasons"),
+    [
+        (WIRED, True, ["OtherDomain"]),
+        (WIRED, False, []),
+        (WIRED_TO_3, True, []),
+        (UNSET, True, ["NotWired"]),
+    ],
+)
+def test_a_template_with_peers_and_without_the_domain_is_told(
+    container: PodContainer, is_undiscovered: bool, reasons: list[str]
+):
+    """Without the webhook, the template has the variables. Nothing told of a missing domain."""
+    of = of2(Ros2Spec(domain=3))
+    found = pod(container, static_peers="", workload="deployment/a")
+    findings = [*ros2_findings(found, of, ADDRESS, is_undiscovered=is_undiscovered)]
+    assert [finding.reason for finding in findings] == reasons
+    if reasons == ["OtherDomain"]:
+        assert "has no variable ROS_DOMAIN_ID (so 0)" in findings[0].message
+        assert "Add ROS_DOMAIN_ID=3 to the template" in findings[0].message
+
+
 def test_an_empty_domain_is_domain_0():
     """The nodes were in domain 0, and the operator reported nothing."""
     container = PodContainer(variables={"ROS_DOMAIN_ID": ""})

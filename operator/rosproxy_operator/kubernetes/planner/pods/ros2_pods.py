@@ -65,6 +65,8 @@ def ros2_findings(
     )
     if uses_peers or is_undiscovered:
         faults += chain.from_iterable(without_effect)
+    if is_undiscovered:
+        faults += chain.from_iterable(_domain_faults(c, pod, rosproxy) for c in pod.containers)
     for reason, fault in dict.fromkeys(faults):
         yield pod_finding(pod, rosproxy, reason, fault, fatal=False)
 
@@ -95,6 +97,21 @@ def _age_faults(container: PodContainer, pod: Pod) -> Iterator[tuple[str, Fault]
         text = f"has ROS 2 {distro[1].capitalize()}, which does not support ROS_STATIC_PEERS"
         fix = edit_fix("Use an image with Iron or a later distribution in the template", pod)
         yield "TooOld", Fault(text, fix)
+
+
+def _domain_faults(
+    container: PodContainer, pod: Pod, rosproxy: RosProxy
+) -> Iterator[tuple[str, Fault]]:
+    """Yield the reason and the fault, if a template with its own peers leaves the domain out."""
+    number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
+    has_domain = "ROS_DOMAIN_ID" in container.variables
+    if number and has_peers(container) and not has_domain and not pod.static_peers:
+        text = (
+            f"has no variable ROS_DOMAIN_ID (so 0), but RosProxy {rosproxy.id.name} has domain "
+            f"{number}"
+        )
+        fix = edit_fix(f"Add ROS_DOMAIN_ID={number} to the template", pod)
+        yield "OtherDomain", Fault(text, fix)
 
 
 def _other_faults(
