@@ -36,3 +36,20 @@ def test_a_node_hears_who_was_there_before(lab: Lab, library: str, side: str, ac
     receiver = lab.node(library, side, "sub", topic=topic)
     for peer in PEERS:
         receiver.wait_for_count(f"^got from-{peer} ", 3)
+
+
+@each_client()
+def test_the_doctor_finds_the_pairs_connected(
+    lab: Lab, library: str, side: str, across: str
+) -> None:
+    """Publishers of rosnodejs and foxglove name no subscribers, and were told as not connected."""
+    topics = [f"/{lab.unique('doctor')}" for _ in ("out", "in")]
+    lab.node(library, side, "pub", topic=topics[0])
+    lab.node("rospy", across, "sub", topic=topics[0]).wait_for("^got hello ")
+    receiver = lab.node(library, side, "sub", topic=topics[1])
+    lab.node("roscpp", across, "pub", topic=topics[1])
+    receiver.wait_for("^got hello ")
+    for topic in topics:
+        report = lab.rosproxy("doctor", topic).output
+        assert "connected" in report
+        assert "not connected" not in report

@@ -77,6 +77,8 @@ class SlaveReport(msgspec.Struct, frozen=True):
     ``peers``: the open connections as (direction, topic, peer). For direction ``o`` (outgoing) the
     peer is the name of a node, for ``i`` (incoming) a slave URI. ``counts``: bytes and messages of
     the connections for which the node counts both. ``at``: monotonic seconds of the counts.
+    ``unnamed``: the published topics for which the node does not name the subscribers: rosnodejs
+    gives the addresses of connections, and foxglove/ros1 gives no connections.
     """
 
     publishes: Mapping[str, str] = {}
@@ -84,6 +86,7 @@ class SlaveReport(msgspec.Struct, frozen=True):
     peers: frozenset[tuple[str, str, str]] = frozenset()
     counts: Mapping[tuple[str, str, str], tuple[int, int]] = {}
     at: float = 0.0
+    unnamed: frozenset[str] = frozenset()
 
     @property
     def characters(self) -> int:
@@ -122,7 +125,10 @@ def slave_report(
     }
     types = [read_types(value) for value in (publications, subscriptions)]
     published, subscribed = ({t: k for t, k in rows.items() if is_wanted(t)} for rows in types)
-    return SlaveReport(published, subscribed, frozenset(links), counts, at)
+    unnamed = {topic for way, topic, peer in links if way == "o" and not peer.startswith("/")}
+    if not isinstance(bus, list):
+        unnamed = {*published}
+    return SlaveReport(published, subscribed, frozenset(links), counts, at, frozenset(unnamed))
 
 
 def data_port(answer: Any) -> HostPort | None:

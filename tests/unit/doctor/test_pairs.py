@@ -13,6 +13,7 @@ from rosproxy.doctor.facts import (
     SlaveReport,
     SystemState,
     scope,
+    slave_report,
 )
 from rosproxy.doctor.rules import pair as pair_rules
 from rosproxy.shared.documents.doctor_finding import DoctorFinding, Severity
@@ -56,6 +57,21 @@ def apart(giver: NodeFacts, taker: NodeFacts, **changes: Any) -> DoctorFinding:
 def silent_talker(**changes: Any) -> NodeFacts:
     """A publisher without connections."""
     return talker(**{"report": SlaveReport({"/chatter": STRING}), **changes})
+
+
+@pytest.mark.parametrize("uri", [INSIDE_URI, INSIDE_URI.rstrip("/"), "http://10.0.0.5:40001/"])
+@pytest.mark.parametrize(
+    "bus", [[[1, "::ffff:192.168.0.9:50000", "o", "TCPROS", "/chatter", True]], ""],
+    ids=["rosnodejs", "foxglove"],
+)  # fmt: skip
+def test_a_publisher_may_not_name_its_subscribers(bus: object, uri: str) -> None:
+    """A connected pair was told as not connected."""
+    nameless = talker(report=slave_report([["/chatter", STRING]], [], bus))
+    report = SlaveReport({}, {"/chatter": STRING}, frozenset({("i", "/chatter", uri)}))
+    (finding,) = check(["/chatter"], nodes=by_name(nameless, listener(report=report)))
+    assert (finding.severity, finding.text) == (Severity.OK, "connected")
+    apart(nameless, listener())
+    apart(silent_talker(), listener(report=report))
 
 
 @pytest.mark.parametrize(

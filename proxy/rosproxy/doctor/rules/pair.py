@@ -14,6 +14,7 @@ from rosproxy.shared.addresses import is_loopback, parse_host_port
 from rosproxy.shared.documents.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok
 from rosproxy.shared.fixes import how_to
 from rosproxy.shared.output.text import listed, quoted, size
+from rosproxy.shared.uris import slave_uri
 
 PAIR = "pair"
 """The name of the check in all findings of this module, except those with UNKNOWN_NAME."""
@@ -138,11 +139,14 @@ def is_connected(topic: str, publisher: NodeFacts, subscriber: NodeFacts) -> boo
     """Whether the report of a publisher has a connection to a subscriber.
 
     A subscriber also lists connections that are not established yet. So the report of the
-    subscriber counts only without a report of the publisher.
+    subscriber counts only if the publisher has no report, or does not name the subscribers.
     """
-    if publisher.report is not None:
+    if publisher.report is not None and topic not in publisher.report.unnamed:
         return ("o", topic, subscriber.name) in publisher.report.peers
-    return subscriber.report is not None and ("i", topic, publisher.uri) in subscriber.report.peers
+    slaves = [slave for slave in (publisher.slave, publisher.inside) if slave]
+    uris = {publisher.uri, *(slave_uri(slave, path) for slave in slaves for path in ("", "/"))}
+    rows = subscriber.report.peers if subscriber.report else frozenset()
+    return any(("i", topic, uri) in rows for uri in uris)
 
 
 def _traffic(facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: NodeFacts) -> str:
