@@ -257,6 +257,18 @@ def test_a_container_may_know_the_master_by_its_hosts_file(
     assert all("Remove robot from extra_hosts of the service" in text for text in told)
 
 
+@pytest.mark.parametrize("labels", [{}, {"master_uri": "http://host.docker.internal:11311"}])
+def test_the_hosts_entry_of_this_host_has_to_stay(labels: dict[str, str]) -> None:
+    """The fix was to remove the entry. No proxy gets this name, so the nodes found no master."""
+    uri = "http://host.docker.internal:11311"
+    talker = replace(node(env=uri, **labels), master_entry="host-gateway")
+    _, problems = read_members(observed(talker, masters={"host.docker.internal": ADDRESS}))
+    (text,) = (p.message for p in problems if "leads past the proxy: /etc/hosts" in p.message)
+    assert "Remove" not in text
+    ending = "" if labels else f" and the label rosproxy.master-uri={uri}"
+    assert text.endswith(f"Set ROS_MASTER_URI=http://rosproxy:11311{ending}")
+
+
 def test_a_label_can_not_widen() -> None:
     _, problems = read_members(observed(node(redirect="true")), OFF)
     assert any("rosproxy.redirect=true is ignored" in problem.message for problem in problems)

@@ -343,19 +343,21 @@ def proxy_alias(container: Container, place: Place) -> tuple[str, Fault | None]:
     if target is None:
         return "", Fault(f"{variable} is not of the form http://HOST:11311", fix)
     host = target.host.lower()
+    # A variable that names the proxy does not say which master the container means.
+    label = "" if MASTER_URI in container.labels else f" and the label {MASTER_URI}={real.uri}"
     if container.master_entry:
         text = f"{variable} leads past the proxy: /etc/hosts of the container has {host}"
-        remove = f"Remove {host} from extra_hosts of the service (docker run: --add-host)"
-        return "", Fault(text, f"{remove}. Or {fix[0].lower()}{fix[1:]}")
+        fix += label
+        if host != THIS_HOST:  # no proxy gets this name, so the entry has to stay
+            remove = f"Remove {host} from extra_hosts of the service (docker run: --add-host)"
+            fix = f"{remove}. Or {fix[0].lower()}{fix[1:]}"
+        return "", Fault(text, fix)
     if not is_address(host) and host in (ALIAS, real.host, proxy_name(place)):
         if target.port == real.port:
             return host, None
         text = f"{variable} has the wrong port, the proxy listens on {real.port}"
         return host, Fault(text, fix)
-    if MASTER_URI not in container.labels:
-        # A variable that names the proxy does not say which master the container means.
-        fix += f" and the label {MASTER_URI}={place.master.uri}"
-    return "", _wrong_master(host, place, variable, fix)
+    return "", _wrong_master(host, place, variable, f"{fix}{label}")
 
 
 def master_by_address(container: Container, place: Place) -> HostPort | None:
