@@ -83,6 +83,7 @@ def second(lab: Lab) -> Iterator[Second]:
     second = Second(lab)
     yield second
     log = second.process.output()
+    print(log)
     assert second.process.returncode is None, log
     assert "Traceback" not in log, log
     second.stop()
