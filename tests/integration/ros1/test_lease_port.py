@@ -11,6 +11,7 @@ from examples.demo.fake_node import FakeNode
 from rosproxy.ros1 import leases
 from rosproxy.ros1.clients.master_client import CALLER_ID
 from rosproxy.ros1.protocol.tcpros import encode_header
+from rosproxy.ros1.registry import endpoint
 from rosproxy.shared.connections import sockets
 from tests.integration.net import (
     HOST,
@@ -23,6 +24,7 @@ from tests.integration.net import (
     connect,
     exchange,
     greet,
+    knock,
     post,
     read_header,
     refuses,
@@ -71,7 +73,10 @@ async def refuse(node, reader, writer, header):
     writer.write(encode_header({"error": f"no {header}"}))
 
 
-async def test_an_unknown_topic_or_service_is_refused_in_a_header_as_by_a_node(proxy, node):
+async def test_an_unknown_topic_or_service_is_refused_in_a_header_as_by_a_node(
+    proxy, node, monkeypatch
+):
+    monkeypatch.setattr(endpoint, "STARTING_S", 0.0)
     node.stream = refuse
     await node.publish(proxy.master)
     asked = await rpc(proxy.uri(node), "requestTopic", "/outside", "/none", [["TCPROS"]])
@@ -79,6 +84,15 @@ async def test_an_unknown_topic_or_service_is_refused_in_a_header_as_by_a_node(p
     for header in UNKNOWN:
         assert "has no" in (await greet(proxy.lease(node), header))["error"]
     assert proxy.metric("relay_errors_total", reason="not offered") == len(UNKNOWN)
+
+
+async def test_a_subscriber_does_not_give_up_on_a_node_that_still_registers(proxy, node):
+    """A new node has the URI of a former one. roscpp ignored the master's update, and gave up."""
+    node.stream = refuse
+    await node.publish(proxy.master)
+    assert await knock(proxy.lease(node), topic_header("/later")) == "reset"
+    assert proxy.metric("relay_errors_total", reason="not offered") == 1
+    assert "has no service" in (await greet(proxy.lease(node), service_header("/later")))["error"]
 
 
 async def test_a_topic_that_the_node_has_a_port_for_is_its_own_to_refuse(proxy, node):

@@ -15,6 +15,7 @@ import pytest
 from examples.demo.fake_http import Answer, host_and_port, value
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.protocol.xmlrpc.limits import SHORT_REPLY
+from rosproxy.ros1.registry import endpoint
 from tests.clock import pass_time
 from tests.integration.net import (
     OTHER_NODE,
@@ -177,7 +178,8 @@ async def test_a_port_that_refuses_is_asked_for_anew_and_no_other_is_forgotten(p
     assert len([1 for method, _ in node.calls if method == "requestTopic"]) == asked + 1
 
 
-async def test_a_topic_that_has_no_port_is_refused(proxy, node):
+async def test_a_topic_that_has_no_port_is_refused(proxy, node, monkeypatch):
+    monkeypatch.setattr(endpoint, "STARTING_S", 0.0)
     await on_own_ports(node, "/out")
     await populate(proxy, node)
     await greeted(proxy, node, topic_header("/out"))

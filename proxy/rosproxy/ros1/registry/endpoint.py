@@ -29,6 +29,9 @@ MOST_FORMER_CALLERS = 64
 MOST_SHOWN_NAMES = 3
 """Most node names of an endpoint in a message. Most endpoints have a single name. An endpoint has
 several names if another node has used the same port again."""
+STARTING_S = 10.0
+"""Seconds after its last registration in which a node may register more. Most nodes register all
+their topics within a second."""
 STATES = ("ok", "new", "failing", "refused", "silent", "cleaned", "ended", "unverified")
 """The values of `Endpoint.state`."""
 
@@ -171,6 +174,11 @@ class Endpoint:
         # A known pid stays, so that the prober notices another process.
         if self.health.pid is None:
             self.health.pid = pid
+
+    def is_starting(self, now: float) -> bool:
+        """Whether the node registers now, or has registered lately."""
+        latest = max((r.since for r in self.registrations.values()), default=now)
+        return self.pending > 0 or now - latest < STARTING_S
 
     def note_former_caller(self, caller_id: str) -> None:
         """Record that a name is no longer registered here."""

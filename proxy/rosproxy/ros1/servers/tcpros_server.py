@@ -40,7 +40,17 @@ NO_PORT = 0
 
 
 class NotOffered(Exception):
-    """A node says that it does not have the topic or service that a client asks for."""
+    """A node says that it does not have the topic or service that a client asks for.
+
+    ``is_final``: the client may give up. A subscriber must not give up on a node that still starts
+    at the URI of a former node: roscpp takes the master's update for the connection that it tries
+    to open again, and would then have none (Subscription::pubUpdate in subscription.cpp, and
+    TransportPublisherLink::onConnectionDropped in transport_publisher_link.cpp).
+    """
+
+    def __init__(self, text: str, is_final: bool) -> None:
+        super().__init__(text)
+        self.is_final = is_final
 
 
 class TcprosTarget(Protocol):
@@ -153,8 +163,11 @@ class TcprosServer:
             return None
         try:
             node = await target.connect(kind, name)
-        except NotOffered as error:  # roscpp gives up; after a reset it would not
-            await self._refuse(conn, str(error), "not offered")
+        except NotOffered as error:  # roscpp gives up; after a reset it does not
+            if error.is_final:
+                await self._refuse(conn, str(error), "not offered")
+            else:
+                self._reset(conn, "not offered")
             return None
         if node is None:
             self._fail(target, conn, name)
@@ -183,11 +196,14 @@ class TcprosServer:
         self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
 
     def _fail(self, target: TcprosTarget, conn: socket.socket, name: str) -> None:
+        self._reset(conn, "node unreachable")
+        target.note_failure(name)
+
+    def _reset(self, conn: socket.socket, reason: str) -> None:
         """Reset the connection, like a node that is gone: roscpp and rospy then try again."""
-        self._context.metrics.relay_errors.labels("node unreachable").inc()
+        self._context.metrics.relay_errors.labels(reason).inc()
         sockets.reset_on_close(conn)
         conn.close()
-        target.note_failure(name)
 
 
 class InsideNodes:
@@ -290,7 +306,9 @@ class InsideNode:
             return node
         port = await self._learn_port(endpoint, kind, name)
         if port == NO_PORT:
-            raise NotOffered(f"{endpoint.label} has no {kind} {name or '(no name given)'}")
+            text = f"{endpoint.label} has no {kind} {name or '(no name given)'}"
+            is_starting = endpoint.is_starting(self._context.now())
+            raise NotOffered(text, is_final=kind != "topic" or not is_starting)
         return await _dial(endpoint.address, port)
 
     def label(self, kind: str, name: str) -> str:
