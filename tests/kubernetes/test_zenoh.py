@@ -46,7 +46,7 @@ class Robot:
     def start_router(self) -> None:
         self._start("router", "rmw_zenohd")
         log = self.root / "tmp/router.log"
-        wait_until(lambda: "router runs" in log.read_text(), 30, "the router runs")
+        wait_until(lambda: log.exists() and "router runs" in log.read_text(), 30, "the router runs")
 
     def node(self, kind: str, topic: str, override: str = "") -> Node:
         """Start a node with its output in a file; with ``override`` as a laptop does."""
