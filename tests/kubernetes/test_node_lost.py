@@ -11,7 +11,7 @@ from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import rosproxy
-from tests.kubernetes.traffic import flow
+from tests.kubernetes.traffic import START, flow
 
 
 def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
@@ -49,7 +49,7 @@ def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
         finally:
             cluster("start-node", lost_node)
         up = time.time()
-        hit.wait(since=up, seconds=120)
+        hit.wait(since=up, seconds=START)
         again = hit.outward.wait_for("inside", since=up) - up
         after = made.the_proxy(lost_node, seconds=60)
         note(f"node stopped: told after {noticed:.1f} s; traffic again {again:.1f} s "
