@@ -37,6 +37,12 @@ REOPEN_PAUSE_S = 0.5
 """Seconds between the end of routers and the start of their successors. Other routers recompute
 their routes 0.1 s after a change. If a router ends and its successor connects within this time,
 they never send their subscriptions to the successor (zenoh 1.7.2, TREES_COMPUTATION_DELAY_MS)."""
+LINKING_TIMEOUT_S = 2.0
+"""Seconds in which the hub links to a router. The hub dials a lost router again after 1 s."""
+LINKING_INTERVAL_S = 0.05
+"""Seconds between two looks at the links of the hub."""
+LINKING_PAUSE_S = 0.1
+"""Seconds in which zenoh notes a new link at both ends."""
 RECEIVING_THREADS = 128
 """Threads that receive for all routers. zenoh has two. A message that may not be dropped holds its
 thread while a queue is full, in each router on its way. With two threads, one publisher at full
@@ -107,21 +113,42 @@ class Routers:
         self._outside = OutsideRouters()
 
     def use(self, configs: Sequence[Mapping[str, str]]) -> None:
-        """Open the routers with new or changed configurations. Raises zenoh.ZError."""
+        """Open the routers with new or changed configurations.
+
+        Raises zenoh.ZError if a router cannot be opened, ValueError as `_wait_for_links` does.
+        """
         changed = [
             index
             for index, config in enumerate(configs)
             if index >= len(self._routers) or self._routers[index].config != config
         ]
         ended = [self._routers[index] for index in changed if index < len(self._routers)]
-        for router in ended:
-            router.session.close()
         if ended:
+            self._wait_for_links(ended)
+            for router in ended:
+                router.session.close()
             time.sleep(REOPEN_PAUSE_S)
         last = len(configs) - 1
         opened = {index: Router(configs[index], is_hub=index == last) for index in changed}
         kept = dict(enumerate(self._routers))
         self._routers = [(kept | opened)[index] for index in range(len(configs))]
+
+    def _wait_for_links(self, routers: Sequence[Router]) -> None:
+        """Wait until the hub is linked to each of these routers.
+
+        A router that ends while the hub dials it may keep the link, and the hub may never dial the
+        port again (zenoh 1.7.2). Then no message of the container passes any more.
+
+        Raises ValueError after LINKING_TIMEOUT_S. The next process needs no change.
+        """
+        hub = self._routers[-1]
+        others = {str(r.session.info.zid()) for r in routers if r is not hub}
+        deadline = time.monotonic() + LINKING_TIMEOUT_S
+        while not others <= {str(zid) for zid in hub.session.info.routers_zid()}:
+            if time.monotonic() > deadline:
+                raise ValueError(f"the hub has no link to a router for {LINKING_TIMEOUT_S:g} s")
+            time.sleep(LINKING_INTERVAL_S)
+        time.sleep(LINKING_PAUSE_S)
 
     def report(self) -> dict[str, Any]:
         """The fields of a report. Raises ValueError if a router does not answer."""
@@ -243,6 +270,18 @@ def run(lines: "queue.SimpleQueue[str]", output: TextIO) -> None:
             line = _NO_LINE
 
 
+def serve(lines: "queue.SimpleQueue[str]", output: TextIO) -> None:
+    """Run the routers until an error or the end of the proxy. The last report has the error."""
+    try:
+        run(lines, output)
+    except (zenoh.ZError, ValueError) as error:
+        report(output, error=str(error))
+    except BrokenPipeError:
+        pass  # the proxy has ended
+    except BaseException as error:  # the library's PanicException is no Exception
+        report(output, error=f"the zenoh library has failed: {error}")
+
+
 def main() -> int:
     """Run the routers until an error, or the end of the proxy. Return the exit status."""
     # The kernel ends this process with the proxy, whose next process needs the ports.
@@ -257,12 +296,7 @@ def main() -> int:
     os.environ["ZENOH_RUNTIME"] = f"(rx: (worker_threads: {RECEIVING_THREADS}))"
     lines = queue.SimpleQueue[str]()
     threading.Thread(target=read_lines, args=[lines], daemon=True).start()
-    try:
-        run(lines, output)
-    except (zenoh.ZError, ValueError) as error:
-        report(output, error=str(error))
-    except BrokenPipeError:
-        pass  # the proxy has ended
+    serve(lines, output)
     return 1
 
 
