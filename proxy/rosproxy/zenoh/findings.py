@@ -23,6 +23,7 @@ from rosproxy.shared.documents.status_document import (
     ZenohLinkStatus,
     ZenohNodeStatus,
     ZenohStatus,
+    ZenohUnlinkedStatus,
 )
 from rosproxy.shared.fixes import how_to
 from rosproxy.shared.output.text import brief, listed, plural, quoted
@@ -34,6 +35,8 @@ ROUTERS = "zenoh routers"
 PEER = "peer"
 """The mode of a session whose router passes no data on to other peers of this router."""
 ROUTER = "router"
+HUB_GRACE_S = 10.0
+"""Seconds in which the hub has to link to a router. The hub dials again at least each 4 s."""
 LINK_GRACE_S = 5.0
 """Seconds in which a link has to come up before it counts as a fault."""
 NODE_GRACE_S = 10.0
@@ -178,6 +181,7 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
         if not link.up and is_fault and is_tried and link.since >= LINK_GRACE_S:
             yield _link_fault(link)
     yield from map(_full_router, zenoh.full)
+    yield from (_unlinked(router) for router in zenoh.unlinked if router.since >= HUB_GRACE_S)
     yield from shared_ports(zenoh).values()
     yield from _peers_apart(zenoh)
     yield from _sessions_without_node(zenoh)
@@ -211,6 +215,15 @@ def _full_router(router: ZenohFullStatus) -> DoctorFinding:
     if router.few_files:
         fix += f". If all these are nodes, {how_to('open files')}"
     return error("sessions", f"zenoh router at port {router.port}", text, fix)
+
+
+def _unlinked(router: ZenohUnlinkedStatus) -> DoctorFinding:
+    text = (
+        "has no link to the hub of the proxy, so its nodes reach no other container, and nothing "
+    )
+    text += "outside"
+    fix = "restart the proxy"
+    return error("routers", f"zenoh router at port {router.port}", text, fix)
 
 
 def link_subject(link: ZenohLinkStatus) -> str:

@@ -24,6 +24,7 @@ from rosproxy.shared.documents.status_document import (
     ZenohQosStatus,
     ZenohSessionStatus,
     ZenohStatus,
+    ZenohUnlinkedStatus,
 )
 from rosproxy.shared.policy.rules import RuleKind
 from rosproxy.shared.settings import Settings
@@ -77,7 +78,8 @@ class Reading(NamedTuple):
     of nodes inside and outside. ``without_node`` has the times since which no node is known of a
     session at a port for containers, by port and zenoh ID. ``apart`` has the peers of routers
     outside that do not reach each other, with the times since which that is known. ``full`` has the
-    routers that refuse sessions. The other fields have the listed rows.
+    routers that refuse sessions. ``unlinked`` has the ports of all other routers without a link to
+    the hub, with the times since which that is known. The other fields have the listed rows.
     ``mismatches`` are also pairs that differ in durability alone.
     """
 
@@ -91,6 +93,7 @@ class Reading(NamedTuple):
     without_node: Mapping[tuple[int, str], float] = MappingProxyType({})
     apart: Mapping[PeersApart, float] = MappingProxyType({})
     full: tuple[ZenohFullStatus, ...] = ()
+    unlinked: Mapping[int, float] = MappingProxyType({})
     nodes: tuple[ZenohNodeStatus, ...] = ()
     rows: tuple[ZenohSessionStatus, ...] = ()
     rows_left_out: int = 0
@@ -171,8 +174,10 @@ class ZenohState(Collector):
             reading = reading._replace(comparison=comparison, inside=inside)
         known = _without_node(former.without_node, sessions, reading.graph.nodes, self._now())
         apart = _apart(former.apart, sessions, report, self._now())
-        full = tuple(self._full(report.routers))
-        reading = reading._replace(without_node=known, apart=apart, full=full)
+        by_port = dict(self._by_port(report.routers))
+        full = tuple(_full(by_port))
+        unlinked = _unlinked(former.unlinked, by_port, report.routers[-1:], self._now())
+        reading = reading._replace(without_node=known, apart=apart, full=full, unlinked=unlinked)
         return reading if graph is None and sessions == former.sessions else _with_rows(reading)
 
     def is_up(self, link: Link) -> bool:
@@ -221,6 +226,10 @@ class ZenohState(Collector):
             not_compared=reading.comparison.not_compared,
             apart=tuple(self._apart_status()),
             full=reading.full,
+            unlinked=tuple(
+                ZenohUnlinkedStatus(port, round(max(self._now() - since, 0.0), 1))
+                for port, since in reading.unlinked.items()
+            ),
         )
 
     def _apart_status(self) -> Iterator[ZenohApartStatus]:
@@ -328,23 +337,16 @@ class ZenohState(Collector):
                 if ends and not is_own:
                     yield _PlacedSession(port, session, ends, index == at_link)
 
-    def _full(self, routers: Sequence[RouterReport]) -> Iterator[ZenohFullStatus]:
-        """Yield the routers that refuse further sessions."""
+    def _by_port(self, routers: Sequence[RouterReport]) -> Iterator[tuple[int, RouterReport]]:
+        """Yield the port and the report of each router with a port."""
         settings = self._settings
         at_links = settings.zenoh_link_listen
         ports: list[int | None] = [*settings.zenoh_ports.ports()]
         ports += [] if settings.zenoh_listen is None else [settings.zenoh_listen]
         ports += [at_links.port if at_links else None] if settings.has_site_links else []
         for port, router in zip([*ports, settings.zenoh_hub_listen], routers, strict=False):
-            if port is not None and router.is_full:
-                ends = filter(None, map(ends_of, router.sessions))
-                hosts = Counter(end.remote.host for end in ends)
-                yield ZenohFullStatus(
-                    port,
-                    len(router.sessions),
-                    tuple(host for host, _ in hosts.most_common(MOST_ADDRESSES_AT_FULL)),
-                    few_files=router.most_sessions < MOST_SESSIONS,
-                )
+            if port is not None:
+                yield port, router
 
     def _with_age(
         self, row: ZenohSessionStatus, without_node: Mapping[tuple[int, str], float]
@@ -363,6 +365,39 @@ class ZenohState(Collector):
             hub=link.is_hub,
             protocol=link.protocol,
         )
+
+
+def _full(routers: Mapping[int, RouterReport]) -> Iterator[ZenohFullStatus]:
+    """Yield the routers that refuse further sessions. ``routers``: the reports by port."""
+    for port, router in routers.items():
+        if router.is_full:
+            ends = filter(None, map(ends_of, router.sessions))
+            hosts = Counter(end.remote.host for end in ends)
+            yield ZenohFullStatus(
+                port,
+                len(router.sessions),
+                tuple(host for host, _ in hosts.most_common(MOST_ADDRESSES_AT_FULL)),
+                few_files=router.most_sessions < MOST_SESSIONS,
+            )
+
+
+def _unlinked(
+    former: Mapping[int, float],
+    routers: Mapping[int, RouterReport],
+    hub: Sequence[RouterReport],
+    now: float,
+) -> dict[int, float]:
+    """The times since which routers have no link to the hub, as in `Reading`.
+
+    ``former``: these times before. ``routers``: the reports by port; ``hub`` is empty without.
+    """
+    linked = {router.zid for router in hub}
+    linked |= {session.peer for router in hub for session in router.sessions}
+    return {
+        port: former.get(port, now)
+        for port, router in routers.items()
+        if router.zid not in linked and not router.is_full
+    }
 
 
 def _without_node(

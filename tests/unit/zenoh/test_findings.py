@@ -13,10 +13,12 @@ from rosproxy.shared.documents.status_document import (
     ZenohNodeStatus,
     ZenohSessionStatus,
     ZenohStatus,
+    ZenohUnlinkedStatus,
 )
 from rosproxy.zenoh.findings import (
     APART_GRACE_S,
     GRAPH_GRACE_S,
+    HUB_GRACE_S,
     LINK_GRACE_S,
     MOST_LIMIT_COMPARISONS,
     MOST_REPORTED_MISMATCHES,
@@ -114,6 +116,15 @@ def test_a_router_that_refuses_sessions_is_told(*, few_files: bool) -> None:
     assert finding.text.startswith("has 33 sessions with 172.18.0.3, 172.18.0.4, and accepts no")
     assert finding.fix.startswith("stop the program that opens these sessions")
     assert ("raise the limit of open files" in finding.fix) is few_files
+
+
+def test_a_router_without_a_link_to_the_hub_is_told() -> None:
+    def told(since: float) -> list[str]:
+        alone = ZenohUnlinkedStatus(7450, since)
+        return [finding.subject for finding in faults(replace(GOOD, unlinked=(alone,)))]
+
+    assert told(HUB_GRACE_S - 0.1) == []
+    assert told(HUB_GRACE_S) == ["zenoh router at port 7450"]
 
 
 def test_sessions_that_announce_no_node_are_told() -> None:

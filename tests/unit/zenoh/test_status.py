@@ -14,6 +14,7 @@ from rosproxy.shared.documents.status_document import (
     ZenohFullStatus,
     ZenohQosStatus,
     ZenohSessionStatus,
+    ZenohUnlinkedStatus,
 )
 from rosproxy.shared.policy.rules import RuleKind
 from rosproxy.zenoh.protocol.liveliness import graph_of
@@ -319,6 +320,21 @@ def test_a_router_with_the_most_sessions_is_full_until_a_session_ends(
     state.take(Report((first, HUB)), None)
     assert not state.status().full
     assert "rosproxy_zenoh_routers_full 0.0" in metrics_of(state)
+
+
+def test_a_router_without_a_link_to_the_hub_is_told_until_it_is_linked() -> None:
+    clock = Clock()
+    state = make_state(FakeProcess(), clock)
+    clock.time += 5.0
+    state.take(REPORT, None)
+    assert state.status().unlinked == (ZenohUnlinkedStatus(7449, 5.0),)
+    full = RouterReport("02", REPORT.routers[0].sessions, most_sessions=1)
+    state.take(Report((REPORT.routers[0], full, HUB)), None)
+    assert not state.status().unlinked
+    link = session("02", "router", "127.0.0.1:50004", "127.0.0.1:7449")
+    linked = replace(HUB, sessions=(*HUB.sessions, link))
+    state.take(Report((*REPORT.routers[:2], linked)), None)
+    assert not state.status().unlinked
 
 
 def sites_state(process: FakeProcess, protocol: str = "tls") -> ZenohState:

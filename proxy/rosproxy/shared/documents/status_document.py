@@ -512,6 +512,13 @@ class ZenohFullStatus(msgspec.Struct, frozen=True):
     few_files: bool = False
 
 
+class ZenohUnlinkedStatus(msgspec.Struct, frozen=True):
+    """A router of the proxy, at a ``port``, without a link to the hub for ``since`` seconds."""
+
+    port: Count = 0
+    since: Seconds = 0.0
+
+
 class ZenohStatus(msgspec.Struct, frozen=True):
     """The routers for rmw_zenoh: ports for containers, and the port ``listen`` for outside.
 
@@ -523,6 +530,7 @@ class ZenohStatus(msgspec.Struct, frozen=True):
     as ``tls/7447``; ``link_listens``: whether this port accepts connections. ``limits``: the rates
     of topics on links to other sites, as ``/camera/*=2Hz``. ``apart``: zenoh peers of routers
     outside that do not reach each other. ``full``: the routers that refuse further sessions.
+    ``unlinked``: the other routers to which the hub has no link.
     """
 
     ports: str = ""
@@ -543,6 +551,7 @@ class ZenohStatus(msgspec.Struct, frozen=True):
     hub_listen: Count | None = None
     apart: tuple[ZenohApartStatus, ...] = ()
     full: tuple[ZenohFullStatus, ...] = ()
+    unlinked: tuple[ZenohUnlinkedStatus, ...] = ()
 
 
 class ProxyStatus(msgspec.Struct, frozen=True):
