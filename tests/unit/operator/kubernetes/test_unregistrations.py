@@ -26,6 +26,7 @@ from tests.unit.operator.kubernetes.objects import (
 
 BEFORE = "2026-01-01T00:00:00Z"
 THEN = "2026-01-01T01:00:00Z"
+A_SECOND_LATER = "2026-01-01T01:00:01Z"
 LATER = "2026-01-01T02:00:00Z"
 OTHER_MASTER = MasterSpec("http://other:11311")
 WITH_NODES = ProxyReport(answered=True, nodes={"10.244.1.7": ("/talker",)})
@@ -77,8 +78,16 @@ def test_another_master_and_back_leaves_older_pods_unregistered() -> None:
 
     back = stored(rosproxy(), first)
     assert told(look(seen(running(), proxy(), of=back)), "NotWired") == [text]
-    started_later = running(created=BEFORE, running_since=THEN)
+    started_later = running(created=BEFORE, running_since=A_SECOND_LATER)
     assert not told(look(seen(started_later, proxy(), of=back)), "NotWired")
+
+
+def test_a_container_that_started_in_the_second_of_the_unregistration_is_told() -> None:
+    """Kubernetes keeps whole seconds. The node may have registered a moment before."""
+    of = replace(rosproxy(), unregistered_at={"one": THEN})
+    started = running(created=BEFORE, running_since=THEN)
+    assert told(look(seen(started, proxy(), of=of, report=WITHOUT_NODES)), "NotWired")
+    assert not told(look(seen(started, proxy(), of=of, report=OF_THE_POD)), "NotWired")
 
 
 def test_a_look_with_a_former_status_still_tells() -> None:

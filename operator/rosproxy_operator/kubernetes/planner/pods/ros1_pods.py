@@ -99,7 +99,8 @@ def why_lost(pod: Pod, rosproxy: RosProxy) -> str:
             "deleted, and the ROS nodes of the pod may have been unregistered at the master"
         )
     at = rosproxy.unregistered_at.get(pod.node, "")
-    if pod.running_since < at:
+    # Within the same second, the nodes may have registered before.
+    if pod.running_since <= at:
         return (
             f"was started before {at}, when the proxy on node {pod.node} unregistered ROS nodes "
             f"after a change of RosProxy {rosproxy.id.name} or of the selected pods. The ROS nodes "
