@@ -13,8 +13,8 @@ from tests.docker.nodes import Log, node_command
 from tests.kubernetes import api
 from tests.kubernetes.api import Json
 from tests.kubernetes.cluster.control_plane import kubectl
-from tests.kubernetes.cluster.layout import node_named
-from tests.kubernetes.cluster.node import crash_container
+from tests.kubernetes.cluster.layout import Node, node_named
+from tests.kubernetes.cluster.node import crash_container, stop_container
 
 INJECT = "rosproxy.io/inject"
 _numbers = itertools.count(1)
@@ -71,10 +71,17 @@ class Pod:
 
     def crash(self) -> None:
         """Kill the first process of the first container, like the kernel."""
+        crash_container(*self._first_container())
+
+    def hang(self) -> None:
+        """Let the first process of the first container hang."""
+        stop_container(*self._first_container())
+
+    def _first_container(self) -> tuple[Node, str]:
+        """The node and the ID of the first container."""
         body = self.body
         container = body["status"]["containerStatuses"][0]["containerID"]
-        node = node_named(body["spec"]["nodeName"])
-        crash_container(node, container.removeprefix("containerd://"))
+        return node_named(body["spec"]["nodeName"]), container.removeprefix("containerd://")
 
     def remove(self, grace: int | None = None, *, wait: bool = True) -> None:
         """Delete the pod, and wait until gone. Another pod may have the name then."""

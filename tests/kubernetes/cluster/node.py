@@ -1,6 +1,8 @@
 """A node: containerd, kubelet and kube-proxy in a network namespace."""
 
 import json
+import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -222,6 +224,16 @@ def _cni_configuration(node: Node) -> dict[str, Any]:
 
 def crash_container(node: Node, container: str) -> None:
     """Kill the first process of a container from behind, as the kernel would for want of memory."""
+    kill(_first_processes(node, container))
+
+
+def stop_container(node: Node, container: str) -> None:
+    """Let the first process of a container hang."""
+    for pid in _first_processes(node, container):
+        os.kill(pid, signal.SIGSTOP)
+
+
+def _first_processes(node: Node, container: str) -> list[int]:
+    """The first process of a container, if the container runs."""
     lines = run("ctr", "-a", node.socket, "-n", "k8s.io", "tasks", "ls").splitlines()
-    pids = [int(line.split()[1]) for line in lines if line.startswith(f"{container} ")]
-    kill(pids)
+    return [int(line.split()[1]) for line in lines if line.startswith(f"{container} ")]
