@@ -85,6 +85,11 @@ class Lab:
         router.wait_for("router runs")
         return router
 
+    def start_cutter(self, port: int) -> None:
+        """Start a port before the router of the robot, which ends sessions at once."""
+        cutter = self._program(OWN_VERSION, "out", "cutter.py", str(port), str(ROUTER_PORT))
+        cutter.wait_for("cuts sessions")
+
     def node(
         self, version: str, role: str, kind: str, topic: str = "chatter", **environment: str
     ) -> Process:

@@ -13,6 +13,8 @@ from tests.zenoh.lab import PORTS, VERSIONS, Lab
 
 VERSION = "1.6.2"
 """Nodes of Kilted."""
+BEFORE_ROUTER = 7446
+"""A port on the machine of the robot."""
 BACK_WITHIN_S = 15.0
 """Nodes dial again 1, 3, 7 and 11 s after the end of a connection."""
 KILLS = 3
@@ -112,6 +114,24 @@ def test_the_link_is_back_with_the_router_of_the_robot(lab: Lab) -> None:
     lab.wait_for_link()
     watched.wait(BACK_WITHIN_S)
     wait_until("the fault is over", lambda: subject not in lab.problems(), 30)
+
+
+def test_a_router_that_ended_its_session_at_once_is_dialed_again(lab: Lab) -> None:
+    """zenoh 1.7.2 dials no more if a session ends within some milliseconds of its begin."""
+    lab.start_router(VERSION)
+    for role in ("c1", "c2"):
+        lab.redirect(role)
+    lab.start_cutter(BEFORE_ROUTER)
+    peer = f"{lab.topology.plan.robot}:{BEFORE_ROUTER}"
+    lab.start_proxy("--zenoh-peer", peer, with_robot=False)
+    beside = Watched(lab, VERSION, "c1", "c2")
+    beside.wait()
+    assert lab.proxy is not None
+    lab.proxy.wait_for(f"zenoh does not dial tcp/{peer} again; opening the hub anew", timeout=90)
+    lab.wait_for_link()
+    for watched in (beside, Watched(lab, VERSION, "out", "c1")):
+        watched.wait(BACK_WITHIN_S)
+    assert lab.zenoh().restarts == 0
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -104,6 +104,11 @@ class Link:
         return self.protocol != "tcp"
 
     @property
+    def is_lost(self) -> bool:
+        """Whether there is no session with the peer, not even at a former address."""
+        return self.fault is not None and self.fault is not LinkFault.ITSELF and not self.former
+
+    @property
     def is_to_router(self) -> bool:
         """Whether the link leads to a router outside (``--zenoh-peer``)."""
         return not self.is_hub and not self.is_to_site

@@ -88,7 +88,8 @@ class RouterPlan:
     With ``certificate``, the hubs use TLS, and each proves itself to the other.
     ``directory`` has the sockets by which the hub dials the other routers of the proxy. If empty,
     the hub dials by TCP, and the routers can have no access control. ``files``: the files that the
-    router process may open.
+    router process may open. Another ``opening`` opens anew the routers that dial: the hub and the
+    router of the links to other sites.
     """
 
     bind: str
@@ -100,6 +101,7 @@ class RouterPlan:
     hubs: Sequence[HostPort] = ()
     certificate: Credentials | None = None
     files: int = NO_FILE_LIMIT
+    opening: int = 0
 
     @property
     def all_ports(self) -> list[int]:
@@ -131,7 +133,9 @@ class RouterPlan:
             )
             for port in self.all_ports
         ]
-        every = [*routers, *([links] if links else []), self._hub(bool(links))]
+        dialing = [*([links] if links else []), self._hub(bool(links))]
+        opening = {"metadata": json.dumps({"opening": self.opening})}
+        every = [*routers, *({**config, **opening} for config in dialing)]
         return [*_bounded(every, self.files)]
 
     def _hub(self, has_links: bool) -> RouterConfig:
@@ -139,20 +143,23 @@ class RouterPlan:
 
         The hub dials the other routers. So without ``hub_listen``, others reach no port of the hub.
         """
-        protocol = _TLS if self.certificate else NODE_PROTOCOL
         hub_ports = [] if self.hub_listen is None else [HostPort(self.bind, self.hub_listen)]
-        listen = [f"{protocol}/{address}" for address in hub_ports]
+        listen = [self.hub_endpoint(address) for address in hub_ports]
         listen += [self.hub_socket] if has_links else []
-        host = _LOOPBACK.get(self.bind, self.bind)
-        dialed = [
-            endpoint
-            for port in self.all_ports
-            for endpoint in self._socket(port) or [_tcp(HostPort(host, port))]
-        ]
+        dialed = [self.dialed_at(port) for port in self.all_ports]
         dialed += [_tcp(peer) for peer in self.peers if peer not in self.hubs]
-        dialed += [f"{protocol}/{hub}" for hub in self.hubs]
+        dialed += map(self.hub_endpoint, self.hubs)
         tls = tls_values(self.certificate) if self.certificate else {}
         return router_config(listen, dialed, tls | LEASE)
+
+    def hub_endpoint(self, address: HostPort) -> str:
+        """The endpoint of a hub at an address."""
+        return f"{_TLS if self.certificate else NODE_PROTOCOL}/{address}"
+
+    def dialed_at(self, port: int) -> str:
+        """The endpoint at which the hub dials the router of a port."""
+        at_port = _tcp(HostPort(_LOOPBACK.get(self.bind, self.bind), port))
+        return next(iter(self._socket(port)), at_port)
 
     def _socket(self, port: int) -> list[str]:
         return [f"{HUB_PROTOCOL}/{self.directory}/{port}"] if self.directory else []

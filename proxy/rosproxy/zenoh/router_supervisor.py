@@ -19,7 +19,12 @@ from typing import TypeVar
 from rosproxy.shared.addresses import HostPort
 from rosproxy.shared.output.text import brief
 from rosproxy.shared.tasks import Tasks
-from rosproxy.zenoh.protocol.library_log import certificate_refusal, is_about_links
+from rosproxy.zenoh.protocol.library_log import (
+    certificate_refusal,
+    is_about_dialing,
+    is_about_links,
+    note_dialing,
+)
 from rosproxy.zenoh.protocol.report import LONGEST_REPORT, Report, read_report
 from rosproxy.zenoh.router_configs import RouterConfig
 
@@ -58,6 +63,8 @@ class RouterSupervisor:
     ``take_report`` gets each report. ``refuse`` gets the reason for each certificate of another
     site that the routers refuse. ``failure``: why no routers run; empty while the routers run.
     ``restarts``: the number of processes that have ended.
+    ``connected``: the endpoints to which the routers have connected, and that they have not dialed
+    again, with the time of the event loop in seconds.
     """
 
     def __init__(
@@ -78,6 +85,7 @@ class RouterSupervisor:
         self.program: Sequence[str] = PROGRAM
         self.failure = "the routers have not started yet"
         self.restarts = 0
+        self.connected = dict[str, float]()
 
     async def start(self, configs: Sequence[RouterConfig]) -> None:
         """Start the process, and wait until the routers run.
@@ -140,8 +148,10 @@ class RouterSupervisor:
             )
         except OSError as error:  # no memory, or too many processes
             return f"the process can't be started: {error.strerror}"
+        self.connected = dict[str, float]()
         logging_task = self._tasks.spawn(
-            _log_lines(_piped(process.stderr), self._refuse), "reading the log of routers"
+            _log_lines(_piped(process.stderr), self._refuse, self.connected),
+            "reading the log of routers",
         )
         self._process = process
         try:
@@ -201,14 +211,19 @@ def _exit_reason(status: int) -> str:
     return f"the process was ended by {signal.Signals(-status).name}"
 
 
-async def _log_lines(stream: asyncio.StreamReader, refuse: Callable[[str], None]) -> None:
-    """Log what the library prints, up to a bound, and read the rest."""
+async def _log_lines(
+    stream: asyncio.StreamReader, refuse: Callable[[str], None], connected: dict[str, float]
+) -> None:
+    """Log what the library prints, up to a bound, and read the rest. See `note_dialing`."""
     count = 0
     while line := await _read_line(stream):
         text = line.decode(errors="replace").strip()
         if is_about_links(text):
             if reason := certificate_refusal(text):
                 refuse(reason)
+            continue
+        if is_about_dialing(text):
+            note_dialing(text, connected, asyncio.get_running_loop().time())
             continue
         count += 1
         if count <= MOST_LOG_LINES:

@@ -35,6 +35,7 @@ from rosproxy.zenoh.link_probe import accepts, try_link
 from rosproxy.zenoh.links import Link, LinkFault, own_peers
 from rosproxy.zenoh.protocol.liveliness import graph_of
 from rosproxy.zenoh.protocol.report import Report
+from rosproxy.zenoh.redialing import Redialing
 from rosproxy.zenoh.router_configs import RouterConfig, RouterPlan
 from rosproxy.zenoh.router_policy import RouterPolicy
 from rosproxy.zenoh.router_supervisor import RoutersFailed, RouterSupervisor
@@ -90,6 +91,7 @@ class Zenoh:
         self._awaiting = bool(settings.await_policy)
         self._tokens: Sequence[str] | None = None
         self._tokens_due = 0.0
+        self._redialing = Redialing()
         self._own_peers = frozenset[HostPort]()
         self.supervisor = RouterSupervisor(runtime.tasks, self._take_report, self._refuse)
         self.state = ZenohState(settings, self.supervisor, runtime.now, self._certificates)
@@ -342,6 +344,7 @@ class Zenoh:
                 await self._look_at(link)
 
         await asyncio.gather(*map(look_at, self.state.links))
+        await self._dial_again()
 
     async def _look_at(self, link: Link) -> None:
         """Look up the addresses of a peer, and record why the link to the peer is down."""
@@ -365,6 +368,22 @@ class Zenoh:
         if link.note(fault, self._runtime.now()):
             state = f"down, {fault.value}" if fault else "up"
             log.info("zenoh link %s: %s", state, link)
+
+    async def _dial_again(self) -> None:
+        """Open the hub anew if it dials a lost router no more."""
+        if self.supervisor.failure:
+            return
+        down = {self._endpoint(link): link.since for link in self.state.links if link.is_lost}
+        down |= {self._plan.dialed_at(port): at for port, at in self.state.unlinked.items()}
+        lost = self._redialing.due(down, self.supervisor.connected, self._runtime.now())
+        if lost:
+            log.error("zenoh does not dial %s again; opening the hub anew", listed(lost))
+            self._plan = replace_plan(self._plan, opening=self._plan.opening + 1)
+            await self._use_again()
+
+    def _endpoint(self, link: Link) -> str:
+        """The endpoint of the peer of a link, as in the configurations."""
+        return self._plan.hub_endpoint(link.peer) if link.is_hub else f"{link.protocol}/{link.peer}"
 
     async def _end_former(self, link: Link) -> None:
         """End the sessions with former addresses of a peer, where no router answers any more.

@@ -195,6 +195,11 @@ class ZenohState(Collector):
         return left_behind(link, self.links, routers)
 
     @property
+    def unlinked(self) -> Mapping[int, float]:
+        """The ports of the proxy's routers without a link to the hub; see `Reading`."""
+        return self._reading.unlinked
+
+    @property
     def container_sessions(self) -> list[tuple[int, str]]:
         """The port and the address of each session with a container."""
         sessions = self._reading.sessions

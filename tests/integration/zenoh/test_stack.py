@@ -70,6 +70,19 @@ for line in sys.stdin:
     print(json.dumps({"revision": given["revision"], "routers": [{"zid": "01"}, hub]}), flush=True)
 """
 """The hub reaches another router of the proxy at a peer, as through the address of a Service."""
+FORGETS = """
+import json, sys
+for line in sys.stdin:
+    with open(sys.argv[1], "a") as told:
+        told.write(line)
+    given = json.loads(line)
+    dialed = json.loads(given["routers"][-1]["connect/endpoints"])[int(sys.argv[2])]
+    log = "DEBUG zenoh::net::runtime::orchestrator: Successfully connected to configured peer"
+    print(log, dialed, file=sys.stderr, flush=True)
+    routers = [{"zid": "01"}, {"zid": "02"}]
+    print(json.dumps({"revision": given["revision"], "routers": routers}), flush=True)
+"""
+"""The hub has connected to one of its two endpoints, and never dials this endpoint again."""
 Make = Callable[..., Zenoh]
 AUTHORITY = certificates.Authority()
 
@@ -213,6 +226,22 @@ async def test_a_peer_that_turns_out_to_be_the_proxy_is_left_out(
     await until(lambda: len(lines()) == 2, "the routers have other configurations")
     assert peers_of_hub(lines()[0]) == ["tcp/192.0.2.7:47448", f"tcp/{PEER}:7447"]
     assert peers_of_hub(lines()[1]) == [f"tcp/{PEER}:7447"]
+
+
+@pytest.mark.parametrize("endpoint", [0, 1], ids=["router of a container", "peer"])
+async def test_the_hub_is_opened_anew_if_it_dials_no_more(
+    make: Make, tmp_path: Path, lines: Lines, monkeypatch: pytest.MonkeyPatch, endpoint: int
+) -> None:
+    """No message passed any more until the proxy was restarted (zenoh 1.7.2)."""
+    monkeypatch.setattr("rosproxy.zenoh.redialing.GRACE_S", 0.0)
+    zenoh = make(zenoh_peer=(PEER,))
+    program = (sys.executable, "-c", FORGETS, str(tmp_path / "told"), str(endpoint))
+    zenoh.supervisor.program = program
+    await zenoh.start()
+    await until(lambda: len(lines()) == 2, "the hub is opened anew")
+    (router, hub), (same_router, other_hub) = (line["routers"] for line in lines())
+    assert router == same_router
+    assert hub != other_hub
 
 
 @pytest.mark.parametrize("is_silent", [True, False])

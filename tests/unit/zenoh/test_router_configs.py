@@ -2,6 +2,7 @@
 
 import base64
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -158,3 +159,12 @@ def test_without_a_directory_there_is_no_access_control() -> None:
     """The routers could not tell the hub from nodes."""
     with pytest.raises(ValueError, match="need a directory"):
         RouterPlan("0.0.0.0", PORTS, None, ()).configs({7448: {"enabled": True}})
+
+
+def test_another_opening_changes_the_routers_that_dial_alone() -> None:
+    links = {"connect/endpoints": '["tls/cloud:7447"]'}
+    plan = RouterPlan("0.0.0.0", PORTS, 7447, (), "/run/r")
+    first = plan.configs({}, links)
+    again = replace(plan, opening=1).configs({}, links)
+    changed = [before != after for before, after in zip(first, again, strict=True)]
+    assert changed == [False, False, False, True, True]
