@@ -81,6 +81,7 @@ def test_the_running_operator_is_asked(
     controller = start_controller("--port-window", "13400-13499", "--ports", "7")
     node = net.idle(net.network())
 
+    wait_until(lambda: bool(controller.status()["proxies"]), 30, controller.logs)
     status = controller.status()
 
     assert status["operator"] == "http://127.0.0.1:21313"
