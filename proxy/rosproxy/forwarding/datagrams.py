@@ -22,13 +22,24 @@ LARGEST_DATAGRAM = 65_536
 """Bytes of a datagram that are read at most."""
 _SO_RCVBUFFORCE = 33
 """An option of asm-generic/socket.h, which Python's socket lacks."""
+_IP_MULTICAST_ALL = 49
+"""An option of linux/in.h: whether a socket receives from networks on which only other sockets have
+joined the group. A socket that has joined no group then receives from all groups of others."""
+_IPV6_MULTICAST_ALL = 29
+"""The same option for IPv6, of linux/in6.h. It has no effect on a socket that has joined the group
+on any network: the kernel compares only the address (inet6_mc_check)."""
 
 
 def bind(address: str, port: int) -> socket.socket:
-    """A bound, non-blocking UDP socket; port 0 stands for any free port. Raises OSError."""
+    """A bound, non-blocking UDP socket; port 0 stands for any free port. Raises OSError.
+
+    The socket receives from no multicast group. Its port may be the multicast port of another
+    domain of ROS 2 (DDSI-RTPS 2.5, 9.6.2.3), whose group this process has joined.
+    """
     sock = _socket(address)
     try:
         enlarge_receive_buffer(sock)
+        ignore_groups_of_others(sock)
         if sock.family == socket.AF_INET6:
             # `::` accepts IPv4, too, with any value of net.ipv6.bindv6only (ipv6(7)).
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
@@ -45,6 +56,14 @@ def enlarge_receive_buffer(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, UDP_RECEIVE_BUFFER_BYTES)
     except PermissionError:  # without NET_ADMIN (socket(7))
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_RECEIVE_BUFFER_BYTES)
+
+
+def ignore_groups_of_others(sock: socket.socket) -> None:
+    """Let a socket receive no multicast of networks on which only other sockets have joined."""
+    with contextlib.suppress(OSError):  # without this option the socket receives too much
+        sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+        if sock.family == socket.AF_INET6:
+            sock.setsockopt(socket.IPPROTO_IPV6, _IPV6_MULTICAST_ALL, 0)
 
 
 class DatagramRelay:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from rosproxy.forwarding.datagrams import DatagramRelay, bind
+from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
 from rosproxy.shared.addresses import HostPort
 from tests.integration.net import NODE, OTHER_NODE, OUTSIDE, PROXY, until
 
@@ -69,3 +70,17 @@ async def test_the_end_of_the_target_ends_the_relay_and_the_sender_gets_an_error
         out.send(b"two")
         with pytest.raises(ConnectionRefusedError):
             await received(out)
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0", "::"])
+def test_multicast_that_another_socket_has_joined_is_not_received(address: str) -> None:
+    """A stand-in may have the multicast port of a domain of which the proxy knows nothing."""
+    with bind(address, 0) as sock, group_socket(HostPort(GROUP, 0)) as member, sender(NODE) as out:
+        join(member, NODE)
+        send_through(out, NODE, loop=True)
+        port = sock.getsockname()[1]
+
+        out.sendto(b"to the group", (GROUP, port))
+        out.sendto(b"to the port", (NODE, port))
+
+        assert sock.recv(100) == b"to the port"

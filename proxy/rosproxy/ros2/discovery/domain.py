@@ -234,8 +234,8 @@ class Domain:
             return self._drop("relay_proof", relay.address.host, str(error))
         self.rediscovery.lan_relay_heard = True
         if fault := claim_fault(source, self.settings):
-            # With IPv6 the relay may receive from the inside network (groups.py,
-            # _IP_MULTICAST_ALL). So the announcement of a participant inside is no fault.
+            # With IPv6 the relay may receive from the inside network (datagrams.py,
+            # _IPV6_MULTICAST_ALL). So the announcement of a participant inside is no fault.
             return [] if is_known else self._drop("claimed_address", source, fault)
         return self._heard_at_discovery(announcement, source, True, len(announcement), now)
 

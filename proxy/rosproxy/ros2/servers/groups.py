@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from rosproxy.forwarding.datagrams import enlarge_receive_buffer
+from rosproxy.forwarding.datagrams import enlarge_receive_buffer, ignore_groups_of_others
 from rosproxy.shared.addresses import HostPort
 from rosproxy.shared.machine.interfaces import interface_index
 
@@ -30,10 +30,6 @@ GROUP_CYCLONE6 = "ff02::ffff:efff:1"
 """The IPv6 group for announcements of Cyclone DDS."""
 _SHARED = {socket.AF_INET: (GROUP,), socket.AF_INET6: (GROUP_FAST_DDS6,)}
 _OF_LINK = {socket.AF_INET: (), socket.AF_INET6: (GROUP_CYCLONE6,)}
-_IP_MULTICAST_ALL = 49
-"""An option of linux/in.h: whether a socket receives from networks on which only other sockets have
-joined the group. With IPv6 a socket always does: the kernel compares only the address
-(inet6_mc_check)."""
 
 
 def family_of(address: str) -> socket.AddressFamily:
@@ -182,9 +178,7 @@ def group_socket(group: HostPort, link_of: str = "") -> socket.socket:
         sock.setblocking(False)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         enlarge_receive_buffer(sock)
-        if sock.family == socket.AF_INET:
-            with contextlib.suppress(OSError):  # without this option the socket receives too much
-                sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+        ignore_groups_of_others(sock)
         # The scope id selects the link of a group of link scope (ipv6(7)).
         link = (0, interface_index(link_of)) if link_of else ()
         sock.bind((group.host, group.port, *link))
